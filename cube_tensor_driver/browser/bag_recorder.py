@@ -12,32 +12,35 @@ from ..core.errors import ConfigError
 from ..processes.children import end_with_parent
 
 MAX_END_S = 10.0
-"""Time, in seconds, that the recorder may take to finish its file; then it is killed."""
+"""Maximum time, in seconds, from SIGINT until the process that records must have finished its file.
+
+A process that takes longer is killed.
+"""
 
 
 class BagRecorder:
-    """Makes at most one recording at a time, each in a new folder.
+    """Runs `./cube record` as a child process, at most one at a time, each into a new folder.
 
     Attributes:
-        path: Folder of the last bag.
+        path: Folder of the bag that was begun last; before the first one, the folder for all bags.
     """
 
     def __init__(self, folder: Path) -> None:
-        """folder: for all bags; it is made when it is needed."""
+        """Set the parent folder of all bags; `start` makes it if it does not exist."""
         self._folder = folder
         self.path = folder
         self._process: subprocess.Popen[bytes] | None = None
 
     @property
     def recording(self) -> bool:
-        """Whether a recording goes on."""
+        """Whether the child process that records has been started and not yet been ended."""
         return self._process is not None
 
     def start(self) -> None:
-        """Start a recording.
+        """Start to record into a new folder whose name contains the local time.
 
         Raises:
-            ConfigError: The folder cannot be made.
+            ConfigError: The parent folder of the bags does not exist and cannot be made.
         """
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
@@ -51,25 +54,33 @@ class BagRecorder:
             [*end_with_parent(), sys.executable, *record],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
-            # Ctrl-C in the terminal of the view must not cut off the file.
+            # Ctrl-C in the terminal reaches every process of its session. In a session of its own,
+            # the recorder does not get it and can finish its file when `end` asks for that.
             start_new_session=True,
         )
 
     def end(self) -> None:
-        """Finish the bag; without a recording nothing happens."""
+        """Ask the recorder to finish its bag, and wait up to `MAX_END_S` for it.
+
+        Without a recording nothing happens.
+        """
         if self._process is None:
             return
         self._process.send_signal(signal.SIGINT)
         try:
             self._process.wait(MAX_END_S)
         except subprocess.TimeoutExpired:
-            # The bag can be repaired then: ./cube bag repair.
+            # ./cube bag repair can make the unfinished bag readable.
             self._process.kill()
             self._process.wait()
         self._process = None
 
     def ended_by_itself(self) -> int | None:
-        """Return, once, the exit code of a recording that ended unasked; None: it did not."""
+        """Check whether the recorder has ended although `end` was not called.
+
+        Returns:
+            Its exit code, in the first call after it has ended; otherwise None.
+        """
         code = None if self._process is None else self._process.poll()
         if code is not None:
             self._process = None

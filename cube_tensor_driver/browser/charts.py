@@ -19,7 +19,7 @@ from . import markup
 from .history import History
 
 HISTORY_S = 10.0
-"""Time, in seconds, that the plots cover."""
+"""Length of the time axis of the plots, in seconds; its right end is the newest value."""
 
 TIME_SCALE = uplot.Scale(
     time=False,
@@ -28,26 +28,39 @@ TIME_SCALE = uplot.Scale(
 )
 
 NUDGE_PERIOD = 3
-"""Number of pictures after which the charts are laid out again, see `Chart.draw`."""
+"""Number of drawings after which the range of the value axis changes by an invisible amount.
+
+The change makes the browser lay the chart out again, see the argument `nudge` of `Chart.draw`.
+"""
 
 MAX_LINES = 12
-"""Number of lines in one chart; more cannot be told apart."""
+"""Maximum number of lines in one chart; readers cannot distinguish more."""
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#000000", "#e69f00", "#56b4e9", "#888888")
-"""Colours of the lines, in order (Okabe and Ito: they differ for the colour-blind, too)."""
+"""Colours of the lines of a chart, in order.
+
+They are those of Okabe and Ito, which colour-blind readers can distinguish, too.
+"""
 
 DASHES = ((), (7, 4))
-"""Dashes of the lines: the first colours are solid, then the colours come again, dashed."""
+"""Dash patterns of the lines of a chart: lengths of dash and gap, in pixels; empty: solid.
+
+The first lines are solid, one in each colour of `COLOURS`; all further lines repeat the colours and
+are dashed.
+"""
 
 AXIS_SIZES = (44, 56)
-"""Room for numbers and label of the time axis and of the value axis, in pixels."""
+"""Space for the numbers and the label of an axis, in pixels.
+
+The first entry is the height below the time axis, the second the width beside the value axis.
+"""
 
 CHART_HEIGHT = 250
 """Height of a chart, in pixels."""
 
 NOISE_SHARE = 0.02
-"""Share of the largest value below which values of the other sign count as noise, which gets no
-room on the axis."""
+"""Fraction of the largest absolute value in a chart; the axis ends at zero on a side where no value
+is larger than this, because such values are noise."""
 
 GROUPS = {
     "normal stress": ("xx", "yy", "zz"),
@@ -58,20 +71,23 @@ GROUPS = {
     "residual": ("residual",),
     **{markup.label(name): (name,) for name in COMPONENTS},
 }
-"""Name of what a chart can show -> its columns of the history, which have one unit."""
+"""Name of a group of values that a chart can show -> their names in `History.COLUMNS`.
+
+All values of a group have the same unit, because a chart has one value axis.
+"""
 
 FIRST_GROUPS = ("normal stress", "gradient of σzz")
-"""What the two charts show at first."""
+"""Names, in `GROUPS`, of the values that the two charts show when the page opens."""
 
 
 class ChartLine(NamedTuple):
     """One line of a chart: one value of one cube.
 
     Attributes:
-        cube: Index of the cube.
-        column: Index in `History.COLUMNS`.
-        label: Name on the page.
-        printed: Name in a picture, with mathematical type.
+        cube: Index of the cube in the skin.
+        column: Index of the value in `History.COLUMNS`.
+        label: Name of the line in the legend on the page, such as "c05 σzz".
+        printed: Name of the line in a PNG file, with the symbol set as mathematics.
     """
 
     cube: int
@@ -81,7 +97,7 @@ class ChartLine(NamedTuple):
 
 
 class Charts:
-    """The tab with the plots of the chosen cube, and of others that are named in a text field."""
+    """The tab with plots over time, of the chosen cube and of cubes named in a text field."""
 
     def __init__(
         self,
@@ -89,7 +105,13 @@ class Charts:
         tab: viser.GuiTabHandle,
         names: Sequence[str],
     ) -> None:
-        """Add the contents of the tab; names: names of the cubes."""
+        """Add the text field, the charts and the buttons to the tab.
+
+        Args:
+            gui: The controls of one browser.
+            tab: The tab of the panel.
+            names: Names of the cubes of the skin.
+        """
         self._names = list(names)
         self._pictures = 0
         self._history: History | None = None
@@ -101,7 +123,7 @@ class Charts:
                 hint="names, for example: c05 c06. The chosen cube comes first.",
                 order=0,
             )
-            # Each chart takes two places: its choice and its plot.
+            # Each chart takes two positions in the tab: its drop-down list and its plot.
             self._charts = [
                 Chart(gui, tab, group, 1 + 2 * number) for number, group in enumerate(FIRST_GROUPS)
             ]
@@ -114,22 +136,30 @@ class Charts:
             self._save(event.client, str(files.value))
 
     def draw(self, history: History, chosen: int) -> None:
-        """Draw all charts; chosen: index of the chosen cube."""
+        """Draw all charts.
+
+        Args:
+            history: Values of all cubes in the last seconds.
+            chosen: Index of the cube that the user chose on the page.
+        """
         self._pictures += 1
         self._history = history
         indices = {name: number for number, name in enumerate(self._names)}
         words = str(self._text.value).replace(",", " ").split()
         named = [indices[word] for word in words if word in indices]
-        # A cube that is named twice is drawn once, and the chosen one first.
+        # `dict.fromkeys` removes repeated cubes and keeps the order: the chosen cube is the first.
         self._cubes = list(dict.fromkeys([chosen, *named]))
         for chart in self._charts:
             chart.choose(self._lines(chart, history))
             chart.draw(history, nudge=bool(self._pictures // NUDGE_PERIOD % 2))
 
     def offer_observed(self, history: History) -> None:
-        """Offer only what some cube observes."""
+        """Limit the lists of both charts to groups of values that at least one cube observes.
+
+        A cube observes a component if it has been finite in `history`.
+        """
         observed = dict(zip(History.COLUMNS, history.observed, strict=True))
-        # Before the first tensors nothing is known of what the cubes observe.
+        # Before the first tensors arrive, it is unknown which components the cubes observe.
         if not any(observed[name] for name in COMPONENTS):
             return
         groups = [
@@ -165,18 +195,18 @@ class Charts:
 
 
 class Chart:
-    """One chart and the choice of what it shows."""
+    """One chart over time, and the drop-down list in which the user chooses its values."""
 
     def __init__(
         self, gui: viser.GuiApi, tab: viser.GuiTabHandle, group: str, order: float
     ) -> None:
-        """Add the choice to the tab; the plot follows when there are lines.
+        """Add the drop-down list to the tab; `choose` adds the plot once there are lines.
 
         Args:
-            gui: The panel.
-            tab: The tab.
-            group: What it shows at first, of `GROUPS`.
-            order: Place of the choice in the tab; the plot has the next one.
+            gui: The controls of one browser.
+            tab: The tab of the panel.
+            group: Name, in `GROUPS`, of the values that the chart shows at first.
+            order: Position of the list in the tab; the plot has the position `order + 1`.
         """
         self._gui, self._tab, self._order = gui, tab, order
         self._range = (0.0, 1.0)
@@ -186,17 +216,24 @@ class Chart:
 
     @property
     def group(self) -> str:
-        """What it shows, of `GROUPS`."""
-        # A browser may send any text.
+        """Name, in `GROUPS`, of the values that the chart shows."""
+        # A browser may send any text, so the value is checked.
         return self._choice.value if self._choice.value in GROUPS else "normal stress"
 
     def offer(self, groups: list[str]) -> None:
-        """Offer these groups. Setting the options again would close a list that is open."""
+        """Set the entries of the drop-down list to names of `GROUPS`.
+
+        Equal entries are not set again, because that would close a list that the user has opened.
+        """
         if tuple(groups) != tuple(self._choice.options):
             self._choice.options = groups
 
     def choose(self, lines: list[ChartLine]) -> None:
-        """Show these lines from now on. Other lines need another chart: uPlot cannot add any."""
+        """Show these lines from now on.
+
+        If they differ from the present ones, the plot is replaced, because uPlot (the plotting
+        library of the page) cannot add a line to a plot. Without any line nothing changes.
+        """
         if lines == self._lines or not lines:
             return
         self._lines = lines
@@ -233,24 +270,25 @@ class Chart:
                 axes=axes,
                 scales=self._scales(),
                 padding=(10, 12, 0, 0),
-                # With one key, both plots show the values of one instant.
+                # Plots with the same key share one cursor: both show the values of one instant.
                 cursor={"sync": {"key": "skin"}},
                 order=self._order + 1,
             )
 
     def draw(self, history: History, nudge: bool) -> None:
-        """Draw the newest values.
+        """Draw the lines with the values of the last seconds.
 
         Args:
-            history: The values.
-            nudge: Change the scale by an invisible amount. A chart that the browser has made
-                before it knew its width shows no time axis until its scales change.
+            history: Values of all cubes in the last seconds.
+            nudge: Whether to change the range of the value axis by an invisible amount. If the
+                browser made the plot before its width was known, the time axis is missing until
+                a range changes.
         """
         if self._plot is None:
             return
         values = self._values(history)
         self._plot.data = (history.times, *values)
-        # uPlot cannot find the range of values with NaN.
+        # The range is computed here, because uPlot cannot compute it from values with NaN.
         finite = np.concatenate(values)
         finite = finite[np.isfinite(finite)]
         low, high = round_range(finite.min(initial=0.0), finite.max(initial=0.0))
@@ -261,9 +299,14 @@ class Chart:
             self._plot.scales = self._scales()
 
     def panel(self, history: History) -> tuple[str, Array, dict[str, Array]]:
-        """Return label of the values, times, and values by name of the line, for a picture."""
+        """Return what `draw_lines` needs to draw this chart into a picture.
+
+        Returns:
+            Label of the value axis; times (M,) in s before now; name of a line -> values (M,), in
+            the unit of the label.
+        """
         lines = zip(self._lines, self._values(history), strict=True)
-        # In a picture the component is set in mathematical type.
+        # matplotlib sets the symbol of a component as mathematics; the page shows plain text.
         label = self._label.replace("σzz", symbol("zz"))
         return label, history.times, {line.printed: values for line, values in lines}
 
@@ -272,7 +315,7 @@ class Chart:
         return f"{self.group} / {markup.unit(GROUPS[self.group][0])[1]}"
 
     def _values(self, history: History) -> list[Array]:
-        """Return the values of each line (M,), in the unit of the chart."""
+        """Return the values (M,) of each line, in the unit of the value axis."""
         size = markup.unit(GROUPS[self.group][0])[0]
         return [history.of(line.cube, line.column) / size for line in self._lines]
 
@@ -281,7 +324,16 @@ class Chart:
 
 
 def csv_of(history: History, cubes: Sequence[int], names: Sequence[str]) -> bytes:
-    """Return all observed columns of some cubes as a table in SI units; a row per instant."""
+    """Return the values of some cubes as a CSV table in SI units, with one row per instant.
+
+    Args:
+        history: Values of all cubes in the last seconds.
+        cubes: Indices of the cubes in the table.
+        names: Names of all cubes.
+
+    Returns:
+        The content of the file. Components that no cube observes have no column.
+    """
     observed = np.flatnonzero(history.observed).tolist()
     header = ["time / s"]
     columns = [history.times]
@@ -300,7 +352,11 @@ def csv_of(history: History, cubes: Sequence[int], names: Sequence[str]) -> byte
 
 @print_style()
 def draw_lines(panels: Sequence[tuple[str, Array, dict[str, Array]]]) -> Figure:
-    """Draw panels over one time axis, each from what `Chart.panel` returns."""
+    """Draw panels one below the other over a common time axis.
+
+    Args:
+        panels: Label, times and values of each panel, as `Chart.panel` returns them.
+    """
     figure = Figure(figsize=(8, 3 * len(panels)))
     axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
     for axis, (label, times, lines) in zip(axes, panels, strict=True):
@@ -318,16 +374,17 @@ def draw_lines(panels: Sequence[tuple[str, Array, dict[str, Array]]]) -> Figure:
 
 
 def round_range(low: float, high: float) -> tuple[float, float]:
-    """Return the range of an axis that contains low, high and zero.
+    """Return the range of an axis that contains zero and the values from `low` to `high`.
 
-    Its ends are multiples of half of 1, 2, 5 or 10 times a power of ten, so that they change
-    seldom while values move.
+    Its ends are multiples of a step, which is half of 1, 2, 5 or 10 times a power of ten. The range
+    therefore changes seldom while the values change. A side on which no value exceeds `NOISE_SHARE`
+    of the largest one ends at zero.
     """
     size = max(-low, high, 1e-9)
-    # One noisy value on the other side of zero would take half of the room.
+    # One noisy value below zero would add a whole step of empty space below positive values.
     low, high = (end if abs(end) > NOISE_SHARE * size else 0.0 for end in (low, high))
     power = 10.0 ** np.floor(np.log10(size))
-    # The tolerance keeps a size of exactly 1, 2 or 5 from taking the next step.
+    # Without the tolerance, rounding could give a size of exactly 1, 2 or 5 the next larger step.
     min_step = size * (1 - 1e-9)
     step = power * next(factor for factor in (1, 2, 5, 10) if factor * power >= min_step) / 2
     n_below = np.floor(min(low, 0) / step)

@@ -1,4 +1,4 @@
-"""What the page asks of other nodes and hears from them: services, replays, contacts."""
+"""ROS clients of the page: calls of services, control of a replay, and contacts."""
 
 from __future__ import annotations
 
@@ -23,17 +23,22 @@ from .markup import NoteColour
 from .moment import Found, SurfaceField
 
 Say = Callable[[str, str, NoteColour], None]
-"""Shows title, text and colour of a note to the user."""
+"""Function that shows a note to the user: it takes the note's title, text and colour."""
 
 MAX_ANSWER_S = 10.0
-"""Time, in seconds, that a service may take to answer."""
+"""Maximum time, in seconds, from the call of a service to its answer.
+
+After this time the call is cancelled and the user is told so.
+"""
 
 MAX_CONTACTS_AGE_S = 1.0
-"""Age, in seconds, above which contacts and traction are not shown any more: the node `contacts`
-has ended, or the skin sends nothing."""
+"""Time since their arrival, in seconds, after which contacts and traction are no longer shown.
+
+Nothing arrives any more if the node `contacts` has ended or the skin sends nothing.
+"""
 
 INTERPOLATION_POINTS = 4
-"""Number of points of the topic `traction` between which the page interpolates."""
+"""Number of nearest points of the topic `traction` from which the page interpolates each value."""
 
 
 class _Call(NamedTuple):
@@ -43,7 +48,7 @@ class _Call(NamedTuple):
 
 
 class ServiceCalls:
-    """Calls services without waiting for the answers, and tells the user what became of them."""
+    """Calls services without waiting for their answers, and shows each result as a note."""
 
     def __init__(self, say: Say) -> None:
         self._say = say
@@ -55,12 +60,12 @@ class ServiceCalls:
         client: Client,
         request: Any,
     ) -> None:
-        """Call a service, unless nobody offers it.
+        """Call a service; if no running node offers it, show a note instead.
 
         Args:
-            what: Name of the action, for the notes to the user.
-            client: Client of the service.
-            request: The request.
+            what: Name of the action in the notes to the user, such as "tare".
+            client: ROS client of the service.
+            request: Request of the type that the service has.
         """
         if not client.service_is_ready():
             text = f"{what}: no node that can do it is running"
@@ -69,7 +74,7 @@ class ServiceCalls:
         self._open.append(_Call(what, client.call_async(request), time.monotonic()))
 
     def update(self) -> None:
-        """Tell the user about calls that have been answered, or that took too long."""
+        """Show a note for each call that was answered, or that is older than `MAX_ANSWER_S`."""
         still_open = []
         for call in self._open:
             if call.future.done():
@@ -91,10 +96,11 @@ class ServiceCalls:
 
 
 class ReplayClient:
-    """Follows and steers a running `./cube replay`.
+    """Follows a running `./cube replay`, and stops it or lets it jump to another time.
 
     Attributes:
-        state: Where the replay is; None: there is none, or it has fallen silent.
+        state: Latest state of the replay (position and length in s, whether it is paused); None if
+            there is no replay or it has sent no state for `STALE_S`.
     """
 
     def __init__(
@@ -116,36 +122,41 @@ class ReplayClient:
 
     @property
     def is_held(self) -> bool:
-        """Whether there is a replay and it is stopped."""
+        """Whether there is a replay and it is paused."""
         return self.state is not None and self.state.paused
 
     @property
     def is_jumping(self) -> bool:
-        """Whether a jump is wanted or under way, so that `state` is not where the user wants to
-        be."""
+        """Whether the user has asked for a jump that the replay has not confirmed yet.
+
+        Until then the position in `state` is not the one that the user has chosen.
+        """
         is_wanted = self._wanted_position is not None or self._jump is not None
         return self.state is not None and is_wanted
 
     def toggle_hold(self) -> None:
-        """Stop the replay, or let it go on."""
+        """Pause the replay if it runs, or let it continue if it is paused."""
         if self.state is None:
             return
         request = SteerReplay.Request(position=np.nan, paused=not self.state.paused)
         self._services.ask("replay", self._client, request)
 
     def jump_to(self, position: float) -> None:
-        """Jump to a position, in seconds, with the next `update`; later wishes replace it."""
+        """Store a position, in s after the start of the bag, to which a later `update` jumps.
+
+        A position that is stored before that replaces this one.
+        """
         self._wanted_position = position
         self._wanted_s = time.monotonic()
 
     def update(self) -> bool:
-        """Ask for the jump that is wanted, once the jump before it is done.
+        """Send the jump that `jump_to` stored, once the jump before it was answered.
 
-        A replay that is silent, or not started yet, is waited for: on a busy machine its messages
-        come late.
+        If no replay is known, the jump waits up to `MAX_ANSWER_S` for one and is then dropped with
+        a note to the user: on a busy machine the messages of a replay arrive late.
 
         Returns:
-            Whether a jump was asked for now.
+            Whether a jump was sent in this call.
         """
         now_s = time.monotonic()
         self._finish_jump(now_s)
@@ -157,18 +168,18 @@ class ReplayClient:
                 self._say("No jump is possible", "jump: no replay is running", "red")
             return False
 
-        # The page may know the length of a bag that was replayed before.
+        # The slider may still have the length of the bag that was replayed before this one.
         position = min(self._wanted_position, self.state.length)
         request = SteerReplay.Request(position=position, paused=self.state.paused)
         self._wanted_position = None
         self._jump = self._client.call_async(request)
         self._jump_asked_s = now_s
-        # The slider must not jump back until the replay has told its new position.
+        # The slider would jump back to the old position until the next state of the replay arrives.
         self.state.position = position
         return True
 
     def _finish_jump(self, now_s: float) -> None:
-        """Forget a jump that was answered, or whose answer is overdue."""
+        """Forget the jump that was sent, if it was answered or is older than `MAX_ANSWER_S`."""
         if self._jump is None:
             return
         if self._jump.done():
@@ -180,7 +191,7 @@ class ReplayClient:
             self._say("The jump had no answer", text, "red")
 
     def forget_if_silent(self) -> None:
-        """Forget a replay that has sent nothing for `STALE_S`."""
+        """Set `state` to None if the replay has sent no state for `STALE_S`."""
         if time.monotonic() - self._received_s > STALE_S:
             self.state = None
 
@@ -189,7 +200,7 @@ class ReplayClient:
 
 
 class ContactsClient:
-    """Listens to what the node `contacts` finds, if it runs."""
+    """Subscribes to the contacts and the traction that the node `contacts` publishes."""
 
     def __init__(self, node: Node, errors: CallbackErrors) -> None:
         node.create_subscription(SkinContacts, "contacts", errors.catch(self._receive_contacts), 2)
@@ -200,13 +211,16 @@ class ContactsClient:
         self._interpolation: _Interpolation | None = None
 
     def found(self, surface: Surface) -> Found:
-        """Return contacts and the field on the points of a surface, where they are recent."""
+        """Return the latest contacts, and pressure and shear interpolated to points of a surface.
+
+        What is older than `MAX_CONTACTS_AGE_S`, or has never arrived, is None.
+        """
         oldest_s = time.monotonic() - MAX_CONTACTS_AGE_S
         contacts = self._contacts if self._contacts_s > oldest_s else None
         if self._cloud_s < oldest_s or not len(self._cloud):
             return Found(contacts)
         points = self._cloud[:, :3]
-        # The points of a skin do not move, so that the weights are computed once.
+        # The points of a skin do not move, so the weights of the interpolation are computed once.
         if self._interpolation is None or not self._interpolation.fits(surface, points):
             self._interpolation = _Interpolation(surface, points)
         pressure, shear, sigma = self._interpolation.values(self._cloud[:, 3:]).T
@@ -222,30 +236,35 @@ class ContactsClient:
 
 
 class _Interpolation:
-    """Interpolates from few points (M, 3) to all points of a surface.
+    """Interpolates from M points of the topic `traction` to all points of a surface.
 
-    The weights are the inverse squared distances of the nearest points (Shepard's method).
+    The weights are the inverse squared distances to the nearest `INTERPOLATION_POINTS` points
+    (Shepard's method).
     """
 
     def __init__(self, surface: Surface, points: Array) -> None:
         self._surface, self._points = surface, points
         shape = len(surface.points), min(INTERPOLATION_POINTS, len(points))
-        # The points of the surface lie at the depth of the cubes, those of `traction` on the skin.
+        # `surface.points` lie in the plane of the cubes' centres, those of `traction` on the outer
+        # surface of the skin, so the former are moved up by the depth of the cubes.
         up = surface.depth * surface.poses.rotation[surface.cube, :, 2]
         distance, nearest = cKDTree(points).query(surface.points + up, shape[1])
         self._nearest = nearest.reshape(shape)
-        # The lower limit avoids a division by zero at a point itself.
+        # The lower limit of the distance avoids a division by zero where two points coincide.
         weight = 1 / np.maximum(distance.reshape(shape), 1e-3 * surface.spacing) ** 2
         self._weight = weight / weight.sum(axis=1, keepdims=True)
 
     def fits(self, surface: Surface, points: Array) -> bool:
-        """Return whether it was made for this surface and these points."""
+        """Return whether the weights were computed for this surface and these points (M, 3)."""
         return surface is self._surface and np.array_equal(points, self._points)
 
     def values(self, values: Array) -> Array:
-        """Interpolate values (M, C); NaN where one of the nearest values is NaN.
+        """Interpolate C quantities from the M points to the points of the surface.
+
+        Args:
+            values: Values (M, C) at the M points.
 
         Returns:
-            (points of the surface, C).
+            Values (points of the surface, C); NaN where one of the nearest values is NaN.
         """
         return np.asarray(np.einsum("pk,pkc->pc", self._weight, values[self._nearest]))

@@ -1,4 +1,4 @@
-"""What the colours of one picture of a skin mean."""
+"""The values that the colours of one picture of a skin stand for."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from .moment import DEVIATION, Moment
 
 
 class Colouring(NamedTuple):
-    """The values behind the colours, for N cubes and M points of the surface.
+    """The values that are drawn as colours, for N cubes and M points of the surface.
 
     Attributes:
-        quantity: What is shown.
-        cubes: (N,) values of the cubes, in SI units.
-        field: (M,) values on the surface, in SI units.
-        top: Upper end of the colour range, in SI units.
-        above: (N, 2) pressure on the surface above each cube and its standard deviation, in Pa;
-            None: the node `contacts` gives none.
+        quantity: The quantity that the colours show.
+        cubes: (N,) values at the cubes, in SI units.
+        field: (M,) values at the points of the surface, in SI units.
+        top: Value, in SI units, at the upper end of the colour scale.
+        above: (N, 2) pressure at the surface above each cube and its standard deviation, in Pa;
+            None if the node `contacts` does not compute them.
     """
 
     quantity: Quantity
@@ -36,19 +36,20 @@ class Colouring(NamedTuple):
     def of(
         cls, moment: Moment, surface: Surface, quantity: Quantity, fixed_top: float, last_top: float
     ) -> Colouring:
-        """Choose the values and the range of a picture.
+        """Compute the values and the range of the colour scale for one picture.
 
         Args:
-            moment: What is shown.
-            surface: The points of its field.
-            quantity: The quantity in colours.
-            fixed_top: Upper end of the range; 0: it follows the values.
-            last_top: Upper end in the picture before, from which an automatic range falls slowly.
+            moment: Values of the cubes and of the surface at the instant that is drawn.
+            surface: Points at which `moment.field` is given.
+            quantity: The quantity that the colours show.
+            fixed_top: Upper end of the colour scale, in SI units; 0: it follows the values.
+            last_top: Upper end in the picture before, in SI units; an automatic range falls slowly
+                from it.
         """
         pressure, sigma = moment.field.pressure, moment.field.sigma
         above = None
         if sigma is not None:
-            # One point of the surface lies above the centre of each cube.
+            # `surface.middle` contains, for each cube, the index of the point nearest to it.
             above = np.stack([pressure, sigma], axis=1)[surface.middle]
         cubes = quantity.of(moment.values, moment.residual)
         if quantity is DEVIATION and above is not None:
@@ -58,7 +59,11 @@ class Colouring(NamedTuple):
         return cls(quantity, cubes, field, top, above)
 
     def text(self, cube: int) -> str:
-        """Return the value of a cube and the pressure on the surface above it, in words."""
+        """Return the value of a cube as text with its unit.
+
+        For pressure and its standard deviation, the pressure at the surface above the cube is
+        added if it is known.
+        """
         value = markup.value(self.quantity, self.cubes[cube])
         if self.above is None or self.quantity not in (QUANTITIES["pressure"], DEVIATION):
             return value
@@ -72,7 +77,17 @@ def _field_values(
     quantity: Quantity,
     cubes: Array,
 ) -> Array:
-    """Return the values on the surface (M,); of the nearest cube where the field has none."""
+    """Return the values (M,) at the points of the surface, in SI units.
+
+    The field contains pressure, shear and perhaps a standard deviation. For other quantities each
+    point has the value of the cube around which it lies.
+
+    Args:
+        moment: The instant that is drawn.
+        surface: Its M points.
+        quantity: The quantity that the colours show.
+        cubes: (N,) values at the cubes, in SI units.
+    """
     if quantity is QUANTITIES["pressure"]:
         return moment.field.pressure
     if quantity is QUANTITIES["shear"]:

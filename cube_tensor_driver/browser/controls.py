@@ -1,4 +1,4 @@
-"""Controls of the page: what is drawn, what colours mean, where a replay is."""
+"""Controls of the page: parts of the 3-D view, quantity of the colours, position of a replay."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .history import History
 from .moment import DEVIATION, SurfaceField
 
 SLIDER_STEP_S = 0.1
-"""Step of the slider of a replay, in seconds."""
+"""Step, in seconds, between two positions of the slider that sets the time within a replay."""
 
 PART_LABELS = {
     "field": "field between the cubes",
@@ -25,12 +25,12 @@ PART_LABELS = {
     "principal": "principal stresses",
     "names": "names of cubes",
 }
-"""Part of the 3-D view, as in `Shown` -> text of its check box."""
+"""Name of a field of `Shown` -> text of the check box that shows or hides this part of the view."""
 
 
 @dataclass
 class Shown:
-    """Which parts of the 3-D view are drawn."""
+    """Which parts of the 3-D view are drawn; `PART_LABELS` describes the parts."""
 
     field: bool = True
     traction: bool = True
@@ -40,7 +40,13 @@ class Shown:
 
 
 class ReplayPosition(Protocol):
-    """Where a replay is, as in ReplayState.msg: position and length in seconds."""
+    """The fields of ReplayState.msg that the page uses.
+
+    Attributes:
+        position: Time of the replay, in s after the start of the bag.
+        length: Duration of the bag, in s.
+        paused: Whether the replay is stopped.
+    """
 
     position: float
     length: float
@@ -48,10 +54,15 @@ class ReplayPosition(Protocol):
 
 
 class ColourControls:
-    """The quantity that is shown in colours, the top of its range, and the legend."""
+    """The list of quantities for the colours, the upper end of the colour scale, and the legend."""
 
     def __init__(self, gui: viser.GuiApi, changed: Callable[[], None]) -> None:
-        """changed: called when another quantity is chosen."""
+        """Add the controls to a panel.
+
+        Args:
+            gui: The controls of one browser.
+            changed: Function that is called when the user chooses another quantity.
+        """
         labels = [quantity.label for quantity in QUANTITIES.values()]
         self._quantity = gui.add_dropdown("colour", labels)
         self._quantity.on_update(lambda _: changed())
@@ -60,22 +71,27 @@ class ColourControls:
 
     @property
     def quantity(self) -> Quantity:
-        """The chosen quantity; the first one if the browser has sent an unknown text."""
+        """The quantity that the user chose; the first one if the browser sent an unknown text."""
         offered = (*QUANTITIES.values(), DEVIATION)
         chosen = [one for one in offered if one.label == self._quantity.value]
         return chosen[0] if chosen else next(iter(QUANTITIES.values()))
 
     @property
     def fixed_top(self) -> float:
-        """The top of the range that the user wants, in SI units; 0: it follows the values."""
+        """Upper end of the colour scale that the user entered, in SI units; 0: it is automatic."""
         value = float(self._range.value)
         return value * self.quantity.size if math.isfinite(value) and value > 0 else 0.0
 
     def offer_known(self, history: History, field: SurfaceField) -> None:
-        """Offer the quantities that some cube observes, and the standard deviation if known.
+        """Limit the list to quantities that can be shown.
 
-        A chosen standard deviation stays, so that colours do not change their meaning when the
-        node `contacts` ends.
+        These are the quantities that at least one cube observes and, if the node `contacts`
+        computes it, the standard deviation of the pressure. The latter stays in the list while it
+        is chosen, so that the colours do not change their meaning when that node ends.
+
+        Args:
+            history: Values of all cubes in the last seconds.
+            field: Pressure and shear on the surface at present.
         """
         observed = dict(zip(History.COLUMNS, history.observed, strict=True))
         if not any(observed[name] for name in COMPONENTS):
@@ -87,12 +103,17 @@ class ColourControls:
         ]
         if field.sigma is not None or self.quantity is DEVIATION:
             labels.append(DEVIATION.label)
-        # Setting the options sends them, and closes a list that the user has just opened.
+        # Equal options are not set again, because that would close a list that the user has opened.
         if tuple(labels) != tuple(self._quantity.options):
             self._quantity.options = labels
 
     def write_legend(self, top: float, field: SurfaceField) -> None:
-        """Write the legend; top: of the range in use, in SI units."""
+        """Write the legend of the colours.
+
+        Args:
+            top: Upper end of the colour scale, in SI units.
+            field: Pressure and shear on the surface at present.
+        """
         if self.quantity is DEVIATION and field.sigma is None:
             self._legend.content = markup.no_deviation()
         else:
@@ -100,7 +121,7 @@ class ColourControls:
 
 
 def add_part_controls(gui: viser.GuiApi, shown: Shown) -> None:
-    """Add a check box for each part of the 3-D view, which sets the field of `shown`."""
+    """Add a check box for each field of `shown`; clicking it sets that field."""
     for field in fields(Shown):
         _add_check_box(gui, shown, field.name)
 
@@ -111,7 +132,7 @@ def _add_check_box(gui: viser.GuiApi, shown: Shown, name: str) -> None:
 
 
 class ReplayControls:
-    """A slider that shows and sets where a replay is, and a button to stop it; hidden without one.
+    """A slider for the time within a replay, and a button to stop it; hidden without a replay.
 
     Attributes:
         is_held: Whether there is a replay and it is stopped.
@@ -123,9 +144,10 @@ class ReplayControls:
         """Add the controls.
 
         Args:
-            gui: The panel.
-            hold: Called to stop the replay or let it go on.
-            jump: Called with a position in seconds.
+            gui: The controls of one browser.
+            hold: Function that stops the replay, or lets it continue if it is stopped.
+            jump: Function that is called with the position that the user has set, in s after the
+                start of the bag.
         """
         self.is_held = False
         with gui.add_folder("replay", visible=False) as self._folder:
@@ -137,11 +159,11 @@ class ReplayControls:
 
         @self._slider.on_update
         def _(event: viser.GuiEvent[Any]) -> None:
-            # Updates by `show` come from here and have no client.
+            # `_move_slider` triggers this function, too; such an event has no client (browser).
             if event.client is None:
                 return
             position = self._slider.value
-            # A browser may send any number.
+            # A browser may send any number, also NaN or infinity.
             if not math.isfinite(position):
                 self._slider.value = self._drawn  # type: ignore[misc]
                 return
@@ -149,7 +171,7 @@ class ReplayControls:
             self._drawn = position
 
     def show(self, replay: ReplayPosition | None) -> None:
-        """Show where a replay is; None: there is none."""
+        """Show position, length and state of a replay, or hide the controls if it is None."""
         self.is_held = replay is not None and replay.paused
         self._folder.visible = replay is not None
         if replay is None:
@@ -162,8 +184,8 @@ class ReplayControls:
         self._button.label = "go on with the replay" if replay.paused else "stop the replay"
 
     def _move_slider(self, position: float) -> None:
-        # What the user has set stays until its event has been handled: it comes in another thread
-        # and may be late.
+        # A slider that differs from `_drawn` was moved by the user, and its event, which another
+        # thread handles, has not arrived yet. It must not be moved back before that.
         if self._slider.value == self._drawn and position != self._drawn:
             self._drawn = position
             self._slider.value = position  # type: ignore[misc]

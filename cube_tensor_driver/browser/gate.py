@@ -28,23 +28,25 @@ from websockets.http11 import Request, Response
 from ..core.errors import ConfigError
 
 LOCAL_HOSTS = ("127.0.0.1", "localhost", "::1")
-"""Names of this machine in a Host header. Through a tunnel (ssh -L) the port is another one, but
-the name is one of these."""
+"""Names of this machine that may stand in the Host header of an HTTP request.
+
+The port in the header is not compared, because it is another one through a tunnel (ssh -L).
+"""
 
 MISSING_TOKEN = (
     "this page is for those who have its token; "
     "open the whole address that ./cube view printed, with ?token=… at its end"
 )
-"""Text for a browser without the token."""
+"""Text that a browser shows if its request contains neither the token nor the cookie with it."""
 
 
 def refusal(host: str, origin: str | None, *, local: bool = True) -> str:
-    """Return why a request is refused, empty if it is not.
+    """Return why a request is refused, or an empty text if it is accepted.
 
     Args:
-        host: The Host header.
-        origin: The Origin header; None: there is none, so that the request is not made by a script
-            of somebody else's page.
+        host: Host header of the request: name and port of the server, as the browser sees them.
+        origin: Origin header of the request: the site whose page makes it. None if it is missing,
+            which means that no script of another site made the request.
         local: Whether the server listens on this machine only.
     """
     if local and _split(host)[0] not in LOCAL_HOSTS:
@@ -57,10 +59,14 @@ def refusal(host: str, origin: str | None, *, local: bool = True) -> str:
 def check_host(host: str) -> None:
     """Check that a server can listen on an address.
 
-    viser would take an address that it cannot have for a port in use, and wait for ever.
+    If this machine does not have the address, viser (the library of the page) would believe that
+    the port is in use, and wait for ever.
+
+    Args:
+        host: Name or IP address.
 
     Raises:
-        ConfigError: The address is none of this machine.
+        ConfigError: This machine does not have the address.
     """
     try:
         for family, kind, _, _, address in socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM):
@@ -75,11 +81,11 @@ def check_host(host: str) -> None:
 
 @contextmanager
 def guarded_server(token: str = "") -> Iterator[None]:
-    """Let a websocket server that is made in this block refuse what `refusal` names.
+    """Let a websocket server that is made in this block refuse the requests that `refusal` names.
 
     Args:
-        token: What a browser needs: once in the address (?token=…), and from then on as a cookie,
-            which its websocket sends too. Empty: the server listens on this machine only.
+        token: Secret text that a browser must send: once in the address (?token=…), and from then
+            on as a cookie. Empty if the server listens on this machine only and needs none.
     """
     serve: Callable[..., Any] = websockets.asyncio.server.serve
 
@@ -99,12 +105,20 @@ def guarded_server(token: str = "") -> Iterator[None]:
 def _answer(
     connection: Any, request: Request, token: str, process_request: Callable[..., Any]
 ) -> Any:
-    """Answer a request: refuse it, or let viser answer it and add the cookie."""
+    """Refuse a request, or let viser answer it and add the cookie with the token.
+
+    Args:
+        connection: The connection, as the websockets library passes it.
+        request: The HTTP request with which the connection begins.
+        token: The token; empty: none is needed.
+        process_request: Function of viser that answers the request.
+    """
     host = request.headers.get("Host", "")
     problem = refusal(host, request.headers.get("Origin"), local=not token)
     if problem:
         return _refused(problem)
-    # Browsers share cookies between all ports of a host, so that the name contains the port.
+    # A browser sends a cookie to every port of a host. Two servers on one host therefore need
+    # cookies with different names, and the name contains the port.
     cookie = f"cube_view_{_split(host)[1]}={token}"
     cookies = request.headers.get("Cookie", "").split("; ")
     if not token or _contains(cookies, cookie):
@@ -120,7 +134,10 @@ def _answer(
 
 
 def _split(host: str) -> tuple[str | None, int | None]:
-    """Return name and port of a Host header, None where it is malformed."""
+    """Return name and port of a Host header such as "localhost:8080"; None for a missing part.
+
+    Both are None if the header is malformed.
+    """
     try:
         parts = urlsplit(f"//{host}")
         return parts.hostname, parts.port
@@ -129,7 +146,11 @@ def _split(host: str) -> tuple[str | None, int | None]:
 
 
 def _contains(texts: list[str], wanted: str) -> bool:
-    """Return whether one text is equal, in a time that does not tell how much of it is right."""
+    """Return whether one of the texts is equal to the wanted one.
+
+    The comparison always takes the same time, so an attacker cannot learn from its duration how
+    many characters of a guessed token are right.
+    """
     return any(
         hmac.compare_digest(text.encode(errors="replace"), wanted.encode()) for text in texts
     )

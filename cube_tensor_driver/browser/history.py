@@ -1,4 +1,4 @@
-"""What every cube showed in the last seconds, and how often its rows come."""
+"""Values of all cubes in the last seconds, and the number of rows per second of each cube."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from ..core.modes import COMPONENTS
 
 
 class History:
-    """The values of all cubes in the last pictures, in a ring buffer."""
+    """The values of all cubes in the last pictures of the page, in a ring buffer."""
 
     COLUMNS = (*COMPONENTS, "residual")
-    """Names of the values of a cube."""
+    """Names of the 16 values that are stored per cube: 15 components, then the residual."""
 
     def __init__(self, cubes: int, length: int) -> None:
-        """length: number of pictures that are kept."""
+        """Make an empty buffer for a number of cubes that keeps the last `length` pictures."""
         self._values = np.full((length, cubes, len(self.COLUMNS)), np.nan, np.float32)
         self._times = np.full(length, np.nan)
         self._count = 0
@@ -26,7 +26,13 @@ class History:
         values: Array,
         residual: Array,
     ) -> None:
-        """Add values (cubes, 15) and residual (cubes,) as they are at the time `now`, in s."""
+        """Add the values of one picture; the oldest picture is overwritten if the buffer is full.
+
+        Args:
+            now: Time of the picture, in s, on any clock that all calls share.
+            values: Stress in Pa and gradients in Pa/m (cubes, 15); NaN where unknown.
+            residual: Residual (cubes,) relative to the expected noise.
+        """
         slot = self._count % len(self._times)
         self._values[slot, :, :-1] = values
         self._values[slot, :, -1] = residual
@@ -34,37 +40,42 @@ class History:
         self._count += 1
 
     def clear(self) -> None:
-        """Forget everything, because a replay has jumped to another time."""
+        """Remove all pictures, for example because a replay has jumped to another time."""
         self._count = 0
 
     def of(self, cube: int, column: int) -> Array:
-        """Return one of `COLUMNS` of a cube (M,), in SI units, the oldest value first."""
+        """Return one value of a cube in the M stored pictures (M,), in SI units, the oldest first.
+
+        Args:
+            cube: Index of the cube.
+            column: Index of the value in `COLUMNS`.
+        """
         return np.asarray(self._values[self._slots(), cube, column], float)
 
     @property
     def times(self) -> Array:
-        """(M,) times relative to the last one, in s: zero or negative."""
+        """Times (M,) of the M stored pictures minus that of the newest one, in s, so at most 0."""
         times = self._times[self._slots()]
-        # The newest value is at the right end of the plots, at zero.
+        # Plots end at zero, which is the time of the newest picture.
         return times - times[-1] if len(times) else times
 
     @property
     def observed(self) -> Mask:
-        """(16,) whether any cube has shown a value of each of `COLUMNS`."""
+        """Whether each of `COLUMNS` is finite (16,) for any cube in any stored picture."""
         return np.asarray(np.isfinite(self._values[self._slots()]).any(axis=(0, 1)))
 
     def _slots(self) -> Index:
-        """Return the places (M,) in the buffer, in the order of time."""
+        """Return the indices (M,) of the stored pictures in the ring buffer, the oldest first."""
         length = len(self._times)
         numbers = np.arange(max(0, self._count - length), self._count)
         return np.asarray(numbers % length)
 
 
 class RowRate:
-    """Counts the rows per second of each cube.
+    """Computes how many rows (measurements of one cube) arrive per second from each cube.
 
     Attributes:
-        rate: (cubes,) Hz; NaN until the first period is over.
+        rate: (cubes,) rows per second, in Hz; NaN until the first period is over.
     """
 
     def __init__(
@@ -73,14 +84,25 @@ class RowRate:
         now: float,
         period: float = 1.0,
     ) -> None:
-        """Start at the time `now`, in s; rows are counted over at least `period` s."""
+        """Start to count.
+
+        Args:
+            cubes: Number of cubes.
+            now: Present time, in s, on the clock that `update` uses too.
+            period: Shortest time, in s, over which the rows of a rate are counted.
+        """
         self.rate = np.full(cubes, np.nan)
         self._period = period
         self._count = np.zeros(cubes, np.int64)
         self._counted_s = now
 
     def update(self, now: float, count: Index) -> None:
-        """Set the rate from the number of rows (cubes,) that have come until `now`, in s."""
+        """Compute new rates if a period is over.
+
+        Args:
+            now: Present time, in s.
+            count: Number of rows (cubes,) that have arrived since the skin appeared.
+        """
         elapsed_s = now - self._counted_s
         if elapsed_s > self._period:
             self.rate = (count - self._count) / elapsed_s

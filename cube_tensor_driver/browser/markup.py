@@ -23,14 +23,19 @@ RED = "#c92a2a"
 BLUE = "#1864ab"
 
 NoteColour = Literal["blue", "green", "red"]
-"""Colours of notes, by the names that viser gives them."""
+"""Names of the colours that a note to the user can have, as viser calls them."""
 
 MAX_LISTED_CUBES = 20
-"""Number of cubes with a fault that are listed; the page tells how many there are in all."""
+"""Maximum number of cubes with a fault that the page lists by name.
+
+The number of all cubes in each state of health stands above the list.
+"""
 
 LEGEND_STEPS = 9
-"""Number of colours between which the bar of the legend changes gradually; an odd number, so that
-one of them is the middle."""
+"""Number of colours of the legend's bar, between which the browser interpolates.
+
+It is odd, so that one colour is that of the middle of the range.
+"""
 
 BOX_STYLE = "padding:0 0.8em 0.4em;font-size:0.85em"
 BAR_STYLE = "height:0.9em;border-radius:3px;background:linear-gradient(to right,{})"
@@ -42,19 +47,22 @@ PHONE_STYLE = (
     "[style*='width: 20em'] {width: 100vw !important}"
     "[style*='max-height: 60%'] {max-height: 45% !important}}</style>"
 )
-"""A style for narrow screens. viser's panel there is 20em wide and covers the skin; this makes it
-as wide as the screen, and lower."""
+"""Style sheet for screens of at most 36em.
+
+viser's panel is 20em wide there and covers the skin. The style makes it as wide as the screen and
+limits its height to 45 % of the screen, so that the skin stays visible above it.
+"""
 
 
 @dataclass
 class PageStatus:
-    """What the page says about other things than the rows.
+    """What the page shows besides measured values: links, recording, result of the last action.
 
     Attributes:
-        links: A line for each link.
-        action: What became of the last action of the user.
-        title: Title of the note about it.
-        colour: Colour of that note.
+        links: One line of text per link (connection to a hub): its name and state.
+        action: Text about the result of the user's last action, such as a tare.
+        title: Title of the note with this text.
+        colour: Colour of this note.
         recording: Whether a bag is being recorded.
     """
 
@@ -70,12 +78,18 @@ class PageStatus:
         action: str,
         colour: NoteColour = "blue",
     ) -> None:
-        """Show what became of an action, as a line and as a note."""
+        """Store the result of an action, which the page shows as a line and as a note.
+
+        Args:
+            title: Title of the note.
+            action: Text of the line and of the note.
+            colour: Colour of the note.
+        """
         self.title, self.action, self.colour = title, action, colour
 
 
 def waiting(domain: str) -> str:
-    """Return what page and terminal say while no skin is published in a DDS domain."""
+    """Return the text that page and terminal show while no skin is published in a DDS domain."""
     return (
         f"Waiting for a skin: none is published in DDS domain {domain}. "
         "Start one, for example with ./cube demo; it appears here."
@@ -83,33 +97,37 @@ def waiting(domain: str) -> str:
 
 
 def box(content: str) -> str:
-    """Return content with the margins that all texts of the page have."""
+    """Return HTML content inside a box with the margins that all texts of the page have."""
     return _div(BOX_STYLE, content)
 
 
 def label(name: str) -> str:
-    """Return a component as people write it: ∂σzz/∂x for zz_x."""
+    """Return the symbol of a component, or "residual" unchanged: σzz for zz, ∂σzz/∂x for zz_x."""
     if name == "residual":
         return name
     return f"∂σ{name[:2]}/∂{name[3]}" if "_" in name else f"σ{name}"
 
 
 def unit(name: str) -> tuple[float, str]:
-    """Return size in SI units and name of the unit in which a component is shown."""
+    """Return the unit in which the page shows a component or the residual.
+
+    Returns:
+        Size of the unit in SI units, and its name: (1000, "kPa") for a stress.
+    """
     if name == "residual":
         return 1.0, "× noise"
     return (1e6, "kPa/mm") if "_" in name else (1e3, "kPa")
 
 
 def value(quantity: scene.Quantity, si_value: float) -> str:
-    """Return a value of a quantity, in SI units, as text with its unit."""
+    """Return text with the label of a quantity, a value and its unit; the value is in SI units."""
     if np.isnan(si_value):
         return "unknown"
     return f"{quantity.label} {_hundredths(si_value / quantity.size)} {quantity.unit}"
 
 
 def surface_pressure(pressure: float, sigma: float) -> str:
-    """Return the pressure on the surface and its standard deviation, in Pa, as text."""
+    """Return text in kPa for a pressure on the surface and its standard deviation, both in Pa."""
     if np.isnan(pressure):
         return "on the surface unknown"
     deviation = "unknown" if np.isnan(sigma) else f"{sigma / 1e3:.2f}"
@@ -123,7 +141,10 @@ def clock(seconds: float) -> str:
 
 
 def newtons(contact: Contact) -> str:
-    """Return the forces of a contact as text; without shear if no cube observes it."""
+    """Return normal and shear force of a contact as text in N.
+
+    The shear force is left out if it is unknown (NaN), because no cube observes shear.
+    """
     shear = "" if np.isnan(contact.shear_force) else f", shear {contact.shear_force:.2f} N"
     return f"{contact.normal_force:.2f} N{shear}"
 
@@ -135,13 +156,13 @@ def headline(
     paused: bool,
     recording: bool,
 ) -> str:
-    """Return the first line of the page.
+    """Return the first line of the page as HTML: state, live cubes, rate, force.
 
     Args:
-        health: (N,) health of the cubes.
-        hertz: Rows per second.
-        contact: The strongest contact.
-        paused: Whether page or replay are stopped.
+        health: (N,) health of the cubes, as in core/latest_stress.py.
+        hertz: Rows per second of the fastest cube.
+        contact: The contact with the largest force; None without a load.
+        paused: Whether the page or the replay is stopped.
         recording: Whether a bag is being recorded.
     """
     live = int(np.count_nonzero(health < FAULTY))
@@ -165,12 +186,12 @@ def headline(
 
 
 def action_line(action: str) -> str:
-    """Return the line about the last action of the user, empty if there was none."""
+    """Return a text about the user's last action as HTML, or an empty text if there was none."""
     return box(escape(action)) if action else ""
 
 
 def no_deviation() -> str:
-    """Return what stands in place of the legend where the standard deviation is unknown."""
+    """Return the text that replaces the legend of the standard deviation while it is unknown."""
     return box(
         "Everything is grey: the standard deviation is known only while the node <i>contacts</i> "
         "runs with <i>method:=inverse</i>."
@@ -178,7 +199,12 @@ def no_deviation() -> str:
 
 
 def legend(quantity: scene.Quantity, top: float) -> str:
-    """Return the bar of colours with its range; top: upper end, in SI units."""
+    """Return the legend of a quantity as HTML: a bar of its colours with numbers and unit.
+
+    Args:
+        quantity: The quantity that the colours show.
+        top: Value at the upper end of the bar, in SI units.
+    """
     values = np.linspace(-top if quantity.signed else 0, top, LEGEND_STEPS)
     colours = (255 * scene.colours(quantity, values, top)).astype(int).tolist()
     stops = ",".join(f"rgb({red},{green},{blue})" for red, green, blue in colours)
@@ -195,13 +221,14 @@ def explanation(
     gradient: float,
     sigma: Array | None,
 ) -> str:
-    """Return what is drawn, and what the lengths of arrows mean.
+    """Return HTML that explains the symbols of the 3-D view and the lengths of its arrows.
 
     Args:
-        bar: Length of the scale bar, in metres.
+        bar: Length of the scale bar beside the skin, in metres.
         stress: Traction, in Pa, whose arrow is as long as the bar.
         gradient: Gradient, in Pa/m, whose arrow is as long as the bar.
-        sigma: Standard deviation of the field, as in `SurfaceField`.
+        sigma: Standard deviation of the pressure (M,) on the surface, in Pa; None if the field is
+            only interpolated between the cubes.
     """
     long = f"as long as the bar ({1e3 * bar:g} mm):"
     arrows = [
@@ -223,13 +250,19 @@ def _field_source(sigma: Array | None) -> str:
     if sigma is None:
         return "field: interpolated between the cubes, at their depth"
     known = sigma[np.isfinite(sigma)]
-    # The deviation differs from point to point; the median stands for all.
+    # The standard deviation differs from point to point; the text gives the median.
     typical = f", ±&nbsp;{np.median(known) / 1e3:.2g}&nbsp;kPa" if len(known) else ""
     return f"field: on the surface, from the node <i>contacts</i>{typical}"
 
 
 def numbers(moment: Moment, cube: int, hertz: float) -> str:
-    """Return a table of the observed components of a cube, its residual, rate and state."""
+    """Return an HTML table of a cube's observed components, residual, rate and state.
+
+    Args:
+        moment: Values of all cubes.
+        cube: Index of the cube.
+        hertz: Rows per second of the cube.
+    """
     rows = []
     for name, si_value in zip(COMPONENTS, moment.values[cube], strict=True):
         size, unit_name = unit(name)
@@ -242,7 +275,7 @@ def numbers(moment: Moment, cube: int, hertz: float) -> str:
 
 
 def _hundredths(number: float) -> str:
-    # Adding 0.0 turns -0.0 into 0.0.
+    # Adding 0.0 turns -0.0 into 0.0, so that no "-0.00" is printed.
     return f"{round(number, 2) + 0.0:.2f}"
 
 
@@ -252,7 +285,13 @@ def _state(status: int, health: int) -> str:
 
 
 def conditions(names: list[str], health: AnyArray, links: list[str]) -> str:
-    """Return the state of the links, the number of cubes in each state, and a list of faults."""
+    """Return HTML about the health of a skin: links, number of cubes per state, cubes with a fault.
+
+    Args:
+        names: Names of the N cubes.
+        health: (N,) health of the cubes, as in core/latest_stress.py.
+        links: One line of text per link (connection to a hub).
+    """
     counts = ", ".join(
         f"{np.count_nonzero(health == state)} {word}" for state, word in enumerate(HEALTH_WORDS)
     )
@@ -267,7 +306,7 @@ def _div(style: str, content: str) -> str:
 
 
 def _table(rows: Iterable[tuple[str, str, str]]) -> str:
-    """Return a table with the columns name, value and unit."""
+    """Return an HTML table of rows with three cells each: name, value and unit."""
     cells = "".join(
         f"<tr><td>{name}</td><td style='{VALUE_STYLE}'>{value}</td><td>&nbsp;{unit}</td></tr>"
         for name, value, unit in rows

@@ -1,4 +1,4 @@
-"""Triangle meshes of the 3-D view: prisms, arrows and rings as arrays, and squares in colours."""
+"""Triangle meshes of the 3-D view: prisms, arrows and rings as arrays, and coloured squares."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from ..views import scene
 from ..views.scene import Quantity
 
 Mesh = tuple[NDArray[Any], NDArray[Any]]
-"""Vertices (V, 3) and faces (F, 3), each three indices of vertices."""
+"""A triangle mesh: positions of V vertices (V, 3), and three vertex indices per triangle (F, 3)."""
 
 NO_MESH: Mesh = (np.zeros((3, 3)), np.array([[0, 1, 2]]))
-"""A mesh without area, which is not seen. viser refuses one without faces."""
+"""An invisible mesh: one triangle without area, because viser refuses a mesh without triangles."""
 
 PRISM_SIDES = 6
-"""Number of sides of the prisms that arrows, crosses and rings consist of."""
+"""Number of sides of the prisms that approximate the cylinders of arrows, crosses and rings."""
 
 CUBE: Mesh = (
     np.array(list(product((-1.0, 1.0), repeat=3))),
@@ -35,7 +35,7 @@ CUBE: Mesh = (
         ]
     ),
 )
-"""A cube with a half side of 1 about the origin."""
+"""Triangle mesh of a cube with its centre at the origin and half a side of 1."""
 
 CUBE_EDGES = np.array(
     [
@@ -45,42 +45,46 @@ CUBE_EDGES = np.array(
         if np.count_nonzero(one != other) == 1
     ]
 )
-"""(12, 2, 3) edges of `CUBE`, each from corner to corner."""
+"""Edges (12, 2, 3) of `CUBE`: the positions of both ends of each edge."""
 
 MIN_ARROW = 0.15
-"""Length, in units of the arrow's unit length, below which an arrow is left out."""
+"""Minimum length of an arrow that is drawn, relative to the unit length of all arrows."""
 
 HEAD_LENGTH = 0.2
-"""Length of the head of an arrow, in units of its unit length."""
+"""Length of the head of an arrow, relative to the unit length of all arrows."""
 
 SHAFT_RADIUS = 0.025
-"""Radius of the shaft of an arrow, in units of its unit length."""
+"""Radius of the shaft of an arrow, relative to the unit length of all arrows."""
 
 HEAD_RADIUS = 0.075
-"""Radius of the head of an arrow at its base, in units of its unit length."""
+"""Radius of the base of an arrow's head, relative to the unit length of all arrows."""
 
 RING_POINTS = 49
-"""Number of points of a ring; the last one is the first one again."""
+"""Number of points that approximate the circle of a ring; the last is equal to the first."""
 
 COLOUR_STEPS = 32
-"""Number of colours of a `SquareLayer`. Each is a mesh of its own, so that more cost more time."""
+"""Number of colours of a `SquareLayer`.
+
+The squares of each colour are a mesh of their own, so more colours take the browser more time.
+"""
 
 _SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
 _SQUARE_FACES = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
 
 
 def rods(lines: Array, start_radius: float, end_radius: float | None = None) -> Mesh:
-    """Make open prisms along lines.
+    """Return one mesh of prisms along lines, without the faces at their ends.
 
     Args:
         lines: (N, 2, 3) start and end of each line.
-        start_radius: Radius at the start.
-        end_radius: Radius at the end, 0 for pyramids; None: as at the start.
+        start_radius: Radius of each prism at its start, in the unit of the lines.
+        end_radius: Radius at its end; 0 makes pyramids, None a constant radius.
     """
     if not len(lines):
         return NO_MESH
     along = lines[:, 1] - lines[:, 0]
-    # The axis that is least parallel to the line gives a stable perpendicular direction.
+    # The cross product with the coordinate axis that is least parallel to the line is never close
+    # to zero, so the perpendicular direction is accurate.
     axis = np.eye(3)[np.abs(along).argmin(axis=1)]
     first = _normalised(np.cross(along, axis))
     second = _normalised(np.cross(along, first))
@@ -90,7 +94,7 @@ def rods(lines: Array, start_radius: float, end_radius: float | None = None) -> 
     radii = np.array([start_radius, start_radius if end_radius is None else end_radius])
     vertices = lines[:, :, None] + circle[:, None] * radii[:, None, None]
 
-    # Each side is two triangles between its two corners at the start and at the end.
+    # Each side of a prism is a quadrilateral, which is divided into two triangles.
     corner = np.arange(PRISM_SIDES)
     following = (corner + 1) % PRISM_SIDES
     triangles = [
@@ -108,9 +112,14 @@ def _normalised(vectors: Array) -> Array:
 
 
 def arrows(lines: Array, unit: float) -> Mesh:
-    """Make arrows along lines (N, 2, 3) whose heads are in proportion to the unit length.
+    """Return one mesh of arrows.
 
-    Arrows that would be hardly more than a head are left out.
+    All heads have the same size. Arrows shorter than `MIN_ARROW` times the unit length, which would
+    be hardly more than a head, are left out.
+
+    Args:
+        lines: (N, 2, 3) tail and tip of each arrow.
+        unit: Unit length, to which the sizes of heads and shafts are relative.
     """
     along = lines[:, 1] - lines[:, 0]
     length = np.linalg.norm(along, axis=1, keepdims=True)
@@ -126,7 +135,12 @@ def arrows(lines: Array, unit: float) -> Mesh:
 
 
 def ring(radius: float, thickness: float) -> Mesh:
-    """Make a ring about the origin in the x-y plane from prisms with the radius `thickness`."""
+    """Return the mesh of a ring around the origin, in the x-y plane.
+
+    Args:
+        radius: Radius of the ring.
+        thickness: Radius of the prisms that the ring consists of.
+    """
     angle = np.linspace(0, 2 * np.pi, RING_POINTS)
     unit_circle = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
     points = radius * unit_circle
@@ -140,15 +154,17 @@ def hit(
     start: Array,
     direction: Array,
 ) -> int | None:
-    """Return which cube a ray meets, None if it meets none.
+    """Return the index of the cube that a ray hits, or None if it hits none.
 
-    Cubes on the far side of a curved skin, behind another cube, do not count.
+    A ray hits a cube if it passes the centre at less than a pitch. Of several cubes, the one with
+    the centre closest to the ray is taken; cubes more than two pitches behind the first one are
+    ignored, because they lie on the far side of a curved skin.
 
     Args:
         position: (N, 3) centres of the cubes.
-        pitch: Their distance from each other.
+        pitch: Distance of neighbouring cubes, in the unit of the positions.
         start: (3,) origin of the ray.
-        direction: (3,) its direction, of any length.
+        direction: (3,) direction of the ray, of any length.
     """
     direction = direction / np.linalg.norm(direction)
     depth = (position - start) @ direction
@@ -163,23 +179,24 @@ def hit(
 class SquareLayer:
     """Squares whose colours change: the field of a skin, or the cubes of a large skin.
 
-    The squares of one colour are one mesh, so that a skin is a few objects, which a computer
-    without a graphics card can draw often. An image would be less to send, but browsers decode
-    images apart from everything else, and a slow one would show the field of another instant than
-    the cubes.
+    The squares of one colour are one mesh. A skin then consists of few objects, and a computer
+    without a graphics card can draw it often enough. An image would be less data, but browsers
+    decode images asynchronously, so that a slow browser would show the field of an earlier instant
+    than the cubes.
     """
 
     def __init__(
         self, api: viser.SceneApi, name: str, points: Array, rotation: Array, side: float
     ) -> None:
-        """Make the layer, without colours.
+        """Add the layer to a scene; the squares are invisible until `paint` is called.
 
         Args:
-            api: The scene.
+            api: The 3-D scene of one browser.
             name: Name of the layer in the scene.
-            points: (M, 3) centres of the squares.
-            rotation: (M, 3, 3) frames of the squares, which lie in x and y.
-            side: Length of their sides.
+            points: (M, 3) centres of the squares, in units of the scene.
+            rotation: (M, 3, 3) rotations from the frame of each square, in whose x-y plane it
+                lies, to the scene.
+            side: Length of the sides of the squares, in units of the scene.
         """
         corners = np.einsum("mij,qj->mqi", rotation[:, :, :2], side * _SQUARE)
         self._corners = (points[:, None] + corners).astype(np.float32)
@@ -207,8 +224,14 @@ class SquareLayer:
         values: Array,
         top: float,
     ) -> None:
-        """Colour the squares by values (M,) of a quantity, on a range up to `top`, in SI units."""
-        # The colours of the steps depend on whether the quantity is signed.
+        """Colour the squares by values of a quantity, and show the layer if it was hidden.
+
+        Args:
+            quantity: The quantity.
+            values: (M,) its values at the squares, in SI units; NaN is grey.
+            top: Value at the upper end of the colour scale, in SI units.
+        """
+        # The colours depend on the quantity: a signed one has colours on both sides of zero.
         if quantity is not self._quantity:
             self._quantity = quantity
             for mesh, colour in zip(self._meshes, step_colours(quantity).tolist(), strict=True):
@@ -217,7 +240,7 @@ class SquareLayer:
         steps = colour_steps(quantity, values, top)
         for step, mesh in enumerate(self._meshes):
             chosen = np.flatnonzero(steps == step)
-            # A mesh that was empty and stays empty is not sent again.
+            # A mesh that was empty and stays empty is not sent to the browser again.
             if len(chosen) or self._is_drawn[step]:
                 mesh.vertices, mesh.faces = self._squares(chosen)
                 self._is_drawn[step] = bool(len(chosen))
@@ -231,7 +254,13 @@ class SquareLayer:
 
 
 def colour_steps(quantity: Quantity, values: Array, top: float) -> Index:
-    """Return the step of the colour scale (M,) of each value; `COLOUR_STEPS` where it is NaN."""
+    """Return the index (M,) of the colour of each value; `COLOUR_STEPS` for NaN.
+
+    Args:
+        quantity: The quantity, which may be signed.
+        values: (M,) its values, in SI units.
+        top: Value at the upper end of the colour scale, in SI units.
+    """
     bottom = -top if quantity.signed else 0.0
     share = (np.nan_to_num(values) - bottom) / (top - bottom)
     step = np.clip(share * COLOUR_STEPS, 0, COLOUR_STEPS - 1).astype(int)
@@ -239,7 +268,7 @@ def colour_steps(quantity: Quantity, values: Array, top: float) -> Index:
 
 
 def step_colours(quantity: Quantity) -> NDArray[np.uint8]:
-    """Return the sRGB colours (COLOUR_STEPS + 1, 3) of the steps; the last one is for NaN."""
+    """Return the colours of a `SquareLayer` (COLOUR_STEPS + 1, 3) in sRGB; the last is for NaN."""
     middle = (np.arange(COLOUR_STEPS) + 0.5) / COLOUR_STEPS
     values = np.append(2 * middle - 1 if quantity.signed else middle, np.nan)
     return np.round(255 * scene.colours(quantity, values, 1.0)).astype(np.uint8)

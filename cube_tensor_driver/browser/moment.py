@@ -1,4 +1,4 @@
-"""One instant of a skin: all that the page shows of it."""
+"""The data that the page shows of a skin at one instant."""
 
 from __future__ import annotations
 
@@ -20,18 +20,21 @@ DEVIATION = Quantity(
     signed=False,
     of=lambda values, residual: np.full(len(values), np.nan),
 )
-"""The standard deviation of the pressure on the surface. Cubes alone have none, so that it is NaN
-unless the node `contacts` gives a field."""
+"""The standard deviation of the pressure on the surface, as a quantity for colours.
+
+Only the node `contacts` computes it, for points of the surface. From the values of the cubes alone
+it is unknown, so that `of` returns NaN.
+"""
 
 
 class SurfaceField(NamedTuple):
-    """Values on the M points of a surface.
+    """Pressure and shear at the M points of a surface.
 
     Attributes:
-        pressure: (M,) Pa; NaN where it is unknown.
-        shear: (M,) Pa; NaN where it is unknown.
-        sigma: (M,) standard deviation of the pressure, in Pa; None: the values are interpolated
-            between the cubes, at their depth.
+        pressure: (M,) pressure in Pa; NaN where it is unknown.
+        shear: (M,) magnitude of the shear traction in Pa; NaN where it is unknown.
+        sigma: (M,) standard deviation of the pressure, in Pa. None if pressure and shear are only
+            interpolated between the cubes, in the plane of their centres.
     """
 
     pressure: Array
@@ -40,11 +43,11 @@ class SurfaceField(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What the node `contacts` found.
+    """The latest results of the node `contacts`.
 
     Attributes:
-        contacts: The contacts; None: the node does not run.
-        field: Pressure and shear on the surface; None: the node does not run with the method
+        contacts: The contacts, strongest first; None if the node does not run.
+        field: Pressure and shear on the surface; None unless the node runs with the method
             `inverse`.
     """
 
@@ -53,15 +56,15 @@ class Found(NamedTuple):
 
 
 class Moment(NamedTuple):
-    """The newest rows of the N cubes at one instant, and what follows from them.
+    """The latest values of the N cubes at one instant, with the field and the contacts.
 
     Attributes:
-        values: (N, 15) as in views/scene.py; NaN where a cube has no tensor.
+        values: (N, 15) stress in Pa and gradients in Pa/m; NaN where a cube has no usable tensor.
         residual: (N,) residual relative to the expected noise.
-        health: (N,) as in core/latest_stress.py.
-        status: (N,) status bits.
-        field: On the points of the surface.
-        contacts: Strongest first.
+        health: (N,) health of the cubes, as in core/latest_stress.py.
+        status: (N,) status bits, as in core/status.py.
+        field: Pressure and shear at the points of the surface.
+        contacts: The contacts, strongest first.
     """
 
     values: Array
@@ -79,12 +82,20 @@ class Moment(NamedTuple):
         surface: Surface,
         found: Found,
     ) -> Moment:
-        """Copy the newest rows, and compute what the node `contacts` did not give."""
+        """Copy the latest values, and interpolate what the node `contacts` did not provide.
+
+        Args:
+            newest: The latest row of each cube.
+            health: (N,) health of the cubes at this instant.
+            surface: Points at which the field is computed.
+            found: Results of the node `contacts`; contacts or field that are None are computed
+                here by interpolation between the cubes.
+        """
         values = newest.usable_values(health)
         field, contacts = found.field, found.contacts
         if field is None:
             between = surface.field(values)
-            # A component that no cube observes counts as 0 here.
+            # A shear component that is unknown (NaN) counts as 0 in the magnitude.
             shear = np.linalg.norm(np.nan_to_num(between.shear), axis=1)
             field = SurfaceField(between.pressure, shear)
         if contacts is None:
@@ -100,5 +111,5 @@ class Moment(NamedTuple):
 
     @property
     def strongest_contact(self) -> Contact | None:
-        """The contact with the largest force; None without a load."""
+        """The contact with the largest force; None if there is no contact."""
         return self.contacts[0] if self.contacts else None

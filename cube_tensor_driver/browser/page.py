@@ -26,35 +26,46 @@ from .scene_3d import SPAN, Scene3D
 from .top_view import TopView
 
 MAX_SURFACE_POINTS = 5000
-"""Approximate number of points of the surface at which the field is drawn."""
+"""Approximate maximum of the number of points of the surface at which the field is drawn."""
 
 MAX_POINTS_PER_SIDE = 12
-"""Number of points of the surface along one side of a cube's part of it."""
+"""Maximum number of points of the surface along one side of the square patch around a cube."""
 
 BRAND_COLOUR = (24, 100, 171)
 BACKGROUND = (246, 247, 249)
 
 LEFT_WIDTH = 440.0
-"""Width of the panel with the plots, in pixels."""
+"""Width, in pixels, of the panel with the plots at the left of the page."""
 
 RIGHT_WIDTH = 320.0
-"""Width of viser's main panel, in pixels."""
+"""Width, in pixels, of viser's main panel (with the controls) at the right of the page."""
 
 CAMERA_POSITION = np.array([0.1, -1.0, 1.05]) * SPAN
-"""Position of the camera, in units of the scene, for a picture of normal proportions."""
+"""Position of the camera in the scene, for a picture that is a little higher than wide.
+
+The origin of the scene is the centre of the skin, and `SPAN` is the length of its longest side.
+"""
 
 CAMERA_TARGET = np.array([0.0, -0.04, 0.0]) * SPAN
-"""Point that the camera looks at, in units of the scene."""
+"""Point of the scene at which the camera looks; the origin is the centre of the skin."""
 
 PHONE_TARGET = np.array([0.0, -0.45, -0.3]) * SPAN
-"""Point that the camera looks at on a phone, whose panels cover the lower part of the picture."""
+"""Point of the scene at which the camera looks on a phone.
+
+It is in front of the skin, which therefore appears in the upper part of the picture; the panels
+cover the lower part.
+"""
 
 MIN_CAMERA_DISTANCE = 0.95
-"""Smallest distance of the camera, relative to that of `CAMERA_POSITION`."""
+"""Minimum distance from the camera to the point at which it looks, relative to the distance from
+`CAMERA_POSITION` to `CAMERA_TARGET`."""
 
 DISTANCE_PER_ASPECT = 0.78
-"""Distance of the camera, relative to that of `CAMERA_POSITION`, times the free width over the
-height of the picture. In narrow pictures the camera must be further away."""
+"""Distance of the camera, relative to the default one, for a picture as wide as it is high.
+
+The distance is divided by the ratio of free width (between the panels) to height, because the
+camera must be further away to show the whole skin in a narrow picture.
+"""
 
 PAUSE = "pause the page"
 GO_ON = "go on"
@@ -64,19 +75,19 @@ TARE = "tare"
 CLEAR_TARE = "undo tare"
 
 NOTE_S = 8.0
-"""Time, in seconds, for which a note is shown."""
+"""Time, in seconds, for which the page shows a note about an action of the user."""
 
 
 @dataclass(frozen=True)
 class Buttons:
-    """What the buttons of the page do. They are called in threads of viser and return at once.
+    """Functions that the buttons of the page call, in threads of viser. They return at once.
 
     Attributes:
-        tare: Take the present load as zero load.
-        clear_tare: Undo that.
-        record: Begin or end a recording.
-        hold: Stop a replay or let it go on.
-        jump: Jump to a position of a replay, in seconds.
+        tare: Takes the present load as zero load.
+        clear_tare: Undoes all tares.
+        record: Begins a recording, or ends the present one.
+        hold: Stops the replay, or lets it continue.
+        jump: Lets the replay jump to a position, in s after the start of the bag.
     """
 
     tare: Callable[[], None]
@@ -87,22 +98,30 @@ class Buttons:
 
 
 class ShownSkin:
-    """A skin as all pages show it.
+    """The skin that is shown, with everything that the pages of all browsers share.
 
     Attributes:
         name: Name of the skin.
         names: Names of its cubes.
-        poses: Poses of its cubes.
-        surface: Points of the field, between the cubes.
-        top_view: The drawing from above.
-        history: The values of the last seconds.
+        poses: Poses of its cubes in the parent frame, in m.
+        surface: Points at which the field of pressure and shear is drawn.
+        top_view: Drawing of the skin from above.
+        history: Values of all cubes in the last seconds.
     """
 
     def __init__(
         self, name: str, names: Sequence[str], poses: CubePoses, depth: float, history: History
     ) -> None:
-        """depth: of the centres of the cubes below the surface, in metres."""
-        # A large skin gets fewer points per cube, so that the whole stays within the limit.
+        """Prepare the points of the field and the drawing from above.
+
+        Args:
+            name: Name of the skin.
+            names: Names of its cubes.
+            poses: Poses of its cubes in the parent frame, in m.
+            depth: Distance from the centres of the cubes to the surface of the skin, in m.
+            history: Buffer for the values of the last seconds.
+        """
+        # A large skin gets fewer points per cube, so that all have about `MAX_SURFACE_POINTS`.
         points_per_side = np.sqrt(MAX_SURFACE_POINTS / len(names))
         points_per_side = np.clip(points_per_side, 2, MAX_POINTS_PER_SIDE)
         self.name, self.names, self.poses = name, list(names), poses
@@ -112,7 +131,7 @@ class ShownSkin:
 
 
 class Page:
-    """The page of one skin in one browser."""
+    """The page that shows a skin in one browser, with the settings of that browser's user."""
 
     def __init__(
         self,
@@ -135,17 +154,17 @@ class Page:
 
     @property
     def paused(self) -> bool:
-        """Whether the user has paused the page."""
+        """Whether the user has stopped the updates of this page (not the replay)."""
         return self._paused
 
     def close(self) -> None:
-        """Remove everything from the browser."""
+        """Remove all objects of the scene and all controls from the browser."""
         self._client.scene.remove_click_callback()
         self._client.scene.reset()
         self._client.gui.reset()
 
     def show_replay(self, replay: ReplayPosition | None) -> None:
-        """Show where a replay is; None: there is none."""
+        """Show position and state of a replay, or hide its controls if there is none (None)."""
         self._replay.show(replay)
 
     def show(
@@ -155,22 +174,24 @@ class Page:
         status: PageStatus,
         with_numbers: bool,
     ) -> None:
-        """Show a moment; while the page is paused it keeps the moment it has.
+        """Show the values of one instant; a paused page keeps those of the instant it shows.
 
         Args:
-            moment: What is shown.
+            moment: Values, field and contacts at the instant.
             rate: (N,) rows per second of each cube.
-            status: Links, recording, and the last action of the user.
-            with_numbers: Whether to show what changes less often, too: numbers and plots.
+            status: Links, recording, and result of the user's last action.
+            with_numbers: Whether to update numbers and plots as well as the 3-D view.
         """
-        # The browser shows all of it in one picture, or the field would be ahead of the cubes.
+        # `atomic` makes the browser apply all changes at once; otherwise it could show the field
+        # of this instant with the cubes of the one before.
         with self._client.atomic():
             if not self._paused or self._moment is None:
                 self._moment = moment
                 self._draw(moment)
             self._write_first_lines(self._moment, rate, status)
             if self._paused and not self._is_complete:
-                # Then all that is shown while the page is paused is of one moment.
+                # Plots and numbers are updated once more after the pause began, so that they
+                # belong to the same instant as the 3-D view.
                 self._write_plots()
                 self._write_numbers(self._moment, rate, status)
                 self._is_complete = True
@@ -196,10 +217,10 @@ class Page:
         line = markup.headline(
             moment.health, hertz, moment.strongest_contact, is_held, status.recording
         )
-        # Each assignment is sent, even if nothing has changed.
+        # viser sends each assignment to the browser, even if the text is the same.
         if line != self._headline.content:
             self._headline.content = line
-        # The button groups show what a press will do.
+        # The text of each button tells what the next press will do.
         view = (GO_ON if self._paused else PAUSE, STOP if status.recording else RECORD)
         if tuple(self._view.options) != view:
             self._view.options = view
@@ -216,8 +237,10 @@ class Page:
         rate: Array,
         status: PageStatus,
     ) -> None:
-        """Write plots and numbers in alternate calls, because each costs a browser as much time
-        as a picture."""
+        """Update the plots in one call and the numbers in the next.
+
+        Each of the two takes a browser as much time as a picture of the 3-D view.
+        """
         self._written += 1
         if self._written % 2:
             self._write_plots()
@@ -246,8 +269,8 @@ class Page:
         self._above.content = self._skin.top_view.draw(self._colouring, moment.contacts, cube)
 
     def _make_controls(self, gui: viser.GuiApi, buttons: Buttons) -> None:
-        """Make the main panel, from top to bottom."""
-        # A style sheet can be anywhere on the page.
+        """Add the controls to the main panel, from top to bottom."""
+        # A style sheet applies to the whole page, wherever it is inserted.
         gui.add_html(markup.PHONE_STYLE)
         self._headline = gui.add_html("")
         self._make_buttons(gui, buttons)
@@ -260,7 +283,7 @@ class Page:
 
         @self._cube.on_update
         def _(_: object) -> None:
-            # A browser may send any text.
+            # A browser may send any text, so it is compared with the names.
             if self._cube.value in names:
                 self._scene.selected = names.index(self._cube.value)
 
@@ -273,7 +296,7 @@ class Page:
             self._health = gui.add_html("")
 
     def _make_panel(self, gui: viser.GuiApi) -> None:
-        """Make the second panel: plots, and the skin from above."""
+        """Add the second panel with two tabs: plots over time, and the skin from above."""
         panel = gui.add_panel()
         self._charts = Charts(
             gui, panel.add_tab("plots of 10 s", viser.Icon.CHART_LINE), self._skin.names
@@ -300,7 +323,7 @@ class Page:
         @self._view.on_click
         @zero.on_click
         def _(event: viser.GuiEvent[Any]) -> None:
-            # A browser may send any text.
+            # A browser may send any text; one that is not the text of a button does nothing.
             action = actions.get(str(event.target.value))
             if action is not None:
                 action()
@@ -309,16 +332,16 @@ class Page:
         self._paused, self._is_complete = not self._paused, False
 
     def _quantity_changed(self) -> None:
-        """Begin the automatic range anew: that of another quantity says nothing."""
+        """Forget the automatic range of the colours, which belongs to another quantity."""
         self._top = 0.0
 
     def _choose(self, cube: int) -> None:
-        # viser's handle has a setter, which its type does not show.
+        # viser's handle has a setter for the value, which its type annotations do not declare.
         self._cube.value = self._skin.names[cube]  # type: ignore[misc]
 
 
 class WaitingPage:
-    """What a browser shows before there is a skin."""
+    """The page that a browser shows while no skin is published."""
 
     def __init__(self, client: viser.ClientHandle, text: str) -> None:
         set_up(client, "no skin yet")
@@ -328,13 +351,18 @@ class WaitingPage:
         )
 
     def close(self) -> None:
-        """Remove everything from the browser."""
+        """Remove the two texts of this page from the browser."""
         self._text.remove()
         self._label.remove()
 
 
 def set_up(client: viser.ClientHandle, name: str) -> None:
-    """Set colours, panel and camera of a page; name: title of the panel."""
+    """Set the colours, the main panel and the camera of a browser.
+
+    Args:
+        client: The browser.
+        name: Title of the main panel.
+    """
     client.gui.configure_theme(
         dark_mode=False,
         show_logo=False,
@@ -349,7 +377,7 @@ def set_up(client: viser.ClientHandle, name: str) -> None:
     width, height = client.camera.image_width, client.camera.image_height
     is_phone = width < height
     target = PHONE_TARGET if is_phone else CAMERA_TARGET
-    # The skin and what stands beside it fill the width that the panels leave.
+    # The skin, the scale bar and the axes fill the width that the panels leave free.
     free_width = width if is_phone else max(width - LEFT_WIDTH - RIGHT_WIDTH, 0.3 * width)
     distance = max(MIN_CAMERA_DISTANCE, DISTANCE_PER_ASPECT * height / free_width)
     client.camera.position = target + distance * (CAMERA_POSITION - CAMERA_TARGET)

@@ -1,8 +1,9 @@
 """The skin in 3-D on the page: cubes, field, arrows, crosses, contact.
 
 A computer without a graphics card draws each instance of a batched mesh separately, and a thousand
-cubes twenty times a second are too many for it. What grows with the skin is therefore a single
-object: all arrows of one kind are one mesh, and the cubes of a large skin are squares.
+cubes twenty times a second are too many for it. Parts whose number grows with the skin are
+therefore joined to one object: all arrows of one kind are one mesh, and the cubes of a large skin
+are squares.
 """
 
 from __future__ import annotations
@@ -30,27 +31,39 @@ from .moment import Moment
 Colour = tuple[int, int, int]
 
 SPAN = 2.0
-"""Longest side of every skin in the scene. Cameras and clipping planes of viewers are made for
-metres, and skins are centimetres long."""
+"""Length of the longest side of every skin, in units of the 3-D scene.
+
+The default camera and clipping planes of viser suit objects a few units long. Skins are only
+centimetres long, so they are enlarged to this length.
+"""
 
 MAX_SOLID_CUBES = 256
-"""Number of cubes above which squares are drawn where the upper faces of the cubes would be."""
+"""Maximum number of cubes that are drawn as solids.
+
+In a larger skin, only the upper face of each cube is drawn, as a square.
+"""
 
 MAX_NAMED_CUBES = 256
-"""Number of cubes above which no names are drawn: they would cover the skin."""
+"""Maximum number of cubes of a skin whose names are drawn; more names would cover the skin."""
 
 MIN_ARROW_UNIT = SPAN / 16
-"""Smallest unit length of arrows. With the pitch of a thousand cubes as the unit, the direction of
-a touch could not be seen."""
+"""Minimum of the unit length to which the sizes of arrows are relative, in units of the scene.
+
+The unit length is usually the pitch (distance of neighbouring cubes). In a skin of a thousand cubes
+the pitch is so small that the direction of arrows of this size could not be seen.
+"""
 
 MIN_THICKNESS = SPAN / 1000
-"""Smallest thickness of a line that is visible on every screen."""
+"""Minimum radius of a line, in units of the scene, that is visible on every screen."""
 
 AMBIENT_LIGHT = 2.4
-"""Intensity of the ambient light. With it and `DIRECT_LIGHT` colours look as in the legend."""
+"""Intensity of the ambient light, in units of viser.
+
+It is chosen together with `DIRECT_LIGHT` so that the cubes have the colours of the legend.
+"""
 
 DIRECT_LIGHT = 1.7
-"""Intensity of the light from above."""
+"""Intensity of the directional light from above, in units of viser."""
 
 DARK: Colour = (40, 44, 52)
 BLUE: Colour = (25, 105, 210)
@@ -60,25 +73,31 @@ TENSION_COLOUR: Colour = (210, 40, 40)
 COMPRESSION_COLOUR: Colour = (40, 80, 220)
 
 FAULT_COLOURS = {DOUBTFUL: (230, 130, 0), FAULTY: (215, 25, 25), STALE: DARK}
-"""Health -> colour of the cross over a cube."""
+"""Health of a cube -> colour of the cross that is drawn over it, as red, green, blue from 0 to 255.
+
+A cube whose health is `FINE` has no cross.
+"""
 
 CROSS_HEIGHT = 0.75
-"""Height of the middle of principal crosses above the centres of the cubes, in pitches. There they
-are outside of the cubes."""
+"""Height of the crosses of the principal stresses above the centres of the cubes.
+
+It is relative to the pitch (distance of neighbouring cubes). At this height the centres of the
+crosses are outside of the cubes and can be seen.
+"""
 
 NO_SHADOWS: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Where the cubes of the skin are in the scene.
+    """Transformation of the skin from its parent frame to the 3-D scene, and lengths in the scene.
 
     Attributes:
         poses: Poses of the cubes, in units of the scene.
         centre: (3,) origin of the scene in the parent frame, in metres.
         unit: Units of the scene per metre.
-        pitch: Typical distance of neighbouring cubes in the scene.
-        arrow: Unit length of arrows in the scene.
+        pitch: Typical distance of neighbouring cubes, in units of the scene.
+        arrow: Unit length to which the sizes of arrows are relative, in units of the scene.
     """
 
     poses: CubePoses
@@ -89,8 +108,12 @@ class Placement:
 
     @classmethod
     def of(cls, poses: CubePoses) -> Placement:
-        """Scale cubes at `poses` in the parent frame, in metres, to `SPAN`."""
-        # The whole skin fits into the span, with half a pitch around it.
+        """Compute the transformation that gives the longest side of a skin the length `SPAN`.
+
+        Args:
+            poses: Poses of the cubes in the parent frame, in metres.
+        """
+        # The skin ends half a pitch outside of the centres of its outer cubes.
         low, high = poses.position.min(axis=0), poses.position.max(axis=0)
         centre = (low + high) / 2
         unit = SPAN / ((high - low).max() + poses.pitch)
@@ -104,12 +127,12 @@ class Placement:
 
 
 class Scene3D:
-    """The 3-D part of the page.
+    """The 3-D view of the page.
 
     Attributes:
-        shown: Which parts are drawn; it may be changed.
-        selected: Index of the cube with a ring around it; it may be set.
-        bar: Length of the scale bar, in metres.
+        shown: Which parts are drawn; the caller may change it between two pictures.
+        selected: Index of the chosen cube, which has a ring around it; the caller may set it.
+        bar: Length of the scale bar beside the skin, in metres.
     """
 
     def __init__(
@@ -120,14 +143,14 @@ class Scene3D:
         surface: Surface,
         pick: Callable[[int], None],
     ) -> None:
-        """Make all objects.
+        """Add all objects to the scene.
 
         Args:
             api: The scene of one browser.
             names: Names of the cubes.
             poses: Poses of the cubes in the parent frame, in metres.
-            surface: Points of the field.
-            pick: Called with the index of a cube that was clicked.
+            surface: Points at which the field of pressure and shear is drawn.
+            pick: Function that is called with the index of a cube when the user clicks it.
         """
         placement = Placement.of(poses)
         self.shown = Shown()
@@ -149,13 +172,18 @@ class Scene3D:
         @api.on_click()
         def _(event: viser.SceneClickEvent) -> None:
             start, direction = np.array(event.ray_origin), np.array(event.ray_direction)
-            # viser reports a click as a ray from the camera.
+            # viser reports a click as a ray from the camera through the point that was clicked.
             cube = hit(placement.poses.position, placement.pitch, start, direction)
             if cube is not None:
                 pick(cube)
 
     def draw(self, moment: Moment, colouring: Colouring) -> None:
-        """Draw a moment in the colours of `colouring`."""
+        """Draw the skin at one instant.
+
+        Args:
+            moment: Values of the cubes at this instant, with their health and the contacts.
+            colouring: The values that are drawn as colours.
+        """
         shown, values = self.shown, moment.values
         self._cubes.draw(colouring, with_field=shown.field)
         self._names.visible = shown.names
@@ -176,11 +204,11 @@ class Scene3D:
 
 
 class ScaleBar:
-    """A bar in front of the skin, and the axes of its parent frame beside it.
+    """A scale bar in front of the skin, and the axes of the skin's parent frame beside it.
 
     Attributes:
-        length: Length of the bar, in metres: 1, 2 or 5 times a power of ten, about a quarter of
-            the skin.
+        length: Length that the bar represents, in metres: the largest of 1, 2 or 5 times a power
+            of ten that is at most a quarter of the skin's length.
     """
 
     def __init__(
@@ -223,15 +251,15 @@ class ScaleBar:
 
 
 def round_down(length: float) -> float:
-    """Return the largest of 1, 2 and 5 times a power of ten that is not above a length."""
+    """Return the largest number of the form 1, 2 or 5 times a power of ten up to `length`."""
     power = 10.0 ** np.floor(np.log10(length))
-    # The tolerance keeps a length of exactly 1, 2 or 5.
+    # Without the tolerance, rounding could reduce a length of exactly 1, 2 or 5.
     limit = length * (1 + 1e-9)
     return float(power * max(factor for factor in (1, 2, 5) if factor * power <= limit))
 
 
 class Cubes:
-    """The cubes and the field between them, in colours."""
+    """The coloured cubes, and the coloured field of pressure or shear below and between them."""
 
     def __init__(
         self,
@@ -240,7 +268,7 @@ class Cubes:
         surface: Surface,
     ) -> None:
         poses, of_cube = placement.poses, surface.cube
-        # The field lies below the cubes, so that it does not hide them.
+        # The field is drawn at the lower faces of the cubes, so that it does not hide them.
         down = poses.rotation[of_cube, :, 2] * poses.half_side[of_cube, None]
         self._field = SquareLayer(
             api,
@@ -265,11 +293,11 @@ class Cubes:
             batched_scales=poses.half_side,
             batched_colors=np.full((len(poses.position), 3), 200, np.uint8),
             flat_shading=True,
-            # viser would draw distant cubes with fewer triangles, which a cube does not have.
+            # By default viser simplifies distant meshes, but a cube cannot have fewer triangles.
             lod="off",
             **NO_SHADOWS,
         )
-        # Without edges, cubes of one colour merge into a plane.
+        # Neighbouring cubes of the same colour could not be told apart without drawn edges.
         edges = np.einsum("nij,eaj->neai", poses.rotation, CUBE_EDGES)
         lines = poses.position[:, None, None] + poses.half_side[:, None, None, None] * edges
         api.add_line_segments(
@@ -277,7 +305,12 @@ class Cubes:
         )
 
     def draw(self, colouring: Colouring, with_field: bool) -> None:
-        """Colour the cubes, and the field if it is wanted."""
+        """Colour the cubes, and colour or hide the field.
+
+        Args:
+            colouring: The values that are drawn as colours.
+            with_field: Whether the field is shown.
+        """
         quantity, top = colouring.quantity, colouring.top
         if with_field:
             self._field.paint(quantity, colouring.field, top)
@@ -291,7 +324,7 @@ class Cubes:
 
 
 class Names:
-    """The names of the cubes above them, unless there are too many."""
+    """The names of the cubes, each above its cube; none in a skin above `MAX_NAMED_CUBES`."""
 
     def __init__(
         self,
@@ -299,7 +332,7 @@ class Names:
         placement: Placement,
         names: Sequence[str],
     ) -> None:
-        # A hidden frame hides all names with one message.
+        # All names are children of one frame; hiding the frame hides them with a single message.
         self._frame = api.add_frame("/names", show_axes=False, visible=False)
         if len(names) > MAX_NAMED_CUBES:
             return
@@ -314,27 +347,29 @@ class Names:
 
     @property
     def visible(self) -> bool:
-        """Whether the names are drawn."""
+        """Whether the names of the cubes are shown."""
         return bool(self._frame.visible)
 
     @visible.setter
     def visible(self, visible: bool) -> None:
-        # Setting a value sends it, even if it is the same.
+        # viser sends each assignment to the browser, even if the value is the same.
         if visible != self._frame.visible:
             self._frame.visible = visible
 
 
 @dataclass(frozen=True)
 class ArrowStyle:
-    """What a set of arrows shows, and how.
+    """Meaning and appearance of a set of arrows, one per cube.
 
     Attributes:
-        name: Name in the scene.
+        name: Name of the set in the scene.
         colour: Colour of the arrows.
-        full_length: Length of the arrow for the top of the range, in unit lengths.
-        quantity: Quantity whose limit the automatic range of the lengths has.
-        measured: Function of values and residual; the values that the range follows.
-        lines: Function of poses, values and a scale in length per SI unit; tails and tips.
+        full_length: Length of the longest arrow, relative to the unit length `Placement.arrow`.
+        quantity: Quantity whose `min_top` limits the automatic range of the lengths from below.
+        measured: Function of values (N, 15) and residual (N,) that returns the values, in SI
+            units, that the automatic range follows.
+        lines: Function of poses, values (N, 15) and a scale in length per SI unit that returns
+            tails and tips (N, 2, 3).
     """
 
     name: str
@@ -364,10 +399,11 @@ GRADIENT = ArrowStyle(
 
 
 class Arrows:
-    """An arrow on the upper face of each cube; all of them are one mesh.
+    """An arrow on the upper face of each cube; all arrows are one mesh.
 
     Attributes:
-        longest: Value, in SI units, of an arrow of full length. It follows what is measured.
+        longest: Value, in SI units, that an arrow of full length stands for. It follows a rise of
+            the measured values at once and a fall slowly.
     """
 
     def __init__(
@@ -383,7 +419,7 @@ class Arrows:
 
     @property
     def value_per_length(self) -> float:
-        """Value, in SI units, of an arrow with a length of 1 in the scene."""
+        """Value, in SI units, that an arrow with a length of one unit of the scene stands for."""
         return self.longest / (self._style.full_length * self._placement.arrow)
 
     def draw(
@@ -392,11 +428,17 @@ class Arrows:
         residual: Array,
         visible: bool,
     ) -> None:
-        """Follow the values, and draw the arrows if they are visible."""
+        """Update the automatic range of the lengths, and draw the arrows if they are shown.
+
+        Args:
+            values: (N, 15) stress in Pa and gradients in Pa/m.
+            residual: (N,) residual relative to the expected noise.
+            visible: Whether the arrows are shown.
+        """
         style, unit = self._style, self._placement.arrow
         measured = style.measured(values, residual)
         self.longest = scene.automatic(style.quantity, measured, self.longest)
-        # The range follows even while the arrows are hidden, so that it is right when they appear.
+        # The range was updated even if the arrows are hidden, so it is right when they appear.
         self._mesh.visible = visible
         if visible:
             scale = style.full_length * unit / self.longest
@@ -405,12 +447,15 @@ class Arrows:
 
 
 class PrincipalCrosses:
-    """The principal stresses of each cube as a cross above it."""
+    """The principal stresses of each cube as a cross of three lines above it.
+
+    Each line lies along a principal direction; its colour tells tension from compression.
+    """
 
     def __init__(self, api: viser.SceneApi, placement: Placement) -> None:
         self._placement = placement
         self._frame = api.add_frame("/principal", show_axes=False, visible=False)
-        # The crosses begin on the upper faces and are lifted out of the cubes.
+        # `scene.principal_crosses` returns crosses centred on the upper faces; this lifts them.
         self._lift = _above(placement, CROSS_HEIGHT, placement.pitch) - _above(placement, 1.0)
         self._tension = _add_mesh(api, "principal/pulls", TENSION_COLOUR)
         self._compression = _add_mesh(api, "principal/pushes", COMPRESSION_COLOUR)
@@ -421,7 +466,14 @@ class PrincipalCrosses:
         longest: float,
         visible: bool,
     ) -> None:
-        """Draw the crosses; longest: stress, in Pa, whose line is as long as the pitch."""
+        """Draw or hide the crosses.
+
+        Args:
+            values: (N, 15) stress in Pa and gradients in Pa/m.
+            longest: Stress, in Pa, whose line is as long as the pitch (distance of neighbouring
+                cubes).
+            visible: Whether the crosses are shown.
+        """
         self._frame.visible = visible
         if not visible:
             return
@@ -434,7 +486,7 @@ class PrincipalCrosses:
 
 
 class FaultCrosses:
-    """A cross over each cube with a fault, in the colour of its health."""
+    """A cross over each cube whose health is not `FINE`, in the colour of `FAULT_COLOURS`."""
 
     def __init__(self, api: viser.SceneApi, placement: Placement) -> None:
         self._placement = placement
@@ -445,7 +497,8 @@ class FaultCrosses:
 
     def draw(self, health: AnyArray) -> None:
         """Draw the crosses again if the health (N,) of any cube has changed."""
-        # Health changes seldom, and a mesh is sent as a whole.
+        # The comparison saves work and data: health seldom changes, and each change of a mesh sends
+        # the whole mesh to the browser.
         if self._drawn is not None and np.array_equal(health, self._drawn):
             return
         self._drawn = health
@@ -457,7 +510,7 @@ class FaultCrosses:
 
 
 class ChosenCube:
-    """A ring around the cube whose numbers the page shows, with its name and a text."""
+    """A ring around the chosen cube, whose numbers the page shows, with a label below it."""
 
     def __init__(
         self,
@@ -471,20 +524,25 @@ class ChosenCube:
         radius = 0.6 * placement.pitch + 0.01 * placement.arrow
         self._ring = _add_mesh(api, "chosen", DARK)
         _set_mesh(self._ring, ring(radius, MIN_THICKNESS + 0.005 * placement.arrow))
-        # Below the ring: the label of a contact stands above its cube.
+        # The label stands below the ring, because the label of a contact stands above a cube.
         self._label = api.add_label(
             "/chosen/label", "", position=(0.0, -radius, 0.0), anchor="top-center"
         )
 
     def show(self, cube: int, text: str) -> None:
-        """Move the ring to a cube and write a text beside it."""
+        """Move the ring to a cube, and write the cube's name and a text into the label.
+
+        Args:
+            cube: Index of the cube.
+            text: Text behind the name, such as the value of the cube.
+        """
         self._ring.position = self._upper_faces[cube]
         self._ring.wxyz = self._orientations[cube]
         self._label.text = f"{self._names[cube]}: {text}"
 
 
 class ContactLabel:
-    """The forces of the strongest contact, written above it."""
+    """A label with the forces of the strongest contact, above the contact."""
 
     def __init__(self, api: viser.SceneApi, placement: Placement) -> None:
         self._placement = placement
@@ -493,9 +551,9 @@ class ContactLabel:
         )
 
     def show(self, contact: Contact | None) -> None:
-        """Write the forces of a contact; None: there is none."""
+        """Write the forces of a contact at its position, or hide the label if it is None."""
         if contact is not None:
-            # Above the tip of the arrow of the cube below it.
+            # The distance keeps the label clear of the cubes and of short arrows.
             above = 1.1 * self._placement.arrow * contact.normal
             self._label.text = markup.newtons(contact)
             self._label.position = self._placement.point(contact.position) + above
@@ -503,12 +561,12 @@ class ContactLabel:
 
 
 def _above(placement: Placement, factor: float, unit: float | None = None) -> Array:
-    """Return points (N, 3) above the centres of the cubes.
+    """Return one point above the centre of each cube (N, 3), in units of the scene.
 
     Args:
-        placement: The cubes.
-        factor: Height in multiples of the unit.
-        unit: Unit of the height; None: half the side of each cube.
+        placement: Poses of the cubes in the scene.
+        factor: Height of the points above the centres, as a multiple of `unit`.
+        unit: Unit of the height, in units of the scene; None: half the side of each cube.
     """
     poses = placement.poses
     height = poses.half_side[:, None] if unit is None else unit
@@ -516,7 +574,10 @@ def _above(placement: Placement, factor: float, unit: float | None = None) -> Ar
 
 
 def _set_up_lights(api: viser.SceneApi) -> None:
-    """Set lights without shadows and reflections, which a processor draws slowly."""
+    """Set up lights without shadows and reflections.
+
+    A computer without a graphics card computes shadows and reflections slowly.
+    """
     api.configure_default_lights(enabled=False)
     api.configure_environment_map(None)
     api.add_light_ambient("/light/all", intensity=AMBIENT_LIGHT)
@@ -534,9 +595,10 @@ def _set_mesh(handle: viser.MeshHandle, mesh: Mesh) -> None:
 
 
 def linear_light(colours: Array) -> NDArray[np.uint8]:
-    """Convert sRGB colours (N, 3) from 0 to 1 into bytes of linear light.
+    """Convert sRGB colours (N, 3) from 0 to 1 into linear intensities from 0 to 255.
 
-    The browser takes the colours of batched meshes as linear light. Source: IEC 61966-2-1.
+    The browser interprets the colours of batched meshes as linear intensities of light. The
+    conversion is the transfer function of sRGB (IEC 61966-2-1).
     """
     linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
     return (255 * linear).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""The skin seen from above, as an SVG: its field as a heat map, its cubes and contacts."""
+"""The skin seen from above, as an SVG drawing: field as a heat map, cubes and contacts."""
 
 from __future__ import annotations
 
@@ -20,29 +20,30 @@ from .colouring import Colouring
 from .scene_3d import round_down
 
 WIDTH = 400.0
-"""Width of the drawing, in its own units."""
+"""Width of the SVG drawing, in its user units; the browser scales it to the width of the panel."""
 
 MARGIN = 44.0
-"""Room for the numbers and labels of the axes, in units of the drawing."""
+"""Space for numbers and labels at the left and lower edge, in user units of the SVG drawing."""
 
 MAX_PIXELS_PER_SIDE = 256
-"""Number of pixels of the heat map along the longer side of the skin."""
+"""Maximum number of pixels of the heat map along the longer side of the skin."""
 
 MAX_NAMED_CUBES = 100
-"""Number of cubes up to which their names are written beside them."""
+"""Maximum number of cubes of a skin whose names are written below the cubes."""
 
 TICKS = 5
-"""Approximate number of ticks of an axis."""
+"""Approximate number of ticks (marks with a number) on the longer axis of the drawing."""
 
 
 class Raster:
-    """An image of points seen along z: each pixel has the colour of the nearest point.
+    """An image of points in the x-y plane: each pixel has the colour of the nearest point.
 
     Attributes:
         low: (2,) corner of the image with the smallest x and y, in metres.
-        high: (2,) the opposite corner.
-        owner: (rows, columns) index of the point whose colour a pixel has, or the number of points
-            if none is near. The first row is at the largest y.
+        high: (2,) corner of the image with the largest x and y, in metres.
+        owner: (rows, columns) index of the point nearest to each pixel; the number of points M
+            where no point is near enough, so that the pixel is transparent. The first row has the
+            largest y.
     """
 
     def __init__(
@@ -51,12 +52,12 @@ class Raster:
         pixel: float,
         reach: float,
     ) -> None:
-        """Assign the pixels to points.
+        """Find the nearest point of each pixel.
 
         Args:
-            points: (M, 3) metres.
-            pixel: Side of a pixel, in metres.
-            reach: Distance in metres from every point above which a pixel is transparent.
+            points: (M, 3) positions of the points, in metres.
+            pixel: Length of the side of a pixel, in metres.
+            reach: Distance, in metres, to the nearest point above which a pixel is transparent.
         """
         flat = points[:, :2]
         extent = np.ptp(flat, axis=0) + 1.4 * reach
@@ -68,11 +69,15 @@ class Raster:
         y = self.high[1] - (np.arange(rows) + 0.5) * pixel
         centres = np.stack(np.meshgrid(x, y), axis=2)
         distance, self.owner = cKDTree(flat).query(centres)
-        # This index is that of the transparent entry in `image`.
+        # `image` appends a transparent colour at this index to the colours of the points.
         self.owner[distance > reach] = len(points)
 
     def image(self, colours: Array) -> NDArray[np.uint8]:
-        """Return pixels (rows, columns, 4); colours: (M, 3) from 0 to 1, NaN is transparent."""
+        """Return the pixels (rows, columns, 4) as red, green, blue and opacity from 0 to 255.
+
+        Args:
+            colours: (M, 3) colours of the points, from 0 to 1; NaN is transparent.
+        """
         table = np.zeros((len(colours) + 1, 4), np.uint8)
         table[:-1, :3] = np.round(255 * np.nan_to_num(colours))
         table[:-1, 3] = 255 * np.isfinite(colours[:, 0])
@@ -80,7 +85,7 @@ class Raster:
 
 
 class TopView:
-    """Draws the skin in the x-y plane of its parent frame."""
+    """Draws a skin, projected onto the x-y plane of its parent frame, as SVG."""
 
     def __init__(
         self,
@@ -99,7 +104,7 @@ class TopView:
         square = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
         rotated = np.einsum("nij,qj->nqi", poses.rotation, square)
         self._corners = poses.position[:, None] + poses.half_side[:, None, None] * rotated
-        # The axes do not change from picture to picture.
+        # The axes are the same in all pictures, so they are drawn once.
         self._axes = self._draw_axes()
 
     def draw(
@@ -108,7 +113,13 @@ class TopView:
         contacts: Sequence[Contact],
         chosen: int,
     ) -> str:
-        """Return an SVG element; chosen: index of the cube with a thick outline."""
+        """Return the drawing as an SVG element.
+
+        Args:
+            colouring: The values that are drawn as colours.
+            contacts: The contacts to draw.
+            chosen: Index of the chosen cube, which gets a thick outline.
+        """
         parts = [
             self._heat_map(scene.colours(colouring.quantity, colouring.field, colouring.top)),
             self._axes,
@@ -121,9 +132,9 @@ class TopView:
         return f"{head} {font}>{''.join(parts)}</svg>"
 
     def _drawn(self, point: Array) -> tuple[float, float]:
-        """Return the place of a point (2,) or (3,), in metres, in the drawing."""
+        """Return x and y in the drawing of a point of the parent frame (2,) or (3,), in metres."""
         x = MARGIN + (point[0] - self._raster.low[0]) * self._scale
-        # In an SVG, y points down.
+        # The y axis of an SVG drawing points down, that of the parent frame up.
         y = (self._raster.high[1] - point[1]) * self._scale
         return float(x), float(y)
 
@@ -133,7 +144,7 @@ class TopView:
         return f"<image {place} preserveAspectRatio='none' href='data:image/png;base64,{data}'/>"
 
     def _draw_axes(self) -> str:
-        """Draw the frame, and ticks and labels in mm."""
+        """Return the frame of the drawing with ticks, numbers and labels in mm, as SVG."""
         low, high = 1e3 * self._raster.low, 1e3 * self._raster.high
         bottom = self._height
         parts = [
@@ -155,13 +166,16 @@ class TopView:
         return "".join(parts)
 
     def _cubes(self, colouring: Colouring, chosen: int) -> list[str]:
-        """Draw the cubes in their colours, with a tool tip, and their names if they are few."""
+        """Return SVG polygons of the cubes in their colours, with tool tips.
+
+        Up to `MAX_NAMED_CUBES` cubes have their names written below them.
+        """
         colours = scene.colours(colouring.quantity, colouring.cubes, colouring.top)
         rgb = (255 * colours).astype(int)
         parts = []
         for cube, (name, corners) in enumerate(zip(self._names, self._corners, strict=True)):
             points = " ".join("{:.1f},{:.1f}".format(*self._drawn(corner)) for corner in corners)
-            # The chosen cube has a thick outline.
+            # The thick outline marks the chosen cube, whose numbers the page shows.
             width = 2.5 if cube == chosen else 0.7
             title = escape(f"{name}: {colouring.text(cube)}")
             parts.append(
@@ -175,13 +189,13 @@ class TopView:
         return parts
 
     def _contact(self, contact: Contact) -> str:
-        """Draw a circle of the area of a contact, its centre, and its forces as text."""
+        """Return SVG of a contact: a circle of its area around its position, and its forces."""
         x, y = self._drawn(contact.position)
         radius = max(3.0, np.sqrt(contact.area / np.pi) * self._scale)
         circle = f"<circle cx='{x:.1f}' cy='{y:.1f}' r='{radius:.1f}'"
         parts = [f"{circle} fill='none' stroke='#1864ab' stroke-width='2'/>"]
         parts.append(f"<circle cx='{x:.1f}' cy='{y:.1f}' r='2.5' fill='#1864ab'/>")
-        # Near the upper edge the text stands below the circle.
+        # The text stands above the circle, but below it if the upper edge would cut it off.
         has_room_above = y - radius - 6 > 8
         text_y = y - radius - 6 if has_room_above else y + radius + 14
         text_x = min(max(x, MARGIN + 60), WIDTH - 60)
@@ -200,7 +214,7 @@ def _text(
 
 
 def _ticks(low: float, high: float, step: float) -> list[float]:
-    """Return the multiples of a step between two numbers, without rounding errors."""
+    """Return all multiples of `step` from `low` to `high`, rounded to six significant digits."""
     first, last = np.ceil(low / step), np.floor(high / step)
     numbers = np.arange(first, last + 1)
     return [float(f"{number * step:.6g}") for number in numbers]

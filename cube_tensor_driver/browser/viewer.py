@@ -1,6 +1,6 @@
-"""`./cube view`: serve a page that shows the running skin.
+"""The node and the web server of `./cube view`, whose page shows the running skin.
 
-It is a process of its own, so that it does not slow down the nodes.
+They run in a process of their own, so that they do not slow down the driver and the other nodes.
 """
 
 from __future__ import annotations
@@ -43,26 +43,29 @@ from .moment import Moment
 from .page import Buttons, Page, ShownSkin, WaitingPage
 
 ALL_ADDRESSES = ("0.0.0.0", "::")
-"""Hosts that stand for all addresses of this machine, in IPv4 and IPv6."""
+"""Values of --host with which the server listens on all addresses of this machine (IPv4, IPv6)."""
 
 PICTURE_PERIOD_S = 0.05
-"""Time, in seconds, from picture to picture."""
+"""Period, in seconds, at which the pages get a new picture of the skin."""
 
 NUMBERS_PERIOD_S = 0.25
-"""Time, in seconds, from one update of numbers and plots to the next. People cannot read faster."""
+"""Period, in seconds, at which numbers and plots change; people cannot read numbers faster."""
 
 WAITING_NOTE_S = 2.0
-"""Time, in seconds, without a skin, after which the terminal says that the page waits for one."""
+"""Time, in seconds after the start, at which the terminal prints that no skin is published yet."""
 
 NEVER_STALE_S = 1e9
-"""Age, in seconds, above which a cube is stale while a replay is held: none is."""
+"""Maximum age, in seconds, of a cube's latest row while a replay is paused.
+
+A paused replay publishes nothing. The limit is so high that no cube is shown as stale then.
+"""
 
 
 class Viewer:
-    """The node and the pages of all browsers.
+    """The ROS node of `./cube view`, its web server, and the pages of all browsers.
 
-    All of it runs in the thread that calls `spin`. Buttons are pressed in threads of viser, and
-    what they ask for waits in a queue.
+    Everything runs in the thread that calls `spin`. viser calls the functions of buttons in threads
+    of its own; these only put an action into a queue, from which `spin` takes it.
     """
 
     def __init__(
@@ -72,9 +75,10 @@ class Viewer:
         depth: float,
         recordings: Path,
     ) -> None:
-        """Start the server and the node; arguments as of `run_view`."""
+        """Start the server and the node; the arguments are those of `run_view`."""
         self._host = host
-        # Whoever can open a local address is a user of this machine already.
+        # An address that only this machine can reach needs no token: whoever can open it is a user
+        # of this machine.
         self._token = "" if host in LOCAL_HOSTS else secrets.token_urlsafe(16)
         self._server = _serve(host, port, self._token)
         self._depth = depth
@@ -100,7 +104,7 @@ class Viewer:
         self._shown: ShownSkin | None = None
         self._rows = RowRate(0, time.monotonic())
         self._pages: dict[int, Page | WaitingPage] = {}
-        # viser calls these in threads of its own.
+        # viser calls both functions in threads of its own, so they only put actions into the queue.
         put = self._actions.put
         self._server.on_client_connect(lambda client: put(lambda: self._open_page(client)))
         self._server.on_client_disconnect(
@@ -111,18 +115,18 @@ class Viewer:
 
     @property
     def url(self) -> str:
-        """Address of the page, with the token where one is needed."""
+        """URL of the page; it contains the token if browsers of other machines may open it."""
         host = socket.gethostname() if self._host in ALL_ADDRESSES else self._host
         name = f"[{host}]" if ":" in host else host
         query = f"/?token={self._token}" if self._token else ""
         return f"http://{name}:{self._server.get_port()}{query}"
 
     def spin(self, stop: threading.Event) -> None:
-        """Serve until `stop` is set."""
+        """Receive messages, execute actions of users and update the pages until `stop` is set."""
         next_picture_s = next_numbers_s = time.monotonic()
         waiting_note_s = next_picture_s + WAITING_NOTE_S
         while not stop.is_set():
-            # The executor returns earlier when a message comes.
+            # `spin_once` returns earlier if a message arrives.
             wait_s = min(next_picture_s - time.monotonic(), PICTURE_PERIOD_S)
             self._executor.spin_once(timeout_sec=max(0.0, wait_s))
             while not self._actions.empty():
@@ -131,7 +135,7 @@ class Viewer:
             if now_s < next_picture_s:
                 continue
 
-            # Pictures that were missed, while the computer slept for example, are left out.
+            # Pictures that are overdue, for example after the computer slept, are skipped.
             next_picture_s = max(next_picture_s + PICTURE_PERIOD_S, now_s)
             with_numbers = now_s >= next_numbers_s
             if with_numbers:
@@ -143,16 +147,16 @@ class Viewer:
                 print(markup.waiting(_domain()), flush=True)
 
     def close(self) -> None:
-        """End a recording, the node and the server."""
+        """End a recording that runs, destroy the node and stop the server."""
         self._recorder.end()
         self._executor.remove_node(self._node)
         self._node.destroy_node()  # type: ignore[no-untyped-call]
-        # viser prints that it has stopped.
+        # viser prints a message when it stops, which is discarded.
         with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
 
     def _show_skin(self, skin: FollowedSkin) -> None:
-        """Make the pages of a skin that has appeared, or has taken the place of another one."""
+        """Open new pages in all browsers for a skin that has appeared or has replaced another."""
         names = [cube.name for cube in skin.info.cubes]
         history = History(len(names), round(HISTORY_S / PICTURE_PERIOD_S))
         self._shown = ShownSkin(skin.info.name, names, skin.poses, self._depth, history)
@@ -165,8 +169,8 @@ class Viewer:
             self._open_page(client)
 
     def _open_page(self, client: viser.ClientHandle) -> None:
-        """Make the page of a browser, unless it has one or has gone already."""
-        # The browser may be gone by the time its event is handled.
+        """Open a page in a browser, unless it has one or is no longer connected."""
+        # The event waited in the queue, and the browser may have disconnected in that time.
         if client.client_id in self._pages or client.client_id not in self._server.get_clients():
             return
         if self._shown is None:
@@ -201,8 +205,14 @@ class Viewer:
         shown: ShownSkin,
         with_numbers: bool,
     ) -> None:
-        """Show one picture, and with `with_numbers` the numbers and plots beside it."""
-        # After a jump the plots would connect two different times.
+        """Update the pages of all browsers.
+
+        Args:
+            followed: The skin, with its latest rows.
+            shown: The skin, as the pages show it.
+            with_numbers: Whether to update numbers and plots as well as the 3-D view.
+        """
+        # After a jump of the replay, the plots would connect values of two different times.
         if self._replay.update():
             shown.history.clear()
         is_held = self._replay.is_held
@@ -213,7 +223,7 @@ class Viewer:
         if with_numbers:
             self._update_status()
             self._rows.update(time.monotonic(), followed.newest.count)
-        # Without a browser there is nobody to draw for.
+        # Without a page, computing the field and the contacts would be useless work.
         if not self._pages:
             return
         moment = Moment.of(
@@ -250,7 +260,7 @@ class Viewer:
 
     def _receive_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            # Names of diagnostics are "NODE: link NAME".
+            # The driver names the diagnostics of a link (connection to a hub) "NODE: link NAME".
             if ": link " in status.name:
                 name = status.name.rpartition(": ")[2]
                 self._links[status.name] = f"{name}: {status.message}"
@@ -261,18 +271,23 @@ def _domain() -> str:
 
 
 def _serve(host: str, port: int, token: str) -> viser.ViserServer:
-    """Start viser.
+    """Start the web server of viser.
+
+    Args:
+        host: Name or IP address on which it listens.
+        port: TCP port; if it is in use, viser takes the next free one.
+        token: Text that browsers must send; empty: none is needed.
 
     Raises:
-        ConfigError: The host is no address of this machine, or the port cannot be had.
+        ConfigError: This machine does not have the address, or the port cannot be opened.
     """
     check_host(host)
-    # A refused request is no error of the server.
+    # websockets logs each refused request as an error, but refusing is intended here.
     logging.getLogger("websockets").setLevel(logging.ERROR)
-    # viser warns when a browser leaves while its picture is made, which is no fault.
+    # viser warns if a browser disconnects while its picture is made, which is no fault.
     warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
     try:
-        # viser prints a banner with an address without the token.
+        # viser prints the address of the page without the token, which would not work.
         with contextlib.redirect_stdout(io.StringIO()), guarded_server(token):
             return viser.ViserServer(host, port, label="cube_tensor_driver", verbose=False)
     except OSError as error:
@@ -285,16 +300,19 @@ def run_view(
     depth: float,
     recordings: Path,
 ) -> int:
-    """Serve the page until Ctrl-C; returns the exit code.
+    """Serve the page until Ctrl-C.
 
     Args:
-        host: Address at which the page is served.
-        port: TCP port of the page.
-        depth: Depth of the centres of the cubes below the surface, in metres.
-        recordings: Folder for bags that are recorded from the page.
+        host: Name or IP address on which the server listens.
+        port: TCP port of the page; if it is in use, the next free one is taken.
+        depth: Distance from the centres of the cubes to the surface of the skin, in metres.
+        recordings: Folder for the bags that are recorded from the page.
+
+    Returns:
+        The exit code, 0.
 
     Raises:
-        ConfigError: Host or port cannot be had.
+        ConfigError: This machine does not have the address, or the port cannot be opened.
     """
     stop = stop_event()
     start_ros()
