@@ -1,1 +1,1 @@
-"""Recordings: rosbag2 folders read, written and repaired without rosbag2. ROS is not imported."""
+"""Recordings (bags): rosbag2's files are read, written and repaired here without ROS or rosbag2."""

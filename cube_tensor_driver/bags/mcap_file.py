@@ -1,8 +1,8 @@
 """MCAP files of bags, read and written with the library mcap.
 
-An MCAP file is a sequence of chunks, each with a checksum, and a summary at the end that says which
-topics there are and where each chunk is. A chunk is read as a whole: this costs one step per chunk
-instead of several per message. Source of the format: https://mcap.dev/spec.
+An MCAP file is a sequence of chunks (blocks of messages, each with a checksum), followed by a
+summary that lists the topics and the offset of each chunk. A chunk is read as a whole, which needs
+one read per chunk instead of several per message. Source of the format: https://mcap.dev/spec.
 """
 
 from __future__ import annotations
@@ -31,58 +31,70 @@ from ..config.yaml import parse_yaml, to_yaml
 from .metadata import Connection, FileSummary, QosProfile, bag_information
 
 MAGIC = b"\x89MCAP0\r\n"
-"""The first and last bytes of a complete file."""
+"""The bytes with which every complete MCAP file begins and ends."""
 
 RECORD_HEAD = struct.Struct("<BQ")
-"""Bytes in front of each record of an MCAP file: its opcode, and the length of the record."""
+"""Layout of the 9 bytes in front of each record of an MCAP file: the opcode, which is the record's
+type, and the length of the record's content in bytes."""
 
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
-"""Bytes in front of the content of a message record: channel, sequence number, and the times of
-recording and of publication in ns."""
+"""Layout of the bytes in front of the serialised message in a message record: channel (number of
+the topic in the file), sequence number, and the times of recording and of publication, in ns."""
 
 CHUNK_BYTES = 1 << 18
-"""Size at which the writer closes a chunk. At 256 kB a chunk fits the processor's cache, and little
-is lost with the last one when the process is killed."""
+"""Size, in bytes, at which the writer completes a chunk (block of messages) of an MCAP file.
+
+A chunk of 256 kB fits the processor's cache. If the process is killed, only the messages of the
+incomplete chunk are lost, and those are few.
+"""
 
 MAX_CHUNK_BYTES = 256 << 20
-"""Largest size, in bytes, of a chunk that is read.
+"""Largest size, in bytes, of a chunk (block of messages) of an MCAP file that is read.
 
-rosbag2 closes a chunk when it has 0.8 MB, so only a single message can make it much larger. A size
-beyond this limit is damage, and no memory is requested for it.
+rosbag2 completes a chunk at 0.8 MB, so only a single large message can make a chunk much larger. A
+file that states a size beyond this limit is treated as damaged, before memory is allocated.
 """
 
 CACHED_CHUNKS = 4
-"""Number of chunks kept in memory. Frequencies and stress are read side by side, each by an
-iterator of its own, from the same chunks."""
+"""Number of chunks (blocks of messages) of a file that stay in memory after they were read.
+
+The topics of frequencies and of stress are read in turn by two iterators, whose messages lie in
+the same chunks. Without this cache each chunk would be read and decompressed twice.
+"""
 
 ROSBAG2 = "rosbag2"
-"""Name of the metadata record in which rosbag2 looks for the description of a file."""
+"""Name of the MCAP metadata record from which rosbag2 reads the description of a file (topics,
+times, numbers of messages) if there is no metadata.yaml."""
 
 _FOOTER_BYTES = RECORD_HEAD.size + 20
-"""Size of the footer record, which stands in front of the last `MAGIC`."""
+"""Size, in bytes, of the footer record of an MCAP file with its opcode and length. The footer
+stands just before the closing `MAGIC` bytes and states where the summary begins."""
 
 CHECKSUM_BYTES = 4
-"""Size of the checksum (CRC-32) at the end of the footer record."""
+"""Size, in bytes, of the checksum (CRC-32) of the summary, with which the footer record of an MCAP
+file ends."""
 
 StoredMessage = tuple[int, int, int, bytes]
-"""Time in ns, offset of the chunk in the file, channel, serialised message."""
+"""A message of an MCAP file: time of recording in ns since the Unix epoch, byte offset of its chunk
+from the start of the file, channel (number of its topic), and its serialised bytes."""
 
 
 class McapReader:
     """An MCAP file open for reading.
 
     Attributes:
-        summary: What the file holds.
+        summary: Topics, times and numbers of messages of the file.
     """
 
     def __init__(self, path: Path) -> None:
-        """Open a file and read its summary.
+        """Open a file and read its summary (topics, and the offset of each chunk of messages).
 
         Raises:
-            OSError, McapError, ValueError, struct.error: The file cannot be read, or is damaged.
+            OSError, McapError, ValueError, struct.error: The file cannot be read, its summary is
+                damaged, or it has no summary because the recording was cut off.
         """
         self._stream = path.open("rb")
-        # The checksum comes first: it covers every offset and length that is used afterwards.
+        # The checksum is checked first, because it covers every offset and length used below.
         try:
             _check_summary(self._stream)
             self._stream.seek(0)
@@ -91,7 +103,8 @@ class McapReader:
                 validate_crcs=True,
                 record_size_limit=MAX_CHUNK_BYTES,
             ).get_summary()
-            # Without statistics nobody knows how many messages there should be.
+            # Only the statistics state how many messages the file should have. Without them, lost
+            # messages would not be noticed.
             if index is None or index.statistics is None:
                 raise McapError("the file has no summary")
             sizes = [chunk.uncompressed_size for chunk in index.chunk_indexes]
@@ -103,7 +116,7 @@ class McapReader:
             raise
         self._index = index
         self._connections = _connections(index)
-        # The cache belongs to this file, and goes with it.
+        # One cache per open file, so that its chunks are freed together with this object.
         self._load_chunk = lru_cache(CACHED_CHUNKS)(self._read_chunk)
         self.summary = summarise(path.name, index)
 
@@ -117,17 +130,17 @@ class McapReader:
         start_ns: int,
         stop_ns: int,
     ) -> Iterator[tuple[Connection, int, bytes]]:
-        """Read messages in the order of their times.
+        """Read messages in the order of their times of recording.
 
         Args:
-            topics: Names of the topics.
-            start_ns: Time of the first message, in ns.
-            stop_ns: Time before which the last message lies.
+            topics: Names of the topics to read.
+            start_ns: Earliest time of recording that is read, in ns since the Unix epoch.
+            stop_ns: Time of recording, in ns, from which on nothing is read.
 
         Yields:
-            The topic, the time in ns and the serialised message.
+            The topic, the time of recording in ns, and the serialised message.
         """
-        # A topic may have several channels, for example after a recorder was restarted.
+        # Several channels can stand for the same topic, for example after a recorder was restarted.
         channels = {
             number: connection
             for number, connection in self._connections.items()
@@ -138,7 +151,7 @@ class McapReader:
             return
         stored = self._in_order(channels, start_ns, stop_ns)
         for time_ns, _, channel, data in stored:
-            # A chunk has messages of all topics, and its times reach beyond those wanted.
+            # A chunk also contains messages of other topics and of times outside the wanted span.
             if channel in channels and start_ns <= time_ns < stop_ns:
                 yield channels[channel], time_ns, data
 
@@ -148,13 +161,25 @@ class McapReader:
         start_ns: int,
         stop_ns: int,
     ) -> Iterator[StoredMessage]:
-        """Read the chunks that matter and merge messages of chunks whose times overlap."""
+        """Read messages of all channels in the order of time, chunk (block of messages) by chunk.
+
+        Chunks without a wanted channel or outside the span of time are skipped. Messages of chunks
+        whose times overlap are merged.
+
+        Args:
+            channels: Channels (numbers of topics in the file) of which a chunk must have one.
+            start_ns: Begin of the span of time, in ns since the Unix epoch.
+            stop_ns: End of the span of time, in ns.
+
+        Yields:
+            All messages of the chunks that were read, also those of other channels and times.
+        """
         chunks = [
             chunk
             for chunk in self._index.chunk_indexes
             if start_ns <= chunk.message_end_time
             and chunk.message_start_time < stop_ns
-            # Without message indexes a chunk does not say which channels it has.
+            # A chunk without message indexes may contain any channel, so it must be read.
             and not (
                 chunk.message_index_offsets
                 and chunk.message_index_offsets.keys().isdisjoint(channels)
@@ -163,7 +188,8 @@ class McapReader:
         pending: Sequence[StoredMessage] = ()
         chunks.sort(key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset))
         for chunk in chunks:
-            # No later chunk has a message before this chunk's first.
+            # The chunks are sorted by their first times, so messages before that of this chunk can
+            # be delivered: no later chunk has an earlier message.
             ready = bisect_left(pending, chunk.message_start_time, key=itemgetter(0))
             yield from pending[:ready]
             loaded = self._load_chunk(chunk.chunk_start_offset, chunk.chunk_length)
@@ -171,25 +197,30 @@ class McapReader:
             if not waiting:
                 pending = loaded
                 continue
-            # Of messages of the same time, the one that was written first comes first.
+            # Messages with equal times stay in the order in which they were written to the file.
             pending = sorted([*waiting, *loaded], key=itemgetter(0, 1))
         yield from pending
 
     def _read_chunk(self, offset: int, length: int) -> Sequence[StoredMessage]:
-        """Read one chunk.
+        """Read one chunk (block of messages) of the file.
+
+        Args:
+            offset: Byte offset of the chunk record from the start of the file.
+            length: Size of the chunk record, in bytes, including its opcode and length.
 
         Returns:
-            Its messages in the order of their times.
+            All messages of the chunk in the order of their times.
         """
         self._stream.seek(offset + RECORD_HEAD.size)
-        # A length inside the record may be damaged: then it ends with the record, not the memory.
+        # Parsing a copy of the record limits what a damaged length inside it can request: reading
+        # stops at the end of the record instead of allocating any amount of memory.
         record = BytesIO(self._stream.read(length - RECORD_HEAD.size))
         chunk = Chunk.read(ReadDataStream(record))
         messages = [
             (time_ns, offset, channel, data)
             for channel, time_ns, data in _chunk_messages(unpack_chunk(chunk))
         ]
-        # Messages of several topics may stand a little out of order.
+        # Recorders write messages of several topics slightly out of the order of their times.
         messages.sort(key=itemgetter(0))
         return messages
 
@@ -199,7 +230,15 @@ class McapReader:
         start_ns: int,
         stop_ns: int,
     ) -> Iterator[tuple[Connection, int, bytes]]:
-        """Read a file without index (rosbag2's preset ``fastwrite``) in the order of writing."""
+        """Read a file without an index of chunks (rosbag2's preset ``fastwrite``).
+
+        The messages come in the order of writing, because only an index allows to sort them.
+
+        Args:
+            channels: Topic of each channel (number of a topic in the file) that is read.
+            start_ns: Earliest time of recording that is read, in ns since the Unix epoch.
+            stop_ns: Time of recording, in ns, from which on nothing is read.
+        """
         self._stream.seek(0)
         reader = NonSeekingReader(
             self._stream,
@@ -212,15 +251,16 @@ class McapReader:
 
 
 class McapWriter:
-    """A new MCAP file of a bag."""
+    """A new MCAP file of a bag, open for writing."""
 
     def __init__(self, path: Path) -> None:
         """Create the file.
 
         Raises:
-            OSError: It exists, or cannot be created.
+            OSError: The file exists already, or cannot be created.
         """
-        # Chunks are not compressed: compression would take processor time from the nodes.
+        # Chunks are not compressed: while recording, compression would take processor time from
+        # the ROS nodes on the same machine.
         self._stream = path.open("xb")
         self._writer = Writer(self._stream, CHUNK_BYTES, CompressionType.NONE)
         self._writer.start("ros2", library="cube_tensor_driver")
@@ -233,10 +273,16 @@ class McapWriter:
         definition: str,
         qos: Sequence[QosProfile],
     ) -> int:
-        """Add a topic.
+        """Add a topic to the file, which must happen before its first message is written.
+
+        Args:
+            topic: Name of the topic.
+            msgtype: Type of its messages, such as ``std_msgs/msg/String``.
+            definition: Text of the type's definition, with those of the types in it.
+            qos: Quality of service profiles that its publishers offered.
 
         Returns:
-            The number by which `write` knows it.
+            The channel (number of the topic in the file), which `write` takes.
         """
         if msgtype not in self._schemas:
             text = definition.encode()
@@ -253,34 +299,46 @@ class McapWriter:
         time_ns: int,
         data: bytes,
     ) -> None:
-        """Add a serialised message that was received at a time, in ns."""
+        """Add a message.
+
+        Args:
+            channel: Number of the topic that `add_topic` returned.
+            time_ns: Time at which the message was received, in ns since the Unix epoch.
+            data: Serialised message (CDR).
+        """
         self._writer.add_message(channel, time_ns, data, time_ns)
 
     def flush(self) -> None:
-        """Hand all messages to the system: a chunk can be repaired once it is complete."""
+        """Complete the current chunk and hand it to the operating system.
+
+        If the process is killed later, `repair` can read all messages written up to this call.
+        """
         self._writer.flush()  # type: ignore[no-untyped-call]
 
     def finish(self, summary: FileSummary) -> None:
-        """Complete the file.
+        """Write the summary at the end of the file and close it.
 
         Args:
-            summary: What the file holds.
+            summary: Topics, times and numbers of messages of the file.
         """
-        # The record must not stand within a chunk.
+        # MCAP allows no metadata record within a chunk, so the current chunk is completed first.
         self.flush()
         self._writer.add_metadata(ROSBAG2, rosbag2_metadata(summary))
         self._writer.finish()  # type: ignore[no-untyped-call]
         self._stream.close()
 
     def abort(self) -> None:
-        """Close the file as it is."""
-        # Bytes that did not fit the disk would fail again.
+        """Close the file without a summary, after writing failed."""
+        # Closing writes buffered bytes again, which fails again on a full disk.
         with suppress(OSError):
             self._stream.close()
 
 
 def unpack_chunk(chunk: Chunk) -> bytes:
-    """Decompress a chunk and compare it with its checksum.
+    """Decompress a chunk (block of messages) of an MCAP file and check its checksum.
+
+    Returns:
+        The records of the chunk as bytes, one after the other.
 
     Raises:
         McapError, ValueError, zstandard.ZstdError: The chunk is damaged.
@@ -288,12 +346,16 @@ def unpack_chunk(chunk: Chunk) -> bytes:
     try:
         stream, size = get_chunk_data_stream(chunk, validate_crc=True)
         return stream.read(size)
-    except RuntimeError as error:  # lz4 reports damage so
+    except RuntimeError as error:  # the library lz4 raises it for damaged data
         raise McapError(str(error)) from None
 
 
 def chunk_records(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Yield opcode, begin and end of each record in a chunk."""
+    """Yield each record of an unpacked chunk: its opcode, and where its content begins and ends.
+
+    Args:
+        data: Result of `unpack_chunk`. Begin and end are indices of this byte string.
+    """
     begin = 0
     while begin < len(data):
         opcode, length = RECORD_HEAD.unpack_from(data, begin)
@@ -303,9 +365,9 @@ def chunk_records(data: bytes) -> Iterator[tuple[int, int, int]]:
 
 
 def _chunk_messages(data: bytes) -> Iterator[tuple[int, int, bytes]]:
-    """Yield channel, time and content of each message in a chunk.
+    """Yield each message of an unpacked chunk: channel, time of recording in ns, serialised bytes.
 
-    The library's reader would take several times as long, as it reads field by field.
+    The reader of the library mcap takes several times as long, because it reads field by field.
     """
     for opcode, begin, end in chunk_records(data):
         if opcode == Opcode.MESSAGE:
@@ -314,12 +376,17 @@ def _chunk_messages(data: bytes) -> Iterator[tuple[int, int, bytes]]:
 
 
 def rosbag2_metadata(file: FileSummary) -> dict[str, str]:
-    """Describe a file in the words of rosbag2, which looks for this where metadata.yaml is lost."""
+    """Return the content of the metadata record that rosbag2 reads if metadata.yaml is missing."""
     return {"serialized_metadata": to_yaml(bag_information("mcap", [file]))}
 
 
 def summarise(name: str, index: Summary) -> FileSummary:
-    """Describe the file `name` by its summary section."""
+    """Describe an MCAP file by the summary at its end.
+
+    Args:
+        name: Name of the file in the bag's folder.
+        index: Summary of the file as the library mcap reads it.
+    """
     times = index.statistics
     return FileSummary(
         name,
@@ -330,10 +397,10 @@ def summarise(name: str, index: Summary) -> FileSummary:
 
 
 def _connections(index: Summary) -> dict[int, Connection]:
-    """Return the topics of a file by the numbers of their channels."""
+    """Return the topics of an MCAP file by their channels (numbers of the topics in the file)."""
     counts = index.statistics.channel_message_counts if index.statistics else {}
     found = {}
-    # In the order of their numbers, which is that in which topics were added.
+    # Channels are numbered in the order in which the recorder added the topics.
     for number, channel in sorted(index.channels.items()):
         schema = index.schemas.get(channel.schema_id)
         has_text = schema is not None and schema.encoding == "ros2msg"
@@ -348,7 +415,7 @@ def _connections(index: Summary) -> dict[int, Connection]:
 
 
 def _check_summary(stream: BinaryIO) -> None:
-    """Compare the summary with its checksum, which the library does not check.
+    """Check the checksum of an MCAP file's summary, which the library mcap does not check.
 
     Raises:
         McapError: The file is cut off, or its summary is damaged.
@@ -360,9 +427,9 @@ def _check_summary(stream: BinaryIO) -> None:
     if tail_start < 0 or not tail.endswith(MAGIC):
         raise McapError("the file does not end as an MCAP file does")
     footer = Footer.read(ReadDataStream(BytesIO(tail[RECORD_HEAD.size :])))
-    if not footer.summary_crc:  # the program that wrote the file made none
+    if not footer.summary_crc:  # 0 states that the writing program computed no checksum
         return
-    # The checksum covers the summary and the footer up to the checksum itself.
+    # The checksum covers the summary and that part of the footer which precedes the checksum.
     end = size - len(MAGIC) - CHECKSUM_BYTES
     stream.seek(footer.summary_start)
     checked = stream.read(max(0, end - footer.summary_start))

@@ -1,7 +1,7 @@
-"""The description of a bag in metadata.yaml, and of each of its topics.
+"""The file metadata.yaml of a bag: its storage files, topics, times and numbers of messages.
 
-The format is that of rosbag2, version 9. Message types, and the hashes that identify them, come
-from the library rosbags.
+The format is that of rosbag2, version 9. The library rosbags provides the definitions of message
+types and the hashes that identify them.
 """
 
 from __future__ import annotations
@@ -24,17 +24,21 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 FILE_NAME = "metadata.yaml"
+"""Name of the file in a bag's folder that describes the bag."""
+
 METADATA_VERSION = 9
-"""Version of the format that rosbag2 of ROS 2 Jazzy writes."""
+"""Version of metadata.yaml's format that is written; it is that of rosbag2 in ROS 2 Jazzy."""
 
 SUFFIXES = {"mcap": ".mcap", "sqlite3": ".db3"}
-"""Suffix of the files of each storage format, by rosbag2's name of the format."""
+"""File name suffix of each storage format; the keys are rosbag2's names of the formats."""
 
 _UNLIMITED = {"sec": 9223372036, "nsec": 854775807}
-"""Largest duration that fits 64 bits of nanoseconds: DDS's value for "no limit"."""
+"""Duration that states "no limit" in a quality of service profile of DDS (the middleware of ROS 2):
+the largest number of nanoseconds in 64 bits, divided into seconds and nanoseconds."""
 
 QosProfile = dict[str, Any]
-"""A DDS quality of service profile with the keys of metadata.yaml, such as ``reliability``."""
+"""Quality of service profile of a publisher, as metadata.yaml lists it: key, such as
+``reliability``, and value."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +51,7 @@ class Connection:
         definition: Text of the type's definition, with those of the types in it; "" if the bag does
             not contain it.
         qos: Quality of service profiles that its publishers offered.
-        msgcount: Number of messages.
+        msgcount: Number of messages on the topic.
     """
 
     topic: str
@@ -58,27 +62,27 @@ class Connection:
 
     @property
     def is_latched(self) -> bool:
-        """Whether all publishers kept their last messages for late subscribers."""
+        """Whether all publishers kept their last messages for subscribers that start later."""
         names = ("transient_local", 1)
         return bool(self.qos) and all(profile.get("durability") in names for profile in self.qos)
 
     @property
     def is_best_effort(self) -> bool:
-        """Whether a publisher did not repeat messages that were lost."""
-        # Up to version 8, rosbag2 wrote the numbers of DDS instead of names.
+        """Whether at least one publisher did not resend lost messages (BEST_EFFORT)."""
+        # Up to version 8 of metadata.yaml, rosbag2 wrote numbers instead of the policies' names.
         names = ("best_effort", 2)
         return any(profile.get("reliability") in names for profile in self.qos)
 
 
 @dataclass(frozen=True)
 class FileSummary:
-    """What one storage file holds.
+    """Topics, times and numbers of messages of one storage file of a bag.
 
     Attributes:
         name: Name of the file in the bag's folder.
-        connections: Its topics.
-        start_ns: Time of its earliest message, in ns since the epoch.
-        end_ns: Time of its latest message.
+        connections: Topics of the file, with their numbers of messages.
+        start_ns: Time at which its earliest message was recorded, in ns since the Unix epoch.
+        end_ns: Time at which its latest message was recorded, in ns since the Unix epoch.
     """
 
     name: str
@@ -112,12 +116,12 @@ def quality(
     reliable: bool = True,
     depth: int = 10,
 ) -> QosProfile:
-    """Describe a quality of service.
+    """Return the quality of service profile of a topic, with the keys of metadata.yaml.
 
     Args:
         latched: Whether late subscribers get the last messages (durability TRANSIENT_LOCAL).
-        reliable: Whether lost messages are sent again.
-        depth: Number of messages that a publisher keeps.
+        reliable: Whether lost messages are sent again (RELIABLE) or not (BEST_EFFORT).
+        depth: Number of messages that a publisher keeps until they are sent.
     """
     return {
         "history": "keep_last",
@@ -134,21 +138,29 @@ def quality(
 
 @lru_cache
 def typestore() -> Typestore:
-    """Return the message types of ROS 2 Jazzy and of this package, as they are today."""
+    """Return the message types of ROS 2 Jazzy and of the installed version of this package."""
     store = get_typestore(Stores.ROS2_JAZZY)
     types: dict[str, Any] = {}
     folder = package_data() / "msg"
     for path in sorted(folder.glob("*.msg")):
         name = f"{PACKAGE}/msg/{path.stem}"
         types |= get_types_from_msg(path.read_text(), name)
-    # All at once, because the types contain each other.
+    # They are registered in one call, because messages of this package contain each other.
     store.register(types)
     return store
 
 
 def type_hash(msgtype: str, definition: str) -> str:
-    """Return ROS 2's hash (REP 2011) of a type; "" if its definition cannot be read."""
-    # A store of its own: the definition in a bag may differ from that of today.
+    """Return the hash by which ROS 2 identifies the definition of a message type (REP 2011).
+
+    Args:
+        msgtype: Name of the type, such as ``std_msgs/msg/String``.
+        definition: Text of its definition, with those of the types in it.
+
+    Returns:
+        The hash, such as ``RIHS01_…``; "" if the definition cannot be read.
+    """
+    # A new, empty store is used, because the definition in a bag may differ from the installed one.
     store = get_typestore(Stores.EMPTY)
     try:
         store.register(get_types_from_msg(definition, msgtype))
@@ -158,10 +170,10 @@ def type_hash(msgtype: str, definition: str) -> str:
 
 
 def read_metadata(folder: Path) -> BagFiles:
-    """Read which storage files a bag's folder has.
+    """Read the names of the storage files from metadata.yaml in a bag's folder.
 
     Raises:
-        BagError: There is no metadata.yaml, or it is damaged.
+        BagError: There is no metadata.yaml in the folder, or it is damaged.
     """
     path = folder / FILE_NAME
     if not path.is_file():
@@ -169,12 +181,12 @@ def read_metadata(folder: Path) -> BagFiles:
             f"{folder}: no {FILE_NAME}: no bag, or a recording that was cut off; "
             f"./cube bag repair {folder} makes the latter readable"
         )
-    # Everything else that the file says about topics stands in the storage files, too.
+    # Only file names and compression are used: the storage files state topics and times, too.
     try:
         about = read_yaml(path)["rosbag2_bagfile_information"]
         names = about["relative_file_paths"]
         mode = str(about.get("compression_mode") or "").lower()
-        # Some versions of rosbag2 put the name of the folder in front.
+        # Some versions of rosbag2 write "folder/file" instead of the name of the file.
         paths = [folder / Path(name).name for name in names]
     except (ConfigError, KeyError, TypeError, AttributeError) as error:
         raise BagError(
@@ -188,7 +200,16 @@ def write_metadata(
     storage: str,
     files: Sequence[FileSummary],
 ) -> None:
-    """Write metadata.yaml of a bag whose storage files are complete."""
+    """Write metadata.yaml of a bag whose storage files are complete.
+
+    Args:
+        folder: Folder of the bag.
+        storage: Storage format, a key of `SUFFIXES`.
+        files: The storage files in the order of recording, at least one.
+
+    Raises:
+        BagError: The file cannot be written.
+    """
     try:
         information = bag_information(storage, files)
         write_yaml(folder / FILE_NAME, {"rosbag2_bagfile_information": information})
@@ -197,13 +218,13 @@ def write_metadata(
 
 
 def bag_information(storage: str, files: Sequence[FileSummary]) -> dict[str, Any]:
-    """Describe storage files as metadata.yaml does; rosbag2 requires every key.
+    """Return the content of metadata.yaml, with every key that rosbag2 requires.
 
     Args:
         storage: Storage format, a key of `SUFFIXES`.
-        files: The files in the order of recording, at least one.
+        files: The storage files in the order of recording, at least one.
     """
-    # A file without messages has no times.
+    # Files without messages have no times, so they do not count for the span of the bag.
     used = [file for file in files if file.msgcount] or files[:1]
     start_ns = min(file.start_ns for file in used)
     end_ns = max(file.end_ns for file in used)
@@ -233,7 +254,11 @@ def bag_information(storage: str, files: Sequence[FileSummary]) -> dict[str, Any
 
 
 def merge_connections(of_files: Iterable[Sequence[Connection]]) -> list[Connection]:
-    """Join the topics of several files: each once, with the messages of all files."""
+    """Return each topic of several files once, with its number of messages in all files together.
+
+    Args:
+        of_files: The topics of each file.
+    """
     merged: dict[tuple[str, str], Connection] = {}
     for connections in of_files:
         for one in connections:
@@ -247,7 +272,7 @@ def merge_connections(of_files: Iterable[Sequence[Connection]]) -> list[Connecti
 
 
 def _time_span(start_ns: int, end_ns: int) -> dict[str, Any]:
-    """Describe a span of time with rosbag2's keys."""
+    """Return begin (ns since the Unix epoch) and duration of a span with metadata.yaml's keys."""
     return {
         "starting_time": {"nanoseconds_since_epoch": start_ns},
         "duration": {"nanoseconds": max(0, end_ns - start_ns)},
@@ -255,7 +280,7 @@ def _time_span(start_ns: int, end_ns: int) -> dict[str, Any]:
 
 
 def _topic_information(connection: Connection) -> dict[str, Any]:
-    """Describe a topic with rosbag2's keys."""
+    """Return the entry of a topic in metadata.yaml, with the keys that rosbag2 requires."""
     return {
         "topic_metadata": {
             "name": connection.topic,

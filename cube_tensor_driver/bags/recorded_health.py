@@ -1,8 +1,8 @@
-"""The health of pads that the reconstruction found while a bag was recorded, row by row.
+"""The health of the pads that the reconstruction found while a bag was recorded, row by row.
 
-`Health` remembers more than a bag contains: what it saw before the recording began, and where its
-statistics windows begin. Therefore its results are taken from the recorded stress when the same
-stress is computed again.
+The health is which pads were left out as faulty, and why. It cannot be computed again exactly from
+a bag, because it also depends on samples before the recording began and on where the statistics
+windows began. Therefore it is read from the recorded stress when that stress is reprocessed.
 """
 
 from __future__ import annotations
@@ -23,17 +23,28 @@ from ..messages.types import STRESS
 from .read import Bag
 
 MAX_DISORDER_NS = SECOND
-"""Largest difference, in ns, between the order of messages in a bag and that of their samples.
+"""Largest time, in ns, by which messages in a bag may be out of the order of their samples' stamps.
 
-Stress is read this much further than the frequencies for which it is wanted.
+To find the stress that belongs to given frequencies, stress is read up to this long after them.
 """
 
 HEALTH_BITS = np.uint16(sum(WORDS))
-"""The status bits of a row that state the health of its pads. The others are computed again."""
+"""Status bits of a row of stress that state conditions of the cube's pads (open, short, noisy, …).
+
+Only these are taken from the recorded stress; the other status bits are computed again.
+"""
 
 
 class _StressBatch(NamedTuple):
-    """Columns of N rows of stress that were read together."""
+    """The columns of N recorded rows of stress that state the health of pads, read together.
+
+    Attributes:
+        cube: (N,) index of the cube.
+        sequence: (N,) sequence number of the sample.
+        stamp_ns: (N,) stamp of the sample, in ns since the Unix epoch.
+        left_out: (N,) bit p is set if pad p was not used.
+        status: (N,) status bits, restricted to `HEALTH_BITS`.
+    """
 
     cube: AnyArray
     sequence: AnyArray
@@ -42,20 +53,20 @@ class _StressBatch(NamedTuple):
     status: StatusBits
 
     def overlaps(self, begin_ns: int, end_ns: int) -> bool:
-        """Return whether a row can lie between two times."""
+        """Return whether a row can have a stamp between two times, in ns since the Unix epoch."""
         first_ns, last_ns = self.stamp_ns.min(), self.stamp_ns.max()
         return bool(first_ns <= end_ns and last_ns >= begin_ns)
 
 
 class RecordedHealthReader:
-    """Reads the stress beside the frequencies on a topic of a bag.
+    """Reads the health of pads for rows of frequencies from the recorded stress of the same skin.
 
-    It is fastest when rows are asked for in the order of recording. When time jumps back, it starts
-    again from the beginning of the bag.
+    Calls in the order of recording are fastest. For rows that are more than `MAX_DISORDER_NS` older
+    than those of the call before, the bag is read again from its beginning.
     """
 
     def __init__(self, bag: Bag, topic: str) -> None:
-        """Prepare to read.
+        """Prepare to read the recorded stress.
 
         Args:
             bag: Open bag.
@@ -70,7 +81,11 @@ class RecordedHealthReader:
         self._unread = self._read()
 
     def health_at(self, rows: FrequencyRows) -> RecordedHealth:
-        """Return the recorded health for rows, which are found by cube, number and stamp."""
+        """Return the recorded health of the pads for rows of frequencies.
+
+        The row of stress that belongs to a row of frequencies has the same cube, sequence number
+        and stamp. Where none was recorded, `known` is false.
+        """
         health = RecordedHealth(
             known=np.zeros(len(rows), bool),
             left_out=np.zeros(len(rows), np.uint32),
@@ -80,7 +95,8 @@ class RecordedHealthReader:
             return health
         begin_ns, end_ns = int(rows.stamp_ns.min()), int(rows.stamp_ns.max())
         for batch in self._batches_between(begin_ns, end_ns):
-            # Usually frequencies and stress were recorded alike: then nothing must be searched.
+            # Usually a batch of stress has exactly the rows of the batch of frequencies, so that no
+            # search is needed.
             has_same_stamps = np.array_equal(batch.stamp_ns, rows.stamp_ns)
             if has_same_stamps and np.array_equal(batch.cube, rows.cube):
                 everything = np.ones(len(rows), bool)
@@ -91,9 +107,14 @@ class RecordedHealthReader:
         return health
 
     def _batches_between(self, begin_ns: int, end_ns: int) -> Iterator[_StressBatch]:
-        """Yield the stress of a span of time.
+        """Yield the batches of stress that can have rows in a span of time.
 
-        The bag is read on only as far as the caller asks for more.
+        Batches already in memory come first. The bag is read further only while the caller takes
+        more batches, and at most `MAX_DISORDER_NS` beyond the span.
+
+        Args:
+            begin_ns: Begin of the span, in ns since the Unix epoch.
+            end_ns: End of the span, in ns since the Unix epoch.
         """
         if end_ns < self._last_wanted_ns - MAX_DISORDER_NS:
             self._newest_ns = 0
@@ -130,9 +151,16 @@ def _copy_matching(
     rows: FrequencyRows,
     health: RecordedHealth,
 ) -> None:
-    """Copy the health of the rows that a batch contains."""
+    """Copy the health of those rows that a batch of recorded stress contains.
+
+    Args:
+        batch: Recorded stress.
+        rows: Rows of frequencies whose health is wanted.
+        health: Health of these rows, which is changed in place.
+    """
     match = match_rows(batch, rows)
-    # The same number with another stamp is a sample from before a restart of the hub.
+    # A hub counts from 0 again after a restart, so an equal sequence number with another stamp is a
+    # different sample.
     has_match = match != NO_MATCH
     is_same = has_match & (batch.stamp_ns[match] == rows.stamp_ns)
     source = match[is_same]

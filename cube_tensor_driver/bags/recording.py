@@ -1,5 +1,8 @@
-"""What a bag states beside its frequencies: the settings, each from its time on, and the health of
-the pads."""
+"""The calibrations, rest frequencies and health of the pads that a bag states for its frequencies.
+
+Calibrations and rest frequencies are in the SkinInfo messages, each of which applies from its stamp
+on. The health (which pads were left out as faulty) is in the recorded stress.
+"""
 
 from __future__ import annotations
 
@@ -23,12 +26,12 @@ from .recorded_health import RecordedHealthReader
 
 @dataclass(frozen=True, eq=False)
 class Settings:
-    """What stress was reconstructed with.
+    """Calibrations and rest frequencies with which stress is reconstructed.
 
     Attributes:
-        calibrations: Calibration of each cube, in order.
-        rest_frequency: (cubes, P) frequencies without load after the last tare, in Hz; NaN where a
-            cube has no such pad.
+        calibrations: Calibration of each cube, by the cube's index.
+        rest_frequency: (cubes, P) frequencies of the P pads without load, in Hz, as the last tare
+            (measurement without load) found them; NaN where a cube has fewer than P pads.
     """
 
     calibrations: tuple[Calibration, ...]
@@ -36,22 +39,23 @@ class Settings:
 
 
 class Recording:
-    """The settings and the recorded health that belong to the frequencies on one topic.
+    """The settings and the health of the pads that a bag states for the frequencies on one topic.
 
     Attributes:
-        infos: SkinInfo messages in the order of their stamps.
-        settings: Settings of each info.
+        infos: SkinInfo messages (cubes, calibrations and rest frequencies) in the order of their
+            stamps; there is at least one.
+        settings: Calibrations and rest frequencies in each of the infos.
     """
 
     def __init__(self, bag: Bag, topic: str) -> None:
-        """Read the infos of an open bag.
+        """Read the SkinInfo messages of an open bag.
 
         Args:
             bag: Open bag.
             topic: Topic of the frequencies.
 
         Raises:
-            BagError: There is no info, or it cannot be used.
+            BagError: The bag has no SkinInfo message for the topic, or one that is invalid.
         """
         self._bag = bag
         self.infos = sorted(skin_infos(bag, topic), key=stamp_ns)
@@ -61,7 +65,7 @@ class Recording:
             raise BagError(f"{bag.path}: {error}") from None
         stamps = [stamp_ns(info) for info in self.infos]
         self._since_ns = np.array(stamps)
-        # It reads the bag only when it is asked.
+        # The recorded stress, which states the health, is read only when `health_at` is called.
         self._health = RecordedHealthReader(bag, topic)
 
     def __repr__(self) -> str:
@@ -69,40 +73,44 @@ class Recording:
 
     @property
     def skin(self) -> Skin:
-        """The skin as the last info describes it."""
+        """The skin (cubes, their poses and calibrations) in the last SkinInfo message."""
         return recorded_skin(self.infos[-1], self.settings[-1].calibrations)
 
     def number_at(self, newest_ns: Any) -> Any:
-        """Return which info holds for a message, by its place in `infos`.
+        """Return the index in `infos` of the SkinInfo that applies to a message of frequencies.
 
-        An info holds for what was sampled from its stamp on: the node stamps it just behind the
-        last row that was reconstructed without it.
+        A SkinInfo applies to rows whose stamps are not before its own: the reconstruction node
+        stamps it just after the last row that it reconstructed with the previous one.
 
         Args:
-            newest_ns: Stamp of the newest row of the message, in ns; or an array (M,) of stamps.
+            newest_ns: Stamp of the newest row of the message, in ns since the Unix epoch; or an
+                array (M,) of such stamps for M messages.
+
+        Returns:
+            An index, or an array (M,) of indices.
         """
         number = np.searchsorted(self._since_ns, newest_ns, side="right") - 1
-        # Nothing earlier is known about messages that were recorded before the first info.
+        # For messages before the first SkinInfo nothing better is known than that first one.
         return np.maximum(number, 0)
 
     def settings_at(self, rows: FrequencyRows) -> Settings:
-        """Return the settings under which the rows of one message were reconstructed."""
+        """Return the calibrations and rest frequencies that applied to the rows of one message."""
         newest_ns = rows.stamp_ns.max(initial=0)
         number = int(self.number_at(newest_ns))
         return self.settings[number]
 
     def health_at(self, rows: FrequencyRows) -> RecordedHealth:
-        """Return the health of the pads that was found when rows were recorded.
+        """Return the health of the pads that the reconstruction found when rows were recorded.
 
-        It is fastest when rows are asked for in the order of recording.
+        Calls in the order of recording are fastest, because the bag is then read only once.
         """
         return self._health.health_at(rows)
 
     def check_calibrations_stay(self) -> None:
-        """Check that no cube changes its calibration.
+        """Check that every cube has the same calibration throughout the recording.
 
         Raises:
-            BagError: One does.
+            BagError: The calibration of a cube changes from one SkinInfo message to another.
         """
         first = self.settings[0].calibrations
         expected = [one.id for one in first]
@@ -114,13 +122,18 @@ class Recording:
 
 
 def skin_infos(bag: Bag, topic: str) -> list[Any]:
-    """Return the infos of the skin whose frequencies are on a topic.
+    """Return the SkinInfo messages of the skin whose frequencies are on a topic.
 
-    They are the reconstruction's. The driver does not know of a tare: its info on `driver/info`
-    counts only where no reconstruction ran.
+    Those of the reconstruction node are preferred, because they contain the rest frequencies after
+    a tare (measurement without load). The driver's messages on `driver/info` contain only those of
+    the calibration, and are used only if no reconstruction was recorded.
+
+    Args:
+        bag: Open bag.
+        topic: Topic of the frequencies; its prefix is that of the skin's topics.
 
     Raises:
-        BagError: There is none.
+        BagError: The bag has no SkinInfo message of this skin.
     """
     skin = topic.removesuffix("frequencies")
     own, of_driver = f"{skin}info", f"{skin}driver/info"
@@ -132,19 +145,20 @@ def skin_infos(bag: Bag, topic: str) -> list[Any]:
 
 
 def stamp_ns(message: Any) -> int:
-    """Return the stamp of a message's header, in ns since the epoch."""
+    """Return the stamp in a message's header, in ns since the Unix epoch."""
     stamp = message.header.stamp
     return int(stamp.sec) * SECOND + int(stamp.nanosec)
 
 
 def settings_of(info: Any) -> Settings:
-    """Return the settings that a SkinInfo describes.
+    """Return the calibrations and rest frequencies in a SkinInfo message.
 
     Raises:
-        MessageError: They contradict each other.
+        MessageError: The message has no cubes, an invalid calibration, or a number of rest
+            frequencies that is not the number of the cube's pads.
     """
     calibrations = cube_calibrations(info)
-    # Without cubes nothing can be reconstructed, and the table below would have no columns.
+    # A skin without cubes cannot be reconstructed; the table of rest frequencies would be empty.
     if not calibrations:
         raise MessageError(f"info of the skin {info.name}: it has no cubes")
     rest = []
@@ -161,8 +175,17 @@ def settings_of(info: Any) -> Settings:
 
 
 def recorded_skin(info: Any, calibrations: tuple[Calibration, ...]) -> Skin:
-    """Return the skin of a SkinInfo; a bag does not state where the ports of its links were."""
-    # A dict keeps each name once, in the order of the cubes.
+    """Return the skin that a SkinInfo message describes.
+
+    Args:
+        info: SkinInfo message.
+        calibrations: Calibration of each of its cubes.
+
+    Returns:
+        The skin. Its links (connections to the hubs) have "recorded" as their port, because a bag
+        does not state the ports.
+    """
+    # `dict.fromkeys` removes repeated names and keeps the order of the cubes.
     names = dict.fromkeys(cube.link for cube in info.cubes if cube.link)
     links = tuple(SkinLink(name, "recorded", 0, None) for name in names)
     cubes = []

@@ -1,12 +1,13 @@
-"""Recordings that were cut off (killed, disk full, power lost) made readable again, where they are.
+"""Repair, in place, of recordings that were cut off (process killed, disk full, power lost).
 
-An MCAP file is a sequence of records. A chunk with the index records behind it is complete or it is
-not. What follows the last complete one is cut off, and the summary that readers look for is written
-again. An SQLite file undoes by itself what was not committed.
+An MCAP file is a sequence of records. Messages lie in chunk records (blocks of messages), each of
+which is followed by the index of each of its channels (topics). Everything after the last chunk
+with all of its indexes is cut off, and the summary, which readers need, is written again. SQLite
+undoes by itself what was not committed.
 
-The library's StreamReader is not used to find the records: it trusts the lengths inside a record,
-so behind the first damaged record it finds nothing any more. Here the next record begins where the
-length in front of the record says.
+The StreamReader of the library mcap is not used to find the records: it relies on the lengths
+inside a record, so it finds nothing after the first damaged record. Here the start of the next
+record follows only from the length that stands in front of each record.
 """
 
 from __future__ import annotations
@@ -56,16 +57,17 @@ from .metadata import FILE_NAME, SUFFIXES, FileSummary, write_metadata
 from .read import READ_ERRORS, open_storage, report_damage
 
 REST = ".rest"
-"""Suffix of the file that keeps what was cut off."""
+"""Suffix of the file that keeps the bytes that a repair cut off; it is appended to the name of the
+storage file."""
 
 
 class Repaired(NamedTuple):
-    """What a repair did.
+    """Result of the repair of a bag.
 
     Attributes:
-        messages: Number of messages that can be read.
-        cut: Number of bytes that were cut off.
-        damaged: Number of chunks that were left out as damaged.
+        messages: Number of messages that can be read after the repair.
+        cut: Number of bytes that were cut off at the ends of the files.
+        damaged: Number of chunks (blocks of messages) that were left out because they are damaged.
     """
 
     messages: int
@@ -74,11 +76,12 @@ class Repaired(NamedTuple):
 
 
 def repair(path: Path, keep_rest: bool = True) -> Repaired:
-    """Make a bag readable.
+    """Make a bag readable whose recording was cut off or whose files are damaged.
 
     Args:
         path: Folder of the bag, or one of its files.
-        keep_rest: Whether to keep what is cut off in a file beside it, ending in `REST`.
+        keep_rest: Whether the bytes that are cut off are kept in a file beside the storage file,
+            whose name ends in `REST`.
 
     Raises:
         BagError: There is no bag, it has no complete message, or it cannot be written.
@@ -91,7 +94,7 @@ def repair(path: Path, keep_rest: bool = True) -> Repaired:
             f"{' or '.join(SUFFIXES.values())}"
         )
     if (path.parent / FILE_NAME).exists():
-        # metadata.yaml describes each file, so it has to be written again, too.
+        # metadata.yaml of the folder describes this file, so it must be written again, too.
         return _repair_folder(path.parent, keep_rest)
     cut, damaged = _repair_file(path, keep_rest)
     if not path.exists():
@@ -101,12 +104,13 @@ def repair(path: Path, keep_rest: bool = True) -> Repaired:
 
 def _repair_folder(folder: Path, keep_rest: bool) -> Repaired:
     """Repair all files of a bag and describe them in metadata.yaml."""
-    # Also the files that metadata.yaml names: a disk may have lost their end later.
+    # Files that metadata.yaml describes as complete are checked, too, because the disk may have
+    # lost their ends after the recording.
     cut = damaged = 0
     for path in _storage_files(folder):
         one_cut, one_damaged = _repair_file(path, keep_rest)
         cut, damaged = cut + one_cut, damaged + one_damaged
-    paths = _storage_files(folder)  # without those in which nothing was complete
+    paths = _storage_files(folder)  # files without a complete chunk have been removed
     existing = {path.suffix for path in paths}
     storages = [name for name, suffix in SUFFIXES.items() if suffix in existing]
     if not storages:
@@ -124,7 +128,7 @@ def _storage_files(folder: Path) -> list[Path]:
     """Return the storage files of a folder in the order in which they were written."""
 
     def number(path: Path) -> tuple[int, str]:
-        digits = path.stem.rpartition("_")[2]  # name_2 was written before name_10
+        digits = path.stem.rpartition("_")[2]  # by number, as text would sort _10 before _2
         return int(digits) if digits.isdigit() else 0, path.name
 
     paths = (path for path in folder.iterdir() if path.suffix in SUFFIXES.values())
@@ -140,28 +144,39 @@ def _repair_file(path: Path, keep_rest: bool) -> tuple[int, int]:
     """Make one storage file readable; an MCAP file without a complete chunk is removed.
 
     Returns:
-        Number of bytes cut off, and of chunks left out.
+        Number of bytes that were cut off, and number of damaged chunks that were left out.
     """
     with report_damage(path):
         if path.suffix == SUFFIXES["mcap"]:
             return _repair_mcap(path, keep_rest)
-        # SQLite undoes an unfinished transaction at the first access with write permission.
+        # SQLite undoes an unfinished transaction by itself when a database is read that was opened
+        # with write permission.
         with closing(sqlite3.connect(path)) as database:
             database.execute("SELECT count(*) FROM messages")
         return 0, 0
 
 
 def _repair_mcap(path: Path, keep_rest: bool) -> tuple[int, int]:
-    """Cut an MCAP file behind its last complete chunk and write its summary."""
+    """Cut off an MCAP file after its last complete chunk and write its summary again.
+
+    A file whose summary and chunks are all intact is not changed.
+
+    Args:
+        path: The MCAP file; it is removed if it has no complete chunk.
+        keep_rest: Whether the bytes that are cut off are kept in a file whose name ends in `REST`.
+
+    Returns:
+        Number of bytes that were cut off, and number of damaged chunks that were left out.
+    """
     size = path.stat().st_size
     is_complete = _has_summary(path)
     with path.open("r+b") as stream:
-        # Even with a good summary a chunk may be damaged, which only reading it shows.
+        # An intact summary does not prove that the chunks are intact, so all of them are read.
         salvaged = _Salvaged(stream)
         if is_complete and not salvaged.damaged:
             return 0, 0
         if keep_rest and not is_complete and size > salvaged.end:
-            # Before anything is cut: nothing is lost if the disk is full.
+            # The rest is copied before the file is cut, so that a full disk cannot lose it.
             stream.seek(salvaged.end)
             rest_path = path.with_name(path.name + REST)
             with rest_path.open("wb") as rest:
@@ -176,7 +191,7 @@ def _repair_mcap(path: Path, keep_rest: bool) -> tuple[int, int]:
 
 
 def _has_summary(path: Path) -> bool:
-    """Return whether an MCAP file has a summary that can be read."""
+    """Return whether an MCAP file ends with an intact summary (topics and offsets of chunks)."""
     try:
         McapReader(path).close()
     except READ_ERRORS:
@@ -185,20 +200,25 @@ def _has_summary(path: Path) -> bool:
 
 
 class _Salvaged:
-    """All complete chunks of an MCAP file.
+    """The complete chunks (blocks of messages) of an MCAP file that was cut off or damaged.
 
     Attributes:
-        index: Schemas, channels and chunks, as the summary has them.
-        counts: Number of messages of each channel.
-        end: Offset at which the last complete chunk ends, with its index records.
-        damaged: Number of records that were left out.
+        index: Message types (schemas), topics (channels) and positions of the complete chunks, in
+            the form of the summary at the end of an MCAP file.
+        counts: Number of messages of each channel (number of a topic in the file).
+        end: Byte offset from the start of the file at which the last complete chunk ends, including
+            the index records that follow it.
+        damaged: Number of records that were left out because they are damaged.
     """
 
     def __init__(self, stream: BinaryIO) -> None:
         """Read all records of a file.
 
+        Args:
+            stream: The MCAP file, open for reading.
+
         Raises:
-            BagError: The file does not begin as an MCAP file.
+            BagError: The file does not begin with the bytes of an MCAP file.
         """
         self.index = Summary()
         self.counts: Counter[int] = Counter()
@@ -215,7 +235,8 @@ class _Salvaged:
                 self.end = stream.tell()
             elif opcode in (Opcode.DATA_END, Opcode.FOOTER):
                 break
-            # A damaged record is left out; the records behind it count again.
+            # A damaged record is left out. The records after it are still used, because their
+            # offsets do not depend on its content.
             try:
                 self._take(opcode, start, content)
             except READ_ERRORS:
@@ -228,10 +249,15 @@ class _Salvaged:
         start: int,
         content: bytes,
     ) -> None:
-        """Take in one record of the file.
+        """Evaluate one record of the file.
+
+        Args:
+            opcode: Type of the record.
+            start: Byte offset of the record from the start of the file.
+            content: The record without its opcode and length.
 
         Raises:
-            READ_ERRORS: It is damaged.
+            READ_ERRORS: The content of the record is damaged.
         """
         if opcode == Opcode.CHUNK:
             self._begin_chunk(start, content)
@@ -241,7 +267,12 @@ class _Salvaged:
             self._learn(opcode, content)
 
     def _begin_chunk(self, start: int, content: bytes) -> None:
-        """Read a chunk, which is complete only with the index of each of its channels."""
+        """Read a chunk (block of messages), which counts once all of its index records follow.
+
+        Args:
+            start: Byte offset of the chunk record from the start of the file.
+            content: The record without its opcode and length.
+        """
         self._open_chunk = None
         chunk: Chunk = _parse(Chunk.read, content)
         counts: Counter[int] = Counter()
@@ -266,13 +297,22 @@ class _Salvaged:
         )
 
     def _add_message_index(self, start: int, content: bytes) -> None:
-        """Take in the index of one channel of the chunk before it."""
+        """Evaluate an index record, which belongs to one channel (topic) of the chunk before it.
+
+        Args:
+            start: Byte offset of the index record from the start of the file.
+            content: The record without its opcode and length.
+
+        Raises:
+            ValueError: The index has another number of messages than the chunk.
+        """
         chunk, counts = self._open_chunk, self._open_counts
         index: MessageIndex = _parse(MessageIndex.read, content)
         if chunk is None or len(index.records) != counts[index.channel_id]:
             raise ValueError("an index has another number of messages than its chunk")
         chunk.message_index_offsets[index.channel_id] = start
-        # Readers need the indexes of all channels, so only the last one makes the chunk complete.
+        # Readers need the indexes of all channels, so the chunk is complete, and its messages
+        # count, only when the index of its last channel has been read.
         if chunk.message_index_offsets.keys() == counts.keys():
             self.end = start + RECORD_HEAD.size + len(content)
             chunk_end = chunk.chunk_start_offset + chunk.chunk_length
@@ -282,7 +322,10 @@ class _Salvaged:
             self._open_chunk = None
 
     def _learn(self, opcode: int, content: bytes) -> None:
-        """Take in a schema or a channel; the first of each number counts."""
+        """Note the message type (schema) or the topic (channel) that a record defines.
+
+        Definitions are repeated in a file; the first one with a number is kept.
+        """
         if opcode == Opcode.SCHEMA:
             schema: Schema = _parse(Schema.read, content)
             self.index.schemas.setdefault(schema.id, schema)
@@ -296,7 +339,13 @@ def _write_summary(
     name: str,
     salvaged: _Salvaged,
 ) -> None:
-    """Write everything that follows the chunks of a complete file."""
+    """Write the records that follow the chunks of a complete MCAP file, up to its end.
+
+    Args:
+        stream: The file; writing begins at its current position, after the last complete chunk.
+        name: Name of the file in the bag's folder.
+        salvaged: The complete chunks of the file.
+    """
     index, chunks = salvaged.index, salvaged.index.chunk_indexes
     index.statistics = statistics = Statistics(
         attachment_count=0,
@@ -309,7 +358,8 @@ def _write_summary(
         metadata_count=1,
         schema_count=len(index.schemas),
     )
-    # rosbag2 takes its topics from the summary, but reads nothing without this record.
+    # rosbag2 reads no messages from a file without this metadata record, although it takes the
+    # topics from the summary.
     about = rosbag2_metadata(summarise(name, index))
     metadata = Metadata(ROSBAG2, about)
     metadata_length = len(_bytes_of([metadata]))
@@ -324,7 +374,8 @@ def _write_summary(
         (Opcode.METADATA_INDEX, [metadata_index]),
         (Opcode.STATISTICS, [statistics]),
     ]
-    # The offsets let a reader find one group without reading the others.
+    # The summary ends with the offset of each group of records, so that a reader can read one group
+    # without the others.
     summary = b""
     offsets: list[McapRecord] = []
     for opcode, records in groups:
@@ -334,7 +385,7 @@ def _write_summary(
         summary += group
     offsets_start = summary_start + len(summary)
     summary += _bytes_of(offsets)
-    # The checksum covers the summary and the footer up to the checksum itself.
+    # The checksum covers the summary and that part of the footer which precedes the checksum.
     footer = _bytes_of([Footer(summary_start, offsets_start, 0)])
     footer = footer[:-CHECKSUM_BYTES]
     checksum = struct.pack("<I", crc32(summary + footer))
@@ -342,25 +393,32 @@ def _write_summary(
 
 
 def _records(stream: BinaryIO) -> Iterator[tuple[int, int, bytes]]:
-    """Yield opcode, offset and content of each record, until the file ends before a record does."""
+    """Yield the complete records of an MCAP file from the current position on.
+
+    It stops at a record that would end after the end of the file.
+
+    Yields:
+        Opcode (type of the record), byte offset of the record from the start of the file, and its
+        content without opcode and length.
+    """
     start = stream.tell()
     size = stream.seek(0, 2)
     stream.seek(start)
     while size - start >= RECORD_HEAD.size:
         opcode, length = RECORD_HEAD.unpack(stream.read(RECORD_HEAD.size))
         if length > size - start - RECORD_HEAD.size:
-            return  # the record was cut off, or its length is damaged
+            return  # the file was cut off within this record, or the record's length is damaged
         yield opcode, start, stream.read(length)
         start += RECORD_HEAD.size + length
 
 
 def _parse(read: Callable[[ReadDataStream], Any], content: bytes) -> Any:
-    """Parse the content of a record."""
+    """Parse the content of an MCAP record with the function `read` of its class in mcap."""
     return read(ReadDataStream(BytesIO(content)))
 
 
 def _bytes_of(records: Sequence[McapRecord]) -> bytes:
-    """Return records as bytes, one after the other."""
+    """Return MCAP records as bytes, one after the other, each with its opcode and length."""
     builder = RecordBuilder()
     for record in records:
         record.write(builder)

@@ -1,4 +1,4 @@
-"""A bag as a source: its recorded frequencies as a stream of rows."""
+"""A bag as a source: the recorded frequencies of one skin, delivered like those of a device."""
 
 from __future__ import annotations
 
@@ -21,12 +21,13 @@ from .recording import Recording
 
 
 class Segment(NamedTuple):
-    """Messages that follow each other, with the same cubes and under the same info.
+    """Consecutive messages of frequencies with the same cubes, reconstructed with one SkinInfo.
 
     Attributes:
         messages: M messages of frequencies.
-        recorded_ns: (M,) when each was recorded, in ns.
-        number: Place of the info in `Recording.infos`.
+        recorded_ns: (M,) time at which each was recorded, in ns since the Unix epoch.
+        number: Index in `Recording.infos` of the SkinInfo message (calibrations and rest
+            frequencies) with which these frequencies were reconstructed.
     """
 
     messages: Decoded[FrequencyRows]
@@ -40,9 +41,9 @@ class BagSource:
     Attributes:
         bag: The open bag.
         topic: Topic of the frequencies.
-        recording: Settings and recorded health that belong to the rows.
-        skin: The skin as it was recorded.
-        is_live: Always false.
+        recording: Calibrations, rest frequencies and health of the pads at the time of each row.
+        skin: The skin (cubes, their poses and calibrations) as the bag describes it.
+        is_live: Always false, because a bag delivers its rows faster than they were measured.
         messages: Number of messages delivered so far.
         rows: Number of rows delivered so far.
     """
@@ -52,8 +53,12 @@ class BagSource:
     def __init__(self, bag: Bag, topic: str) -> None:
         """Prepare to read a topic.
 
+        Args:
+            bag: Open bag.
+            topic: Topic of the frequencies.
+
         Raises:
-            BagError: There is no info for the topic.
+            BagError: The bag has no SkinInfo message for the topic, or one that is invalid.
         """
         self.bag, self.topic = bag, topic
         self.recording = Recording(bag, topic)
@@ -71,9 +76,10 @@ class BagSource:
         self.bag.close()
 
     def __iter__(self) -> Iterator[FrequencyRows]:
-        """Yield all rows in the order of recording.
+        """Yield all rows (samples of cubes) in the order of recording.
 
-        Rows of several messages come at once where that gives the same results.
+        The rows of several messages are delivered together, which is faster, where reconstructing
+        them together gives the same stress as one message after the other.
 
         Raises:
             BagError: The bag is damaged.
@@ -86,7 +92,9 @@ class BagSource:
         return {"messages": self.messages, "rows": self.rows}
 
     def segments(self) -> Iterator[Segment]:
-        """Yield the rows together with the messages that they came in.
+        """Yield all messages in the order of recording, with their rows (samples of cubes).
+
+        Each segment has messages of the same cubes that were reconstructed with one SkinInfo.
 
         Raises:
             BagError: The bag is damaged.
@@ -94,17 +102,18 @@ class BagSource:
         for messages, recorded_ns in self.bag.frequencies(self.topic):
             cube = messages.by_message(messages.rows.cube)
             times_ns = messages.by_message(messages.rows.stamp_ns)
-            # A message may have no rows.
+            # A message without rows has no newest row, so its own stamp is used.
             newest_ns = times_ns.max(axis=1) if times_ns.size else messages.stamp_ns
             number = self.recording.number_at(newest_ns)
 
-            # A segment ends where the cubes change, or the info that holds.
+            # A segment ends where the next message has other cubes or a newer SkinInfo applies.
             has_other_cubes = (cube[1:] != cube[:-1]).any(axis=1)
             has_other_info = number[1:] != number[:-1]
             ends = np.flatnonzero(has_other_cubes | has_other_info) + 1
             bounds = [0, *ends.tolist(), len(messages)]
             for begin, end in pairwise(bounds):
-                # Only repeats of one scan give the same results together as one by one.
+                # Messages are reconstructed together only if each consists of whole scans (the same
+                # cubes in the same order); otherwise the results can differ in the last bits.
                 step = end - begin if count_repeats(cube[begin]) else 1
                 for first in range(begin, end, step):
                     chosen = slice(first, first + step)
@@ -115,16 +124,17 @@ class BagSource:
 
 
 def open_bag(path: Path | str, topic: str | None = None) -> BagSource:
-    """Open the frequencies of a bag.
+    """Open the recorded frequencies of one skin in a bag.
 
     Args:
         path: Folder or file of the bag.
-        topic: Topic of the frequencies; needed where the bag has those of several skins.
+        topic: Topic of the frequencies; None: that of the only skin in the bag.
 
     Raises:
-        BagError: There is no bag, no such topic, no info for it, or several skins.
+        BagError: There is no bag, no such topic, no SkinInfo message for it, or no topic was given
+            although the bag has several skins.
     """
-    # The source closes the bag; until there is one, an error must do so.
+    # The returned source closes the bag. If an error occurs before, the bag is closed here.
     bag = Bag(Path(path))
     bag.open()
     try:

@@ -38,23 +38,24 @@ CREATE TABLE messages(
 CREATE INDEX timestamp_idx ON messages (timestamp ASC);
 INSERT INTO schema(schema_version, ros_distro) VALUES (4, 'rosbags');
 """
-"""The tables as rosbag2 of ROS 2 Jazzy creates them (version 4)."""
+"""SQL that creates the tables of a .db3 file as rosbag2 of ROS 2 Jazzy does (schema version 4)."""
 
 
 class SqliteReader:
     """An SQLite file open for reading.
 
     Attributes:
-        summary: What the file holds.
+        summary: Topics, times and numbers of messages of the file.
     """
 
     def __init__(self, path: Path) -> None:
-        """Open a file and read which topics it has.
+        """Open a file and read its topics with their numbers of messages.
 
         Raises:
             sqlite3.Error: The file cannot be read, or is damaged.
         """
-        # "immutable" also reads from a folder in which SQLite cannot create its lock files.
+        # The option "immutable" makes SQLite read without lock files, which it could not create in
+        # a write-protected folder.
         uri = f"{path.resolve().as_uri()}?immutable=1"
         self._database = sqlite3.connect(
             uri,
@@ -68,7 +69,7 @@ class SqliteReader:
             self._database.close()
             raise
         connections = list(self._connections.values())
-        # Both are NULL where there is no message.
+        # SQL's min and max are NULL (None) if the file has no message.
         start_ns, end_ns = span
         self.summary = FileSummary(
             path.name,
@@ -87,7 +88,16 @@ class SqliteReader:
         start_ns: int,
         stop_ns: int,
     ) -> Iterator[tuple[Connection, int, bytes]]:
-        """Read messages in the order of their times; arguments as in `McapReader.messages`."""
+        """Read messages in the order of their times of recording.
+
+        Args:
+            topics: Names of the topics to read.
+            start_ns: Earliest time of recording that is read, in ns since the Unix epoch.
+            stop_ns: Time of recording, in ns, from which on nothing is read.
+
+        Yields:
+            The topic, the time of recording in ns, and the serialised message.
+        """
         numbers = [number for number, one in self._connections.items() if one.topic in topics]
         places = ",".join("?" * len(numbers))
         rows = self._database.execute(
@@ -96,14 +106,15 @@ class SqliteReader:
             [*numbers, start_ns, stop_ns],
         )
         for number, time_ns, data in rows:
-            # A column has no type of its own: damage can change that of a value.
+            # SQLite stores a type with every value, not per column, so damage can change a type.
             if not isinstance(time_ns, int) or not isinstance(data, bytes):
                 raise sqlite3.DatabaseError("a message has values of other types")
             yield self._connections[number], time_ns, data
 
     def _read_connections(self) -> dict[int, Connection]:
-        """Read the topics by their numbers."""
-        # Older versions of rosbag2 had neither profiles nor definitions.
+        """Read the topics of the file by their ids in the table ``topics``."""
+        # Older versions of rosbag2 stored neither quality of service profiles nor definitions of
+        # message types.
         has_qos = "offered_qos_profiles" in self._columns("topics")
         definitions: dict[str, str] = {}
         if self._columns("message_definitions"):
@@ -113,7 +124,8 @@ class SqliteReader:
                     " WHERE encoding = 'ros2msg'"
                 )
             )
-        # No table states the number of messages. Counting them is fast compared with reading them.
+        # No table states the number of messages per topic, so they are counted here. This is fast
+        # compared with reading them.
         counts = dict(
             self._database.execute("SELECT topic_id, count(*) FROM messages GROUP BY topic_id")
         )
@@ -131,23 +143,25 @@ class SqliteReader:
         }
 
     def _columns(self, table: str) -> set[str]:
-        """Return the names of a table's columns; none where there is no such table."""
+        """Return the names of a table's columns; an empty set if the table does not exist."""
         return {row[1] for row in self._database.execute(f"PRAGMA table_info({table})")}
 
 
 class SqliteWriter:
-    """A new SQLite file of a bag."""
+    """A new SQLite file of a bag, open for writing."""
 
     def __init__(self, path: Path) -> None:
-        """Create the file.
+        """Create the file with empty tables.
 
         Raises:
-            sqlite3.Error: It cannot be created.
+            sqlite3.Error: The file cannot be created.
         """
-        # A recorder adds topics in one thread and messages in another, one at a time.
+        # Several threads may use the file, because a recorder adds topics in one thread and
+        # messages in another. They never do so at the same time, so SQLite's check is not needed.
         self._database = sqlite3.connect(path, check_same_thread=False)
         self._database.executescript(_TABLES)
-        # Numbers and types are kept here, so that nothing is read back while recording.
+        # The known types and the number of topics are also kept in memory, so that the database is
+        # never queried while recording.
         self._types: set[str] = set()
         self._topics = 0
 
@@ -158,10 +172,16 @@ class SqliteWriter:
         definition: str,
         qos: Sequence[QosProfile],
     ) -> int:
-        """Add a topic.
+        """Add a topic to the file, which must happen before its first message is written.
+
+        Args:
+            topic: Name of the topic.
+            msgtype: Type of its messages, such as ``std_msgs/msg/String``.
+            definition: Text of the type's definition, with those of the types in it.
+            qos: Quality of service profiles that its publishers offered.
 
         Returns:
-            The number by which `write` knows it.
+            The id of the topic in the file, which `write` takes.
         """
         digest = type_hash(msgtype, definition)
         if msgtype not in self._types:
@@ -185,21 +205,27 @@ class SqliteWriter:
         time_ns: int,
         data: bytes,
     ) -> None:
-        """Add a serialised message that was received at a time, in ns."""
+        """Add a message.
+
+        Args:
+            channel: Id of the topic that `add_topic` returned.
+            time_ns: Time at which the message was received, in ns since the Unix epoch.
+            data: Serialised message (CDR).
+        """
         self._database.execute(
             "INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)",
             (channel, time_ns, data),
         )
 
     def flush(self) -> None:
-        """Hand all messages to the system."""
+        """Commit all messages, so that they are in the file even if the process is killed later."""
         self._database.commit()
 
     def finish(self, summary: FileSummary) -> None:
-        """Complete the file.
+        """Write the description of the file into it and close it.
 
         Args:
-            summary: What the file holds.
+            summary: Topics, times and numbers of messages of the file.
         """
         information = to_yaml(bag_information("sqlite3", [summary]))
         self._database.execute(
@@ -210,7 +236,7 @@ class SqliteWriter:
         self._database.close()
 
     def abort(self) -> None:
-        """Close the file without the messages that were not handed over."""
+        """Close the file after writing failed; messages since the last `flush` are lost."""
         with suppress(sqlite3.Error):
             self._database.rollback()
         self._database.close()

@@ -1,4 +1,4 @@
-"""Summary of a bag for people: rates, losses and gaps of each cube, and the last diagnostics."""
+"""Summary of a bag: sample rates, losses and gaps of each cube, and the last diagnostics."""
 
 from __future__ import annotations
 
@@ -12,24 +12,27 @@ from ..core.arrays import AnyArray, Times
 from .read import Bag
 
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
+"""Message type of the diagnostics, which state the condition of each node and cube."""
 
 MIN_GAP_PERIODS = 1.5
-"""Time between two samples of a cube, in median periods, from which on it counts as a gap."""
+"""Time between two successive samples of a cube above which it counts as a gap, as a multiple of
+the cube's median sampling period."""
 
 SEQUENCE_RANGE = 1 << 32
-"""Number of different sequence numbers (32 bits); the largest one is followed by 0."""
+"""Number of different sequence numbers of samples (32 bits). After the largest one, a hub continues
+with 0."""
 
 
 @dataclass(frozen=True)
 class CubeSummary:
-    """How completely one cube was recorded.
+    """Completeness of the recorded samples of one cube.
 
     Attributes:
         name: Name of the cube.
-        uid: Number of its hub.
-        samples: Number of samples.
-        lost: Number of samples missing in the sequence.
-        gaps: Number of gaps in time.
+        uid: Unique number of the cube, as in its SkinInfo message.
+        samples: Number of recorded samples.
+        lost: Number of samples whose sequence numbers are missing.
+        gaps: Number of gaps, which are times between two samples above `MIN_GAP_PERIODS`.
         rate: Samples per second, from the median period; None with fewer than two samples.
         longest_gap: Longest time between two samples, in s; None with fewer than two samples.
     """
@@ -48,7 +51,13 @@ def cube_summaries(
     topic: str,
     info: Any,
 ) -> Iterator[CubeSummary]:
-    """Summarise every cube of a SkinInfo from the frequencies on a topic."""
+    """Summarise the recorded samples of every cube of a skin.
+
+    Args:
+        bag: Open bag.
+        topic: Topic of the skin's frequencies.
+        info: SkinInfo message of the skin, which lists the cubes.
+    """
     cube, sequence, stamp_ns = _columns(bag, topic)
     for number, one in enumerate(info.cubes):
         rows = cube == number
@@ -61,8 +70,8 @@ def cube_summaries(
 
 
 def last_diagnostics(bag: Bag) -> list[Any]:
-    """Return the last DiagnosticStatus of each name, sorted by name."""
-    # Later messages replace earlier ones of the same name.
+    """Return the last recorded DiagnosticStatus of each name, sorted by name."""
+    # Entries come in the order of recording, so a later status replaces an earlier one.
     last = {}
     topics = set(bag.topics(DIAGNOSTICS))
     for entry in bag.entries(topics) if topics else ():
@@ -77,16 +86,24 @@ def _summarise(
     sequence: AnyArray,
     stamp_ns: Times,
 ) -> CubeSummary:
-    """Summarise the samples of one cube."""
+    """Summarise the samples of one cube.
+
+    Args:
+        name: Name of the cube.
+        uid: Unique number of the cube.
+        sequence: (N,) sequence numbers of its samples in the order of recording.
+        stamp_ns: (N,) stamps of its samples, in ns since the Unix epoch.
+    """
     if len(sequence) < 2:
         return CubeSummary(name, uid, len(sequence))
     differences = np.diff(sequence.astype(np.int64))
     steps = np.mod(differences, SEQUENCE_RANGE)
-    # A step of half the range or more is a hub that restarted, not loss.
+    # A forward step of at least half the range is in fact a step back: the hub restarted and
+    # counts from 0 again, so no samples were lost.
     is_forward = (steps > 0) & (steps < SEQUENCE_RANGE // 2)
     lost = (steps[is_forward] - 1).sum()
     periods_ns = np.diff(stamp_ns)
-    # The median is not moved by a pause, as the mean would be.
+    # The median is used because a pause of the recording would lengthen the mean period.
     median_ns = float(np.median(periods_ns))
     return CubeSummary(
         name,
@@ -100,8 +117,12 @@ def _summarise(
 
 
 def _columns(bag: Bag, topic: str) -> tuple[AnyArray, AnyArray, Times]:
-    """Return cube, sequence number and stamp of all rows."""
-    # An empty part keeps the type where there is no message.
+    """Return cube index, sequence number and stamp of all rows of frequencies on a topic.
+
+    Returns:
+        Three arrays (N,); the stamps are in ns since the Unix epoch.
+    """
+    # The empty first parts give the arrays their types even if the topic has no message.
     cube = [np.empty(0, np.uint16)]
     sequence = [np.empty(0, np.uint32)]
     stamp_ns = [np.empty(0, np.int64)]

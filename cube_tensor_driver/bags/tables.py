@@ -1,4 +1,4 @@
-"""Tables of stress rows, Parquet or CSV, with units in the names of the columns."""
+"""Tables of stress in Parquet or CSV: one row per sample of a cube, units in the columns' names."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ from ..core.modes import GRADIENT, STRESS
 from ..core.rows import StressRows
 
 ROWS_PER_GROUP = 1 << 16
-"""Number of rows written at a time: one row group of a Parquet file."""
+"""Number of rows that are written together, as one row group (independent block) of a Parquet
+file. Fewer, larger groups compress better and are read faster."""
 
-# A dictionary keeps each name once, however many rows a cube has.
+# Dictionary encoding stores the name of a cube once and only a number in each row.
 _CUBE_NAME = pyarrow.dictionary(pyarrow.int32(), pyarrow.string())
 _SCHEMA = pyarrow.schema(
     [
@@ -49,14 +50,18 @@ def report_write_errors(path: Path) -> Iterator[None]:
 
 
 class TableWriter:
-    """A new table of stress; a context manager that completes it. NaN stands for not observed."""
+    """A new table of stress; a context manager that completes the file on exit.
+
+    A component of the stress is NaN where the cube's pads do not determine it.
+    """
 
     def __init__(self, path: Path, cubes: list[str]) -> None:
         """Create the file.
 
         Args:
-            path: File; its suffix decides the format, ``.csv`` or else Parquet.
-            cubes: Names of the cubes. Rows of cubes that the skin does not have get the last one.
+            path: File to create; the format is CSV if its suffix is ``.csv``, otherwise Parquet.
+            cubes: Names of the cubes by their indices. A row whose index is beyond the last name
+                gets the last name, for which callers pass "unknown".
 
         Raises:
             BagError: The file cannot be written.
@@ -68,7 +73,7 @@ class TableWriter:
         self._is_csv = path.suffix == ".csv"
         self._schema = _SCHEMA
         if self._is_csv:
-            # CSV has no dictionaries.
+            # CSV has no dictionary encoding, so every row contains the name of its cube.
             plain = pyarrow.field("cube", pyarrow.string())
             self._schema = _SCHEMA.set(1, plain)
         make = pyarrow.csv.CSVWriter if self._is_csv else pyarrow.parquet.ParquetWriter
@@ -84,10 +89,10 @@ class TableWriter:
             self._writer.close()
 
     def write(self, rows: StressRows) -> None:
-        """Add rows.
+        """Add rows to the table.
 
         Raises:
-            BagError: The disk is full or gone.
+            BagError: Writing to the disk failed.
         """
         last = len(self._cubes) - 1
         numbers = np.minimum(rows.cube, last).astype(np.int32)
@@ -105,14 +110,14 @@ class TableWriter:
         ]
         batch = pyarrow.RecordBatch.from_arrays(columns, schema=self._schema)
         self._batches.append(batch)
-        # Groups of many rows compress better and are read faster.
+        # Rows are collected until they fill a row group, which compresses better than small ones.
         self._waiting_rows += len(rows)
         if self._waiting_rows >= ROWS_PER_GROUP:
             with report_write_errors(self._path):
                 self._flush()
 
     def _flush(self) -> None:
-        """Write the rows that wait."""
+        """Write all collected rows as one row group."""
         if self._batches:
             self._writer.write_table(pyarrow.Table.from_batches(self._batches))
         self._batches, self._waiting_rows = [], 0

@@ -1,4 +1,4 @@
-"""Tables of stress rows as a Zarr group: one array per column, chunked along the rows."""
+"""Tables of stress as a Zarr group (folder of arrays): one array per column of the table."""
 
 from __future__ import annotations
 
@@ -14,14 +14,18 @@ from ..core.rows import StressRows, concatenate
 from .tables import report_write_errors
 
 ROWS_PER_CHUNK = 1 << 16
-"""Number of rows in one chunk of an array."""
+"""Number of rows in one chunk (file) of a Zarr array."""
 
 _UNITS = {
     "stamp_ns": "ns",
     "stress": "Pa",
     "gradient": "Pa/m",
 }
+"""Unit of each column that has one, stored as an attribute of the column's array."""
+
 _COMPONENTS = {"stress": STRESS, "gradient": GRADIENT}
+"""Names of the components of each column with several numbers per row."""
+
 _COLUMNS: dict[str, Any] = {
     "stamp_ns": np.int64,
     "cube": np.uint16,
@@ -33,21 +37,26 @@ _COLUMNS: dict[str, Any] = {
     "observed": np.uint16,
     "left_out": np.uint32,
 }
+"""Type of each column; the columns are the attributes of `StressRows` with these names."""
 
 
 class ZarrWriter:
-    """A new group of columns; a context manager that completes it. NaN stands for not observed."""
+    """A new table of stress as a Zarr group; a context manager that completes the group on exit.
+
+    A component of the stress is NaN where the cube's pads do not determine it.
+    """
 
     def __init__(self, path: Path, cubes: list[str]) -> None:
         """Create the group.
 
         Args:
-            path: Folder of the group.
-            cubes: Names of the cubes, kept in the attributes of the column `cube`, which contains
-                their indices. Rows of cubes that the skin does not have get the last index.
+            path: Folder of the group, which is created or replaced.
+            cubes: Names of the cubes by their indices, stored as an attribute of the column `cube`.
+                An index beyond the last name is replaced by the last index, whose name is
+                "unknown" by convention.
 
         Raises:
-            BagError: The library zarr is too old.
+            BagError: The installed library zarr is older than version 3.
         """
         if not hasattr(zarr.Group, "create_array"):
             raise BagError(
@@ -68,10 +77,10 @@ class ZarrWriter:
         self._flush()
 
     def write(self, rows: StressRows) -> None:
-        """Add rows.
+        """Add rows to the table.
 
         Raises:
-            BagError: The disk is full or gone.
+            BagError: Writing to the disk failed.
         """
         self._waiting.append(rows)
         self._waiting_rows += len(rows)
@@ -79,10 +88,11 @@ class ZarrWriter:
             self._flush()
 
     def _flush(self) -> None:
-        """Write the rows that wait."""
+        """Append all collected rows to the arrays."""
         if not self._waiting:
             return
-        # Whole chunks at a time: Zarr would read a chunk that is not full to append to it.
+        # Rows are collected until they fill a chunk, because appending to a chunk that is not full
+        # makes Zarr read and rewrite that chunk.
         rows = concatenate(self._waiting)
         columns = {name: getattr(rows, name) for name in self._arrays}
         columns["cube"] = np.minimum(rows.cube, self._last_cube)
@@ -97,7 +107,13 @@ def _create_column(
     name: str,
     cubes: list[str],
 ) -> Any:
-    """Create the array of one column, with attributes that state what it means."""
+    """Create the empty array of one column, with its unit and components as attributes.
+
+    Args:
+        group: Zarr group of the table.
+        name: Name of the column, a key of `_COLUMNS`.
+        cubes: Names of the cubes, an attribute of the column `cube`.
+    """
     components = _COMPONENTS.get(name, ())
     width = (len(components),) if components else ()
     attributes: dict[str, Any] = {}
