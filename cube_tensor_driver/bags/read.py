@@ -30,22 +30,30 @@ from .metadata import SUFFIXES, BagFiles, Connection, merge_connections, read_me
 from .sqlite_file import SqliteReader
 
 VERSION = 3
-"""Version of this package's messages that can be read: ``SkinInfo.VERSION``."""
+"""Version of this package's message definitions that can be read: ``SkinInfo.VERSION``."""
 
 MAX_BATCH_MESSAGES = 64
-"""Largest number of messages decoded at once. With more, the cost of calling numpy no longer
-matters."""
+"""Largest number of messages decoded by one call of numpy. With more messages, the fixed cost of
+the call is already negligible."""
+
 MAX_BATCH_ROWS = 1 << 13
-"""Largest number of rows decoded at once, so that they fit the processor's cache (82 bytes per row
-of stress). The limit is in rows, so that batches of frequencies and of stress begin and end with
-the same samples, and one need not be searched in the other."""
+"""Largest number of rows (samples of cubes) decoded by one call of numpy.
+
+This many rows of stress (82 bytes each) fit the processor's cache. Frequencies and stress have the
+same limit in rows, not in bytes, so that their batches contain the same samples; then the stress of
+a batch of frequencies is found without a search.
+"""
 
 MAX_MESSAGE_BYTES = 64 << 20
-"""Largest size of one message after decompression; an image of 4096 x 4096 pixels in colour has
-48 MB."""
+"""Largest allowed size, in bytes, of one message after decompression.
+
+An image of 4096 x 4096 pixels in colour has 48 MB. Without a limit, a damaged message could fill
+the memory.
+"""
 
 MAX_TIME_NS = (1 << 63) - 1
-"""Largest time that 64 bits can hold, in ns since the epoch: the end where no end is asked for."""
+"""Largest time in 64 bits, in ns since the Unix epoch. It stands for the end of the bag where the
+caller gives no end."""
 
 READ_ERRORS = (
     McapError,
@@ -59,27 +67,32 @@ READ_ERRORS = (
     KeyError,
     OverflowError,
 )
-"""What the libraries raise where the bytes of a file are damaged.
+"""Exceptions that the libraries raise when they read a damaged storage file of a bag.
 
-`struct.error`, `ValueError` and `OverflowError` come from numbers, texts and lengths that cannot
-be, `KeyError` from a channel, schema or type that the file does not define.
+`struct.error`, `ValueError` and `OverflowError` come from impossible numbers, texts and lengths,
+`KeyError` from a topic or message type that is used but not defined in the file.
 """
 
 
 def is_bag(path: Path) -> bool:
-    """Return whether a path is a folder or has a name like a storage file. It may be damaged."""
+    """Return whether a path is a folder or ends in .mcap or .db3; the content is not checked."""
     return path.is_dir() or path.suffix in SUFFIXES.values()
 
 
 @contextmanager
 def report_damage(path: Path) -> Iterator[None]:
-    """Turn the libraries' errors about the bag `path` into a BagError of one line."""
+    """Turn errors of reading in the enclosed block into a BagError of one line.
+
+    Args:
+        path: Bag or file that the block reads, which the error names.
+    """
     try:
         yield
     except OSError as error:
         raise BagError(f"{path}: {error.strerror or error}; name a bag that can be read") from None
     except READ_ERRORS as error:
-        # Some texts have several lines, and some quote the damaged bytes.
+        # Texts of the libraries can have several lines or quote many damaged bytes, so they are
+        # joined to one line and shortened.
         text = " ".join(str(error).split()) or type(error).__name__
         raise BagError(
             f"{path}: damaged, or no bag ({text[:200]}); "
@@ -88,15 +101,16 @@ def report_damage(path: Path) -> Iterator[None]:
 
 
 def open_storage(path: Path) -> McapReader | SqliteReader:
-    """Open one storage file for reading.
+    """Open one storage file (.mcap or .db3) of a bag for reading.
 
     Raises:
-        BagError: It is missing, damaged, or not a storage file.
+        BagError: The file is missing, damaged, or not a storage file.
     """
     if not path.exists():
         raise BagError(f"{path}: no such file or folder; name a bag")
     if not path.is_file():
-        # Opening a pipe would wait for a writer, and a device has no end.
+        # A pipe or device is refused, because opening a pipe waits for a writer, and reading a
+        # device may never end.
         raise BagError(f"{path}: no regular file; name a bag")
     if path.suffix not in SUFFIXES.values():
         raise BagError(
@@ -109,7 +123,12 @@ def open_storage(path: Path) -> McapReader | SqliteReader:
 
 
 def make_message(kind: str, **fields: Any) -> Any:
-    """Make a message of the library rosbags from its type and its fields."""
+    """Make a message object of the library rosbags.
+
+    Args:
+        kind: Name of the message type, such as ``std_msgs/msg/String``.
+        fields: Value of each field of the message.
+    """
     return typestore().types[kind](**fields)
 
 
@@ -119,12 +138,12 @@ def serialise(message: Any) -> bytes:
 
 
 class Entry(NamedTuple):
-    """A message of a bag.
+    """A serialised message of a bag.
 
     Attributes:
-        topic: Name of its topic.
-        msgtype: Its type.
-        time_ns: Time at which it was recorded, in ns since the epoch.
+        topic: Name of the message's topic.
+        msgtype: Type of the message, such as ``std_msgs/msg/String``.
+        time_ns: Time at which the message was recorded, in ns since the Unix epoch.
         data: Serialised message (CDR).
     """
 
@@ -139,21 +158,26 @@ class Bag:
 
     Attributes:
         path: Folder or file of the bag.
-        connections: Topics of the bag; empty until it is open.
-        start_ns: Time at which the earliest message was recorded, in ns since the epoch.
-        end_ns: Time at which the latest message was recorded.
+        connections: Topics of the bag, with types and numbers of messages; empty until `open`.
+        start_ns: Time at which the earliest message was recorded, in ns since the Unix epoch; 0
+            until `open`.
+        end_ns: Time at which the latest message was recorded, in ns since the Unix epoch; 0 until
+            `open`.
     """
 
     def __init__(self, path: Path) -> None:
-        """Find the files of a bag without opening them.
+        """Find the storage files of a bag without opening them.
+
+        Args:
+            path: Folder of the bag with its metadata.yaml, or one storage file.
 
         Raises:
-            BagError: There is no bag.
+            BagError: The folder has no readable metadata.yaml.
         """
         self.path = path
         self.connections: list[Connection] = []
         self.start_ns = self.end_ns = 0
-        # A single file is a bag, too: then nobody says that it is compressed.
+        # A single storage file is also a bag. Without metadata.yaml it counts as not compressed.
         self._bag_files = BagFiles([path], "")
         if path.is_dir():
             self._bag_files = read_metadata(path)
@@ -172,12 +196,13 @@ class Bag:
         self.close()
 
     def open(self) -> None:
-        """Open the files.
+        """Open all storage files of the bag.
 
         Raises:
-            BagError: A file is missing or damaged, or has another version of the messages.
+            BagError: A file is missing or damaged, or was recorded with another version of this
+                package's messages.
         """
-        # If one file cannot be opened, those before it are closed again.
+        # If one file cannot be opened, the files that were opened before are closed again.
         try:
             for path in self._unpacked_paths():
                 file = open_storage(path)
@@ -195,21 +220,21 @@ class Bag:
             self.end_ns = max(summary.end_ns for summary in used)
 
     def close(self) -> None:
-        """Close the files; a second time does nothing."""
+        """Close all storage files; calling it again does nothing."""
         self._opened.close()
         self._files.clear()
         self.connections = []
 
     def topics(self, msgtype: str) -> list[str]:
-        """Return the topics of a type, sorted."""
+        """Return the sorted names of all topics with a message type."""
         names = {one.topic for one in self.connections if one.msgtype == msgtype}
         return sorted(names)
 
     def skin(self) -> str:
-        """Return the prefix of the skin's topics, which ends in "/".
+        """Return the common prefix of the names of the skin's topics, which ends in "/".
 
         Raises:
-            BagError: The bag has no skin, or several.
+            BagError: The bag has no topic of frequencies, or those of several skins.
         """
         names = [topic.removesuffix("frequencies") for topic in self.topics(FREQUENCIES)]
         if not names:
@@ -230,9 +255,10 @@ class Bag:
         """Read messages in the order of recording.
 
         Args:
-            topics: Names of the topics; None: all.
-            start_ns: Time of the first message; None: from the beginning.
-            stop_ns: Time before which the last message was recorded; None: to the end.
+            topics: Names of the topics; None: all topics.
+            start_ns: Earliest time of recording that is read, in ns since the Unix epoch; None: no
+                limit.
+            stop_ns: Time of recording, in ns, from which on nothing is read; None: to the end.
 
         Raises:
             BagError: The bag is damaged.
@@ -241,24 +267,27 @@ class Bag:
             yield Entry(connection.topic, connection.msgtype, time_ns, data)
 
     def decode(self, entry: Entry) -> Any:
-        """Return the message of an entry.
+        """Return the message object that the bytes of an entry stand for.
 
         Raises:
-            BagError: Its bytes do not fit its type.
+            BagError: The bytes do not fit the message type.
         """
         with report_damage(self.path):
             return typestore().deserialize_cdr(entry.data, entry.msgtype)
 
     def fields(self, msgtype: str) -> list[tuple[str, Any]]:
-        """Return name and kind (in rosbags' form) of a type's fields; none if it is unknown."""
+        """Return name and kind of each field of a message type, as the library rosbags states them.
+
+        The list is empty if the type is unknown.
+        """
         constants_and_fields = typestore().fielddefs.get(msgtype, ((), ()))
         return list(constants_and_fields[1])
 
     def infos(self, topic: str) -> list[Any]:
-        """Return the SkinInfo messages of a topic.
+        """Return the SkinInfo messages (cubes, calibrations, rest frequencies) of a topic.
 
         Raises:
-            BagError: There is none, or one of another version.
+            BagError: The topic has no message, or a message has another version than `VERSION`.
         """
         infos = list(map(self.decode, self.entries({topic})))
         if not infos:
@@ -267,7 +296,8 @@ class Bag:
                 f"mean; record {topic} too"
             )
         for info in infos:
-            # The number also changes where a field has another meaning but the same type.
+            # Comparing definitions is not enough: the version also changes when a field gets
+            # another meaning but keeps its type.
             if info.version != VERSION:
                 self._refuse_version(f"{topic} has version {info.version}")
         return infos
@@ -275,22 +305,36 @@ class Bag:
     def frequencies(self, topic: str) -> Iterator[tuple[Decoded[FrequencyRows], Times]]:
         """Read frequencies in the order of recording.
 
-        Messages of the same shape that follow each other come together.
+        Successive messages with the same number of rows and the same frame id are decoded together.
 
         Yields:
-            M messages, and (M,) when each was recorded, in ns.
+            M messages, and an array (M,) of the times at which they were recorded, in ns since the
+            Unix epoch.
 
         Raises:
-            BagError: The bag is damaged, or a message contradicts itself.
+            BagError: The bag is damaged, or the lengths stated in a message are inconsistent.
         """
         return self._decoded(topic, frequency_codec, frequency_codec.decode)
 
     def stress(self, topic: str) -> Iterator[tuple[Decoded[StressRows], Times]]:
-        """Read stress as `frequencies` reads frequencies."""
+        """Read recorded stress in the order of recording.
+
+        Yields:
+            M messages, and an array (M,) of the times at which they were recorded, in ns since the
+            Unix epoch.
+        """
         return self._decoded(topic, stress_codec, stress_codec.decode)
 
     def stress_columns(self, topic: str, names: Sequence[str]) -> Iterator[list[AnyArray]]:
-        """Read `stamp_ns` and the named columns of stress, which is faster than all of `stress`."""
+        """Read some columns of recorded stress, which is faster than reading all with `stress`.
+
+        Args:
+            topic: Topic of the stress.
+            names: Names of the columns, which are attributes of `StressRows`.
+
+        Yields:
+            For each batch of N rows: `stamp_ns` (N,), then the named columns in their order.
+        """
         decode = partial(stress_codec.decode_columns, names)
         for columns, _ in self._decoded(topic, stress_codec, decode):
             yield columns
@@ -301,7 +345,20 @@ class Bag:
         start_ns: int | None = None,
         stop_ns: int | None = None,
     ) -> Iterator[tuple[Connection, int, bytes]]:
-        """Read messages file by file and count them."""
+        """Read messages file by file, decompress them, and check their number.
+
+        Args:
+            topics: Names of the topics; None: all topics.
+            start_ns: Earliest time of recording that is read, in ns since the Unix epoch; None: no
+                limit.
+            stop_ns: Time of recording, in ns, from which on nothing is read; None: to the end.
+
+        Yields:
+            The topic, the time of recording in ns, and the serialised message.
+
+        Raises:
+            BagError: The bag is damaged, or has another number of messages than its summary states.
+        """
         wanted = {one.topic for one in self.connections}
         if topics is not None:
             wanted &= topics
@@ -310,13 +367,15 @@ class Bag:
         end_ns = MAX_TIME_NS if stop_ns is None else stop_ns
         count = 0
         with report_damage(self.path):
-            # Files follow each other in time, so they need not be merged.
+            # A recorder begins a new file after the last message of the one before, so messages of
+            # different files need not be merged by time.
             for file in self._files:
                 for connection, time_ns, data in file.messages(wanted, begin_ns, end_ns):
                     count += 1
                     yield connection, time_ns, _decompress(data) if is_packed else data
 
-        # Damage to the name of a topic or to the number of a channel only makes messages disappear.
+        # If the name of a topic or the number of a channel is damaged, no library raises an error:
+        # messages are only missing. Therefore their number is compared with the one stated.
         promised = sum(one.msgcount for one in self.connections if one.topic in wanted)
         if start_ns is None and stop_ns is None and count != promised:
             raise BagError(
@@ -330,8 +389,18 @@ class Bag:
         codec: MessageCodec[Any],
         decode: Callable[..., Any],
     ) -> Iterator[tuple[Any, Times]]:
-        """Decode messages of one shape together, and say when they were recorded."""
-        # One call of numpy for many messages takes as long as for one.
+        """Decode successive messages of one shape (frame id and number of rows) together.
+
+        Args:
+            topic: Topic of the messages.
+            codec: Codec of their type, which determines the shape of a message.
+            decode: Function that decodes serialised messages, which are its arguments.
+
+        Yields:
+            The result of `decode` for M messages, and an array (M,) of the times at which they were
+            recorded, in ns since the Unix epoch.
+        """
+        # Decoding many messages with one call of numpy takes hardly longer than decoding one.
         waiting: list[bytes] = []
         times_ns: list[int] = []
         size = limit = 0
@@ -344,7 +413,7 @@ class Bag:
                         yield decode(*waiting), np.array(times_ns)
                     waiting, times_ns = [], []
                     size, shape = len(data), codec.shape_bytes(data)
-                    # The shape ends with the number of rows.
+                    # The last 4 bytes of the shape are the number of rows in the message.
                     rows = int.from_bytes(shape[-4:], "little")
                     fitting = MAX_BATCH_ROWS // max(1, rows)
                     limit = max(1, min(MAX_BATCH_MESSAGES, fitting))
@@ -356,7 +425,11 @@ class Bag:
             raise BagError(f"{self.path}: {topic}: {error}") from None
 
     def _unpacked_paths(self) -> Sequence[Path]:
-        """Return the storage files, decompressed into a temporary folder if they are compressed."""
+        """Return the paths of the storage files.
+
+        Files that rosbag2 compressed as a whole are first decompressed into a temporary folder,
+        which is removed when the bag is closed.
+        """
         if self._bag_files.compression != "file":
             return self._bag_files.paths
         folder = Path(self._opened.enter_context(TemporaryDirectory()))
@@ -364,7 +437,8 @@ class Bag:
         for path in self._bag_files.paths:
             unpacked.append(folder / path.name.removesuffix(".zstd"))
             with (
-                # In steps of some kB: a recording need not fit the memory.
+                # `copy_stream` decompresses in steps of some kB, because a recording can be larger
+                # than the memory.
                 report_damage(path),
                 path.open("rb") as source,
                 unpacked[-1].open("wb") as destination,
@@ -373,13 +447,17 @@ class Bag:
         return unpacked
 
     def _check_definitions(self) -> None:
-        """Compare the definitions of this package's messages in the bag with those of today."""
+        """Check that this package's messages have the same fields in the bag as in this version.
+
+        Raises:
+            BagError: The definition of a message in the bag differs.
+        """
         for one in self.connections:
             if not one.msgtype.startswith(PACKAGE) or not one.definition:
                 continue
             with report_damage(self.path):
                 definitions = get_types_from_msg(one.definition, one.msgtype)
-            # Constants may differ: the bytes of a message do not depend on them.
+            # Only fields are compared; constants of a definition do not change a message's bytes.
             for name, (_, fields) in definitions.items():
                 if not name.startswith(PACKAGE):
                     continue
@@ -394,12 +472,14 @@ class Bag:
 
 
 def _decompress(data: bytes) -> bytes:
-    """Decompress a message that rosbag2 compressed.
+    """Decompress a message that rosbag2 compressed with zstd.
 
     Raises:
-        zstandard.ZstdError, ValueError: It is damaged, or larger than `MAX_MESSAGE_BYTES`.
+        zstandard.ZstdError, ValueError: The message is damaged, or has more than
+            `MAX_MESSAGE_BYTES` after decompression.
     """
-    # As a stream, because a frame that states its size would be unpacked to any size.
+    # A stream is read up to the limit. Decompression in one step would allocate whatever size the
+    # compressed data states.
     with zstandard.ZstdDecompressor().stream_reader(data) as reader:
         message = reader.read(MAX_MESSAGE_BYTES + 1)
     if len(message) > MAX_MESSAGE_BYTES:

@@ -1,5 +1,8 @@
-"""Bags written as rosbag2 writes them: a folder with metadata.yaml and storage files, which contain
-the definitions of the message types."""
+"""Writing of bags in the format of rosbag2: a folder with metadata.yaml and storage files.
+
+The storage files contain the definitions of the message types, so that a bag can be read without
+this package.
+"""
 
 from __future__ import annotations
 
@@ -22,23 +25,25 @@ from .metadata import (
 from .sqlite_file import SqliteWriter
 
 WRITE_ERRORS = (OSError, sqlite3.Error)
-"""What the libraries raise where the disk is full or gone."""
+"""Exceptions that the libraries raise when writing fails, for example on a full disk."""
 
 
 @dataclass
 class _Part:
-    """The storage file that is being written.
+    """The storage file that is being written; a bag can be divided into several.
+
+    All times are those at which messages were received, in ns since the Unix epoch.
 
     Attributes:
-        path: The file.
-        file: Its writer.
-        channels: Number of each topic in the file.
-        counts: Number of messages of each topic.
+        path: Path of the file.
+        file: Writer of the file's format.
+        channels: Number by which the file identifies each topic, by the topic's name.
+        counts: Number of messages written on each topic.
         first_ns: Time of the message that was written first.
         start_ns: Time of the earliest message.
         end_ns: Time of the latest message.
-        messages: Number of messages.
-        bytes: Their size.
+        messages: Number of messages written.
+        bytes: Total size of the serialised messages, in bytes.
     """
 
     path: Path
@@ -57,7 +62,13 @@ class _Part:
         time_ns: int,
         size: int,
     ) -> None:
-        """Take note of a message."""
+        """Include a message that has been written in the counts and times.
+
+        Args:
+            topic: Topic of the message.
+            time_ns: Time at which the message was received, in ns since the Unix epoch.
+            size: Size of the serialised message, in bytes.
+        """
         if not self.messages:
             self.first_ns = self.start_ns = self.end_ns = time_ns
         self.counts[topic] += 1
@@ -67,7 +78,11 @@ class _Part:
         self.bytes += size
 
     def summary(self, topics: Sequence[Connection]) -> FileSummary:
-        """Describe the file."""
+        """Return the times and numbers of messages of the file.
+
+        Args:
+            topics: All topics of the bag.
+        """
         counted = [replace(one, msgcount=self.counts[one.topic]) for one in topics]
         return FileSummary(
             self.path.name,
@@ -78,12 +93,14 @@ class _Part:
 
 
 class BagWriter:
-    """A new bag, for one thread at a time; a context manager that completes it.
+    """A new bag, open for writing; a context manager that completes the bag on exit.
+
+    It may be used by several threads, but not at the same time.
 
     Attributes:
         folder: Folder of the bag.
         messages: Number of messages written so far.
-        bytes: Their size.
+        bytes: Total size of these messages in serialised form, in bytes.
     """
 
     def __init__(
@@ -98,8 +115,10 @@ class BagWriter:
         Args:
             folder: Folder to create.
             storage: Format of the files, ``mcap`` or ``sqlite3``.
-            max_bytes: Size of messages after which a new file begins; 0: never.
-            max_seconds: Duration after which a new file begins, in s; 0: never.
+            max_bytes: Total size of the messages in a storage file, in bytes, at which a new file
+                begins; 0: no limit.
+            max_seconds: Time between the first and the next message of a storage file, in s, at
+                which a new file begins; 0: no limit.
 
         Raises:
             BagError: The folder exists or cannot be created, or the format is unknown.
@@ -116,7 +135,8 @@ class BagWriter:
         self._topics: list[Connection] = []
         self._complete: list[FileSummary] = []
         self._part: _Part | None = None
-        # Now, not with the first message, so that a folder that cannot be written is noticed early.
+        # Folder and file are created now, not with the first message, so that a folder that cannot
+        # be written is reported before recording begins.
         self._attempt(lambda: folder.mkdir(parents=True))
         self._attempt(self._begin_part)
 
@@ -127,7 +147,7 @@ class BagWriter:
         return self
 
     def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
-        # After an error of writing nothing more can be written: `repair` saves what is there.
+        # After an error of writing the bag cannot be completed; `repair` makes it readable later.
         if error is None or not issubclass(error, BagError):
             self.close()
 
@@ -137,15 +157,15 @@ class BagWriter:
         msgtype: str,
         qos: Sequence[QosProfile] = (),
     ) -> None:
-        """Add a topic before its first message.
+        """Add a topic, which must happen before its first message is written.
 
         Args:
             topic: Name of the topic.
-            msgtype: Type of its messages.
-            qos: Profiles that its publishers offer, as `quality` makes them.
+            msgtype: Type of its messages, such as ``std_msgs/msg/String``.
+            qos: Quality of service profiles that its publishers offer, as `quality` returns them.
 
         Raises:
-            BagError: The type is unknown.
+            BagError: The message type is unknown, or writing to the disk failed.
         """
         store = typestore()
         if msgtype not in store.fielddefs:
@@ -153,10 +173,10 @@ class BagWriter:
                 f"{topic}: the type {msgtype} is not known; known are those of ROS 2 Jazzy and "
                 "of this package"
             )
-        # The definition goes into the file, so that the bag can be read without this package.
+        # The file contains the type's definition, so that the bag can be read without this package.
         definition, _ = store.generate_msgdef(msgtype, ros_version=2)
         one = Connection(topic, msgtype, definition, list(qos))
-        self._topics.append(one)  # for the files that follow
+        self._topics.append(one)  # each storage file that begins later gets the topic, too
         self._attempt(lambda: self._connect(self._open_part(), one))
 
     def write(
@@ -168,19 +188,20 @@ class BagWriter:
         """Add a message.
 
         Args:
-            topic: Topic that has been added.
-            time_ns: Time at which it was received, in ns since the epoch.
+            topic: Name of a topic that has been added with `add_topic`.
+            time_ns: Time at which the message was received, in ns since the Unix epoch.
             data: Serialised message (CDR).
 
         Raises:
-            BagError: The disk is full or gone.
+            BagError: Writing to the disk failed; after that, nothing can be written any more.
         """
         part = self._open_part()
         is_large = self._max_bytes and part.bytes >= self._max_bytes
         duration_ns = time_ns - part.first_ns if part.messages else 0
         is_long = self._max_ns and duration_ns >= self._max_ns
         if is_large or is_long:
-            # metadata.yaml is complete at this point, so a reader sees all files before this one.
+            # `close` also writes metadata.yaml, so that all complete files can be read while the
+            # recording continues in the next one.
             self.close()
             self._attempt(self._begin_part)
             part = self._open_part()
@@ -193,12 +214,15 @@ class BagWriter:
         self.bytes += len(data)
 
     def flush(self) -> None:
-        """Hand everything written so far to the system, so that it survives the process."""
+        """Hand all messages to the operating system, so that none is lost if the process is killed.
+
+        Until the bag is closed, reading them requires `repair`.
+        """
         if self._part is not None:
             self._attempt(self._part.file.flush)
 
     def close(self) -> None:
-        """Complete the bag; a second time does nothing."""
+        """Complete the bag; calling it again does nothing."""
         if self._part is not None:
             self._attempt(self._finish_part)
 
@@ -208,7 +232,7 @@ class BagWriter:
         return self._part
 
     def _begin_part(self) -> None:
-        """Create the next storage file, with all topics that are known."""
+        """Create the next storage file and add all topics of the bag to it."""
         name = f"{self.folder.resolve().name}_{len(self._complete)}{SUFFIXES[self._storage]}"
         path = self.folder / name
         file = McapWriter(path) if self._storage == "mcap" else SqliteWriter(path)
@@ -217,18 +241,23 @@ class BagWriter:
             self._connect(self._part, one)
 
     def _finish_part(self) -> None:
-        """Complete the storage file, and describe it in metadata.yaml."""
+        """Complete the current storage file and write metadata.yaml with it."""
         part = self._open_part()
         summary = part.summary(self._topics)
         part.file.finish(summary)
-        # From here on a failure does not concern this file any more.
+        # The file is complete now. A failure in writing metadata.yaml must not close it again.
         self._part = None
         self._complete.append(summary)
         write_metadata(self.folder, self._storage, self._complete)
 
     @staticmethod
     def _connect(part: _Part, one: Connection) -> None:
-        """Make a topic known in a storage file."""
+        """Add a topic to a storage file.
+
+        Args:
+            part: The storage file.
+            one: Topic with its type, definition and quality of service.
+        """
         channel = part.file.add_topic(
             one.topic,
             one.msgtype,
@@ -245,7 +274,10 @@ class BagWriter:
             self._fail(error)
 
     def _fail(self, error: Exception) -> NoReturn:
-        """Give the bag up, so that nothing is written behind a gap."""
+        """Close the current file after an error of writing, and raise that error as a BagError.
+
+        Nothing can be written afterwards; otherwise messages would be missing within the bag.
+        """
         part, self._part = self._part, None
         if part is not None:
             part.file.abort()

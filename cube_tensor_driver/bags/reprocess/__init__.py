@@ -1,1 +1,1 @@
-"""Stress and contacts computed again from the recorded frequencies of bags."""
+"""Reprocessing of bags: stress and contacts are computed again from recorded frequencies."""

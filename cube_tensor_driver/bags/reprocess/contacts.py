@@ -1,4 +1,4 @@
-"""Contacts and traction on the surface, computed from the stress of a bag and written with it."""
+"""Contacts and surface traction, computed while a bag is reprocessed and written with its stress."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from ..write import BagWriter
 
 @dataclass(frozen=True)
 class ContactsOverTime:
-    """How contacts of a bag are computed.
+    """Settings with which the contacts of a bag are computed.
 
     Attributes:
-        settings: Method and parameters.
-        rate: Largest number of messages per second.
+        settings: Method of contact estimation and its parameters.
+        rate: Largest number of messages of contacts per second, in Hz.
     """
 
     settings: ContactSettings
@@ -41,12 +41,12 @@ class ContactWriter:
         topics: str,
         wanted: ContactsOverTime,
     ) -> None:
-        """Add the topics to a bag.
+        """Add the topics of contacts and traction to a bag.
 
         Args:
-            writer: The bag.
-            topics: Prefix of the skin's topics.
-            wanted: How contacts are computed.
+            writer: The bag that is being written.
+            topics: Common prefix of the names of the skin's topics, which ends in "/".
+            wanted: Settings with which contacts are computed.
         """
         self._writer, self._wanted = writer, wanted
         self._period_ns = 1e9 / wanted.rate
@@ -59,12 +59,13 @@ class ContactWriter:
         self._last_ns: int | None = None
 
     def set_up(self, info: Any) -> None:
-        """Use a SkinInfo for the rows that follow.
+        """Use a SkinInfo message (poses and calibrations of the cubes) for the rows that follow.
 
-        As in the node, contacts continue where the cubes stay in place.
+        If the geometry is that of the message before, the tracked contacts continue. Otherwise
+        contact estimation begins anew. The contact node does the same.
 
         Raises:
-            CubeError: No contacts can be computed on such a skin.
+            CubeError: Contacts cannot be computed on a skin with these cubes.
         """
         if self._geometry == geometry(info):
             return
@@ -82,19 +83,21 @@ class ContactWriter:
         messages: Decoded[Any],
         recorded_ns: Times,
     ) -> None:
-        """Compute the contacts of M messages and write them when each message was recorded.
+        """Compute contacts from the stress of M messages and write them into the bag.
+
+        The message of contacts gets the recording time of the message from which it was computed.
 
         Args:
-            stress: Rows of all messages, message after message.
-            messages: The messages of frequencies.
-            recorded_ns: (M,) when each was recorded, in ns.
+            stress: Rows of stress of all M messages, message after message.
+            messages: The M messages of frequencies, all with the same number of rows.
+            recorded_ns: (M,) time at which each was recorded, in ns since the Unix epoch.
         """
         rows_per_message = len(stress) // len(messages)
         begin = 0
         for number, stamp_ns in enumerate(messages.stamp_ns.tolist()):
             if not self._is_due(stamp_ns):
                 continue
-            # Rows of the messages since the last one that was due come in, too.
+            # The stress of all messages since the last computed contacts is included.
             end = (number + 1) * rows_per_message
             rows = stress.select(slice(begin, end))
             self._latest.update(rows, stamp_ns * 1e-9)
@@ -106,7 +109,12 @@ class ContactWriter:
             self._latest.update(rows, last_ns * 1e-9)
 
     def _is_due(self, stamp_ns: int) -> bool:
-        """Return whether a period has passed since the last message, or time jumped back."""
+        """Return whether contacts are due: a period has passed since the last, or time jumped back.
+
+        Args:
+            stamp_ns: Stamp of the message of frequencies, in ns since the Unix epoch. If contacts
+                are due, it is remembered as the start of the next period.
+        """
         last = self._last_ns
         if last is not None and 0 <= stamp_ns - last < self._period_ns:
             return False
@@ -114,7 +122,12 @@ class ContactWriter:
         return True
 
     def _write(self, stamp_ns: int, recorded_ns: int) -> None:
-        """Write the contacts of the newest stress."""
+        """Compute contacts and traction from the newest stress of each cube and write them.
+
+        Args:
+            stamp_ns: Stamp of the messages, in ns since the Unix epoch.
+            recorded_ns: Time of recording that the bag states for them, in ns.
+        """
         if self._finder is None:
             raise BagError(f"{self._contacts}: no info says where the cubes are; record info")
         health = self._latest.health(stamp_ns * 1e-9, STALE_S)

@@ -1,4 +1,5 @@
-"""A bag that determines a reconstruction, so that replayed frequencies give the recorded stress."""
+"""Settings and health from a bag for a reconstruction, so that replayed frequencies give exactly
+the recorded stress."""
 
 from __future__ import annotations
 
@@ -11,17 +12,18 @@ from ..source import open_bag
 
 
 class RecordedReconstruction:
-    """The rest frequencies and the health of a recording, each at its time.
+    """The rest frequencies and the health of the pads that applied at each time of a recording.
 
     Attributes:
-        skin: The skin as it was recorded.
+        skin: The skin (cubes, their poses and calibrations) as the bag describes it.
     """
 
     def __init__(self, path: Path) -> None:
         """Open a bag.
 
         Raises:
-            BagError: There is no bag, or it has several skins or changes its calibrations.
+            BagError: There is no bag, it has several skins, or the calibration of a cube changes
+                within the recording.
         """
         self._source = open_bag(path)
         try:
@@ -37,10 +39,18 @@ class RecordedReconstruction:
         self._source.bag.close()
 
     def health_at(self, rows: FrequencyRows, reconstructor: Reconstructor) -> RecordedHealth:
-        """Return the recorded health for the rows of one message.
+        """Return the recorded health of the pads for the rows of one message.
 
-        It also sets the rest frequencies of the reconstructor to those of the rows' time. What the
-        recording does not state is decided when the rows come.
+        The rest frequencies that were recorded for the time of these rows are set in the
+        reconstructor.
+
+        Args:
+            rows: Rows of one message of frequencies.
+            reconstructor: The reconstructor that will process these rows.
+
+        Returns:
+            The health. Where its `known` is false, no stress was recorded for the row, and the
+            reconstructor determines the health itself.
         """
         settings = self._source.recording.settings_at(rows)
         if settings is not self._settings:
