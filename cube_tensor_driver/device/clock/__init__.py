@@ -1,1 +1,1 @@
-"""The clock of a hub, mapped to the clock of the host."""
+"""Device times (of the clock of a hub) are converted to host times here."""

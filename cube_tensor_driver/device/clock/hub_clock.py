@@ -1,8 +1,9 @@
 """Conversion of one hub's device times to host times.
 
-One straight line (`line.py`) converts them, bounded by round trips and restarted after a step.
-`steps.py` finds the steps. A hub's clock that stands still or jumps again and again cannot be
-converted; then the stamp of a row is its arrival.
+Host time is a straight line over device time (`line.py`). Round trips (a question for the hub's
+time and its answer) bound the error of the line, and it is restarted after a step of the hub's
+clock, which `steps.py` finds. Device times of a clock that stands still or jumps again and again
+cannot be converted; then the stamp (host time) of a row is its arrival time.
 """
 
 from __future__ import annotations
@@ -14,23 +15,26 @@ from .line import ClockLine, ClockRoundTrip
 from .steps import SampleTiming, StepDecision
 
 MAX_DELAY_NS = 60_000_000_000
-"""Longest credible delay, in ns, between sampling and arrival. If the estimated sampling time is
-older, the estimate is discarded and the arrival is the stamp."""
+"""Longest credible delay, in ns, between the sampling of a sample and its arrival. If the estimated
+time of sampling is further before the arrival, the arrival time is the stamp of the sample."""
 RESTART_US = 1_000_000
-"""Step back of the device time, in µs, that shows that the hub restarted. If the step is smaller,
-the sample is out of order."""
+"""Smallest step back of the device time, in µs, that is taken for a restart of the hub. If the
+device time of a sample is earlier by less, the sample has only come out of order."""
 MIN_STILL_NS = 200_000_000
-"""Time, in ns, after which a device time that does not change shows that the hub's clock stands
-still."""
+"""Time, in ns, for which the device times of samples must stay the same before the hub's clock
+counts as standing still. `MIN_STILL_READS` must be reached, too."""
 MIN_STILL_READS = 3
-"""Number of reads without a change of the device time after which the hub's clock stands still. Two
-reads may give frames of the same sample."""
+"""Number of successive reads with an unchanged device time before the hub's clock counts as
+standing still. It is more than one, because two reads may give two frames of one sample."""
 MAX_STEPS = 3
-"""Number of steps of a hub's clock within `STEPS_NS` after which the clock is not used."""
+"""Number of steps of a hub's clock within `STEPS_NS` at which its device times are no longer used;
+rows then have their arrival times as stamps."""
 STEPS_NS = 10_000_000_000
-"""Time, in ns, in which the steps of a hub's clock are counted."""
+"""Length, in ns, of the time window in which the steps of a hub's clock are counted. Older steps do
+not count, so that the clock is used again."""
 MAX_BAD_ANSWERS = 3
-"""Number of successive answers to TIME that contradict the samples, after which it is reported."""
+"""Number of successive answers to the request TIME (for the hub's time) that contradict the device
+times of its samples before this is reported as a problem."""
 CLOCK_SET = "the hub's clock was set: stamps follow its new time"
 CLOCK_STANDS_STILL = "the hub's clock stands still: rows are stamped by their arrival"
 CLOCK_KEEPS_JUMPING = (
@@ -38,21 +42,26 @@ CLOCK_KEEPS_JUMPING = (
     "rows are stamped by their arrival"
 )
 BAD_ANSWERS = "the hub's answers to TIME contradict its samples: they are not used"
-_NEVER = -(2**80)  # Before every time: device times are 64 bits of µs, here in ns.
+# This time, in ns, is earlier than every device time, which has 64 bits in µs.
+_NEVER = -(2**80)
 
 
 class HubClock:
-    """Converts the device times of one hub, in bounded memory and constant time per sample.
+    """Converts the device times of one hub to host times (stamps).
+
+    It needs bounded memory and constant time per sample.
 
     Attributes:
-        resets: Number of times the line was restarted or the hub's clock was set.
-        in_doubt: Whether the stamps of the last update may be wrong, because the hub's clock may
+        resets: Number of times that the line was restarted (for example with the hub) or the hub's
+            clock was set.
+        in_doubt: Whether the stamps of the last `update` may be wrong, because the hub's clock may
             have been set or cannot be used.
-        problems: Texts to report.
+        problems: Texts of problems, which the caller reports and removes.
     """
 
-    # Device times count from _first_us and arrivals from _first_ns, in ns, because a float rounds
-    # absolute times to 256 ns. When a clock was set, its origin moves by the step.
+    # Inside, device times are in ns since _first_us, and arrival times in ns since _first_ns,
+    # because a float would round absolute times to 256 ns. When one of the clocks was set, its
+    # origin (_first_us or _first_ns) is moved by the step, so that the line still holds.
 
     def __init__(self) -> None:
         self.resets = 0
@@ -60,29 +69,33 @@ class HubClock:
         self.problems: set[str] = set()
         self._line = ClockLine()
         self._timing = SampleTiming()
-        self._last_us = -1  # device time of the last read
-        self._moved_ns = 0
-        self._n_still = 0
+        self._last_us = -1  # newest device time, in µs, in the last read
+        self._moved_ns = 0  # arrival time at which _last_us changed last
+        self._n_still = 0  # number of reads since then
         self._steps_ns: deque[int] = deque(maxlen=MAX_STEPS)
         self._n_bad_answers = 0
         self._last_arrival = _NEVER
         self._last_stamp = _NEVER
-        self._doubtful_stamp = _NEVER  # the last stamp in doubt before the latest step
+        # Last stamp before the latest step of the hub's clock was confirmed; it may be too late.
+        self._doubtful_stamp = _NEVER
         self._restart()
 
     @property
     def drift_ppm(self) -> float:
-        """Drift, positive if host time runs faster than the hub's; 0 until it is known."""
+        """Drift of the hub's clock, in parts per million; 0 until it is estimated.
+
+        It is positive if host time runs faster than device time.
+        """
         return 1e6 * self._line.drift
 
     @property
     def jitter_ns(self) -> float:
-        """Mean delay beyond the smallest delay, over about the last 64 reads."""
+        """Mean delay of samples above the smallest delay, in ns, over about the last 64 reads."""
         return self._line.jitter_ns
 
     @property
     def offset_ns(self) -> int:
-        """Host time minus device time at the newest sample; 0 before the first."""
+        """Host time minus device time at the newest sample, in ns; 0 before the first sample."""
         if self._is_fresh:
             return 0
         at_first = self._first_ns - 1000 * self._first_us
@@ -90,24 +103,31 @@ class HubClock:
 
     @property
     def delay_ns(self) -> float:
-        """Smallest delay of samples, from round trips; 0 without them."""
+        """Smallest delay between sampling and arrival, in ns; 0 without round trips.
+
+        It is estimated from round trips: questions for the hub's time and their answers.
+        """
         return self._line.offset - self._line.bounded_offset
 
     @property
     def bound_ns(self) -> float | None:
-        """Largest error of stamps that are not in doubt; None without round trips."""
+        """Bound of the error of stamps that are not in doubt, in ns; None without round trips."""
         return self._line.error_bound
 
     def reset(self) -> None:
-        """Restart the line, because the hub restarted.
+        """Restart the line from device time to host time, because the hub restarted.
 
-        The drift is kept as a first guess, and stamps still do not go back.
+        The drift is kept as a first guess. Stamps still do not go back.
         """
         self._count_reset()
         self._restart()
 
     def shift(self, step_ns: int) -> None:
-        """Continue in the new time after the host's clock was set by `step_ns`."""
+        """Move all stored host times by the step by which the host's clock was set.
+
+        Args:
+            step_ns: New time minus old time of the host's clock, in ns.
+        """
         self._first_ns += step_ns
         self._moved_ns += step_ns
         self._steps_ns = deque((at + step_ns for at in self._steps_ns), MAX_STEPS)
@@ -118,12 +138,15 @@ class HubClock:
             self._doubtful_stamp += step_ns
 
     def add_answer(self, sent_ns: int, device_us: int, arrival_ns: int) -> None:
-        """Bound the offset by a round trip during which the host's clock was not set.
+        """Bound the offset (host time minus device time) by one question and its answer.
+
+        The host's clock must not have been set between the two. Without samples, or while stamps
+        are in doubt, the answer is not used.
 
         Args:
-            sent_ns: Time at which the question was sent.
-            device_us: Device time of the answer.
-            arrival_ns: Arrival of the answer.
+            sent_ns: Host time at which the hub was asked for its time, in ns.
+            device_us: Device time in the answer, in µs.
+            arrival_ns: Host time at which the answer arrived, in ns.
         """
         if self._is_fresh or self.in_doubt or not sent_ns <= arrival_ns:
             return
@@ -143,19 +166,19 @@ class HubClock:
         arrival_ns: int,
         numbers: Sequence[int] = (),
     ) -> list[int]:
-        """Learn from samples that arrived together, and convert their device times.
+        """Fit the line to samples that arrived together, and convert their device times.
 
-        Along device time stamps never go back, unless the host's clock does, and none is later than
-        its arrival.
+        Stamps never decrease with increasing device time, unless the host's clock was set back. No
+        stamp is later than the arrival.
 
         Args:
             device_us: Device times of the samples, in µs.
-            arrival_ns: Arrival of the samples.
-            numbers: Numbers of the samples. Without them a step of the hub's clock is found later,
-                and small steps back are not found.
+            arrival_ns: Host time at which the samples arrived, in ns.
+            numbers: Numbers of the samples. Without numbers, a step of the hub's clock is found
+                later, and small steps back are not found.
 
         Returns:
-            Host time of each sample, in ns.
+            Stamp (host time) of each sample, in ns.
         """
         self.in_doubt = False
         stamps: list[int] = []
@@ -164,7 +187,7 @@ class HubClock:
             step_us = self._timing.find_step(number, device_us[k])
             if not step_us:
                 continue
-            # The samples before a step are converted by the clock before it.
+            # Samples before a step of the hub's clock are converted by the line before the step.
             if k > start:
                 stamps += self._convert(device_us[start:k], arrival_ns)
                 start = k
@@ -175,27 +198,36 @@ class HubClock:
 
     @property
     def _is_fresh(self) -> bool:
-        """Whether there was no sample since the restart."""
+        """Whether there was no sample since the start or the last restart."""
         return self._newest == _NEVER
 
     def _restart(self) -> None:
-        """Forget all samples but the drift and the last stamp."""
+        """Discard all that was learned from samples, except for the drift and the last stamp."""
         self._first_us = self._first_ns = 0
-        self._newest = _NEVER  # device time of the newest sample
+        self._newest = _NEVER  # device time of the newest sample, in ns since _first_us
         self._line.restart()
         self._timing.restart()
         self._decision: StepDecision | None = None
 
     def _count_reset(self) -> None:
-        """Count a restart of the line or a step of the hub's clock."""
+        """Count a restart of the line or a step of the hub's clock, and note when it happened."""
         self.resets += 1
         self._steps_ns.append(self._last_arrival)
 
     def _convert(self, times: Sequence[int], arrival_ns: int) -> list[int]:
-        """Learn from the newest of some samples and convert the device times of all."""
+        """Fit the line to the newest of some samples, and convert the device times of all.
+
+        Args:
+            times: Device times of samples that arrived together, in µs.
+            arrival_ns: Host time at which they arrived, in ns.
+
+        Returns:
+            Stamp (host time) of each sample, in ns.
+        """
         if not times:
             return []
-        # Of samples that arrive together the newest waited least; only it can touch the line.
+        # Of samples that arrive together the newest one has the smallest delay. Only the smallest
+        # delays determine the line, so the others need not be added to it.
         is_usable = self._learn(max(times), arrival_ns)
         offset, drift = self._line.bounded_offset, self._line.drift
         stamps = []
@@ -204,7 +236,8 @@ class HubClock:
             stamp = self._first_ns + device_ns + round(offset + drift * device_ns)
             if not is_usable or not 0 <= arrival_ns - stamp <= MAX_DELAY_NS:
                 stamp = arrival_ns
-            # Along device time stamps do not go back, not even behind those that were in doubt.
+            # Stamps must not decrease with increasing device time. A sample with an older device
+            # time, which came late, must not have a later stamp than the newest one.
             if device_ns <= self._newest and is_usable:
                 stamp = min(stamp, self._last_stamp)
             else:
@@ -217,11 +250,20 @@ class HubClock:
         return stamps
 
     def _learn(self, newest_us: int, arrival_ns: int) -> bool:
-        """Learn from the newest of some samples; return whether the hub's clock can be used."""
+        """Fit the line to the newest of some samples, and look for steps of the hub's clock.
+
+        Args:
+            newest_us: Device time of the newest sample, in µs.
+            arrival_ns: Host time at which it arrived, in ns.
+
+        Returns:
+            Whether device times of this hub can be converted now.
+        """
         goes_back = arrival_ns < self._last_arrival
         self._last_arrival = arrival_ns
         if goes_back:
-            # Only a clock of the host that was set unnoticed, or a simulated time, does that.
+            # The arrival time went back although no step of the host's clock was reported: either
+            # the step was missed, or the host time is a simulated time that was restarted.
             self._last_stamp = _NEVER
             self.reset()
 
@@ -239,7 +281,8 @@ class HubClock:
             self._first_us, self._first_ns = newest_us, arrival_ns
             device_ns = 0
 
-        # While it is open whether the clock was set, the delays of samples are unknown.
+        # Until it is decided whether the hub's clock was set, the delay of a sample is unknown, so
+        # the line is not fitted to it.
         arrival = arrival_ns - self._first_ns
         if self._decision is None and self._line.add(device_ns, arrival):
             self.problems.add(CLOCK_SET)
@@ -249,14 +292,20 @@ class HubClock:
         return not problem
 
     def _find_problem(self, device_us: int, arrival_ns: int) -> str:
-        """Return why the hub's clock cannot be used now; empty if it can."""
+        """Return the text of the problem if device times cannot be converted now; else empty.
+
+        Args:
+            device_us: Device time of the newest sample, in µs.
+            arrival_ns: Host time at which it arrived, in ns.
+        """
         if device_us == self._last_us:
             self._n_still += 1
             if self._stands_still(arrival_ns):
                 return CLOCK_STANDS_STILL
         else:
             if self._n_still and self._stands_still(arrival_ns):
-                self.reset()  # It is unknown how long the clock stood still.
+                # The clock runs again, but it is unknown for how long it stood still.
+                self.reset()
             self._last_us, self._moved_ns, self._n_still = device_us, arrival_ns, 0
         steps_ns = self._steps_ns
         if steps_ns and arrival_ns - steps_ns[0] > STEPS_NS:
@@ -264,12 +313,19 @@ class HubClock:
         return CLOCK_KEEPS_JUMPING if len(steps_ns) == MAX_STEPS else ""
 
     def _stands_still(self, arrival_ns: int) -> bool:
-        """Return whether the device time has not changed for too long."""
+        """Return whether the device time has not changed for `MIN_STILL_NS` and enough reads."""
         still_ns = arrival_ns - self._moved_ns
         return self._n_still >= MIN_STILL_READS and still_ns > MIN_STILL_NS
 
     def _begin_decision(self, step_us: int, arrival_ns: int) -> None:
-        """Begin to decide whether the hub's clock was set, or add a step to the decision."""
+        """Begin to decide whether the hub's clock was set, or the hub sampled late or early.
+
+        If a decision is pending, the step is added to its step.
+
+        Args:
+            step_us: Deviation of the device time from the sample period, in µs.
+            arrival_ns: Host time at which the sample after the step arrived, in ns.
+        """
         newest_ns = self._newest
         before_ns = self._last_arrival - self._first_ns
         since_ns = arrival_ns - self._first_ns
@@ -279,7 +335,8 @@ class HubClock:
             before_ns = self._decision.before_ns
             since_ns = self._decision.since_ns
         if not step_us:
-            self._decision = None  # The second step has undone the first.
+            # This step has undone the one before, so there is nothing left to decide.
+            self._decision = None
             return
         self._decision = StepDecision(
             step_us=step_us,
@@ -290,7 +347,13 @@ class HubClock:
         )
 
     def _decide(self, decision: StepDecision, newest_us: int, arrival_ns: int) -> None:
-        """Decide whether the hub's clock was set, if that can be done now."""
+        """Decide whether the hub's clock was set, if the samples so far are sufficient.
+
+        Args:
+            decision: The pending decision.
+            newest_us: Device time of the newest sample, in µs.
+            arrival_ns: Host time at which it arrived, in ns.
+        """
         device_ns = 1000 * (newest_us - self._first_us)
         arrival = arrival_ns - self._first_ns
         delay = self._line.height(device_ns, arrival)
@@ -301,7 +364,8 @@ class HubClock:
         if not was_set:
             self._timing.forget_period()
             return
-        # Device times without the step continue as before, and so does all that was learned.
+        # The origin of device times is moved by the step, so that device times relative to it
+        # continue as before the step, and the line and its points stay valid.
         self._first_us += decision.step_us
         self._newest = min(self._newest, decision.newest_ns)
         self._doubtful_stamp = self._last_stamp

@@ -1,19 +1,20 @@
-"""The straight line from one hub's clock to the host's, bounded by round trips.
+"""The straight line from the device time of one hub to host time, bounded by round trips.
 
     arrival = device time + offset + drift * device time + delay
 
-The delay of a sample (buffers, USB polling, the scheduler) is never negative, so the line that
-touches the points (device time, arrival) from below is the clock, and the height of a point above
-it is its delay. Only the earliest point of each second is kept. The line is the edge of the lower
-convex hull of these points over their mean device time: of all lines below the points it has the
-smallest mean distance to them (Moon, Skelly, Towsley, "Estimation and removal of clock skew from
-network delay measurements", INFOCOM 1999).
+Each sample is a point (device time, arrival). Its delay (buffers, USB polling, the scheduler) is
+never negative, so the line that touches the points from below gives host time over device time, and
+the height of a point above the line is its delay. Only the point of each second with the smallest
+delay is kept. The line is the edge of the lower convex hull of these points at their mean device
+time: of all lines below the points it has the smallest mean distance to them (Moon, Skelly,
+Towsley, "Estimation and removal of clock skew from network delay measurements", INFOCOM 1999).
 
-Arrivals alone cannot separate the smallest delay from the offset. A question and its answer can,
-because the hub read its clock between them: each round trip bounds the offset from both sides (F.
-Cristian, "Probabilistic clock synchronization", Distributed Computing 3, 1989). All bounds hold at
-once. The centre between the highest lower bound and the lowest upper bound is right if the line is
-as slow in both directions, and never wrong by more than half their distance.
+Arrival times alone cannot separate the smallest delay from the offset. A round trip, that is a
+question for the hub's time and its answer, can, because the hub reads its clock between the two:
+each round trip bounds the offset from both sides (F. Cristian, "Probabilistic clock
+synchronization", Distributed Computing 3, 1989). All bounds hold at once. The centre between the
+highest lower bound and the lowest upper bound is exact if both directions of the link have the same
+delay, and is never wrong by more than half the distance of these bounds.
 """
 
 from __future__ import annotations
@@ -24,43 +25,50 @@ from itertools import pairwise
 from typing import NamedTuple
 
 BUCKET_NS = 1_000_000_000
-"""Length, in ns, of the intervals (buckets) of each of which the earliest point is kept."""
+"""Length, in ns, of the intervals of time (buckets) of which only one sample each is kept: that
+with the smallest delay."""
 MAX_BUCKETS = 120
-"""Number of buckets whose earliest point is kept; together they are two minutes."""
+"""Number of buckets (intervals of 1 s) to whose samples of smallest delay the line is fitted;
+together they are two minutes."""
 MIN_BUCKETS_FOR_DRIFT = 5
-"""Number of buckets before the drift is estimated. Over a shorter time, a change of the delay
-cannot be distinguished from drift."""
+"""Number of buckets (intervals of 1 s) that must be complete before the drift between hub and host
+clock is estimated. In a shorter time, a change of the delay would look like drift."""
 UNKNOWN_DRIFT = 1e-4
-"""Bound of the relative drift of a hub's clock before it is estimated. Crystals are better than
-that."""
+"""Largest assumed error of the relative drift between hub and host clock while the drift is not
+estimated yet. Quartz crystals deviate by less than 100 parts per million."""
 MAX_DRIFT = 1e-3
-"""Largest credible relative drift between two clocks. A steeper line comes from a pause of the
-host."""
+"""Largest credible relative drift between hub and host clock, to which the slope of the line is
+limited. A larger slope arises when the host pauses and reads many samples late."""
 MAX_RISE_NS = 20e6
-"""Height above the line, in ns. If all points of a bucket are higher, a clock was set. USB adapters
-delay samples by up to 16 ms without that."""
+"""Largest delay above the smallest one, in ns, that samples have without a set clock; USB adapters
+delay them by up to 16 ms. If all samples of `MIN_BUCKETS_HIGH` seconds exceed it, or the line falls
+by more at once, a clock was set."""
 MAX_FALL_NS = 4e6
-"""Depth below the line, in ns. A point that is deeper shows that a clock was set, because no delay
-is negative. Steps of 5 ms are found, with 1 ms for the error of the line itself."""
+"""Largest sum of the distances, in ns, by which samples lower the line in one bucket (1 s) without
+a set clock. Delays are never negative, so a larger sum shows that a clock was set. Steps of 5 ms
+are found, with 1 ms for the error of the line itself."""
 MIN_BUCKETS_HIGH = 2
-"""Number of successive buckets above `MAX_RISE_NS` that show that a clock was set. A single one may
-come from a pause of the host."""
+"""Number of successive buckets (intervals of 1 s) in which every sample must be delayed by more
+than `MAX_RISE_NS` to show that a clock was set. One alone may come from a pause of the host."""
 JITTER_POINTS = 64
-"""Number of points over which the jitter, the mean height above the line, is averaged."""
+"""Number of points over which the jitter (mean height of the points above the line, that is mean
+delay above the smallest one) is averaged."""
 MAX_ROUND_TRIPS = 64
-"""Number of round trips that are kept. With one per second they cover about one minute."""
+"""Number of newest round trips (questions for the hub's time and their answers) that are kept. With
+one per second they cover about one minute."""
 MAX_COMMON_DELAY_NS = 1e9
-"""Longest credible delay, in ns, that all samples have and the answers to TIME do not have. An
-answer that requires a longer one contradicts the samples."""
+"""Longest credible delay, in ns, that all samples have but the answers to the request TIME (for the
+hub's time) do not have. An answer that implies a longer one contradicts the samples and is not
+used."""
 
 
 class ClockRoundTrip(NamedTuple):
-    """Bounds of the offset from one question for the hub's time.
+    """Bounds of the offset (host time minus device time) from one question for the hub's time.
 
     Attributes:
-        device_ns: Device time in the answer.
-        low_ns: Host time minus device time when the question was sent.
-        high_ns: Host time minus device time when the answer came.
+        device_ns: Device time in the answer, in ns since the first sample.
+        low_ns: Lower bound, in ns: host time of the question minus device time in the answer.
+        high_ns: Upper bound, in ns: host time of the answer minus device time in the answer.
     """
 
     device_ns: float
@@ -69,14 +77,17 @@ class ClockRoundTrip(NamedTuple):
 
 
 class ClockLine:
-    """The clock line of one hub, fitted in bounded memory and amortised constant time per point.
+    """Straight line below the points (device time, arrival time) of the samples of one hub.
 
-    All times are in ns since the first point.
+    It is fitted in bounded memory and, on average, constant time per point. All times are in ns
+    since the first point.
 
     Attributes:
-        drift: Slope of the line; positive if host time runs faster.
-        offset: Arrival minus device time of the line below all points, at device time 0.
-        bounded_offset: The same without the smallest delay, as far as round trips bound it.
+        drift: Relative drift, the slope of arrival minus device time over device time; positive if
+            host time runs faster.
+        offset: Arrival minus device time on the line at device time 0. It contains the smallest
+            delay.
+        bounded_offset: The same without the smallest delay, as far as round trips determine that.
         error_bound: Largest possible error of `bounded_offset`; None without round trips.
         jitter_ns: Mean height of the newest points above the line.
     """
@@ -87,7 +98,7 @@ class ClockLine:
         self.restart()
 
     def restart(self) -> None:
-        """Discard all points and round trips. The drift is kept as a first guess."""
+        """Discard all points and round trips; the drift is kept as a first guess."""
         self.offset = self.bounded_offset = 0.0
         self.error_bound: float | None = None
         self._bucket_end = BUCKET_NS
@@ -100,24 +111,31 @@ class ClockLine:
         self._n_high = 0
 
     def __len__(self) -> int:
-        """Return the number of points kept, one for each full bucket."""
+        """Return the number of kept points, one for each complete bucket (interval of 1 s)."""
         return len(self._points)
 
     @property
     def recent_min_height(self) -> float:
-        """Smallest height of a point in this and the previous bucket; 0 if there is no point."""
+        """Smallest height (delay), in ns, of a point in this and the previous bucket of 1 s.
+
+        It is 0 if there is no point.
+        """
         height = min(self._bucket_height, self._previous_height)
         return height if math.isfinite(height) else 0.0
 
     def height(self, device_ns: float, arrival_ns: float) -> float:
-        """Return the height of a point above the line, which is its delay."""
+        """Return the height, in ns, of a point above the line: its delay above the smallest one."""
         return arrival_ns - device_ns - self.offset - self.drift * device_ns
 
     def add(self, device_ns: float, arrival_ns: int) -> bool:
-        """Add a point: lower the line if the point is below it, and fit it after each bucket.
+        """Add a point. It lowers the line if it is below; after each bucket the line is fitted.
+
+        Args:
+            device_ns: Device time of the sample, in ns since the first point.
+            arrival_ns: Host time at which it arrived, in ns since the first point.
 
         Returns:
-            Whether the point shows that one of the clocks was set.
+            Whether the points show that the hub's or the host's clock was set.
         """
         height = self.height(device_ns, arrival_ns)
         was_set = False
@@ -133,7 +151,7 @@ class ClockLine:
         return was_set
 
     def add_round_trip(self, trip: ClockRoundTrip) -> bool:
-        """Bound the offset by a round trip.
+        """Bound the offset by a round trip: a question for the hub's time and its answer.
 
         Returns:
             Whether the answer is consistent with the samples; otherwise it is not used.
@@ -146,15 +164,24 @@ class ClockLine:
         return True
 
     def discard_round_trips_after(self, arrival_ns: float) -> None:
-        """Discard the round trips whose answer came after `arrival_ns`."""
+        """Discard the round trips whose answer arrived after this host time (ns since the first
+        point)."""
         trips = self._round_trips
         while trips and trips[-1].device_ns + trips[-1].high_ns > arrival_ns:
             trips.pop()
         self._intersect_bounds()
 
     def _lower(self, height: float) -> bool:
-        """Lower the line to a point at a negative height; return whether a clock was set."""
-        # In the first bucket the line falls because the smallest delay is not known yet.
+        """Lower the line to a point below it.
+
+        Args:
+            height: Height of the point above the line, in ns; negative.
+
+        Returns:
+            Whether this shows that the hub's or the host's clock was set.
+        """
+        # In the first bucket, the line falls until the smallest delay is known. This shows nothing
+        # about the clocks and is not added up.
         self._fall -= height if self._points else 0.0
         was_set = self._fall > MAX_FALL_NS or -height > MAX_RISE_NS
         if was_set:
@@ -166,10 +193,13 @@ class ClockLine:
         return was_set
 
     def _fit(self, arrival_ns: int) -> bool:
-        """Fit the line to the earliest points of all buckets, and begin the next bucket.
+        """Fit the line to the points of smallest delay of all buckets, and begin the next bucket.
+
+        Args:
+            arrival_ns: Host time, in ns since the first point, at which this bucket ends.
 
         Returns:
-            Whether a clock was set some buckets ago.
+            Whether the last `MIN_BUCKETS_HIGH` buckets show that a clock was set before them.
         """
         device_ns, delay = self._earliest
         height = delay - self.offset - self.drift * device_ns
@@ -184,7 +214,8 @@ class ClockLine:
         if len(points) >= MIN_BUCKETS_FOR_DRIFT:
             slope = _slope_at_centre(points)
             self.drift = min(max(slope, -MAX_DRIFT), MAX_DRIFT)
-        # The line must not lie above any point, not even where the slope was limited.
+        # The line must not lie above any point, because no delay is negative. With a limited slope
+        # it need not touch two points, so the offset is computed from all of them.
         self.offset = min(delay - self.drift * device_ns for device_ns, delay in points)
         self._bucket_end = arrival_ns + BUCKET_NS
         self._fall = 0.0
@@ -193,7 +224,10 @@ class ClockLine:
         return was_set
 
     def _drift_error(self) -> float:
-        """Return the largest error that the estimated drift may have."""
+        """Return the largest assumed error of the estimated relative drift.
+
+        It is the jitter divided by the time that the points cover, and at most `UNKNOWN_DRIFT`.
+        """
         if len(self._points) < MIN_BUCKETS_FOR_DRIFT:
             return UNKNOWN_DRIFT
         first, _ = self._points[0]
@@ -203,38 +237,52 @@ class ClockLine:
         return min(UNKNOWN_DRIFT, self.jitter_ns / (last - first))
 
     def _intersect_bounds(self) -> None:
-        """Find the offset within the bounds of all recent round trips, and its largest error."""
+        """Compute the offset from the bounds of all kept round trips, and its largest error.
+
+        Both are stored; without round trips the offset is infinite and the error None.
+        """
         self._trip_offset, self.error_bound = math.inf, None
         low, high = -math.inf, math.inf
         drift_error = self._drift_error()
         for trip in reversed(self._round_trips):
             drifted = self.drift * trip.device_ns
-            # The error of the drift widens the bounds of round trips that are long ago.
+            # The bounds of older round trips are widened by the error of the drift since then.
             age = abs(self._round_trips[-1].device_ns - trip.device_ns)
             tolerance = drift_error * age
             next_low = max(low, trip.low_ns - drifted - tolerance)
             next_high = min(high, trip.high_ns - drifted + tolerance)
             if next_low > next_high:
-                break  # A clock was set between the round trips: the earlier ones are invalid.
+                # Bounds that do not overlap show that a clock was set between the round trips, so
+                # this one and all older ones are not used.
+                break
             low, high = next_low, next_high
             self._trip_offset = (low + high) / 2
             self.error_bound = (high - low) / 2
         self._set_bounded_offset()
 
     def _set_bounded_offset(self) -> None:
-        """Use the offset of the round trips, unless a delay would then be negative."""
+        """Set `bounded_offset` to the offset from round trips, but not above the line.
+
+        Above the line, the delays of some samples would be negative.
+        """
         self.bounded_offset = min(self.offset, self._trip_offset)
 
 
 def _slope_at_centre(points: list[tuple[float, float]]) -> float:
-    """Return the slope of the lower convex hull at the mean x of at least two sorted points."""
+    """Return the slope of the lower convex hull of points at their mean x.
+
+    Args:
+        points: At least two points (x, y), sorted by x.
+    """
     hull: list[tuple[float, float]] = []
     for x, y in points:
         while len(hull) > 1:
             (x0, y0), (x1, y1) = hull[-2:]
             turns_left = (x1 - x0) * (y - y0) > (x - x0) * (y1 - y0)
             if turns_left:
-                break  # The last point lies below the line to the new one.
+                # The last hull point lies below the straight line from the one before to the new
+                # point, so it remains on the hull.
+                break
             hull.pop()
         hull.append((x, y))
     centre = sum(x for x, _ in points) / len(points)

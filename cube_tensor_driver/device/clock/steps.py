@@ -1,9 +1,10 @@
 """Detection of steps of the host's clock and of a hub's clock.
 
 The host's clock is compared with the monotonic clock, which is never set. A hub numbers its samples
-and takes one in each period, so its device times follow the numbers. Where they do not, either the
-hub's clock was set, or the hub sampled late or early. The delays of the next samples distinguish
-the two: in the first case they differ from those before by the step, in the second they do not.
+and takes one in each sample period, so its device times grow by one period with each number. If a
+device time deviates from this, either the hub's clock was set, or the hub sampled late or early.
+The delays (arrival minus device time) of the next samples distinguish the two: they change by the
+step if the clock was set, and stay the same if the hub sampled late or early.
 """
 
 from __future__ import annotations
@@ -15,41 +16,47 @@ from collections.abc import Callable
 from ..scans.sequence import MAX_DISORDER, MAX_GAP
 
 MIN_STEP_US = 4000.0
-"""Smallest deviation of a device time from the sample period, in µs, that counts as a step of the
-hub's clock. Steps of 5 ms are found, with 1 ms for the jitter of the hub."""
+"""Deviation of a sample's device time from the one expected from its number and the sample period,
+in µs, above which a step of the hub's clock is suspected. Steps of 5 ms are found, with 1 ms for
+the jitter of the hub."""
 PERIOD_TOLERANCE = 1e-3
-"""Relative error of the estimated sample period. Over a gap of lost samples, `MIN_STEP_US` is
-increased by this part of the gap."""
+"""Largest assumed relative error of the estimated sample period. After lost samples, the threshold
+`MIN_STEP_US` is increased by this fraction of the time between the received samples."""
 PERIOD_SAMPLES = 64
-"""Number of samples over which the sample period of a hub is averaged."""
+"""Time constant, in samples, of the low-pass filter that estimates the sample period of a hub."""
 DECISION_NS = 200_000_000
-"""Time after a step, in ns, in which only samples decide whose delay leaves no doubt. After it, the
-smallest delay decides whether the clock was set."""
+"""Time after a suspected step of the hub's clock, in ns, in which a decision is made only if the
+delay of a sample is possible with just one explanation. After this time, the smallest delay since
+the step decides whether the clock was set or the hub sampled late."""
 MAX_DECISION_NS = 1_000_000_000
-"""Longest time after a step, in ns, without a decision, while the smallest delay fits both
-explanations equally well."""
+"""Time after a suspected step of the hub's clock, in ns, at which it is decided in any case. Before
+it, no decision is made if the smallest delay lies about midway between the values expected for a
+set clock and for a late sample."""
 MIN_DECISION_READS = 8
-"""Number of reads after a step before the smallest delay decides, because one sample may wait
-long."""
+"""Number of reads after a suspected step of the hub's clock before the smallest delay decides. The
+samples of a few reads may all be delayed."""
 UNLIKELY_DELAY = 8.0
-"""Ratio of a delay to the mean delay above which hardly any sample waits."""
+"""Ratio of a delay to the mean delay (both above the smallest delay) that hardly any sample
+exceeds. A step larger than this cannot be mistaken for a delayed sample."""
 MIN_HOST_STEP_NS = 1_000_000
-"""Smallest step of the host's clock, in ns, that is detected. Reading it and the monotonic clock
-one after the other takes time."""
+"""Smallest step of the host's clock, in ns, that is detected. The host's and the monotonic clock
+are read one after the other, so that smaller differences of the two are not certain."""
 MAX_READ_NS = 100_000
-"""Longest time, in ns, that reading both clocks of the host may take for a valid comparison."""
+"""Longest time, in ns, that reading the host's clock and the monotonic clock may take. After a
+longer time their difference is not used, because the thread was interrupted between them."""
 MAX_READS = 3
-"""Number of attempts to read both clocks of the host within `MAX_READ_NS`."""
+"""Number of attempts to read the host's clock and the monotonic clock within `MAX_READ_NS`. If all
+of them fail, no step is reported."""
 _WRAP = 1 << 32
-_NO_NUMBER = -2  # With -1, number 0 would be the next one.
+_NO_NUMBER = -2  # not -1, because sample number 0 would then seem to follow it
 
 
 class HostClockWatch:
-    """Detects steps of the host's clock.
+    """Detects steps of the host's clock by comparing it with the monotonic clock.
 
     Args:
-        clock_ns: The clock that is watched.
-        steady_ns: A clock that is never set.
+        clock_ns: Clock that is checked, in ns.
+        steady_ns: Clock that is never set, in ns.
     """
 
     def __init__(
@@ -61,14 +68,21 @@ class HostClockWatch:
         self._offset: int | None = None
 
     def look(self) -> tuple[int, int]:
-        """Return the host's time, and by how much it was set since the last call, both in ns."""
+        """Read the host's clock and compare it with the monotonic clock.
+
+        Returns:
+            Time of the host's clock, and the step by which it was set since the last call (0 if it
+            was not set), both in ns.
+        """
         for _ in range(MAX_READS):
             before = self._steady_ns()
             now = self._clock_ns()
             if self._steady_ns() - before < MAX_READ_NS:
                 break
         else:
-            return now, 0  # The thread was interrupted each time, so nothing can be compared.
+            # The thread was interrupted between the two clocks in every attempt, so they cannot be
+            # compared now; the next call finds the step.
+            return now, 0
         offset = now - before
         step = 0 if self._offset is None else offset - self._offset
         if self._offset is not None and abs(step) < MIN_HOST_STEP_NS:
@@ -78,27 +92,37 @@ class HostClockWatch:
 
 
 class SampleTiming:
-    """Compares the device times of one hub's samples with their numbers."""
+    """Finds samples of one hub whose device times deviate from number times sample period."""
 
     def __init__(self) -> None:
         self.restart()
 
     def restart(self) -> None:
-        """Forget all samples, because the hub restarted."""
+        """Discard the sample period and the last sample, because the hub restarted."""
         self._number = self._reference = _NO_NUMBER
         self._reference_us = 0
         self._period_us = 0.0
 
     def forget_period(self) -> None:
-        """Discard the estimated sample period; the next sample gives a new one."""
+        """Discard the estimated sample period; the next sample gives a new estimate."""
         self._period_us = 0.0
 
     def find_step(self, number: int, device_us: int) -> int:
-        """Return the deviation of a sample from the period, in µs; 0 if there is no step."""
+        """Compare the device time of a sample with the time expected from its number.
+
+        Args:
+            number: Number of the sample, 32 bits, which wraps to 0.
+            device_us: Device time of the sample, in µs.
+
+        Returns:
+            Device time minus expected device time, in µs, if the difference is large enough for a
+            step of the hub's clock; else 0.
+        """
         if number != self._number + 1 and not self._is_ahead(number, device_us):
             return 0
         self._number = number
-        # The reference is the newest sample before this one whose device time had changed.
+        # The expected time is counted from a reference: the newest earlier sample whose device time
+        # differed from that of the sample before it.
         n_periods = (number - self._reference) % _WRAP
         interval = device_us - self._reference_us
         period = self._period_us
@@ -109,29 +133,36 @@ class SampleTiming:
         elif abs(error) > MIN_STEP_US + PERIOD_TOLERANCE * n_periods * period:
             is_step = True
         else:
-            # Bounded, because a clock that stands still must not pass for a shorter period.
+            # The change of the period is limited, because otherwise a clock that stands still would
+            # look like a shorter and shorter period.
             bound = period / PERIOD_SAMPLES
             if error > bound:
                 error = bound
             elif error < -bound:
                 error = -bound
             self._period_us = period + error / PERIOD_SAMPLES
-        # While the clock stands still, the deviation adds up from the last sample before.
+        # While the hub's clock stands still, the reference stays, so that the deviation grows until
+        # it counts as a step.
         if interval or is_step or period <= 0.0:
             self._reference, self._reference_us = number, device_us
         return round(error) if is_step else 0
 
     def _is_ahead(self, number: int, device_us: int) -> bool:
-        """Return whether a number follows the newest one, with a credible gap.
+        """Return whether a number is ahead of the newest one, by at most `MAX_GAP`.
 
-        A number that neither does nor belongs to a late sample comes from a hub that restarted:
-        then all samples before are forgotten.
+        A number that is neither ahead nor that of a late sample comes from a hub that restarted.
+        Then all earlier samples are discarded and this sample becomes the first.
+
+        Args:
+            number: Number of the sample, 32 bits, which wraps to 0.
+            device_us: Device time of the sample, in µs.
         """
         advance = (number - self._number + _WRAP // 2) % _WRAP - _WRAP // 2
         is_known = self._number != _NO_NUMBER
         if is_known and 0 < advance <= MAX_GAP:
             return True
-        # The newest sample may have another frame.
+        # A number equal to the newest one (advance 0) belongs to a further frame of that sample,
+        # because a hub with many cubes needs several frames for a sample.
         is_late = is_known and -MAX_DISORDER <= advance <= 0
         if not is_late:
             self.restart()
@@ -143,14 +174,20 @@ class SampleTiming:
 class StepDecision:
     """Decides whether a hub's clock was set or the hub sampled late, from the delays that follow.
 
-    If the hub sampled late or early, samples wait as long as before. If its clock was set, their
-    delay seems to be shorter by the step.
+    If the hub sampled late or early, the delays (arrival minus device time) of the next samples are
+    as before. If its clock was set, they seem to be shorter by the step. All times but `step_us`
+    are in ns, relative to the origins of the hub's clock line.
 
-    Attributes:
-        step_us: Step of the device times against the numbers of the samples, in µs.
+    Args:
+        step_us: Device time of the first sample after the step minus the device time expected from
+            its number, in µs.
         newest_ns: Device time of the newest sample before the step.
         before_ns: Arrival of the newest sample before the step.
         since_ns: Arrival of the first sample after the step.
+        usual_delay_ns: Smallest delay of the samples just before the step, above the clock line.
+
+    Attributes:
+        step_us, newest_ns, before_ns, since_ns: The arguments of the same names.
     """
 
     def __init__(
@@ -177,32 +214,36 @@ class StepDecision:
         arrival_ns: int,
         mean_delay_ns: float,
     ) -> bool | None:
-        """Decide after one more sample.
+        """Decide whether the hub's clock was set, after one more sample.
 
         Args:
-            device_ns: Device time of the sample.
-            delay_ns: Delay of the sample, computed as if the clock had not been set.
-            arrival_ns: Arrival of the sample.
-            mean_delay_ns: Mean delay of many samples.
+            device_ns: Device time of the sample, in ns.
+            delay_ns: Delay of the sample, in ns, computed as if the clock had not been set.
+            arrival_ns: Host time at which the sample arrived, in ns.
+            mean_delay_ns: Mean delay of many samples above the smallest one, in ns.
 
         Returns:
             Whether the clock was set; None if more samples are needed.
         """
         step_ns = 1000 * self.step_us
         if step_ns < 0 and device_ns < self.newest_ns:
-            return True  # A clock does not go back by itself.
+            # Device times never decrease unless the hub's clock is set back.
+            return True
         self._n_reads += 1
         self._min_delay_ns = min(self._min_delay_ns, delay_ns)
-        # A shift is 0 if the sample waited as before, and 1 if the clock was set. Before a step
-        # forward, the shortest possible delay counts, because the next sample may wait less.
+        # The shift is the change of the delay in units of the step: 0 if the hub sampled late or
+        # early, 1 if its clock was set. After a step forward, the delay is compared with 0, the
+        # smallest possible one, because the next sample may have a smaller delay than the usual.
         reference_ns = self._usual_delay_ns if step_ns < 0 else 0.0
         shift = (reference_ns - delay_ns) / step_ns
         max_shift = (reference_ns - self._min_delay_ns) / step_ns
         if (step_ns > 0) == (max_shift > 0.5):
-            return step_ns > 0  # With the other explanation, the delay would be negative.
+            # With the other explanation, the delay of a sample would be negative.
+            return step_ns > 0
 
         if abs(step_ns) > UNLIKELY_DELAY * mean_delay_ns:
-            # With the other explanation, the delay would equal the step by chance.
+            # Hardly any delay is as long as the step. If the shift is near 0 or 1, the other
+            # explanation would need such a delay.
             if abs(shift) < 0.25:
                 return False
             if abs(shift - 1) < 0.25:

@@ -32,7 +32,7 @@ ASK_TIME_S = 0.983
 so that the requests fall on all phases of the sample period in turn."""
 REOPEN_S = 5.0
 """Time without a received byte, in s, after which a link is closed and opened again. A working hub
-sends at least HELLO every second, so its port no longer leads to it."""
+sends HELLO every second, so after this time the open port leads to no working hub."""
 CHECK_PORT_S = 0.25
 """Period, in s, at which a link whose port is not open checks whether the device file of the port
 has appeared or changed."""
