@@ -1,4 +1,4 @@
-"""Many bags reprocessed into a folder: in processes here, or on a Dask cluster."""
+"""Reprocessing of many bags into one folder, in parallel processes or on a Dask cluster."""
 
 from __future__ import annotations
 
@@ -23,10 +23,11 @@ SUFFIXES = {
     "csv": ".csv",
     "zarr": ".zarr",
 }
-"""Suffix of the output, by its format."""
+"""Suffix of a reprocessed result for each output format."""
 
 RECIPE = "reprocess.yaml"
-"""File in the folder of the results that states how they were made."""
+"""Name of the file in the folder of the results that states their format, calibrations, tare and
+settings of contacts."""
 
 
 def make_jobs(
@@ -36,19 +37,19 @@ def make_jobs(
     overrides: Overrides,
     contacts: ContactsOverTime | None = None,
 ) -> list[ReprocessJob]:
-    """Make one job per bag; its result has the name of the bag.
+    """Return one job per bag, whose result has the name of the bag and the suffix of the format.
 
     Args:
-        bags: The bags.
+        bags: Folders or files of the bags.
         folder: Folder of the results.
         form: Format of the results, a key of `SUFFIXES`.
-        overrides: What differs from the recordings.
-        contacts: How contacts are computed; None: not at all.
+        overrides: Calibrations and tare that replace those of the recordings.
+        contacts: Settings with which contacts are computed; None: no contacts are computed.
 
     Raises:
-        BagError: Two bags have the same name.
+        BagError: Two bags have the same name, so that their results would be the same file.
     """
-    # Results stand side by side in one folder, whatever folders the bags come from.
+    # All results lie in one folder, so bags from different folders must have different names.
     names: dict[str, Path] = {}
     for bag in bags:
         path = bag.resolve()
@@ -70,12 +71,18 @@ def write_recipe(
     overrides: Overrides,
     contacts: ContactsOverTime | None = None,
 ) -> None:
-    """Create the folder and note how its results are made, so that a restart continues alike.
+    """Create the folder of the results and write into it how they are made (`RECIPE`).
 
-    Arguments are those of `make_jobs`.
+    With it, an interrupted run is only continued with the same options.
+
+    Args:
+        folder: Folder of the results.
+        form: Format of the results, a key of `SUFFIXES`.
+        overrides: Calibrations and tare that replace those of the recordings.
+        contacts: Settings with which contacts are computed; None: no contacts are computed.
 
     Raises:
-        BagError: Results in the folder were made another way, or it cannot be written.
+        BagError: The folder has results that were made with other options, or cannot be written.
     """
     cubes = overrides.skin.cubes if overrides.skin else ()
     recipe: dict[str, Any] = {
@@ -88,7 +95,8 @@ def write_recipe(
         settings = asdict(contacts.settings)
         recipe["contacts"] = {**settings, "rate": contacts.rate}
     path = folder / RECIPE
-    # A recipe without results is of a run that failed at once: it may be replaced.
+    # A recipe without results was left by a run that failed before its first result, so it may be
+    # replaced.
     if path.exists() and has_results(folder):
         if read_yaml(path) != recipe:
             raise BagError(
@@ -103,13 +111,13 @@ def write_recipe(
 
 
 def has_results(folder: Path) -> bool:
-    """Return whether a folder of results has any."""
+    """Return whether a folder contains at least one complete result."""
     names = {path.name for path in folder.iterdir()}
     return bool(names - {RECIPE, PARTIAL})
 
 
 def remove_without_results(folder: Path) -> None:
-    """Remove a folder in which no result was completed, with what was begun in it."""
+    """Remove a folder of results, with incomplete ones, if it contains no complete result."""
     if folder.is_dir() and not has_results(folder):
         shutil.rmtree(folder, ignore_errors=True)
 
@@ -118,7 +126,15 @@ def reprocess_all(
     jobs: Sequence[ReprocessJob],
     executor: Executor,
 ) -> Iterator[tuple[ReprocessJob, ReprocessResult | CubeError]]:
-    """Do jobs in parallel and yield each, as it ends, with its result or its error."""
+    """Reprocess bags in parallel.
+
+    Args:
+        jobs: One job per bag.
+        executor: Worker processes that do the jobs.
+
+    Yields:
+        Each job with its result or its error, in the order in which the jobs end.
+    """
     futures = {executor.submit(reprocess, job): job for job in jobs}
     for future in as_completed(futures):
         try:
@@ -129,20 +145,22 @@ def reprocess_all(
 
 @contextmanager
 def workers(count: int, scheduler: str | None = None) -> Iterator[Executor]:
-    """Provide worker processes.
+    """Provide worker processes for the duration of a `with` block.
 
     Args:
-        count: Number of processes on this machine.
-        scheduler: Address of a Dask cluster to use instead; None: this machine.
+        count: Number of processes on this machine; a Dask cluster has its own number.
+        scheduler: Address of the scheduler of a Dask cluster, such as tcp://host:8786; None: the
+            processes run on this machine.
 
     Raises:
-        ConfigError: There is no scheduler at the address.
-        ModuleNotFoundError: `distributed` is not installed.
+        ConfigError: No scheduler answers at the address within 5 s.
+        ModuleNotFoundError: The package `distributed`, which Dask requires, is not installed.
     """
     if scheduler is None:
-        # A process per core needs no threads beside it. The processes inherit it.
+        # With one process per core, further threads of numpy (OpenBLAS) would only compete for the
+        # cores. The worker processes inherit this environment variable.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-        # Spawned, not forked: numpy's threads do not survive a fork.
+        # The processes are spawned, not forked, because numpy's threads do not survive a fork.
         with ProcessPoolExecutor(count, multiprocessing.get_context("spawn")) as executor:
             yield executor
         return
@@ -159,6 +177,11 @@ def workers(count: int, scheduler: str | None = None) -> Iterator[Executor]:
 
 
 def useful_workers(wanted: int | None, jobs: int) -> int:
-    """Return the number of workers: as wanted (None: one per core), but at most one per job."""
+    """Return the number of worker processes to start.
+
+    Args:
+        wanted: Number that the user gave; None: one per core of this machine.
+        jobs: Number of jobs, which is the largest useful number of processes.
+    """
     cores = os.cpu_count() or 1
     return max(1, min(wanted or cores, jobs))

@@ -1,4 +1,4 @@
-"""Contacts and surface traction, computed while a bag is reprocessed and written with its stress."""
+"""Contacts and surface traction, computed and written while a bag is reprocessed."""
 
 from __future__ import annotations
 

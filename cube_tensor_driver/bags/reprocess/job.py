@@ -1,7 +1,7 @@
-"""Stress computed again from recorded frequencies: a bag source, a Reconstructor, a writer.
+"""Reprocessing of one bag: stress is computed again from its recorded frequencies.
 
-The result has the bits that the reconstruction node published, unless something is asked for that
-differs from the recording.
+The result is equal, bit by bit, to the stress that the reconstruction node published, unless other
+calibrations or another tare (measurement without load) are chosen.
 """
 
 from __future__ import annotations
@@ -37,13 +37,15 @@ if TYPE_CHECKING:
     from ..zarr_table import ZarrWriter
 
 PARTIAL = ".partial"
-"""Folder beside the results for results that are not complete. A restart begins those again."""
+"""Name of the folder, beside the results, in which incomplete results lie. After an interruption
+they are made again from the start."""
 
 WORKING_BYTES = 30 << 20
-"""Size, in bytes, of the block that is allocated and freed once before reprocessing.
+"""Size, in bytes, of a memory block that is allocated and freed once before reprocessing.
 
-The allocator of glibc keeps freed memory up to twice the size of the largest block freed so far;
-without this block it would return the arrays of every batch to the system.
+The allocator of glibc keeps freed memory up to twice the size of the largest block freed so far.
+Without this block it would return the arrays of every batch to the operating system, which takes
+time.
 """
 
 MAX_NAMED_CUBES = 5
@@ -52,12 +54,13 @@ MAX_NAMED_CUBES = 5
 
 @dataclass(frozen=True)
 class Overrides:
-    """What differs from the recording; None means as recorded.
+    """Calibrations and tare that replace those of a recording; None keeps the recorded ones.
 
     Attributes:
-        calibration: Calibration of all cubes.
-        skin: Skin whose calibrations are used, by the names of the cubes.
-        tare: Begin and end of a time when nothing touched the skin, in s after the bag's start.
+        calibration: Calibration that is used for every cube.
+        skin: Skin whose calibrations are used; its cubes are found by their names.
+        tare: Begin and end of a time without load, in s after the start of the bag. The mean
+            frequencies in it become the rest frequencies.
     """
 
     calibration: Calibration | None = None
@@ -66,13 +69,13 @@ class Overrides:
 
     @property
     def any(self) -> bool:
-        """Whether anything differs."""
+        """Whether anything replaces what was recorded."""
         values = (self.calibration, self.skin, self.tare)
         return any(value is not None for value in values)
 
 
 AS_RECORDED = Overrides()
-"""Overrides that change nothing: calibrations and tare are those of the recording."""
+"""Overrides that replace nothing, so that the recorded calibrations and tare are used."""
 
 
 @dataclass(frozen=True)
@@ -83,8 +86,9 @@ class ReprocessJob:
         bag: Folder or file of the bag.
         output: Folder or file to write.
         form: Format of the output: bag, parquet, csv or zarr.
-        overrides: What differs from the recording.
-        contacts: How contacts are computed, which a bag then has, too; None: it has none.
+        overrides: Calibrations and tare that replace those of the recording.
+        contacts: Settings with which contacts are computed and written into an output bag; None: no
+            contacts are computed.
     """
 
     bag: Path
@@ -95,12 +99,12 @@ class ReprocessJob:
 
 
 class ReprocessResult(NamedTuple):
-    """What a job made.
+    """Size of what one job has reprocessed.
 
     Attributes:
-        messages: Number of messages of stress.
-        rows: Number of rows of stress.
-        seconds: Duration of the bag, in s.
+        messages: Number of messages of stress that were computed.
+        rows: Number of rows of stress (samples of cubes).
+        seconds: Duration of the recording, in s.
     """
 
     messages: int
@@ -109,14 +113,15 @@ class ReprocessResult(NamedTuple):
 
 
 def reprocess(job: ReprocessJob) -> ReprocessResult:
-    """Do one job. The output appears when it is complete.
+    """Reprocess one bag. The output gets its final name only when it is complete.
 
     Raises:
-        BagError: The bag is damaged, the overrides do not fit, or the output cannot be written.
+        BagError: The bag is damaged, the overrides do not fit its cubes, or the output cannot be
+            written.
     """
-    # From here on the allocator keeps the arrays of a batch for the next one.
+    # Freeing this block makes the allocator keep the memory of one batch for the next.
     np.empty(WORKING_BYTES, np.uint8)
-    # In the same file system as the output, so that it can be renamed when it is complete.
+    # The incomplete output must lie in the same file system as the final one to be renamed.
     partial = job.output.parent / PARTIAL / job.output.name
     try:
         partial.parent.mkdir(parents=True, exist_ok=True)
@@ -127,7 +132,7 @@ def reprocess(job: ReprocessJob) -> ReprocessResult:
         with Bag(job.bag) as bag:
             result = _reprocess(bag, job, partial)
         partial.replace(job.output)
-        with suppress(OSError):  # the folder is in use where other jobs are at work
+        with suppress(OSError):  # the folder is not empty while other jobs are running
             partial.parent.rmdir()
     except OSError as error:
         raise BagError(
@@ -137,10 +142,15 @@ def reprocess(job: ReprocessJob) -> ReprocessResult:
 
 
 def make_table(path: Path, cubes: list[str]) -> TableWriter | ZarrWriter:
-    """Create a table in the format that the suffix of a path states.
+    """Create a table of stress; the suffix of its path decides the format.
+
+    Args:
+        path: Table to create, ending in .zarr, .csv or .parquet.
+        cubes: Names of the cubes by their indices, and a last name for unknown cubes.
 
     Raises:
-        ModuleNotFoundError: The library of the format is missing.
+        ModuleNotFoundError: The library zarr, which .zarr requires, is not installed.
+        BagError: The table cannot be created.
     """
     if path.suffix == ".zarr":
         from ..zarr_table import ZarrWriter
@@ -153,20 +163,31 @@ def reconstruct(
     source: BagSource,
     overrides: Overrides = AS_RECORDED,
 ) -> Iterator[tuple[Segment, StressRows]]:
-    """Yield each segment of a bag with its stress.
+    """Compute the stress of a bag again.
+
+    Args:
+        source: The recorded frequencies.
+        overrides: Calibrations and tare that replace those of the recording.
+
+    Yields:
+        Each segment (consecutive messages of frequencies with the same cubes) and its stress.
 
     Raises:
-        BagError: The bag is damaged, or the overrides do not fit.
+        BagError: The bag is damaged, or the overrides do not fit its cubes.
     """
     settings = settings_with(source, overrides)
     return _reconstruct(source, settings, use_health=not overrides.any)
 
 
 def settings_with(source: BagSource, overrides: Overrides) -> list[Settings]:
-    """Return the settings of each info of a bag, with what differs.
+    """Return the calibrations and rest frequencies to use for each SkinInfo message of a bag.
+
+    Args:
+        source: The recorded frequencies with their SkinInfo messages.
+        overrides: Calibrations and tare that replace those of the recording.
 
     Raises:
-        BagError: The overrides do not fit the bag.
+        BagError: The overrides do not fit the cubes of the bag.
     """
     recording = source.recording
     settings = recording.settings
@@ -186,7 +207,13 @@ def _reprocess(
     job: ReprocessJob,
     output: Path,
 ) -> ReprocessResult:
-    """Write the output of a job."""
+    """Reconstruct all skins of a bag and write them in the format of the job.
+
+    Args:
+        bag: The open bag.
+        job: Format, overrides and settings of contacts.
+        output: Folder or file to write, which is renamed when it is complete.
+    """
     topics = bag.topics(FREQUENCIES)
     if not topics:
         raise BagError(f"{job.bag}: no topic of {FREQUENCIES}; record frequencies and info")
@@ -194,7 +221,8 @@ def _reprocess(
         raise BagError(
             f"{job.bag}: {len(topics)} skins ({', '.join(topics)}); a table holds one: write a bag"
         )
-    # All infos are read before anything is written, so that a bad one leaves nothing behind.
+    # The constructor reads the SkinInfo messages of each skin. All are read before the output is
+    # created, so that an invalid one leaves no output behind.
     sources = [BagSource(bag, topic) for topic in topics]
     if job.form == "bag":
         with BagWriter(output) as writer:
@@ -217,14 +245,21 @@ def _write_skin(
     job: ReprocessJob,
     writer: BagWriter,
 ) -> None:
-    """Write info and stress of one skin into a bag, and its contacts if they are wanted."""
+    """Write SkinInfo messages, stress and, if the job has settings for them, contacts of one skin.
+
+    Args:
+        source: The recorded frequencies of the skin.
+        job: Overrides and settings of contacts.
+        writer: The bag to write into.
+    """
     bag, skin = source.bag, source.topic.removesuffix("frequencies")
     settings = settings_with(source, job.overrides)
     writer.add_topic(f"{skin}info", INFO, [quality(latched=True)])
     writer.add_topic(f"{skin}stress", STRESS, [quality()])
     infos = list(_infos_with(source.recording.infos, settings))
     for info in infos:
-        # An info may be stamped before the first message that was recorded.
+        # A SkinInfo message can be stamped before or after the recording. It is written at a time
+        # within the recording, so that the output has the same start and end.
         inside_ns = min(bag.end_ns, stamp_ns(info))
         inside_ns = max(bag.start_ns, inside_ns)
         writer.write(f"{skin}info", inside_ns, serialise(info))
@@ -250,13 +285,14 @@ def _reconstruct(
     *,
     use_health: bool,
 ) -> Iterator[tuple[Segment, StressRows]]:
-    """Reconstruct each segment of a bag.
+    """Reconstruct the stress of each segment (consecutive messages with the same cubes) of a bag.
 
     Args:
-        source: The bag.
-        settings: Settings for each of its infos.
-        use_health: Whether the recorded health of the pads applies. Under other settings than the
-            recorded ones the same pads need not be faulty.
+        source: The recorded frequencies.
+        settings: Calibrations and rest frequencies for each SkinInfo message of the bag.
+        use_health: Whether the pads that were left out as faulty in the recording are left out
+            again. With other settings than the recorded ones, other pads can be faulty, so the
+            health is then determined anew.
     """
     number = -1
     ids: list[str] = []
@@ -267,11 +303,13 @@ def _reconstruct(
             if segment.number != number:
                 number = segment.number
                 current = settings[number]
-                # Health remembers across a tare, but not across other calibrations.
+                # A new reconstructor forgets the health of the pads. A tare changes only rest
+                # frequencies, so the health continues; other calibrations require a new start.
                 if ids != (ids := [one.id for one in current.calibrations]):
                     reconstructor = Reconstructor(current.calibrations)
                 reconstructor.rest_frequency = current.rest_frequency
-            # Health that is known need not be found again, which saves two fifths of the time.
+            # If the recording states the health of every row, it is not determined again, which
+            # saves two fifths of the time.
             if health is not None and health.known.all():
                 stress = reconstructor.process_known(rows, health)
             else:
@@ -287,7 +325,19 @@ def _recalibrate(
     recorded: Settings,
     overrides: Overrides,
 ) -> Settings:
-    """Replace the calibrations of an info by those of the overrides."""
+    """Return recorded settings with the calibrations of the overrides instead of the recorded ones.
+
+    Rest frequencies that a tare (measurement without load) found are kept.
+
+    Args:
+        source: The recorded frequencies, whose bag errors name.
+        info: SkinInfo message with the names and uids of the cubes.
+        recorded: Calibrations and rest frequencies in this message.
+        overrides: Calibration of all cubes, or a skin with calibrations of the same cubes.
+
+    Raises:
+        BagError: The skin lacks a cube, or a calibration does not fit the layout or uid of a cube.
+    """
     path = source.bag.path
     if overrides.skin is not None:
         by_name = {cube.name: cube.calibration for cube in overrides.skin.cubes}
@@ -313,8 +363,8 @@ def _recalibrate(
             new.check(old.layout, cube.uid or None)
         except CalibrationError as error:
             raise BagError(f"{path}: cube {cube.name}: {error}") from None
-        # A tare is a measurement and stays. A pad that was never tared has the rest frequency of
-        # its calibration, so it gets that of the new one.
+        # A rest frequency that differs from the old calibration was measured by a tare and is kept.
+        # An equal one came from the old calibration and is replaced by that of the new one.
         pads = rest[: old.layout.n_pads]
         pads[:] = np.where(pads != old.rest_frequency, pads, new.rest_frequency)
     return Settings(tuple(calibrations), rest_frequency)
@@ -326,19 +376,21 @@ def _measure_rest(
     begin_s: float,
     end_s: float,
 ) -> Array:
-    """Measure the rest frequencies in a span of a bag in which nothing touched the skin.
+    """Return the mean frequencies in a span of a bag in which nothing touched the skin.
 
     Args:
-        source: The bag.
-        settings: Calibrations of the cubes.
+        source: The recorded frequencies.
+        settings: Calibrations, which state the effect of temperature, and rest frequencies, whose
+            NaN states which pads a cube does not have.
         begin_s: Begin of the span, in s after the start of the bag.
-        end_s: End of the span.
+        end_s: End of the span, in s after the start of the bag.
 
     Returns:
-        (cubes, P) mean frequencies at the reference temperature, in Hz.
+        (cubes, P) mean frequencies of the P pads, in Hz, converted to the reference temperature of
+        the calibration; NaN where a cube has fewer than P pads.
 
     Raises:
-        BagError: A pad was not measured in that time.
+        BagError: A pad has no valid frequency in the span.
     """
     bag = source.bag
     pipeline = Pipeline(settings.calibrations)
@@ -378,10 +430,16 @@ def _measure_rest(
 
 
 def _infos_with(infos: list[Any], settings: list[Settings]) -> Iterator[Any]:
-    """Yield the recorded infos with other settings in them."""
+    """Yield the recorded SkinInfo messages with other calibrations and rest frequencies.
+
+    Args:
+        infos: The recorded SkinInfo messages.
+        settings: Calibrations and rest frequencies for each of them.
+    """
     covariances: dict[str, Array] = {}
     for info, current in zip(infos, settings, strict=True):
-        # Each calibration stands once in an info; the first cube that has it represents it.
+        # A SkinInfo message contains each calibration once, even if several cubes share it. Its
+        # text and covariance are taken from the first cube that has the calibration.
         numbered = reversed(list(enumerate(current.calibrations)))
         first_cube = {calibration.id: number for number, calibration in numbered}
         if not first_cube.keys() <= covariances.keys():
