@@ -1,1 +1,1 @@
-"""The wire protocol: bytes to frames and frames to bytes. No I/O and no clock."""
+"""The wire protocol: conversion of bytes to frames and of frames to bytes, without any I/O."""

@@ -1,8 +1,9 @@
 """Consistent overhead byte stuffing (COBS): removes zero bytes, so that a zero can end a frame.
 
-Each zero of the data ends a block. A block is encoded as its length plus one, then its bytes
-without the zero. Blocks longer than 254 bytes are split, and the last block has no zero. Source:
-Cheshire, Baker, "Consistent overhead byte stuffing", IEEE/ACM Transactions on Networking 7 (1999).
+Each zero byte of the data ends a block. A block is encoded as one byte with its length plus one
+(the zero not counted), then its bytes without the zero. Blocks longer than 254 bytes are split, and
+the last block has no zero. Source: Cheshire, Baker, "Consistent overhead byte stuffing", IEEE/ACM
+Transactions on Networking 7 (1999).
 """
 
 from __future__ import annotations
@@ -10,11 +11,12 @@ from __future__ import annotations
 from .native import wire
 
 MAX_BLOCK = 254
-"""Length of the longest block, in bytes. Its code, 255, means that no zero follows."""
+"""Length of the longest block of the COBS encoding (bytes between two zeros), in bytes. Its length
+byte, 255, means that no zero follows the block."""
 
 
 def encode_in_python(data: bytes) -> bytes:
-    """Return the COBS encoding of any bytes."""
+    """Return the COBS encoding of any bytes, which contains no zero byte."""
     code = bytearray()
     block = b""
     for block in data.split(b"\0"):
@@ -25,13 +27,14 @@ def encode_in_python(data: bytes) -> bytes:
         code += block
 
     if data and data[-1] and not block:
-        # The data end with a full block, which needs no empty block after it.
+        # The data end with a block of 254 bytes, and the loop has added an empty block after it,
+        # which the encoding does not need.
         del code[-1]
     return bytes(code)
 
 
 def decode_in_python(code: bytes) -> bytes | None:
-    """Return the bytes that a COBS encoding stands for; None if it is not valid."""
+    """Return the data of a COBS encoding; None if the bytes are no valid COBS encoding."""
     if b"\0" in code:
         return None
     blocks: list[bytes] = []
@@ -42,7 +45,7 @@ def decode_in_python(code: bytes) -> bytes | None:
         if end > len(code):
             return None
         blocks.append(code[start + 1 : end])
-        # The zero that ends a block is implied, except after a full block and after the last one.
+        # A zero follows every block of the data, except for blocks of 254 bytes and the last one.
         if length <= MAX_BLOCK and end < len(code):
             blocks.append(b"\0")
         start = end

@@ -1,9 +1,8 @@
-"""Decoding of the bytes of a link to frames, whatever the bytes are.
+"""Decoding of the bytes of a link to frames. Any bytes are accepted, also damaged ones.
 
-Each non-empty run of bytes between two zeros becomes one frame, or is counted in exactly one
-counter of `Counters`. `PythonDecoder` is the readable implementation and the fallback where no
-compiler was present; `Decoder` is the implementation in C where it was compiled. Both give the same
-result.
+Each non-empty run (bytes between two zero bytes) becomes one frame, or increases exactly one error
+counter of `Counters`. `PythonDecoder` is easy to read and is used where no C compiler was present;
+`NativeDecoder` is implemented in C. Both give the same result, and `Decoder` is the one to use.
 """
 
 from __future__ import annotations
@@ -16,27 +15,30 @@ from .native import NOT_COMPILED, wire
 from .protocol import HEADER, MAX_FRAME, OVERHEAD, UNPACK, VERSION, Frame
 
 MAX_RUN = MAX_FRAME + (MAX_FRAME + 253) // 254
-"""Length of the longest run of bytes that can be a frame. COBS adds one byte to each 254."""
+"""Length, in bytes, of the longest run (bytes between two zero bytes) that can be a frame. The COBS
+encoding adds one byte to each 254."""
 MIN_PAYLOAD = 5
 """Smallest payload of a frame, in bytes. Later protocol versions keep this limit."""
 MIN_RUN = OVERHEAD + MIN_PAYLOAD + 1
-"""Length of the shortest run of bytes that can be a frame of any protocol version."""
+"""Length, in bytes, of the shortest run (bytes between two zero bytes) that can be a frame of any
+protocol version: header, CRC, smallest payload, and the byte that COBS adds."""
 _CRC_RESIDUE = 0x2144DF1C
-"""CRC-32 of any data followed by its own CRC-32. So the CRC need not be cut off for the check."""
+"""CRC-32 of any data that are followed by their own CRC-32. So a frame, including the CRC at its
+end, is valid if its CRC-32 has this value."""
 
 
 @dataclass(slots=True)
 class Counters:
-    """Numbers of bytes, frames and invalid runs that a decoder has received.
+    """Numbers of bytes, frames and invalid runs (bytes between two zeros) of one decoder.
 
     Attributes:
-        bytes: Bytes.
+        bytes: Received bytes.
         frames: Valid frames.
         crc: Runs with a wrong checksum.
-        framing: Runs that are not COBS, or were cut off by the end of the stream.
+        framing: Runs that are no valid COBS encoding, or were cut off by the end of the stream.
         length: Runs that are too short for a frame, or whose length does not fit their contents.
-        version: Runs of another protocol version with a right checksum.
-        unknown_type: Runs with a right checksum and a type that version 1 does not have.
+        version: Runs with a correct checksum but another protocol version.
+        unknown_type: Runs with a correct checksum but a frame type that version 1 does not have.
         overrun: Runs longer than any frame, which were discarded up to the next zero.
     """
 
@@ -59,8 +61,8 @@ class PythonDecoder:
 
     Attributes:
         counters: Numbers of bytes, frames and invalid runs since the decoder was made.
-        other_version: Protocol version of the last frame that had a right checksum and another
-            version than ours; None if there was no such frame.
+        other_version: Protocol version of the last frame with a correct checksum and another
+            version than `VERSION`; None if there was no such frame.
     """
 
     def __init__(self) -> None:
@@ -70,12 +72,16 @@ class PythonDecoder:
         self._discarding = False
 
     def feed(self, data: bytes | bytearray) -> list[Frame]:
-        """Return the frames that `data` completes, in order. Never raises, whatever the bytes."""
+        """Return the frames that are complete with these bytes, in order. Never raises.
+
+        Args:
+            data: The next received bytes. An unfinished frame at their end is kept.
+        """
         self.counters.bytes += len(data)
         *runs, rest = bytes(data).split(b"\0")
         frames: list[Frame] = []
         if runs:
-            # The first zero ends the run that earlier bytes began.
+            # The first zero ends a run whose beginning may have come in an earlier call.
             runs[0] = b"" if self._discarding else bytes(self._tail + runs[0])
             self._tail.clear()
             self._discarding = False
@@ -86,7 +92,7 @@ class PythonDecoder:
 
         if not self._discarding:
             self._tail += rest
-            # A longer run cannot become a frame, so its bytes need no memory.
+            # A run longer than MAX_RUN cannot become a frame, so the rest of it is not kept.
             if len(self._tail) > MAX_RUN:
                 self.counters.overrun += 1
                 self._tail.clear()
@@ -94,7 +100,7 @@ class PythonDecoder:
         return frames
 
     def reset(self) -> None:
-        """Discard an unfinished frame, because the stream ended; it counts as `framing`."""
+        """Discard an unfinished frame, because the stream has ended, and count it as `framing`."""
         self.counters.framing += bool(self._tail)
         self._tail.clear()
         self._discarding = False
@@ -116,7 +122,8 @@ class PythonDecoder:
             counters.crc += 1
             return None
 
-        # From here on the bytes are as they were sent, and the checks tell what the sender is.
+        # The checksum is correct, so these bytes are as they were sent. What is wrong from here on
+        # was sent like that, for example by a hub with another protocol version.
         code, version, size = HEADER.unpack_from(raw)
         if version != VERSION:
             counters.version += 1
@@ -135,10 +142,10 @@ class PythonDecoder:
 
 
 class NativeDecoder:
-    """Decodes the bytes of one link in C; see `PythonDecoder`.
+    """Decodes the bytes of one link in C, with the same result as `PythonDecoder`.
 
     Attributes:
-        wire: The decoder of the C module, for reading several links in one call.
+        wire: Decoder object of the C module, with which one call can read several links.
 
     Raises:
         RuntimeError: The C module was not compiled.
@@ -156,20 +163,28 @@ class NativeDecoder:
 
     @property
     def other_version(self) -> int | None:
-        """Protocol version of the last valid frame of another version; None without one."""
+        """Protocol version of the last frame with a correct checksum and another version.
+
+        It is None if there was no such frame.
+        """
         return self.wire.other_version()
 
     def feed(self, data: bytes | bytearray) -> list[Frame]:
-        """Return the frames that `data` completes, in order."""
+        """Return the frames that are complete with these bytes, in order."""
         return unpack_all(self.wire.feed(data))
 
     def reset(self) -> None:
-        """Discard an unfinished frame, because the stream ended."""
+        """Discard an unfinished frame, because the stream has ended, and count it as `framing`."""
         self.wire.reset()
 
 
 def unpack_all(raws: list[bytes]) -> list[Frame]:
-    """Return the frames of the bytes that the decoder in C gives and has checked."""
+    """Return the frames of decoded bytes.
+
+    Args:
+        raws: The bytes of each frame, from the type to the CRC, as the decoder in C returns them
+            after its checks.
+    """
     frames: list[Frame] = []
     for raw in raws:
         unpack = UNPACK[raw[0]]

@@ -1,6 +1,6 @@
-"""The wire module in C (native/), if it was compiled.
+"""Import of the wire module in C (folder native/), which reads and decodes frames.
 
-Without it everything works in Python, more slowly.
+Where it was not compiled, `wire` is None, and the same functions run in Python, more slowly.
 """
 
 from __future__ import annotations
@@ -16,4 +16,4 @@ NOT_COMPILED = (
     "the wire is decoded in Python, which is slower, because no C compiler was there at the "
     "installation: install one (sudo apt install gcc python3-dev) and install again"
 )
-"""Warning that is logged where `wire` is None."""
+"""Warning that is logged where the wire module in C was not compiled (`wire` is None)."""

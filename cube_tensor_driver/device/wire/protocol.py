@@ -1,12 +1,12 @@
 """The frames of wire protocol version 1 and their bytes, without input or output.
 
-A frame is ``type:u8 version:u8 length:u16 payload crc:u32``, little-endian, where `length` is that
-of the payload and `crc` is the IEEE 802.3 CRC-32 of all bytes before it. On the wire a frame is
-COBS-encoded between two zero bytes. docs/protocol.md has the fields and an annotated dump of each
-type. The driver and the simulated hubs share this file.
+A frame is ``type:u8 version:u8 length:u16 payload crc:u32``, little-endian. `length` is the length
+of the payload in bytes, and `crc` is the IEEE 802.3 CRC-32 of all bytes before it. On the wire a
+frame is COBS-encoded (see `cobs.py`) between two zero bytes. docs/protocol.md has the fields and an
+annotated dump of each type. The driver and the simulated hubs share this file.
 
-`encode` turns a frame into bytes; `decoder.py` does the reverse. Arrays must have the dtype that
-the docstring of the frame names, because nothing is converted. The arrays of decoded frames are
+`encode` converts a frame to bytes; `decoder.py` does the reverse. Arrays must have the dtype that
+the docstring of the frame names; other dtypes are refused. The arrays of decoded frames are
 read-only and are made when they are first used.
 """
 
@@ -31,44 +31,62 @@ VERSION = 1
 MAX_PAYLOAD = 0xFFFF
 """Largest payload of a frame, in bytes."""
 MAX_FRAME = 4 + MAX_PAYLOAD + 4
-"""Length of the longest frame, in bytes, with header and CRC and before COBS."""
+"""Length of the longest frame, in bytes, with header and CRC, before COBS encoding."""
 TEMPERATURE_UNKNOWN = -32768
-"""Value of `Sample.temperature` where the hub does not know the temperature."""
+"""Value of `Sample.temperature` for a cube whose temperature the hub did not measure."""
 NOT_MEASURED = 0
-"""Value of `Sample.frequency` where the hub did not measure a pad."""
+"""Value of `Sample.frequency` for a pad (capacitive sensor of a cube) that was not measured."""
 
 HEADER = struct.Struct("<BBH")
-"""Type, version and length of a frame."""
+"""Header of a frame: type, protocol version, and length of the payload in bytes."""
 OVERHEAD = HEADER.size + 4
-"""Bytes of a frame beside its payload: header and CRC."""
+"""Number of bytes of a frame besides its payload: header and CRC."""
 _HELLO = struct.Struct("<QIHBBI")
 _SAMPLE = struct.Struct("<IHHQB3x")
 _FREQUENCY = HEADER.size + _SAMPLE.size
-"""Position of the frequencies in a decoded SAMPLE."""
+"""Byte offset of the frequencies from the start of a decoded SAMPLE frame."""
 _U32 = np.dtype("<u4")
 _U64 = np.dtype("<u8")
 _I16 = np.dtype("<i2")
 _Arrays = tuple[NDArray[np.uint32], NDArray[np.uint32], NDArray[np.int16]]
-"""Frequencies, pad faults and temperatures."""
+"""Arrays of a SAMPLE frame: frequencies, pad faults and temperatures (see `Sample`)."""
 
 
 class Command(IntEnum):
-    """What a `Request` asks for. Each comment gives the argument."""
+    """Number of a request to a hub, the field `request` of `Request`.
 
-    HELLO = 1  # none (0)
-    START = 2  # none (0)
-    STOP = 3  # none (0)
-    SET_PERIOD = 4  # sample period, µs
-    IDENTIFY = 5  # duration for which the hub shows itself, s
-    TIME = 6  # any number, which the answer repeats; the answer is a `Time`
+    Attributes:
+        HELLO: Identify yourself; the hub answers by a `Hello`. The argument is 0.
+        START: Send samples. The argument is 0.
+        STOP: Send no more samples. The argument is 0.
+        SET_PERIOD: Set the sample period. The argument is the period in µs.
+        IDENTIFY: Show a person which hub this is, for example by a light. The argument is the
+            duration in s.
+        TIME: Report the device time; the hub answers by a `Time`. The argument is any number, which
+            the answer repeats.
+    """
+
+    HELLO = 1
+    START = 2
+    STOP = 3
+    SET_PERIOD = 4
+    IDENTIFY = 5
+    TIME = 6
 
 
 class Result(IntEnum):
-    """What an `Ack` answers."""
+    """Result of a request, the field `result` of `Ack`.
+
+    Attributes:
+        DONE: The hub has executed the request.
+        UNKNOWN: The firmware of the hub does not support the request.
+        REFUSED: The hub cannot use the requested value; the argument of the ACK is the value that
+            remains in force.
+    """
 
     DONE = 0
-    UNKNOWN = 1  # the hub does not know the request
-    REFUSED = 2  # the hub cannot do it; the argument of the ACK is the value in force
+    UNKNOWN = 1
+    REFUSED = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,8 +98,8 @@ class Hello:
         firmware: Version of its firmware, u32.
         n_pads: Number of pads of each cube, u8.
         period_us: Sample period in force, in µs, u32.
-        cube_uids: Unique numbers of the cubes (n_cubes,) uint64.
-        flags: 0 in version 1, u8.
+        cube_uids: Unique numbers of the cubes (n_cubes,) uint64, in the order of their indices.
+        flags: Reserved, u8; 0 in protocol version 1.
     """
 
     hub_uid: int
@@ -124,12 +142,14 @@ class Sample:
     """One measurement of all pads of successive cubes of a hub, at the same instant.
 
     Attributes:
-        sequence: Number of the sample, u32, which wraps. The hub counts when it samples, so a
-            sample that it drops leaves a gap.
-        first_cube: Index of the first cube on the hub, u16.
-        device_us: Device time of the measurement, in µs, u64.
-        shape: (n_cubes, n_pads).
-        raw: Decoded bytes from type to CRC; empty if the sample was not decoded.
+        sequence: Number of the sample, u32, which wraps to 0. The hub increases it whenever it
+            samples, so a sample that is then dropped leaves a gap in the numbers.
+        first_cube: Index on the hub of the first cube in this frame, u16. A hub with many cubes
+            splits a sample into several frames.
+        device_us: Time of the measurement by the hub's clock, in µs, u64.
+        shape: Numbers of cubes in this frame and of pads per cube: (n_cubes, n_pads).
+        raw: Bytes of the received frame from its type to its CRC; empty if the sample was not
+            received but made from arrays.
     """
 
     __slots__ = ("_arrays", "device_us", "first_cube", "raw", "sequence", "shape")
@@ -156,7 +176,7 @@ class Sample:
 
     @property
     def n_cubes(self) -> int:
-        """Number of cubes in the sample."""
+        """Number of cubes in this frame."""
         return self.shape[0]
 
     @property
@@ -166,26 +186,27 @@ class Sample:
 
     @property
     def frequency(self) -> NDArray[np.uint32]:
-        """Frequencies (n_cubes, n_pads) in mHz; 0 where a pad was not measured."""
+        """Frequencies of the pads (n_cubes, n_pads) in mHz; 0 where a pad was not measured."""
         return self._make_arrays()[0]
 
     @property
     def pad_fault(self) -> NDArray[np.uint32]:
-        """Pad faults (n_cubes,); bit p is set if the hub reports that pad p is faulty."""
+        """Bit mask of each cube (n_cubes,); bit p is set if the hub reports pad p as faulty."""
         return self._make_arrays()[1]
 
     @property
     def temperature(self) -> NDArray[np.int16]:
-        """Temperatures (n_cubes,) in 0.01 °C; -32768 where unknown."""
+        """Temperatures of the cubes (n_cubes,) in 0.01 °C; -32768 where not measured."""
         return self._make_arrays()[2]
 
     @property
     def spare(self) -> bytes:
-        """The spare bytes as they were received, which hubs send as 0."""
+        """The three reserved bytes of the received frame, which hubs send as 0."""
         return self.raw[_FREQUENCY - 3 : _FREQUENCY] or bytes(3)
 
     def _make_arrays(self) -> _Arrays:
-        # The arrays are made late, because `join` makes those of several samples at once.
+        # Usually `join` makes the arrays of several samples at once, so they are made here only if
+        # somebody asks for those of a single sample.
         if self._arrays is None:
             self._arrays = join([self])
         return self._arrays
@@ -225,19 +246,24 @@ class Sample:
 
 @lru_cache(maxsize=64)
 def _split_fields(n_cubes: int, n_pads: int) -> struct.Struct:
-    """Return what splits a decoded SAMPLE into frequencies, faults and temperatures."""
+    """Return the `struct.Struct` that splits the bytes of a decoded SAMPLE frame of this shape.
+
+    Its `unpack` returns the bytes of the frequencies, the pad faults and the temperatures.
+    """
     sizes = 4 * n_cubes * n_pads, 4 * n_cubes, 2 * n_cubes
     fields = "".join(f"{size}s" for size in sizes)
     return struct.Struct(f"{_FREQUENCY}x{fields}4x")
 
 
 def join(samples: Sequence[Sample]) -> _Arrays:
-    """Return the arrays of samples with the same number of pads, one after the other.
+    """Return the arrays of several samples, concatenated.
 
-    The bytes of all decoded samples become arrays at once, which are read-only.
+    Args:
+        samples: At least one sample; all have the same number of pads per cube.
 
     Returns:
-        Frequencies (N, n_pads), pad faults (N,) and temperatures (N,).
+        Frequencies (N, n_pads) in mHz, pad faults (N,) and temperatures (N,) in 0.01 °C of all N
+        cubes, sample after sample. They are read-only if all samples were received.
     """
     if not all(sample.raw for sample in samples):
         arrays = [sample._make_arrays() for sample in samples]
@@ -263,7 +289,7 @@ _Fixed = TypeVar("_Fixed", bound="_FixedFrame")
 
 
 class _FixedFrame:
-    """A frame whose payload is a fixed sequence of numbers, the fields in their order."""
+    """Base of frames whose payload is a fixed sequence of numbers: their fields, in order."""
 
     __slots__ = ()
     _PAYLOAD: ClassVar[struct.Struct]
@@ -281,12 +307,13 @@ class _FixedFrame:
 
 @dataclass(frozen=True, slots=True)
 class Stats(_FixedFrame):
-    """Counters of a hub.
+    """Counters of a hub, which it sends once a second.
 
     Attributes:
-        uptime_ms: Time since power-up, in ms, u64.
-        taken: Samples taken since power-up, u32, which wraps.
-        dropped: Samples dropped in the hub since power-up, u32, which wraps.
+        uptime_ms: Time since power-up of the hub, in ms, u64.
+        taken: Number of samples taken since power-up, u32, which wraps to 0.
+        dropped: Number of samples that the hub has taken but not sent since power-up, u32, which
+            wraps to 0.
         supply_mv: Supply voltage, in mV, u16; 0 if unknown.
     """
 
@@ -303,8 +330,9 @@ class Request(_FixedFrame):
     """Request of the host to a hub.
 
     Attributes:
-        request: A `Command`, u8. To other numbers the hub answers UNKNOWN.
-        argument: Argument of the command, u32.
+        request: A `Command`, u8. To any other number the hub answers by an `Ack` with the result
+            UNKNOWN.
+        argument: Argument of the command, u32; see `Command`.
     """
 
     _PAYLOAD = struct.Struct("<BI")
@@ -320,7 +348,7 @@ class Ack(_FixedFrame):
     Attributes:
         request: The `Command` that is answered, u8.
         result: A `Result`, u8.
-        argument: The value that is now in force, u32.
+        argument: The value that is now in force, for example the sample period in µs, u32.
     """
 
     _PAYLOAD = struct.Struct("<BBI")
@@ -335,9 +363,9 @@ class Time(_FixedFrame):
     """Answer of a hub to the request TIME, in place of an `Ack`.
 
     Attributes:
-        number: The argument of the request, u32.
-        device_us: Device time between the end of the request and the beginning of the answer, in
-            µs, u64.
+        number: The argument of the request, by which the host knows which one is answered, u32.
+        device_us: Time of the hub's clock, in µs, u64, read after the hub had received the whole
+            request and before it sent this answer.
     """
 
     _PAYLOAD = struct.Struct("<IQ")
@@ -360,25 +388,33 @@ _CODES = {frame_type: code for code, frame_type in _TYPES.items()}
 UNPACK: dict[int, Callable[[bytes, int], Frame | None]] = {
     code: frame_type._unpack for code, frame_type in _TYPES.items()
 }
-"""For each type code the function that turns the bytes of a frame and the length of its payload
-into the frame, or into None if they do not fit."""
+"""Function for each type code (first byte of a frame) that makes the frame. Its arguments are the
+decoded bytes from type to CRC and the length of the payload; it returns None if the fields do not
+fit the length."""
 
 
 def sample_bytes(n_cubes: int, n_pads: int) -> int:
-    """Return the length on the wire, in bytes, of one SAMPLE of all cubes of a hub in one frame."""
+    """Return the largest number of bytes on the wire of one SAMPLE frame.
+
+    Args:
+        n_cubes: Number of cubes in the frame.
+        n_pads: Number of pads of each cube.
+    """
     frame = _FREQUENCY + n_cubes * (4 * n_pads + 4 + 2) + 4
-    # COBS adds one byte in 254, and each frame lies between two zeros.
+    # COBS encoding adds at most one byte, and one more for each 254 bytes. On the wire, a zero byte
+    # stands before and after each frame.
     return frame + 1 + frame // 254 + 2
 
 
 def encode(frame: Frame, version: int = VERSION) -> bytes:
     """Return the bytes of one frame on the wire: a zero, the COBS-encoded frame, and a zero.
 
-    The first zero ends an unfinished frame before it, which would otherwise absorb this one.
+    The first zero ends a frame before it that was cut off; otherwise the two would be read as one.
 
     Args:
         frame: The frame.
-        version: Protocol version; another than ours is for tests of the other end.
+        version: Protocol version in the header. Other values than `VERSION` serve to test how a
+            receiver handles them.
 
     Raises:
         ProtocolError: A field is out of its range, an array has the wrong dtype or shape, or the
@@ -410,7 +446,14 @@ def _check_array(
     dtype: np.dtype[Any],
     shape: tuple[int, ...],
 ) -> NDArray[Any]:
-    """Return a field that is an array of this dtype and shape; raise ProtocolError otherwise."""
+    """Return `value` if it is an array of this dtype and shape; otherwise raise ProtocolError.
+
+    Args:
+        name: Name of the field, for the error message.
+        value: Value of the field.
+        dtype: Required dtype.
+        shape: Required shape.
+    """
     if isinstance(value, np.ndarray) and value.dtype == dtype and value.shape == shape:
         return value
     actual = type(value).__name__
