@@ -12,63 +12,88 @@ from ..status import DRIFT, LEFT_OUT, NOISY, OPEN, RANGE, SHORT, STUCK
 from .statistics import Window
 
 HOLD_WINDOWS = 3
-"""Number of windows without a condition after which the condition ends, so that it does not flicker
-while a pad has an intermittent contact."""
+"""Number of successive windows (of 0.5 s) without a condition of a pad after which the condition
+ends. Several are needed, so that the condition of a pad with an intermittent contact does not
+flicker."""
 
 MIN_COUNT = 20
-"""Minimum number of rows in a window for its statistics to be used.
+"""Minimum number of rows (samples of a cube) in a window of 0.5 s for its statistics to be used.
 
-With fewer rows, the noise is too uncertain for the limits below.
+With fewer rows, the measured noise is too uncertain to be compared with limits.
 """
 
 NOISY_ENTER = 10.0
-"""Ratio of a pad's noise to its usual noise above which the pad becomes noisy.
+"""Ratio of the measured noise of a pad to its usual noise above which the pad is reported as noisy.
 
-The usual noise is the larger of the calibration's noise and the median over the cube's pads.
+The usual noise is the larger of the noise in the calibration and the median of the measured noise
+of the cube's pads. Noise is the standard deviation of the frequency.
 """
 
 NOISY_LEAVE = 5.0
-"""Ratio of a noisy pad's noise to its usual noise below which the pad is no longer noisy."""
+"""Ratio of the measured noise of a noisy pad to its usual noise below which the pad is no longer
+reported as noisy.
+
+The usual noise is the larger of the noise in the calibration and the median of the measured noise
+of the cube's pads.
+"""
 
 MAX_SECOND_DIFFERENCE = 60.0
-"""Limit of a second difference in the noise, as a multiple of the usual noise.
+"""Limit to which a second difference of a pad's frequency, f[n] - 2 f[n-1] + f[n-2], is cut before
+the noise is computed, as a multiple of the pad's usual noise.
 
-Two second differences of this size in `MIN_COUNT` rows are a noise below `NOISY_ENTER`, so one jump
-of the frequency does not make a pad noisy.
+One jump of the frequency gives two large second differences. Cut to this limit, they raise the
+noise of `MIN_COUNT` rows by less than `NOISY_ENTER`, so one jump does not make a pad noisy.
 """
 
 STUCK_MIN_SPAN = 5.0
-"""Span of the other pads of a cube, as a multiple of their noise, above which a pad that shows a
-single value is stuck."""
+"""Span (highest minus lowest frequency in a window) of the pads of a cube, as a multiple of their
+noise, that shows that the cube is loaded.
+
+If the median span of the cube's pads is larger, and one pad keeps a single value, this pad is
+reported as stuck.
+"""
 
 STILL_MAX_SPAN = 8.0
-"""Span (peak to peak) of a pad, as a multiple of its noise, below which the pad is still.
+"""Span (highest minus lowest frequency in a window) below which a pad counts as still, as a
+multiple of the noise (standard deviation) in its calibration.
 
 In 1000 rows, noise alone spans 6 times its standard deviation.
 """
 
 RESIDUAL_ENTER = 0.5
-"""Share of a window's rows with a residual above its limit for a cube's residual to become high."""
+"""Fraction of the rows of a window (0.5 s) with a residual above its limit above which a cube is
+reported with a high residual.
+
+The limit of the residual (from the chi-square distribution) is exceeded by noise alone in one row
+of a thousand.
+"""
 
 RESIDUAL_LEAVE = 0.1
-"""Share of a window's rows with a residual above its limit for a high residual to stay high."""
+"""Fraction of the rows of a window (0.5 s) with a residual above its limit at or below which a cube
+is no longer reported with a high residual."""
 
 DRIFT_LIMIT = 2e-4
-"""Distance, relative to the rest frequency, that one pad of a still cube moves away from the others
-before it is drifting."""
+"""Shift of a pad's frequency, relative to its rest frequency and to the median shift of the cube's
+pads, above which the pad is reported as drifting.
+
+The shift is measured from the mean frequency at the time at which the cube came to rest.
+"""
 
 
 class Conditions:
-    """Present conditions of all pads; each lasts until `HOLD_WINDOWS` windows were without it.
+    """Present conditions (such as open, stuck or noisy) of all pads of a skin.
+
+    A condition ends when `HOLD_WINDOWS` successive windows were without it.
 
     Attributes:
         state: Conditions of each pad (cubes, P), bits of `status.py`.
-        mask: Bit masks of the pads that are left out (cubes,).
-        status: Conditions of all pads of a cube together (cubes,).
+        mask: Bit masks of the pads that are not used, because of their conditions (cubes,).
+        status: Conditions that any pad of a cube has (cubes,), bits of `status.py`.
     """
 
     def __init__(self, n_cubes: int, n_pads: int) -> None:
-        # Conditions found in the present window come first, then those of the windows before.
+        # Row 0 holds the conditions found in the present window, the next rows those of the windows
+        # before it.
         shape = (n_cubes, n_pads)
         self._recent = np.zeros((HOLD_WINDOWS, *shape), np.uint16)
         self._since_collected = np.zeros(shape, np.uint16)
@@ -77,27 +102,32 @@ class Conditions:
         self._combine()
 
     def add(self, cube: Index, bits: StatusBits) -> None:
-        """Add conditions (n, P) that were just found on cubes (n,)."""
-        # A pad that is broken for good brings the same bits with every row, which need no work.
+        """Add conditions that were just found, in the window that has not ended.
+
+        Args:
+            cube: Numbers of the cubes (n,).
+            bits: Conditions of their pads (n, P), bits of `status.py`.
+        """
+        # A permanently broken pad brings the same bits with every row, so usually nothing changes.
         if (bits & ~self._recent[0][cube]).any():
             np.bitwise_or.at(self._recent[0], cube, bits)
             self._combine()
 
     def end_window(self, found: StatusBits, has_rows: Mask) -> None:
-        """End a window.
+        """Add the conditions that the statistics of a window show, and start the next window.
 
         Args:
-            found: Conditions found in the window (cubes, P).
-            has_rows: Whether a cube had rows in the window (cubes,).
+            found: Conditions found in the window that ends (cubes, P).
+            has_rows: Whether a cube had rows in this window (cubes,).
         """
         self._recent[0] |= found
         self._combine()
-        # A cube without rows keeps its conditions, because silence does not show recovery.
+        # A cube without rows keeps its conditions, because nothing shows that its pads recovered.
         self._recent[1:, has_rows] = self._recent[:-1, has_rows]
         self._recent[0, has_rows] = 0
 
     def collect(self) -> StatusBits:
-        """Return all conditions (cubes, P) since the last call, including the present ones."""
+        """Return all conditions (cubes, P) that a pad had at any time since the last call."""
         found: StatusBits = self._since_collected | self.state
         self._since_collected = np.zeros_like(found)
         return found
@@ -112,29 +142,37 @@ class Conditions:
 
 
 class PadDiagnosis:
-    """Finds stuck, noisy and drifting pads, and still cubes, in the windows of a skin.
+    """Finds stuck, noisy and drifting pads, and still cubes, from the statistics of windows.
 
     Attributes:
-        still: Whether no usable pad of a cube moved in the last window (cubes,).
-        noise: Noise of each pad (cubes, P) as the calibration states it, in Hz.
-        bound: Limit of squared second differences in the next window (cubes, P), in Hz².
+        still: Whether the frequency of no usable pad of a cube moved in the last window (cubes,).
+        noise: Standard deviation of the frequency of each pad (cubes, P), in Hz, by the
+            calibration.
+        bound: Limit to which squared second differences of the frequency are cut in the next window
+            (cubes, P), in Hz².
     """
 
     def __init__(self, exists: Mask) -> None:
-        """Prepare the diagnosis of a skin.
+        """Prepare the diagnosis of the pads of a skin.
 
         Args:
-            exists: Whether a cube has this pad (cubes, P).
+            exists: Whether a cube has a pad with this number (cubes, P).
         """
         self._exists = exists
         self.still: Mask = np.zeros(len(exists), bool)
-        # Mean frequencies of the first window since the cube is still; NaN while it moves.
+        # Mean frequencies in the window in which the cube came to rest; NaN while it moves.
         self._mean_at_rest = np.full(exists.shape, np.nan)
-        # Mean frequencies of the last window with rows.
+        # Mean frequencies in the last window with rows of the cube.
         self._mean_before = self._mean_at_rest.copy()
 
     def set_reference(self, rest_frequency: Array, noise: Array) -> None:
-        """Set rest frequency and noise of the pads (cubes, P), in Hz, NaN for missing pads."""
+        """Set the quantities to which measured frequencies are compared.
+
+        Args:
+            rest_frequency: Frequencies without load (cubes, P), in Hz; NaN where a cube has no such
+                pad.
+            noise: Standard deviations of the frequencies (cubes, P), in Hz, likewise.
+        """
         self._rest = rest_frequency
         self.noise = noise
         self.bound = _squared_bound(noise)
@@ -162,19 +200,22 @@ class PadDiagnosis:
         return valid
 
     def _find_noisy(self, window: Window, state: StatusBits) -> Mask:
-        # Vibration raises the noise of all pads of a cube, so the median is what is usual now.
+        # Vibration raises the noise of all pads of a cube. It must not make pads noisy, so the
+        # median over the pads counts as usual noise if it is larger than that of the calibration.
         usual = np.fmax(self.noise, _lower_median(window.noise))
         self.bound = _squared_bound(usual)
         was_noisy = state & NOISY > 0
         limit = np.where(was_noisy, NOISY_LEAVE, NOISY_ENTER) * usual
-        # A moving load looks like noise but is smooth. It must not end a noisy pad's condition.
+        # A moving load raises the computed noise, too, but the frequency is then smooth, not rough.
+        # A pad that was noisy before stays noisy even if the load now makes its frequency smooth.
         is_noise = window.rough | was_noisy
         noisy: Mask = (window.noise > limit) & is_noise
         return noisy
 
     def _find_stuck(self, span: Real, state: StatusBits) -> Mask:
         others_moved = _lower_median(span / self.noise) > STUCK_MIN_SPAN
-        # A pad with an intermittent contact shows a single value now and then and is not stuck.
+        # A pad with an intermittent contact may show a single value for a window. It is not stuck,
+        # and has another condition already.
         is_intermittent = state & (OPEN | SHORT | RANGE) > 0
         stuck: Mask = (span == 0) & others_moved & ~is_intermittent
         return stuck
@@ -187,7 +228,7 @@ class PadDiagnosis:
         state: StatusBits,
     ) -> None:
         limit = STILL_MAX_SPAN * self.noise
-        # A step between two windows is visible in the span of neither.
+        # A step of the frequency between two windows is not visible in the span of either of them.
         jumped = np.abs(window.mean - self._mean_before) > limit
         is_unmoved = (span < limit) & ~jumped
         is_unused = (state & LEFT_OUT > 0) | ~self._exists
@@ -202,10 +243,11 @@ class PadDiagnosis:
         self._mean_at_rest[has_come_to_rest] = window.mean[has_come_to_rest]
 
         shift = (window.mean - self._mean_at_rest) / self._rest
-        # The means of two windows of a still cube may differ by the span that counts as still.
+        # While a cube is still, its mean frequencies in two windows may differ by up to the span
+        # that counts as still.
         still_span = STILL_MAX_SPAN * self.noise / self._rest
         limit = np.maximum(DRIFT_LIMIT, still_span)
-        # A shift that all pads share is temperature or a slow load, not a fault of one pad.
+        # A shift that all pads share is caused by temperature or a slow load, not by a fault.
         drifting: Mask = np.abs(shift - _lower_median(shift)) > limit
         return drifting
 
@@ -215,15 +257,19 @@ def has_high_residual(
     over_limit: Index,
     rows: Index,
 ) -> Mask:
-    """Decide, with hysteresis, which cubes have a high residual after a window.
+    """Decide, with hysteresis, which cubes have a high residual after a window of 0.5 s.
 
-    Noise alone exceeds the limit in one row of a thousand, so a share of the rows decides. Cubes
-    without rows keep their state.
+    Noise alone exceeds the limit of the residual in one row of a thousand, so the fraction of the
+    window's rows above the limit decides: `RESIDUAL_ENTER` or `RESIDUAL_LEAVE`. Cubes without rows
+    keep their state.
 
     Args:
-        was_high: Whether the residual was high before the window (cubes,).
+        was_high: Whether the residual of a cube was high before the window (cubes,).
         over_limit: Number of rows in the window with a residual above its limit (cubes,).
-        rows: Number of rows in the window (cubes,).
+        rows: Number of all rows in the window (cubes,).
+
+    Returns:
+        Whether the residual of a cube is high now (cubes,).
     """
     share = np.where(was_high, RESIDUAL_LEAVE, RESIDUAL_ENTER)
     return np.where(rows > 0, over_limit > share * rows, was_high)
@@ -235,7 +281,7 @@ def _squared_bound(noise: Array) -> Array:
 
 
 def _lower_median(values: Real) -> Real:
-    """Return the lower median (cubes, 1) over the pads of each cube that have a value."""
+    """Return the lower median (cubes, 1) of the values (cubes, P) of each cube that are not NaN."""
     ordered = np.sort(values, axis=1)  # NaN is sorted to the end
     n_unknown = np.isnan(ordered).sum(axis=1)
     n_known = values.shape[1] - n_unknown

@@ -16,7 +16,8 @@ from .health import Health
 from .statistics import WINDOW_S
 
 CONTACT_THRESHOLD = 3e-4
-"""Relative frequency shift |f/f0 - 1| above which a pad counts as loaded.
+"""Relative shift |f/f0 - 1| of a pad's frequency f from its rest frequency f0 above which the pad
+counts as loaded.
 
 It corresponds to about 0.1 kPa for foam with E = 0.3 MPa.
 """
@@ -29,7 +30,8 @@ recovery as drift.
 """
 
 WINDOWS_PER_UPDATE = 20
-"""Number of statistics windows between two updates of the rest frequencies in use.
+"""Number of windows of 0.5 s between two updates of the rest frequencies from which stress is
+computed.
 
 Every update is published, so that a recording can be reprocessed. Updating in every window would
 fill the recording.
@@ -39,14 +41,14 @@ fill the recording.
 class DriftTracker:
     """Follows slow drift of the rest frequencies of one skin.
 
-    At the end of each statistics window, the tracked rest frequency of every unloaded cube moves
-    towards the mean frequency of the window::
+    At the end of each window of 0.5 s, the tracked rest frequency f0 (frequency without load) of
+    every pad of an unloaded cube moves towards the mean frequency of the window::
 
         f0 += (mean(f) / temperature_factor - f0) * WINDOW_S / time_constant
 
     A cube is unloaded when all of its usable pads have been still and within `CONTACT_THRESHOLD`
-    of rest for `RELEASE_S`. A load that stays below the threshold cannot be told from drift and is
-    absorbed.
+    of their rest frequency for `RELEASE_S`. A load that stays below the threshold cannot be
+    distinguished from drift and becomes part of the rest frequency.
     """
 
     def __init__(self, pipeline: Pipeline, health: Health) -> None:
@@ -58,13 +60,13 @@ class DriftTracker:
         self._windows = 0
 
     def step(self, time_constant: float) -> bool:
-        """Process the window that `Health` has just closed.
+        """Move the tracked rest frequencies by the statistics of the window that has just ended.
 
         Args:
             time_constant: Time constant of the low-pass filter, in seconds.
 
         Returns:
-            Whether new rest frequencies have been put into use.
+            Whether stress is computed from new rest frequencies from now on.
         """
         self._adopt_tare()
         window = self._health.history[-1]
@@ -72,7 +74,7 @@ class DriftTracker:
         cubes = np.arange(len(has_rows))
         factor = self._pipeline.temperature_factor(cubes, self._health.temperature)
         measured = window.mean / factor
-        # Pads that a cube does not have are NaN, and so never usable.
+        # The rest frequency of a pad that a cube does not have is NaN, so this pad is never usable.
         is_left_out = self._health.state & LEFT_OUT > 0
         usable = ~is_left_out & ~np.isnan(self._tracked_rest)
 
@@ -85,13 +87,21 @@ class DriftTracker:
         return self._update_when_due()
 
     def _adopt_tare(self) -> None:
-        """Start again from the rest frequencies in use if a tare has replaced them."""
+        """Continue from the rest frequencies of the pipeline if a tare has replaced them."""
         current = self._pipeline.rest_frequency
         if not np.array_equal(current, self._rest_in_use, equal_nan=True):
             self._rest_in_use = self._tracked_rest = current
 
     def _is_at_rest(self, measured: Array, usable: Mask) -> Mask:
-        """Return, per cube, whether all usable pads are still and close to their rest frequency."""
+        """Return whether the usable pads of a cube are still and near their rest frequencies.
+
+        Args:
+            measured: Mean frequencies of the window at the reference temperature (cubes, P), in Hz.
+            usable: Whether a cube has this pad and the pad works (cubes, P).
+
+        Returns:
+            The answer for each cube (cubes,); False for a cube without usable pads.
+        """
         with np.errstate(invalid="ignore"):  # NaN where a cube has no such pad
             is_close = np.abs(measured / self._tracked_rest - 1) < CONTACT_THRESHOLD
         all_close = (is_close | ~usable).all(axis=1)
@@ -99,12 +109,23 @@ class DriftTracker:
         return at_rest
 
     def _count_unloaded_windows(self, at_rest: Mask, has_rows: Mask) -> None:
-        """Count windows since the last contact. Silence neither ends a contact nor begins one."""
+        """Count the windows since the last contact of each cube.
+
+        A cube without rows keeps its count, because nothing shows whether it is loaded.
+
+        Args:
+            at_rest: Whether all usable pads are near their rest frequencies (cubes,).
+            has_rows: Whether the cube had rows in the window (cubes,).
+        """
         counted = np.where(at_rest, self._unloaded_windows + 1, 0)
         self._unloaded_windows = np.where(has_rows, counted, self._unloaded_windows)
 
     def _update_when_due(self) -> bool:
-        """Put the tracked rest frequencies into use, every `WINDOWS_PER_UPDATE` windows."""
+        """Give the tracked rest frequencies to the pipeline every `WINDOWS_PER_UPDATE` windows.
+
+        Returns:
+            Whether the rest frequencies of the pipeline changed.
+        """
         self._windows += 1
         unchanged = np.array_equal(self._tracked_rest, self._rest_in_use, equal_nan=True)
         if self._windows % WINDOWS_PER_UPDATE or unchanged:

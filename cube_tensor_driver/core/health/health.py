@@ -1,9 +1,9 @@
 """Health of pads and cubes: which pads are broken, found from their frequencies alone.
 
-Every row is checked when it arrives, and a pad whose frequency is impossible (open, short, out of
-range) is left out of that very row. Conditions that need statistics (stuck, noisy, drifting) are
-found at the end of windows of `WINDOW_S` of the rows' own time. All arrays are (cubes, pads);
-nothing loops over cubes.
+Every row (sample of one cube) is checked when it arrives. A pad whose frequency is impossible
+(open, short, out of range) is already left out of the reconstruction of this row. Conditions that
+need statistics (stuck, noisy, drifting) are found at the end of windows of `WINDOW_S`, measured by
+the time stamps of the rows. All arrays are (cubes, pads); nothing loops over cubes.
 """
 
 from __future__ import annotations
@@ -24,30 +24,45 @@ from .diagnosis import Conditions, PadDiagnosis, has_high_residual
 from .statistics import WINDOW_S, Cubes, Window, WindowStatistics
 
 WINDOW_NS = round(1e9 * WINDOW_S)
-"""Length of a window, in ns."""
+"""Length of a window over which statistics of the pads are formed, in ns."""
 
 MAX_BACKWARD_NS = 2 * WINDOW_NS
-"""Longest time, in ns, that a row may lie before the end of the window and still belong to it.
+"""Longest time, in ns, by which the time stamp of a row may precede the end of the present window
+for the row to be counted in this window.
 
 An older row is from another recording, or from a clock that was set, so a new window starts.
 """
 
 HISTORY_WINDOWS = 20
-"""Number of closed windows that are kept for a tare: 10 s of data."""
+"""Number of ended windows whose statistics are kept for a tare: 10 s of data."""
 
 MIN_STRAIN = -0.8
-"""Smallest strain d/d_rest - 1 of a pad's foam that is possible: a fifth of its thickness."""
+"""Smallest possible strain d/d_rest - 1 of a pad's foam: pressed to a fifth of its thickness.
+
+A frequency that the pad law relates to a smaller strain counts as out of range.
+"""
 
 MAX_STRAIN = 1.0
-"""Largest strain of a pad's foam that is possible: twice its thickness."""
+"""Largest possible strain d/d_rest - 1 of a pad's foam: stretched to twice its thickness.
+
+A frequency that the pad law relates to a larger strain counts as out of range.
+"""
 
 OPEN_STRAIN = 3.0
-"""Strain whose frequency, or a higher one, means that the pad is disconnected."""
+"""Strain d/d_rest - 1 of a pad's foam from which on the pad counts as disconnected.
+
+The foam cannot reach it, so a frequency that the pad law relates to this strain or a larger one
+shows that the capacitor is disconnected.
+"""
 
 
 class _Limits(NamedTuple):
-    """Frequencies of the pads (cubes, P), in Hz: the possible range, and the lowest of an open
-    pad."""
+    """Limits of the frequencies of pads (cubes, P), in Hz.
+
+    Attributes:
+        low, high: Possible range of the frequency.
+        open: Frequency from which on the pad counts as disconnected.
+    """
 
     low: Single
     high: Single
@@ -58,11 +73,13 @@ class _Pattern(NamedTuple):
     """Quantities that depend only on the cube numbers of a message.
 
     Attributes:
-        repeats: Number of scans in the message; 0 if the cubes come in another order.
+        repeats: Number of scans (at most one row per cube, with rising cube numbers) in the
+            message; 0 if its rows are in another order.
         cube: Numbers of the cubes of one scan (n,).
-        cubes: The same cubes; a slice where they are neighbours, because it makes no copies.
+        cubes: The same numbers; a slice if they are consecutive, because indexing with a slice
+            makes no copy.
         low, high: Possible range of the frequencies (n, P), in Hz.
-        n_pads: Number of pads of all cubes of a scan.
+        n_pads: Number of pads of all cubes of a scan together.
     """
 
     repeats: int
@@ -74,14 +91,14 @@ class _Pattern(NamedTuple):
 
 
 class Health:
-    """Watches the cubes of a pipeline.
+    """Checks the pads of all cubes of a pipeline, and keeps their statistics.
 
     Attributes:
-        high_residual: Whether the residual of a cube stays above its limit (cubes,).
+        high_residual: Whether the residual of a cube is high by `has_high_residual` (cubes,).
         temperature: Newest temperature of each cube (cubes,), in °C.
-        history: The last closed windows.
-        closed: Number of windows that have been closed.
-        newest_ns: Newest time stamp, in ns.
+        history: Statistics of the last `HISTORY_WINDOWS` windows that have ended.
+        closed: Number of windows that have ended so far.
+        newest_ns: Newest time stamp of a row, in ns.
     """
 
     def __init__(self, pipeline: Pipeline) -> None:
@@ -98,9 +115,9 @@ class Health:
         self.closed = 0
         self.newest_ns = 0
         self._window_end_ns: int | None = None
-        # Number of rows in the present window with a residual above its limit.
+        # Number of rows of each cube in the present window with a residual above its limit.
         self._over_limit = np.zeros(n_cubes, int)
-        # The next two gather what `collect` returns.
+        # Number of rows, and whether the residual was high, since the last call of `collect`.
         self._rows = np.zeros(n_cubes, int)
         self._had_high_residual = np.zeros(n_cubes, bool)
         self.refresh()
@@ -109,22 +126,22 @@ class Health:
 
     @property
     def state(self) -> StatusBits:
-        """Present conditions of each pad (cubes, P), bits of `status.py`."""
+        """Present conditions (such as open) of each pad (cubes, P), bits of `status.py`."""
         return self._conditions.state
 
     @property
     def mask(self) -> PadMasks:
-        """Bit masks of the pads that are left out (cubes,)."""
+        """Bit masks of the pads that are not used, because of their conditions (cubes,)."""
         return self._conditions.mask
 
     @property
     def still(self) -> Mask:
-        """Whether no pad of a cube moved in the last window (cubes,)."""
+        """Whether the frequency of no usable pad of a cube moved in the last window (cubes,)."""
         return self._diagnosis.still
 
     @property
     def noise(self) -> Array:
-        """Noise of each pad (cubes, P) as the calibration states it, in Hz."""
+        """Standard deviation of each pad's frequency (cubes, P), in Hz, by the calibration."""
         return self._diagnosis.noise
 
     @property
@@ -134,7 +151,7 @@ class Health:
 
     @property
     def age_ns(self) -> Times:
-        """Time from the newest row of each cube to the newest row of all (cubes,), in ns."""
+        """Time from the newest row of each cube to the newest row of any cube (cubes,), in ns."""
         age: Times = self.newest_ns - self._statistics.newest_ns
         return age
 
@@ -143,7 +160,10 @@ class Health:
         return self._statistics.window()
 
     def refresh(self) -> None:
-        """Take over the rest frequencies of the pipeline, after a tare has changed them."""
+        """Compute the limits of the frequencies again, from the rest frequencies of the pipeline.
+
+        To be called after these have changed, by a tare or by the tracking of drift.
+        """
         calibrations, n_pads = self._pipeline.calibrations, self._pipeline.n_pads
         beta = pad_table([c.beta for c in calibrations], n_pads, fill=1.0)
         modulus = pad_table([c.modulus for c in calibrations], n_pads, fill=1.0)
@@ -164,26 +184,27 @@ class Health:
         self._patterns.clear()
 
     def update(self, rows: FrequencyRows) -> tuple[PadMasks, StatusBits]:
-        """Check rows before they are reconstructed.
+        """Check rows before their stress is reconstructed.
 
-        Several scans at once give the same bits as one by one.
+        The results do not depend on the number of scans per call.
 
         Args:
             rows: N rows of one scan, or of several scans one after the other.
 
         Returns:
-            Bit masks of the pads to leave out of each row (N,), including the faults that the
-            device reports, and the conditions of the row's cube (N,).
+            Bit masks of the pads to leave out of each row (N,), including those that the device
+            reports as broken, and the conditions that any pad of the row's cube has (N,).
 
         Raises:
-            LayoutError: The frequencies have another shape, or the skin has no such cube.
+            LayoutError: The frequencies have the wrong shape, or the skin does not have a cube.
         """
         if rows.frequency.shape != (len(rows), self._exists.shape[1]):
             raise self._misfit(rows.cube, rows.frequency.shape)
         pattern = self._patterns.get(rows.cube)
         if pattern.repeats:
             return self._check(pattern, rows)
-        # Cubes in another order are rare, so their parts are not kept in the cache.
+        # Rows in another order than that of scans are rare, so what is computed for them is not
+        # kept in the cache.
         left_out = np.empty(len(rows), np.uint32)
         status = np.empty(len(rows), np.uint16)
         for chosen in _split_into_scans(rows.cube):
@@ -193,17 +214,22 @@ class Health:
         return left_out, status
 
     def count_residuals(self, cube: AnyArray, status: StatusBits) -> None:
-        """Count the rows of cubes (N,) whose status (N,) says that the residual is high."""
+        """Count the rows whose residual is above its limit.
+
+        Args:
+            cube: Numbers of the cubes (N,).
+            status: Status bits of the rows of stress (N,).
+        """
         is_over_limit = status & RESIDUAL != 0
         if is_over_limit.any():
             np.add.at(self._over_limit, cube[is_over_limit], 1)
 
     def collect(self) -> tuple[StatusBits, Mask, Index]:
-        """Return what was found since the last call.
+        """Return the results of the time since the last call, and start again.
 
         Returns:
-            Conditions of the pads (cubes, P), whether the residual was high (cubes,), and the
-            number of rows (cubes,).
+            All conditions that a pad had (cubes, P), whether the residual was ever high (cubes,),
+            and the number of rows (cubes,).
         """
         had_high_residual: Mask = self._had_high_residual | self.high_residual
         rows = self._rows
@@ -212,7 +238,10 @@ class Health:
         return self._conditions.collect(), had_high_residual, rows
 
     def _check(self, pattern: _Pattern, rows: FrequencyRows) -> tuple[PadMasks, StatusBits]:
-        """Check the rows of B scans of the same n cubes; `update` states what is returned."""
+        """Check the rows of one or more scans of the same cubes, and add them to the statistics.
+
+        `update` explains the result.
+        """
         scans = pattern.repeats, len(pattern.cube)
         frequency = rows.frequency.reshape(*scans, -1)
         pad_fault = rows.pad_fault.reshape(scans)
@@ -222,7 +251,8 @@ class Health:
         any_doubtful = bool(is_doubtful.any())
         newest_ns = stamp_ns.max(axis=1).tolist()
         is_possible = (frequency > pattern.low) & (frequency < pattern.high)
-        # Scan by scan, because a scan with a fault changes the masks of those after it.
+        # Scans are examined one by one, because a scan with a bad pad changes which pads are left
+        # out of the scans after it.
         is_healthy = [
             np.count_nonzero(scan) == pattern.n_pads and not np.count_nonzero(faults)
             for scan, faults in zip(is_possible, pad_fault, strict=True)
@@ -232,12 +262,14 @@ class Health:
         start = 0
         while start < len(frequency):
             self._advance(newest_ns[start])
-            # Healthy scans of the same window change nothing but sums, so they are added at once.
+            # Scans without a bad pad in the same window change only sums, so they are added in one
+            # step.
             end = start + 1
             while end < len(frequency) and is_healthy[end] and self._in_window(newest_ns[end]):
                 end += 1
             if not is_healthy[start]:
-                # Before the masks are read below, so that the pad is left out of this very row.
+                # The conditions change before the masks are read below, so that the pad is left out
+                # of this very row.
                 self._mark_impossible(pattern.cube, frequency[start], is_possible[start])
                 self._mark_reported(pattern.cube, pad_fault[start])
             self._statistics.add(
@@ -255,7 +287,10 @@ class Health:
         return left_out.ravel(), status.ravel()
 
     def _advance(self, stamp_ns: int) -> None:
-        """Move on to a time: close the window if it has ended, discard it after a jump back."""
+        """End the present window if a time stamp, in ns, lies outside it, and start the next one.
+
+        If time went back, the statistics of the window are discarded and not evaluated.
+        """
         if self._in_window(stamp_ns):
             return
         if self._window_end_ns is None or stamp_ns < self._window_end_ns:
@@ -289,22 +324,33 @@ class Health:
         frequency: Single,
         is_possible: Mask,
     ) -> None:
-        """Add OPEN, SHORT or RANGE for pads whose frequency (n, P), in Hz, is impossible."""
+        """Add the condition OPEN, SHORT or RANGE of pads whose frequency is impossible.
+
+        Args:
+            cube: Numbers of the cubes (n,).
+            frequency: Frequencies (n, P), in Hz.
+            is_possible: Whether a frequency lies in the possible range (n, P).
+        """
         is_impossible = ~is_possible & self._exists[cube]
         rows = np.flatnonzero(is_impossible.any(axis=1))
         cube, frequency = cube[rows], frequency[rows]
         bits = np.where(frequency >= self._limits.open[cube], OPEN, RANGE)
-        bits[~(frequency > 0)] = SHORT  # NaN, too
+        bits[~(frequency > 0)] = SHORT  # true for NaN, too
         bits[~is_impossible[rows]] = 0
         self._conditions.add(cube, bits.astype(np.uint16))
 
     def _mark_reported(self, cube: Index, pad_fault: PadMasks) -> None:
-        """Add the faults that the device reports, of the pads that the cube has."""
+        """Add the condition REPORTED of pads that the device reports as broken.
+
+        Args:
+            cube: Numbers of the cubes (n,).
+            pad_fault: Bit masks of the pads that the device reports (n,).
+        """
         rows = np.flatnonzero(pad_fault)
         cube = cube[rows]
         pads = np.arange(self._exists.shape[1])
         is_reported = pad_fault[rows, None] >> pads & 1 > 0
-        # The hub may report a bit of a pad that the cube does not have.
+        # The hub may set the bit of a pad that the cube does not have.
         is_reported &= self._exists[cube]
         self._conditions.add(cube, is_reported * np.uint16(REPORTED))
 
@@ -319,7 +365,8 @@ class Health:
         if repeats:
             scan = cubes = cube[: len(cube) // repeats].copy()
             first, last = int(scan[0]), int(scan[-1])
-            # Numbers of a scan rise, so it has no gaps if its length fits.
+            # The cube numbers of a scan rise, so they are consecutive if the first and the last
+            # differ by their number minus 1.
             if last - first + 1 == len(scan):
                 cubes = slice(first, last + 1)
         return _Pattern(
@@ -340,11 +387,14 @@ class Health:
 
 
 def _split_into_scans(cube: AnyArray) -> list[Index]:
-    """Split rows of cubes (N,) in any order into parts, each of several scans of the same cubes.
+    """Split rows in any order into parts, each of one or more scans of the same cubes.
 
     The first scan has the first row of each cube, the second scan the second row of each, and so
-    on. Neighbouring scans of the same cubes are one part. The cubes that come k times are among
-    those that come k - 1 times, so there are at most as many parts as cubes.
+    on. Consecutive scans of the same cubes are one part. A cube with k rows also has k - 1 rows, so
+    the scans only lose cubes, and there are at most as many parts as cubes.
+
+    Args:
+        cube: Cube number of each row (N,).
 
     Returns:
         Row numbers of each part.

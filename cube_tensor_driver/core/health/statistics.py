@@ -1,19 +1,22 @@
 """Statistics of every pad over windows of half a second.
 
+From the frequencies f[n] of a pad at the times t[n] of successive rows are computed:
+
     first difference     d[n] = f[n] - f[n-1]
     second difference    e[n] = d[n] - r d[n-1],   r = (t[n] - t[n-1]) / (t[n-1] - t[n-2])
     noise                sqrt(mean(w e²) / 6),     w = 6 / (1 + (1 + r)² + r²)
     roughness            sum(w e²) / sum(d²)
 
-Second differences of white noise with variance s² have the variance 6 s² (for r = 1). A load that
-moves slowly does not appear in them, not even where rows are missing, because r follows the times.
+Second differences of white noise with variance s² have the variance 6 s² (for r = 1). The frequency
+shift by a load that moves slowly has almost no second difference, not even where rows are missing,
+because the ratio r of the time intervals takes them into account.
 
-In the noise each term w e² is bounded, so that one jump does not look like noise. In the roughness
-it is not bounded, because strong noise would then look like a moving load. The roughness is 3 for
-noise, and (2 pi F T)² for a load that moves with frequency F and is sampled with period T.
+In the noise each term w e² is cut to a limit, so that one jump does not look like noise. In the
+roughness it is not cut, because strong noise would then look like a moving load. The roughness is 3
+for noise, and (2 pi F T)² for a load that oscillates with frequency F and is sampled with period T.
 
-r is 1 as long as two intervals are equal within `MAX_JITTER_RATIO`. w is 0 across a gap, and where
-one of the three time stamps is doubtful.
+r is set to 1 if two intervals are equal within `MAX_JITTER_RATIO`. w is set to 0 if an interval is
+`GAP_NS` or longer, and if one of the three time stamps is doubtful.
 
 The sums are only needed at the end of a window. Single scans therefore wait until several can be
 added in one pass: a call of numpy costs as much as the arithmetic of 64 cubes. All arrays are
@@ -29,42 +32,52 @@ import numpy as np
 from ..arrays import AnyArray, Array, Index, Mask, Single, Times
 
 Cubes = slice | Index
-"""Cubes of a scan. A slice selects a view of an array, an index makes a copy."""
+"""Numbers of the cubes of a scan, as an index array or as a slice. Indexing an array with a slice
+gives a view, indexing with an index array makes a copy."""
 
 WINDOW_S = 0.5
-"""Length of a window, in seconds of the rows' own time."""
+"""Length of a window over which statistics of the pads are formed, in seconds.
+
+It is measured by the time stamps of the rows and not by a clock, so that a replay gives the same
+windows.
+"""
 
 MAX_SMOOTH_ROUGHNESS = 0.3
-"""Roughness below which the frequency of a pad is smooth, so that a moving load explains it.
+"""Roughness (squared second differences / squared first differences of a pad's frequency, summed
+over a window) below which a moving load, and not noise, explains the changes of the frequency.
 
-A load is smooth up to 9 Hz at 100 rows a second.
+At 100 rows per second, the roughness of a load that oscillates at up to 9 Hz is below it.
 """
 
 GAP_NS = 50_000_000
-"""Interval between two rows, in ns, from which on the motion between them is unknown.
+"""Interval between the time stamps of two rows of a cube, in ns, from which on the interval counts
+as a gap: how the frequencies changed within it is unknown.
 
-At `MIN_COUNT` rows in a window, rows come twice as often.
+A cube with the minimum rate for statistics (`MIN_COUNT` rows in 0.5 s) has intervals of half this.
 """
 
 MAX_JITTER_RATIO = 1.5
-"""Ratio of two intervals up to which they count as equal.
+"""Ratio of two successive intervals between rows up to which the intervals count as equal.
 
-Time stamps jitter, but a missing row doubles the interval.
+The jitter of time stamps changes intervals by less, and a missing row doubles an interval.
 """
 
 MAX_WAITING_SCANS = 8
-"""Number of single scans that are added in one pass; more scans of 1260 cubes would not fit into
-the cache of the processor."""
+"""Number of single scans (one row of each of some cubes) that are collected and then added to the
+statistics in one pass. More scans of 1260 cubes would not fit into the cache of the processor."""
 
 
 class Window(NamedTuple):
-    """Statistics of one window.
+    """Statistics of the frequencies of all pads in one window of 0.5 s.
 
     Attributes:
         rows: Number of rows of each cube (cubes,).
-        mean, lowest, highest, noise: Of each pad's frequency (cubes, P), in Hz. NaN where nothing
-            was measured.
-        rough: Whether the frequency is rougher than a moving load makes it (cubes, P).
+        mean, lowest, highest: Mean, lowest and highest frequency of each pad (cubes, P), in Hz. NaN
+            where nothing was measured.
+        noise: Noise (standard deviation without slow changes) of each pad's frequency (cubes, P),
+            in Hz. NaN where nothing was measured.
+        rough: Whether the roughness of a pad's frequency is above `MAX_SMOOTH_ROUGHNESS`, so that
+            noise and not a moving load explains its changes (cubes, P).
         gap_before: Interval from the last row before the window to its first row (cubes,), in ns.
         gap_within: Longest interval between two rows of the window (cubes,), in ns.
 
@@ -82,20 +95,22 @@ class Window(NamedTuple):
 
 
 class WindowStatistics:
-    """Sums over the present window.
+    """Sums over the rows of the present window, from which `Window` is computed.
 
-    The differences between rows continue from window to window.
+    Differences are formed from row to row also across the end of a window.
     """
 
     def __init__(self, rest_frequency: Array) -> None:
         """Start the first window.
 
         Args:
-            rest_frequency: Rest frequencies (cubes, P), in Hz, NaN where a cube has no such pad.
-                Sums are of the difference from them, for which float32 is precise enough.
+            rest_frequency: Frequencies without load (cubes, P), in Hz, NaN where a cube has no such
+                pad. Frequencies are summed after these are subtracted, because float32 is precise
+                enough only for the differences.
         """
         n_cubes = len(rest_frequency)
-        # One array holds all quantities of the pads, so that a scan selects its cubes only once.
+        # One array holds all quantities of the pads, so that one indexing operation per scan
+        # selects the cubes in all of them.
         self._pads = np.full((10, *rest_frequency.shape), np.nan, np.float32)
         (
             self._last,
@@ -113,10 +128,11 @@ class WindowStatistics:
         self._count = np.zeros(n_cubes, int)
         self._gap_before = np.zeros(n_cubes, np.int64)
         self._gap_within = np.zeros(n_cubes, np.int64)
-        # Time stamp of the newest row of each cube, and the interval before it; 0 is unknown.
+        # Time stamp of the newest row of each cube, and the interval before it; 0 means unknown.
         self._time_ns = np.zeros(n_cubes, np.int64)
         self._interval_ns = np.zeros(n_cubes, np.int64)
-        # Whether the newest stamp of each cube is doubtful; then so is the interval after it.
+        # Whether the newest time stamp of each cube is doubtful. The interval to the next row is
+        # then doubtful, too.
         self._is_doubtful = np.zeros(n_cubes, bool)
         self._waiting = _WaitingScans(slice(0), (0, 0))
         self.clear()
@@ -136,18 +152,18 @@ class WindowStatistics:
 
     @property
     def bound(self) -> Single:
-        """Upper limit of each term of the noise (cubes, P), in Hz²."""
+        """Limit to which each squared second difference in the noise is cut (cubes, P), in Hz²."""
         bound: Single = self._bound
         return bound
 
     @bound.setter
     def bound(self, value: Array) -> None:
-        # Scans that wait belong to the window before, whose bound was another.
+        # Scans that wait are added first, because the old limit holds for them.
         self._add_waiting()
         self._bound[:] = value
 
     def clear(self) -> None:
-        """Start a new window."""
+        """Set all sums to zero, to start a new window."""
         self._add_waiting()
         self._first_squares[:] = 0
         self._second_squares[:] = 0
@@ -168,22 +184,22 @@ class WindowStatistics:
     ) -> None:
         """Add B scans of the same N cubes.
 
-        Sums are formed scan by scan, so their bits do not depend on the number of scans that are
-        added at a time.
+        Sums are formed scan by scan, so their bits do not depend on the number of scans per call.
 
         Args:
-            cubes: The N cubes.
+            cubes: Numbers of the N cubes.
             frequency: Frequencies (B, N, P), in Hz.
             stamp_ns: Time stamps (B, N), in ns.
-            doubtful: Which stamps are doubtful (B, N); None stands for none of them.
+            doubtful: Whether a time stamp is doubtful (B, N); None if none of them is.
         """
         frequency = frequency.astype(np.float32, copy=False)
         if len(frequency) > 1 or doubtful is not None or self._is_doubtful.any():
-            # Scans that wait have no doubtful stamps, and come first.
+            # The scans that wait are older, so they are added first.
             self._add_waiting()
             self._add(cubes, frequency, stamp_ns, doubtful)
             return
-        # The pattern cache returns the same object for the same cubes, so `is` is enough.
+        # `PatternCache` returns the same object for the same cubes, so comparing the objects with
+        # `is not` suffices.
         if cubes is not self._waiting.cubes:
             self._add_waiting()
             self._waiting = _WaitingScans(cubes, frequency.shape[1:])
@@ -234,7 +250,7 @@ class WindowStatistics:
         last[:] = frequency[-1]
 
         if not isinstance(cubes, slice):
-            # An index has made a copy, whose sums go back into the table.
+            # Indexing with an array made a copy, so the changed sums are written back.
             self._pads[:, cubes] = chosen
         self._count[cubes] += len(frequency)
 
@@ -262,7 +278,16 @@ class WindowStatistics:
         doubtful: Mask | None,
         scans: int,
     ) -> Mask | None:
-        """Return which intervals have a doubtful stamp at an end (B, N); None stands for none."""
+        """Return whether an interval between rows begins or ends with a doubtful time stamp.
+
+        Args:
+            cubes: Numbers of the N cubes.
+            doubtful: Whether a time stamp is doubtful (B, N); None if none of them is.
+            scans: Number B of scans.
+
+        Returns:
+            Whether the interval before each row is doubtful (B, N); None if none of them is.
+        """
         before = self._is_doubtful[cubes]
         if doubtful is None:
             if not before.any():
@@ -279,15 +304,17 @@ class WindowStatistics:
         stamp_ns: Times,
         doubtful: Mask | None,
     ) -> tuple[Single, Single] | None:
-        """Compute r and w of B scans from the intervals between the rows of a cube.
+        """Compute ratios and weights for second differences from the intervals between rows.
+
+        The formulas are those of r and w in the head of this file.
 
         Args:
-            cubes: The N cubes.
+            cubes: Numbers of the N cubes.
             stamp_ns: Time stamps (B, N), in ns.
-            doubtful: Which intervals are doubtful (B, N).
+            doubtful: Whether the interval before each row is doubtful (B, N); None if none is.
 
         Returns:
-            r and w (B, N, 1), or None where all of them are 1.
+            Ratios r and weights w (B, N, 1), or None if all of them are 1.
         """
         between = _differences(self._time_ns[cubes], stamp_ns)
         interval = between if doubtful is None else np.where(doubtful, 0, between)
@@ -300,7 +327,7 @@ class WindowStatistics:
         is_not_shorter = before < MAX_JITTER_RATIO * interval
         is_even = is_not_longer & is_not_shorter
         longest = max(interval.max(), before.max())
-        # The usual case returns early, which saves a third of the time of `add`.
+        # Usually all intervals are even. Returning early then saves a third of the time of `add`.
         if longest < GAP_NS and is_even.all():
             return None
         self._note_gaps(cubes, between)
@@ -310,12 +337,18 @@ class WindowStatistics:
         safe_before = np.where(is_known, before, 1)
         ratio = np.where(is_known & ~is_even, interval / safe_before, 1.0)
         weight = is_known * 6 / (1 + (1 + ratio) ** 2 + ratio**2)
-        # One value for all pads of a row.
+        # The added axis applies one value to all pads of a row.
         ratio, weight = ratio[..., None], weight[..., None]
         return ratio.astype(np.float32), weight.astype(np.float32)
 
     def _note_gaps(self, cubes: Cubes, interval: Times) -> None:
-        """Remember the longest gap among intervals (B, N), in ns; negative if time went back."""
+        """Keep the longest gap between rows, for the statistics of the window.
+
+        Args:
+            cubes: Numbers of the N cubes.
+            interval: Interval before each row (B, N), in ns; negative if time went back, which
+                counts as a gap, too.
+        """
         is_gap = (interval < 0) | (interval >= GAP_NS)
         gap = np.where(is_gap, interval, 0)
         if not gap.any():
@@ -332,17 +365,22 @@ class WindowStatistics:
 
 
 class _WaitingScans:
-    """Copies of single scans of the same N cubes that wait until they are added.
+    """Copies of single scans of the same N cubes that wait to be added to the statistics.
 
     Attributes:
         count: Number of scans that wait.
-        cubes: The cubes of a scan.
+        cubes: Numbers of the cubes of a scan.
         frequency: Frequencies (MAX_WAITING_SCANS, N, P), in Hz.
         stamp_ns: Time stamps (MAX_WAITING_SCANS, N), in ns.
     """
 
     def __init__(self, cubes: Cubes, shape: tuple[int, ...]) -> None:
-        """Make room for scans whose frequencies have this shape (N, P)."""
+        """Allocate memory for `MAX_WAITING_SCANS` scans.
+
+        Args:
+            cubes: Numbers of the N cubes of a scan.
+            shape: Shape (N, P) of the frequencies of a scan.
+        """
         self.cubes = cubes
         self.frequency = np.empty((MAX_WAITING_SCANS, *shape), np.float32)
         self.stamp_ns = np.empty((MAX_WAITING_SCANS, shape[0]), np.int64)
@@ -355,9 +393,11 @@ class _WaitingScans:
 
 
 def _differences(before: AnyArray, values: AnyArray) -> AnyArray:
-    """Return the difference (B, ...) of each value to the one before it.
+    """Return the difference (B, ...) between each value and the previous one.
 
-    The value before the first one is `before`.
+    Args:
+        before: Value before the first one (...).
+        values: Successive values (B, ...).
     """
     result = np.empty_like(values)
     np.subtract(values[0], before, out=result[0])
@@ -366,6 +406,9 @@ def _differences(before: AnyArray, values: AnyArray) -> AnyArray:
 
 
 def _add_in_order(total: Single, terms: Single) -> None:
-    """Add terms (B, N, P) to a total (N, P) one after the other, as single scans are added."""
+    """Add terms (B, N, P) to a total (N, P) in place, one after the other.
+
+    The bits of the sum are then the same as if the scans were added in separate calls.
+    """
     for term in terms:
         total += term

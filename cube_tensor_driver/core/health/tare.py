@@ -2,9 +2,10 @@
 
     f0 = mean(f) / factor(T)
 
-per pad, over the last windows of `Health`; factor(T) is the temperature model of the calibration.
-The mean is of data that have already arrived, so nothing has to wait. A tare is refused if the
-signal moved during these windows, or if the data have a gap.
+The mean frequency of each pad over the last windows (of 0.5 s) that `Health` keeps becomes the
+frequency without load, f0. factor(T) is f0(T) / f0 by the temperature model of the calibration. The
+mean is of data that have already arrived, so nothing has to wait. A tare is refused if a frequency
+moved during these windows, or if the data have a gap.
 """
 
 from __future__ import annotations
@@ -24,45 +25,57 @@ from .health import HISTORY_WINDOWS, Health
 from .statistics import WINDOW_S, Window
 
 MAX_DURATION_S = HISTORY_WINDOWS * WINDOW_S
-"""Longest duration of a tare, in s: that of the windows which `Health` keeps."""
+"""Longest duration over which a tare can average, in s, limited by the windows that `Health`
+keeps."""
 
 MAX_SPAN = 12.0
-"""Span (peak to peak) of a pad, as a multiple of the calibration's noise, above which it moves.
+"""Span (highest minus lowest frequency of a pad) above which a tare is refused because the load
+moves, as a multiple of the noise (standard deviation) in the calibration.
 
 In 10000 rows, noise alone spans 9 times its standard deviation.
 """
 
 MAX_NOISE = 4.0
-"""Noise of a pad, as a multiple of the calibration's noise, above which a mean is unreliable."""
+"""Measured noise of a pad above which a tare is refused because a mean would be unreliable, as a
+multiple of the noise (standard deviation of the frequency) in the calibration."""
 
 MAX_REST_CHANGE = 0.2
-"""Largest relative difference of a new rest frequency from that of the calibration.
+"""Largest relative change, against the calibration, of a rest frequency (frequency without load)
+with which a tare is accepted.
 
-A larger one shows a load or another cube.
+A larger difference shows that a load is on the cube, or that the calibration is of another cube.
 """
 
 JUMP_SPAN = 10.0
-"""Span of a pad, as a multiple of its own noise, above which the signal has jumped.
+"""Span (highest minus lowest frequency of a pad), as a multiple of the measured noise, above which
+the frequency has jumped.
 
-A jump raises the noise as well, but white noise does not span so much. The span is then reported,
-and not the noise.
+White noise does not span so much. A jump raises the measured noise as well, so a refused tare then
+reports the span and not the noise.
 """
 
 MAX_GAP_S = 0.25
-"""Longest gap in the data, in s, over which the load counts as unchanged."""
+"""Longest gap between two rows of a cube, in s, with which a tare is accepted.
+
+The load might have changed during a longer gap. Where rows come slowly, `MAX_GAP_ROWS` replaces
+this limit.
+"""
 
 MAX_GAP_ROWS = 4.0
-"""Longest gap over which the load counts as unchanged, as a multiple of the rows' mean interval.
+"""Longest gap between two rows of a cube with which a tare is accepted, as a multiple of the mean
+interval between rows.
 
-It replaces `MAX_GAP_S` where rows come so slowly that it is the longer one.
+It replaces `MAX_GAP_S` where rows come so slowly that it gives the longer time.
 """
 
 
 class _Means(NamedTuple):
-    """Statistics of the tared cubes over several windows.
+    """Statistics of the frequencies of the cubes to tare, over several windows.
 
     Attributes:
-        frequency, span, noise: Mean, peak-to-peak span and noise (cubes, P), in Hz.
+        frequency: Mean frequency of each pad (cubes, P), in Hz.
+        span: Highest minus lowest frequency of each pad (cubes, P), in Hz.
+        noise: Standard deviation of each pad's frequency, without slow changes (cubes, P), in Hz.
     """
 
     frequency: Array
@@ -71,12 +84,13 @@ class _Means(NamedTuple):
 
 
 class _Check(NamedTuple):
-    """A quantity of each pad that must not exceed a limit.
+    """A quantity of each pad that must not exceed a limit for a tare to be accepted.
 
     Attributes:
         values: The quantity (cubes, P).
-        limit: Its limit.
-        problem, unit, fix: Words for the error message.
+        limit: Limit of the quantity.
+        problem, unit, fix: Texts for the error message: what is wrong with the pad, the unit of the
+            quantity, and what to do.
     """
 
     values: Array
@@ -93,13 +107,13 @@ def measure_rest(
     duration: float,
     names: Sequence[str],
 ) -> Array:
-    """Compute the rest frequencies that a tare sets.
+    """Compute the rest frequencies (frequencies without load) that a tare sets.
 
-    Pads that are left out, and other cubes, keep their rest frequencies.
+    Pads that do not work, and cubes that are not tared, keep their rest frequencies.
 
     Args:
         pipeline: Pipeline with the calibrations and the present rest frequencies.
-        health: Health with the last windows.
+        health: Health of the pads, with the statistics of the last windows.
         cubes: Numbers of the cubes to tare.
         duration: Duration of the newest data to average, in s, in steps of `WINDOW_S`.
         names: Names of all cubes, for messages.
@@ -108,8 +122,8 @@ def measure_rest(
         Rest frequencies of all cubes (cubes, P), in Hz.
 
     Raises:
-        TareError: A cube's signal moves, is noisy, too short or too far from its calibration, or
-            none of its pads works.
+        TareError: The frequencies of a cube moved, are noisy, are too far from its calibration, or
+            were received for a shorter time than `duration`; or none of its pads works.
     """
     chosen = np.asarray(cubes, dtype=int)
     windows = _select_windows(health, chosen, duration, names)
@@ -137,7 +151,21 @@ def _select_windows(
     duration: float,
     names: Sequence[str],
 ) -> list[Window]:
-    """Return the windows to average. TareError: there are not enough data."""
+    """Return the windows to average.
+
+    Args:
+        health: Health of the pads, with the statistics of the last windows.
+        chosen: Numbers of the cubes to tare.
+        duration: Duration to average, in s.
+        names: Names of all cubes, for messages.
+
+    Returns:
+        The last windows that cover the duration, and the present one, which has not ended.
+
+    Raises:
+        TareError: The duration is outside its limits, or the data are too short, too few, or have
+            a gap.
+    """
     if not 0 < duration <= MAX_DURATION_S:
         raise TareError(f"tare over {duration:g} s; allowed: above 0 to {MAX_DURATION_S:g} s")
     # The rounding error of a duration such as 0.1 + 0.2 + 0.2 must not add a window.
@@ -148,7 +176,8 @@ def _select_windows(
             f"tare takes {duration:g} s: wait"
         )
     windows = list(health.history)[-count:]
-    # A signal that moves in the present window, which has not ended, is refused, too.
+    # The present window, which has not ended, is included, so that a tare is also refused if a
+    # frequency moves in it.
     present = health.window()
     if present.rows.any():
         windows.append(present)
@@ -172,14 +201,14 @@ def _refuse_gaps(
     rows: Index,
     names: Sequence[str],
 ) -> None:
-    """Raise TareError if rows of a cube are too far apart in time to be averaged.
+    """Raise TareError if the time between two rows of a cube is too long for a tare.
 
     Args:
-        health: Health, for the age of the newest rows.
+        health: Health of the pads, which states the age of the newest row of each cube.
         chosen: Numbers of the cubes to tare.
         windows: Windows to average.
         rows: Number of rows of each of these cubes in the windows.
-        names: Names of all cubes.
+        names: Names of all cubes, for messages.
     """
     # A gap before the first window does not matter, because no earlier row is averaged.
     before = [window.gap_before[chosen] for window in windows[1:]]
@@ -198,7 +227,12 @@ def _refuse_gaps(
 
 
 def _average(windows: Sequence[Window], chosen: Index) -> _Means:
-    """Average the windows, each weighted with its number of rows."""
+    """Combine the statistics of several windows, each weighted with its number of rows.
+
+    Args:
+        windows: Windows to average.
+        chosen: Numbers of the cubes to tare.
+    """
     rows = np.array([window.rows[chosen] for window in windows])
     rows = rows[:, :, None]
     mean = np.array([window.mean[chosen] for window in windows])
@@ -207,10 +241,11 @@ def _average(windows: Sequence[Window], chosen: Index) -> _Means:
     highest = np.fmax.reduce([window.highest[chosen] for window in windows])
     lowest = np.fmin.reduce([window.lowest[chosen] for window in windows])
 
-    # The mean of a window without rows is NaN, which its weight 0 would not remove.
+    # The mean of a window without rows is NaN, and NaN times its weight 0 would be NaN.
     known_mean = np.where(rows > 0, mean, 0)
     total = (known_mean * rows).sum(axis=0)
-    # The first rows of a cube have no differences yet, so the noise of their window is NaN.
+    # The noise of a window is NaN if it holds the first rows of a cube ever, because these have no
+    # differences to rows before.
     rows_with_noise = rows * np.isfinite(variance)
     total_variance = (np.nan_to_num(variance) * rows_with_noise).sum(axis=0)
     n_with_noise = np.maximum(rows_with_noise.sum(axis=0), 1)
@@ -265,8 +300,16 @@ def _apply_check(
     pipeline: Pipeline,
     names: Sequence[str],
 ) -> None:
-    """Raise TareError that names the worst pad, if one of the used pads exceeds the limit."""
-    # Written so that NaN exceeds every limit.
+    """Raise TareError if a quantity of a pad exceeds its limit; the error names the worst pad.
+
+    Args:
+        check: The quantity and its limit.
+        used: Whether a pad is checked (cubes, P).
+        chosen: Numbers of the cubes to tare.
+        pipeline: Pipeline with the calibrations, which name the pads.
+        names: Names of all cubes.
+    """
+    # The comparison is negated, so that NaN counts as above the limit.
     exceeds = used & ~(check.values <= check.limit)
     if not exceeds.any():
         return
