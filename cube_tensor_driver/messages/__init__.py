@@ -1,4 +1,5 @@
-"""Messages as plain data: the codec of the batch messages, the description of a skin, contacts.
+"""Encoding and decoding of messages: rows of frequencies or stress, skin info, contacts.
 
-Nodes and bags share this folder, so it imports neither ROS nor a library for bags.
+ROS nodes and the code for bags (recordings) share this folder, so it imports neither ROS nor a
+library for bags.
 """

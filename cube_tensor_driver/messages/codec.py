@@ -1,9 +1,10 @@
-"""The codec of the batch messages: serialised bytes to rows, and rows to serialised bytes.
+"""The codec of SkinFrequencies and SkinStress: serialised bytes to rows, rows to serialised bytes.
 
-Two messages with the same number of rows and pads, and frame ids of the same length, have their
-fields at the same bytes. So a record type of numpy describes all of them, and nothing here loops
-over rows. The bytes are little-endian CDR (OMG DDS-XTypes 7.4.1): a sequence begins with its number
-of values as 4 bytes, at a multiple of 4.
+Each of these messages holds many rows (one row is one sample of one cube). Two messages with the
+same numbers of rows and pads, and frame ids of the same length, have each field at the same byte
+offset. So one structured dtype of numpy describes all of them, and there is no loop over rows. The
+bytes are little-endian CDR (OMG DDS-XTypes 7.4.1): a sequence begins with the number of its values
+as 4 bytes, at an offset that is a multiple of 4.
 """
 
 from __future__ import annotations
@@ -23,22 +24,22 @@ from ..core.modes import GRADIENT, STRESS
 from ..core.rows import FrequencyRows, StressRows
 
 SECOND = 1_000_000_000
-"""One second, in ns."""
+"""Number of nanoseconds in one second."""
 
 MAX_CACHED_LAYOUTS = 32
-"""Number of layouts of messages that a codec keeps in memory.
+"""Number of message layouts (byte offsets of all fields) that a codec keeps in memory.
 
-There is one per skin and number of scans in a message.
+Messages of one skin have one layout for each number of rows that occurs.
 """
 
 LITTLE_ENDIAN = b"\x00\x01\x00\x00"
-"""First bytes of a message in little-endian CDR."""
+"""First 4 bytes of every serialised message in little-endian CDR."""
 
 PER_PAD = -1
-"""Value of `_Field.width` for a field that has one value per pad in each row."""
+"""Value of `_Field.width` for a field with one value for each pad of a cube in each row."""
 
 PER_MESSAGE = 0
-"""Value of `_Field.width` for a field that has one value per message."""
+"""Value of `_Field.width` for a field with a single value in a message, which is no sequence."""
 
 _SECONDS_AT = len(LITTLE_ENDIAN)
 _NANOSECONDS_AT = _SECONDS_AT + 4
@@ -46,18 +47,20 @@ _FRAME_LENGTH_AT = _NANOSECONDS_AT + 4
 _FRAME_AT = _FRAME_LENGTH_AT + 4
 
 SHAPE_AT = _FRAME_LENGTH_AT
-"""Place in a message of the bytes that `MessageCodec.shape_bytes` returns."""
+"""Byte offset, from the start of the serialised message, of the bytes that
+`MessageCodec.shape_bytes` returns."""
 
 AnyRows = TypeVar("AnyRows", FrequencyRows, StressRows)
 
 
 class _Field(NamedTuple):
-    """A field behind the header.
+    """Definition of one field that follows the header of a message.
 
     Attributes:
         name: Name in the message definition.
-        type: numpy's name of the type of a value, whose last character is its size in bytes.
-        width: Number of values per row, or PER_PAD, or PER_MESSAGE.
+        type: numpy's name of the type of a value, such as "<f4"; its last character is the size in
+            bytes.
+        width: Number of values in each row, or PER_PAD, or PER_MESSAGE.
     """
 
     name: str
@@ -89,12 +92,12 @@ _STRESS = (
 
 
 class _Shape(NamedTuple):
-    """What determines the places of the fields of a message.
+    """Lengths that determine the byte offsets of all fields of a message.
 
     Attributes:
-        frame: Length of the frame id including its closing zero.
-        rows: Number of rows.
-        pads: Number of pads of a row; 0 in messages without pads.
+        frame: Length of the frame id in bytes, including its closing zero.
+        rows: Number of rows (samples of one cube each).
+        pads: Number of pads in each row; 0 in SkinStress, which has no values per pad.
     """
 
     frame: int
@@ -102,14 +105,14 @@ class _Shape(NamedTuple):
     pads: int
 
 
-class _Place(NamedTuple):
-    """The place of a field in a message.
+class _FieldOffsets(NamedTuple):
+    """Byte offsets of one field from the start of the serialised message.
 
     Attributes:
-        field: The field.
-        count_at: Place of its number of values; None if it is no sequence.
-        at: Place of its values.
-        values: Number of values.
+        field: Definition of the field.
+        count_at: Byte offset of the number of its values; None if the field is no sequence.
+        at: Byte offset of its first value.
+        values: Number of its values.
     """
 
     field: _Field
@@ -119,14 +122,15 @@ class _Place(NamedTuple):
 
 
 class _Layout(NamedTuple):
-    """The layout of all messages of one shape.
+    """Layout of all messages with the same numbers of rows and pads and length of the frame id.
 
     Attributes:
-        shape: The shape.
-        record: Record type of a message.
-        sequences: Names of the sequences, `frame_id` first.
+        shape: These three lengths.
+        record: Structured dtype of numpy that describes a whole message.
+        sequences: Names of the fields that are sequences, `frame_id` first.
         counts: Numbers of values that these sequences must have.
-        count_words: Places of these numbers, in units of 4 bytes.
+        count_words: Offsets, in units of 4 bytes from the start of the message, at which these
+            numbers are stored.
     """
 
     shape: _Shape
@@ -138,12 +142,12 @@ class _Layout(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Decoded(Generic[AnyRows]):
-    """M messages of one shape.
+    """Contents of M decoded messages with the same numbers of rows and pads.
 
     Attributes:
-        rows: Rows of all messages, message after message. Those of a single message are views of
-            its bytes.
-        stamp_ns: Time stamps of the headers (M,), in ns.
+        rows: Rows of all messages, message after message. With M = 1, most columns are views of the
+            bytes of the message; with more they are copies.
+        stamp_ns: Time stamps of the headers (M,), in ns since the Unix epoch.
         frame_id: Frame id of the headers, with its closing zero.
     """
 
@@ -155,19 +159,33 @@ class Decoded(Generic[AnyRows]):
         return len(self.stamp_ns)
 
     def select(self, chosen: slice) -> Decoded[AnyRows]:
-        """Return some neighbouring messages."""
+        """Return the successive messages that a slice without a step selects."""
         n_rows = len(self.rows) // len(self)
         begin, end, _ = chosen.indices(len(self))
         rows = self.rows.select(slice(begin * n_rows, end * n_rows))
         return Decoded(rows, self.stamp_ns[chosen], self.frame_id)
 
     def by_message(self, column: AnyArray) -> AnyArray:
-        """Return a column of `rows` as (M, rows, ...), message by message."""
+        """Reshape a column of `rows` so that its first axis counts the messages.
+
+        Args:
+            column: Column of the rows of all M messages, for example `rows.frequency`.
+
+        Returns:
+            The column with the shape (M, rows of one message, ...).
+        """
         return column.reshape(len(self), -1, *column.shape[1:])
 
 
 class MessageBuffer(Generic[AnyRows]):
-    """A serialised message of fixed shape that is filled in place again and again.
+    """Memory of a serialised message with fixed numbers of rows and pads, which is used repeatedly.
+
+    The caller writes values into `rows` and calls `data` to get the bytes of the message.
+
+    Args:
+        codec: Codec of the type of message.
+        layout: Byte offsets of the fields.
+        frame_id: Frame id with its closing zero.
 
     Attributes:
         rows: Rows to write into. All columns but `stamp_ns` are views of the bytes of the message.
@@ -184,20 +202,22 @@ class MessageBuffer(Generic[AnyRows]):
         stamp_ns = np.zeros(layout.shape.rows, np.int64)
         self.rows: AnyRows = codec.make_rows(self._record, stamp_ns)
         self._time_offset = self._record["time_offset"][0]
-        # Looked up here once, because this takes as long as copying the rows of a small skin.
+        # The columns are looked up only once, because this takes as long as copying the rows of a
+        # skin with few cubes.
         self._names = [field.name for field in fields(self.rows)]
         self._columns = [getattr(self.rows, name) for name in self._names]
 
     def fill(self, rows: AnyRows) -> None:
-        """Copy rows into the message; their number must be that of the buffer."""
+        """Copy rows into the message; there must be as many rows as the message has."""
         for name, column in zip(self._names, self._columns, strict=True):
             column[:] = getattr(rows, name)
 
     def data(self, stamp_ns: int | None = None) -> bytes:
-        """Return the message as it is now.
+        """Return the bytes of the message with the values that `rows` has now.
 
         Args:
-            stamp_ns: Time stamp of the header, in ns. None stands for that of the earliest row.
+            stamp_ns: Time stamp of the header, in ns since the Unix epoch. None takes the stamp of
+                the earliest row.
         """
         times_ns = self.rows.stamp_ns
         if stamp_ns is None:
@@ -208,7 +228,7 @@ class MessageBuffer(Generic[AnyRows]):
 
 
 class MessageCodec(Generic[AnyRows]):
-    """Decodes and encodes one type of message."""
+    """Converts one type of message between serialised bytes and rows."""
 
     def __init__(
         self,
@@ -219,9 +239,9 @@ class MessageCodec(Generic[AnyRows]):
         """Describe a type of message.
 
         Args:
-            name: Name for error messages.
-            rows: Type of the rows.
-            message_fields: Fields behind the header, in order.
+            name: Name of the message type, for error messages.
+            rows: Class of the rows: FrequencyRows or StressRows.
+            message_fields: Fields that follow the header, in order.
         """
         self._name = name
         self._rows: type[AnyRows] = rows
@@ -233,11 +253,11 @@ class MessageCodec(Generic[AnyRows]):
         self._find_layout = lru_cache(MAX_CACHED_LAYOUTS)(self._make_layout)
 
     def decode(self, *messages: bytes) -> Decoded[AnyRows]:
-        """Decode one or several serialised messages of the same shape (`shape_bytes`).
+        """Decode one or several serialised messages whose lengths and `shape_bytes` are equal.
 
         Raises:
-            MessageError: A message is too short, its fields contradict each other, or the shapes
-                differ.
+            MessageError: A message is too short, its fields contradict each other, or the messages
+                have different numbers of rows or pads.
         """
         layout, record = self._read_records(messages)
         stamp_ns, times_ns = _read_stamps(record)
@@ -246,15 +266,27 @@ class MessageCodec(Generic[AnyRows]):
         return Decoded(rows, stamp_ns, frame_id)
 
     def decode_columns(self, names: Sequence[str], *messages: bytes) -> list[AnyArray]:
-        """Decode only `stamp_ns` and the named columns of the rows, without copying the others."""
+        """Decode only some columns of the rows, without copying the others.
+
+        Args:
+            names: Names of the columns, for example "cube".
+            messages: Serialised messages whose lengths and `shape_bytes` are equal.
+
+        Returns:
+            The column `stamp_ns`, in ns since the Unix epoch, then the named columns.
+
+        Raises:
+            MessageError: See `decode`.
+        """
         record: AnyArray = self._read_records(messages)[1]
         _, times_ns = _read_stamps(record)
         return [times_ns, *(_read_column(record, name) for name in names)]
 
     def shape_bytes(self, data: bytes) -> bytes:
-        """Return the bytes at `SHAPE_AT` that hold frame id and number of rows.
+        """Return the bytes of a serialised message that hold its frame id and number of rows.
 
-        Messages of one length that agree in these bytes can be decoded together.
+        They begin at the byte offset `SHAPE_AT`. Messages of the same length that agree in these
+        bytes can be decoded together.
         """
         frame = int.from_bytes(data[_FRAME_LENGTH_AT:_FRAME_AT], "little")
         end = _align(_FRAME_AT + frame) + 4
@@ -266,12 +298,12 @@ class MessageCodec(Generic[AnyRows]):
         rows: int,
         pads: int = 0,
     ) -> MessageBuffer[AnyRows]:
-        """Return a message to fill.
+        """Return the memory of a message, for the caller to fill.
 
         Args:
             frame_id: Frame id with its closing zero.
             rows: Number of rows.
-            pads: Number of pads of a row of frequencies; 0 for rows of stress.
+            pads: Number of pads in each row of SkinFrequencies; 0 for SkinStress.
         """
         layout = self._find_layout(_Shape(len(frame_id), rows, pads))
         return MessageBuffer(self, layout, frame_id)
@@ -282,12 +314,13 @@ class MessageCodec(Generic[AnyRows]):
         frame_id: bytes,
         stamp_ns: int | None = None,
     ) -> bytes:
-        """Encode rows as one message.
+        """Return the bytes of one message that contains these rows.
 
         Args:
             rows: The rows.
             frame_id: Frame id with its closing zero.
-            stamp_ns: Time stamp of the header, in ns. None stands for that of the earliest row.
+            stamp_ns: Time stamp of the header, in ns since the Unix epoch. None takes the stamp of
+                the earliest row.
         """
         if stamp_ns is None:
             stamp_ns = int(rows.stamp_ns.min())
@@ -299,12 +332,12 @@ class MessageCodec(Generic[AnyRows]):
         stamp_ns: Times,
         frame_id: bytes,
     ) -> list[bytes]:
-        """Encode rows as M messages of one shape.
+        """Return the bytes of M messages with the same number of rows.
 
         Args:
             rows: Rows of all messages, message after message.
-            stamp_ns: Time stamps of the headers (M,), in ns.
-            frame_id: Frame id with its closing zero.
+            stamp_ns: Time stamps of the headers (M,), in ns since the Unix epoch.
+            frame_id: Frame id with its closing zero, the same in all messages.
         """
         count = len(stamp_ns)
         pads = rows.frequency.shape[1] if isinstance(rows, FrequencyRows) else 0
@@ -313,7 +346,8 @@ class MessageCodec(Generic[AnyRows]):
         record = np.zeros(count, layout.record)
         self.write_constants(record, layout, frame_id)
         record["sec"], record["nanosec"] = np.divmod(stamp_ns, SECOND)
-        # 4 bytes hold the time of a row only as the distance from the stamp of its message.
+        # A message stores the time of a row in 4 bytes, as the difference in ns from the time stamp
+        # of its header.
         times_ns = rows.stamp_ns.reshape(count, -1)
         record["time_offset"] = times_ns - stamp_ns[:, None]
         for name in self._columns:
@@ -322,7 +356,15 @@ class MessageCodec(Generic[AnyRows]):
         return [message.tobytes() for message in record]
 
     def make_rows(self, record: AnyArray, stamp_ns: Times) -> AnyRows:
-        """Return the rows of records (M,): views of a single one, copies of several."""
+        """Return the rows of serialised messages.
+
+        Args:
+            record: Messages (M,) as an array of the structured dtype of their layout.
+            stamp_ns: Times of all their rows, in ns since the Unix epoch.
+
+        Returns:
+            Rows of all messages. With M = 1 their columns are views of `record`, else copies.
+        """
         columns: dict[str, AnyArray] = {
             name: stamp_ns if name == "stamp_ns" else _read_column(record, name)
             for name in self._columns
@@ -335,7 +377,13 @@ class MessageCodec(Generic[AnyRows]):
         layout: _Layout,
         frame_id: bytes,
     ) -> None:
-        """Write what all messages of a layout have in common into records (M,)."""
+        """Write the values that are equal in all messages of a layout: lengths and frame id.
+
+        Args:
+            record: Messages (M,) to write into, as an array of the structured dtype of the layout.
+            layout: Layout of the messages.
+            frame_id: Frame id with its closing zero.
+        """
         record["encapsulation"] = LITTLE_ENDIAN
         # Void data keep the closing zero, which numpy removes from strings of bytes.
         record["frame_id"] = np.void(frame_id)
@@ -345,12 +393,19 @@ class MessageCodec(Generic[AnyRows]):
             record["n_pads"] = layout.shape.pads
 
     def _read_records(self, messages: Sequence[bytes]) -> tuple[_Layout, AnyArray]:
-        """Return messages of one shape as records (M,). MessageError: see `decode`."""
+        """View serialised messages as an array (M,) of the structured dtype of their layout.
+
+        Returns:
+            The layout of the messages, and the array.
+
+        Raises:
+            MessageError: See `decode`.
+        """
         layout = self._find_layout(self._read_shape(messages[0]))
         size, count = layout.record.itemsize, len(messages)
         data = messages[0]
         if count > 1:
-            # Bytes that middleware has added at the end are cut off.
+            # DDS middleware may have added bytes at the end of a message, which are cut off.
             data = b"".join(message[:size] for message in messages)
             if len(data) != count * size:
                 raise MessageError(
@@ -361,10 +416,11 @@ class MessageCodec(Generic[AnyRows]):
         return layout, record
 
     def _read_shape(self, data: bytes) -> _Shape:
-        """Return the shape that a message states.
+        """Return the length of the frame id and the numbers of rows and pads that a message states.
 
         Raises:
-            MessageError: It is too short, or its length does not belong to this shape.
+            MessageError: The message is too short, is not little-endian CDR, or has another length
+                than follows from these numbers.
         """
         if len(data) < _FRAME_AT + 4 or data[:2] != LITTLE_ENDIAN[:2]:
             raise MessageError(
@@ -377,16 +433,18 @@ class MessageCodec(Generic[AnyRows]):
             raise MessageError(
                 f"{self._name} of {len(data)} bytes says its frame id has {frame}: damaged"
             )
-        # The first sequence has one value per row.
+        # The first field that follows the header is a sequence with one value per row, so its
+        # number of values is the number of rows.
         (rows,) = struct.unpack_from("<I", data, rows_at)
         pads = 0
         if self._n_fields_before_pads is not None:
             pads_at = self._find_end(_Shape(frame, rows, 0), self._n_fields_before_pads)
-            # Only as long as the message has that byte; a wrong length is refused below.
+            # A damaged message may be too short to have this byte. Then the check of its length
+            # below refuses it.
             pads = data[pads_at] if pads_at < len(data) else 0
         shape = _Shape(frame, rows, pads)
-        # Middleware may add up to three bytes at the end. Before this check nothing is allocated,
-        # because a damaged message may state any number of rows.
+        # DDS middleware may add up to three bytes at the end. Before this check no memory is
+        # allocated for rows, because a damaged message may state any number of them.
         n_extra = len(data) - self._find_end(shape, len(self._fields))
         if not 0 <= n_extra < 4:
             raise MessageError(
@@ -401,13 +459,22 @@ class MessageCodec(Generic[AnyRows]):
         data: bytes,
         count: int,
     ) -> None:
-        """Raise MessageError if a sequence does not have as many values as the rows need."""
+        """Check that each sequence has as many values as the number of rows requires.
+
+        Args:
+            layout: Layout of the messages.
+            data: The messages, one after the other.
+            count: Number of messages.
+
+        Raises:
+            MessageError: A sequence has another number of values.
+        """
         size, expected = layout.record.itemsize, layout.counts
-        # The size of a message need not be a multiple of 4, so the rows of this view of words are
-        # `size` bytes apart.
+        # This array has one row of 32-bit integers for each message. The rows are `size` bytes
+        # apart, which need not be a multiple of 4.
         words = np.ndarray((count, size // 4), "<u4", data, 0, (size, 4))
         counts = words.take(layout.count_words, axis=1)
-        # Comparing bytes takes a third of the time that comparing arrays takes.
+        # The numbers are compared as bytes, which takes a third of the time of comparing arrays.
         if counts.tobytes() == expected.tobytes() * count:
             return
         message, which = np.argwhere(counts != expected)[0].tolist()
@@ -417,16 +484,20 @@ class MessageCodec(Generic[AnyRows]):
         )
 
     def _compute_end(self, shape: _Shape, n_fields: int) -> int:
-        """Return the place where the first fields of a message end."""
-        _, end = self._place_fields(shape, n_fields)
+        """Return the byte offset at which the first `n_fields` fields of a message end."""
+        _, end = self._locate_fields(shape, n_fields)
         return end
 
-    def _place_fields(self, shape: _Shape, n_fields: int) -> tuple[list[_Place], int]:
-        """Return the places of the first fields of a message, and where they end.
+    def _locate_fields(self, shape: _Shape, n_fields: int) -> tuple[list[_FieldOffsets], int]:
+        """Return the byte offsets of the first fields of a message, and the offset of their end.
 
-        Only integers are computed, because a damaged message may state any shape.
+        No memory is allocated for values, because a damaged message may state any number of rows.
+
+        Args:
+            shape: Numbers of rows and pads, and length of the frame id.
+            n_fields: Number of fields to locate.
         """
-        places = []
+        located = []
         end = _FRAME_AT + shape.frame
         for field in self._fields[:n_fields]:
             count_at, values = None, 1
@@ -436,13 +507,13 @@ class MessageCodec(Generic[AnyRows]):
                 end = count_at + 4
                 width = shape.pads if field.width == PER_PAD else field.width
                 values = shape.rows * width
-            places.append(_Place(field, count_at, end, values))
+            located.append(_FieldOffsets(field, count_at, end, values))
             end += values * int(field.type[-1])
-        return places, end
+        return located, end
 
     def _make_layout(self, shape: _Shape) -> _Layout:
-        places, size = self._place_fields(shape, len(self._fields))
-        # Name, type and place of each entry of the record.
+        located, size = self._locate_fields(shape, len(self._fields))
+        # Each entry of the structured dtype has a name, a type and a byte offset.
         entries: list[tuple[str, Any, int]] = [
             ("encapsulation", "S4", 0),
             ("sec", "<i4", _SECONDS_AT),
@@ -453,7 +524,7 @@ class MessageCodec(Generic[AnyRows]):
         sequences = ["frame_id"]
         counts = [shape.frame]
         counts_at = [_FRAME_LENGTH_AT]
-        for field, count_at, at, values in places:
+        for field, count_at, at, values in located:
             if count_at is not None:
                 entries.append((f"length of {field.name}", "<u4", count_at))
                 sequences.append(field.name)
@@ -480,7 +551,12 @@ class MessageCodec(Generic[AnyRows]):
 
 
 def _dimensions(width: int, shape: _Shape) -> tuple[int, ...]:
-    """Return the shape of a field's values in one message."""
+    """Return the array shape of the values of one field in one message.
+
+    Args:
+        width: Number of values in each row, or PER_PAD, or PER_MESSAGE.
+        shape: Numbers of rows and pads of the message.
+    """
     if width == PER_MESSAGE:
         return ()
     if width == 1:
@@ -489,7 +565,14 @@ def _dimensions(width: int, shape: _Shape) -> tuple[int, ...]:
 
 
 def _read_stamps(record: AnyArray) -> tuple[Times, Times]:
-    """Return the time stamps of records (M,), and those of all their rows one after the other."""
+    """Return the time stamps of messages and of their rows, in ns since the Unix epoch.
+
+    Args:
+        record: Messages (M,) as an array of the structured dtype of their layout.
+
+    Returns:
+        Time stamps of the headers (M,), and those of the rows of all messages, one after the other.
+    """
     seconds = record["sec"].astype(np.int64)
     stamp_ns: Times = seconds * SECOND + record["nanosec"]
     times_ns: Times = stamp_ns[:, None] + record["time_offset"]
@@ -497,18 +580,23 @@ def _read_stamps(record: AnyArray) -> tuple[Times, Times]:
 
 
 def _read_column(record: AnyArray, name: str) -> AnyArray:
-    """Return a field of records (M,), with the rows of all of them one after the other."""
+    """Return the values of one field for the rows of all messages, one after the other.
+
+    Args:
+        record: Messages (M,) as an array of the structured dtype of their layout.
+        name: Name of the field.
+    """
     values: AnyArray = record[name]
     if len(record) == 1:
-        # A single message is not copied, which matters in the nodes.
+        # The values of a single message are not copied, which saves time in the nodes.
         view: AnyArray = values[0]
         return view
     return values.reshape(-1, *values.shape[2:])
 
 
-def _align(place: int) -> int:
-    """Round a place up to a multiple of 4."""
-    return -(-place // 4) * 4
+def _align(offset: int) -> int:
+    """Round a byte offset up to a multiple of 4."""
+    return -(-offset // 4) * 4
 
 
 frequency_codec = MessageCodec("SkinFrequencies", FrequencyRows, _FREQUENCIES)

@@ -1,7 +1,8 @@
-"""Messages of contacts, which the node `contacts` and reprocessing make in the same way.
+"""Messages of contacts and surface traction, made in the same way by a node and by reprocessing.
 
-The caller passes the function that makes a message: of the classes of rclpy in a node, of those of
-the bag library in reprocessing. So a robot needs no bag library for its contacts.
+The caller passes the function that constructs a message: a node passes one that uses the classes of
+rclpy, reprocessing one that uses those of the bag library. So the node `contacts` needs no bag
+library.
 """
 
 from __future__ import annotations
@@ -19,15 +20,16 @@ from .codec import SECOND
 from .types import CONTACTS, TRACTION
 
 MakeMessage = Callable[..., Any]
-"""Function that makes a message from its type, such as geometry_msgs/msg/Point, and its fields by
-name. Fields with numbers are numpy arrays."""
+"""Function that constructs a message. Its arguments are the name of the type, such as
+"geometry_msgs/msg/Point", and the fields by name; arrays of numbers are numpy arrays."""
 
 CLOUD = ("x", "y", "z", "pressure", "shear", "sigma")
-"""Fields of a point of the topic `traction`, each a float32: position in the parent frame of the
-skin in m, pressure and shear on the surface in Pa, standard deviation of the pressure in Pa."""
+"""Names of the fields of each point of the topic `traction`, all float32: position x, y, z in the
+parent frame of the skin, in m; pressure and shear stress on the surface, in Pa; and sigma, the
+standard deviation of the pressure, in Pa."""
 
 POINT_SIZE = 4 * len(CLOUD)
-"""Size of a point, in bytes."""
+"""Size of one point of the topic `traction`, in bytes."""
 
 _NUMBERS = (
     "normal_force",
@@ -56,15 +58,16 @@ def contacts_message(
     frame_id: str,
     contacts: Sequence[Contact] | Sequence[TrackedContact],
 ) -> Any:
-    """Make a SkinContacts.
+    """Make a SkinContacts message.
 
     Args:
-        make: Function that makes messages.
-        stamp_ns: Time stamp, in ns.
-        frame_id: Frame of the contacts.
-        contacts: The contacts. Only tracked ones have an id, a moment and its uncertainties.
+        make: Function that constructs a message.
+        stamp_ns: Time stamp of the header, in ns since the Unix epoch.
+        frame_id: Coordinate frame of the positions, normals and forces.
+        contacts: The contacts: all with a tracker (`TrackedContact`) or all without one.
     """
-    # The numbers of tracked contacts stay empty if the contacts come without a tracker.
+    # Only tracked contacts have an id, a moment and further uncertainties. Without a tracker, these
+    # arrays of the message stay empty.
     tracked = [contact for contact in contacts if isinstance(contact, TrackedContact)]
     fields: dict[str, Any] = {name: _collect(contacts, name) for name in _NUMBERS}
     fields |= {name: _collect(tracked, name) for name in _TRACKED_NUMBERS}
@@ -82,13 +85,13 @@ def traction_message(
     frame_id: str,
     cloud: Array,
 ) -> Any:
-    """Make a PointCloud2.
+    """Make a PointCloud2 message of the traction (pressure and shear stress) on the surface.
 
     Args:
-        make: Function that makes messages.
-        stamp_ns: Time stamp, in ns.
-        frame_id: Frame of the points.
-        cloud: Points (M, 6) of `ContactFinder.cloud`.
+        make: Function that constructs a message.
+        stamp_ns: Time stamp of the header, in ns since the Unix epoch.
+        frame_id: Coordinate frame of the points.
+        cloud: Points (M, 6) with the columns of `CLOUD`.
     """
     data = cloud.astype("<f4")
     fields = [
@@ -110,14 +113,18 @@ def traction_message(
         is_bigendian=False,
         point_step=POINT_SIZE,
         row_step=POINT_SIZE * len(data),
-        # PointCloud2 wants the points as bytes.
+        # PointCloud2 stores the values of all points as bytes.
         data=data.reshape(-1).view(np.uint8),
         is_dense=True,
     )
 
 
 def decode_contacts(message: Any) -> list[Contact]:
-    """Return the contacts of a SkinContacts. ValueError: its arrays differ in length."""
+    """Return the contacts of a SkinContacts message, without the values of a tracker.
+
+    Raises:
+        ValueError: The arrays of the message have different lengths.
+    """
 
     def read_xyz(vector: Any) -> Array:
         return np.array([vector.x, vector.y, vector.z])
@@ -130,10 +137,10 @@ def decode_contacts(message: Any) -> list[Contact]:
 
 
 def decode_traction(message: Any) -> Array:
-    """Return the points (M, 6) of a PointCloud2 from the topic `traction`.
+    """Return the points (M, 6), with the columns of `CLOUD`, of a message of the topic `traction`.
 
     Raises:
-        BagError: The points have other fields.
+        BagError: The points of the message have other fields than those of `CLOUD`.
     """
     names = tuple(field.name for field in message.fields)
     if names != CLOUD or message.point_step != POINT_SIZE:
@@ -141,13 +148,13 @@ def decode_traction(message: Any) -> Array:
             f"a point cloud has the fields {', '.join(names)}; those of the topic traction are "
             f"{', '.join(CLOUD)}: listen to the topic of the node contacts"
         )
-    # rclpy gives an array of bytes, a bag a numpy array.
+    # The data are an `array.array` in a message of rclpy, and a numpy array in one of a bag.
     points = np.frombuffer(bytes(message.data), "<f4")
     return points.reshape(-1, len(CLOUD)).astype(float)
 
 
 def _collect(contacts: Sequence[Any], name: str) -> Array:
-    """Return an attribute of all contacts (contacts,)."""
+    """Return one attribute of all contacts as an array (contacts,)."""
     return np.array([getattr(contact, name) for contact in contacts], float)
 
 

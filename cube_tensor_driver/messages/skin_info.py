@@ -1,6 +1,6 @@
-"""Reading of a SkinInfo: poses and calibrations of the cubes of a skin.
+"""Reading of a SkinInfo message: poses and calibrations of the cubes of a skin.
 
-The message may be one of rclpy or one of a bag.
+The message may be an object of rclpy or of the bag library.
 """
 
 from __future__ import annotations
@@ -17,10 +17,14 @@ from ..core.tensor import rotation_from_quaternion
 
 
 def cube_poses(info: Any) -> CubePoses:
-    """Return the poses of the cubes.
+    """Return the poses and half sides of the cubes of a skin.
+
+    Args:
+        info: SkinInfo message (names, poses and calibrations of the cubes).
 
     Raises:
-        MessageError: There are no cubes, or a pose or size is impossible.
+        MessageError: The message has no cubes, or a position or half side is not finite, or a half
+            side is not above 0.
     """
     if not info.cubes:
         raise MessageError(f"info of the skin {info.name}: it has no cubes")
@@ -35,7 +39,8 @@ def cube_poses(info: Any) -> CubePoses:
         rotation=np.array(rotations),
         half_side=np.array(half_sides),
     )
-    # A wrong message must not reach the solvers, which would fail far from its cause.
+    # Invalid numbers are refused here, because otherwise an error would be raised only later, in a
+    # solver, where its cause is hard to find.
     is_possible = np.isfinite(poses.position).all(axis=1)
     is_possible &= np.isfinite(poses.half_side)
     is_possible &= poses.half_side > 0
@@ -49,10 +54,13 @@ def cube_poses(info: Any) -> CubePoses:
 
 
 def cube_calibrations(info: Any) -> tuple[Calibration, ...]:
-    """Return the calibration of each cube; cubes with the same one share an object.
+    """Return the calibration of each cube. Cubes with the same calibration id share one object.
+
+    Args:
+        info: SkinInfo message (names, poses and calibrations of the cubes).
 
     Raises:
-        MessageError: The calibration of a cube is missing or invalid.
+        MessageError: The calibration of a cube is missing in the message or is invalid.
     """
     texts = dict(zip(info.calibration_ids, info.calibrations, strict=False))
     used_ids = [cube.calibration_id for cube in info.cubes]
@@ -72,6 +80,10 @@ def cube_calibrations(info: Any) -> tuple[Calibration, ...]:
 
 
 def geometry(info: Any) -> list[object]:
-    """Return the parts of the message whose change means that the skin has become another one."""
+    """Return the parts of a SkinInfo message that describe the geometry of the skin.
+
+    They are the coordinate frame and the name, pose and half side of each cube. If they differ from
+    those of an earlier message, results that depend on the geometry must be computed anew.
+    """
     cubes = [(cube.name, cube.pose, cube.half_side) for cube in info.cubes]
     return [info.header.frame_id, *cubes]

@@ -1,10 +1,16 @@
-"""Names of the message types that the package uses."""
+"""Names of the ROS message types whose messages the package publishes and records."""
 
 from __future__ import annotations
 
 PACKAGE = "cube_tensor_driver"
+"""Name of the ROS package that defines the message types below."""
 FREQUENCIES = f"{PACKAGE}/msg/SkinFrequencies"
+"""Type of the messages with the frequencies of the pads, which the driver publishes."""
 STRESS = f"{PACKAGE}/msg/SkinStress"
+"""Type of the messages with stress and gradients, which the reconstruction node publishes."""
 INFO = f"{PACKAGE}/msg/SkinInfo"
+"""Type of the message that describes a skin: names, poses and calibrations of its cubes."""
 CONTACTS = f"{PACKAGE}/msg/SkinContacts"
+"""Type of the messages with the contacts on a skin."""
 TRACTION = "sensor_msgs/msg/PointCloud2"
+"""Type of the messages of the topic `traction`: points on the surface with pressure and shear."""
