@@ -1,5 +1,6 @@
-"""Bags as a LeRobot data set (LeRobotDataset v3.0): Parquet files and metadata for learning.
+"""Export of bags to a LeRobot data set (LeRobotDataset v3.0: Parquet files and metadata for robot
+learning).
 
-The stress comes from `bags.reprocess`; how a data set is laid out is decided here. Neither ROS nor
-the package `lerobot` is imported.
+The stress comes from `bags.reprocess`; this package arranges it in frames and episodes. Neither ROS
+nor the package `lerobot` is imported.
 """

@@ -1,6 +1,6 @@
 """The files of a LeRobot data set, version 3.0: Parquet in data/ and meta/, and JSON in meta/.
 
-Source: `lerobot.datasets` of the package lerobot 0.4.4, which reads and writes them.
+Source of the format: `lerobot.datasets` in the package lerobot 0.4.4.
 """
 
 from __future__ import annotations
@@ -23,17 +23,19 @@ from .topics import Topic
 from .windows import COLUMNS, TACTILE
 
 VERSION = "v3.0"
-"""Version of the format LeRobotDataset that is written."""
+"""Version of the format LeRobotDataset in which data sets are written."""
 
 MAX_FILES_PER_CHUNK = 1000
-"""Largest number of Parquet files in one folder ("chunk") of a data set."""
+"""Largest number of Parquet files in one folder (which LeRobot calls chunk) of a data set."""
 
 MAX_FILE_MB = 100
-"""Size of a Parquet file, in MB, after which the next episode begins a new file. An episode is
-never divided between files."""
+"""Size of a Parquet file, in MB (2**20 bytes), from which on the next episode begins a new file.
+
+An episode is never divided between files, so a file can become larger than this.
+"""
 
 FILE_NAME = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-"""Path of a Parquet file below data/ or meta/episodes/, as a pattern for `str.format`."""
+"""Pattern (for `str.format`) of a Parquet file's path, relative to data/ or meta/episodes/."""
 
 COUNTED = {
     "timestamp": "float32",
@@ -42,7 +44,8 @@ COUNTED = {
     "index": "int64",
     "task_index": "int64",
 }
-"""Features that count frames, episodes and tasks, with their types. LeRobot requires them."""
+"""Features that state the time and the numbers of each frame, its episode and its task, with their
+types. LeRobot requires them in every data set."""
 
 _IMAGE = pyarrow.struct(
     [
@@ -50,17 +53,18 @@ _IMAGE = pyarrow.struct(
         ("path", pyarrow.string()),
     ]
 )
+"""Parquet type of an image as LeRobot stores it: the bytes of the image file, or its path."""
 
 
 class DataSet:
-    """A data set that is written episode after episode; a context manager.
+    """A data set that is written episode after episode; a context manager that closes its files.
 
     Attributes:
         fps: Frames per second.
-        depth: Number of samples in a window.
-        widths: Number of columns of each feature that has statistics.
+        depth: Number of samples of each cube that a frame has room for.
+        widths: Number of columns of each feature for which statistics are computed, by its name.
         frames: Number of frames written so far.
-        episodes: Descriptions of the complete episodes.
+        episodes: Description of each complete episode: a row of the table in meta/episodes/.
     """
 
     def __init__(
@@ -73,21 +77,22 @@ class DataSet:
         depth: int,
         samples: int,
     ) -> None:
-        """Create the folder.
+        """Create the folder of the data set.
 
         Args:
             folder: Folder of the data set.
             skin: Skin of all bags.
-            topics: Other topics.
+            topics: Topics other than stress that become features, such as images.
             fps: Frames per second.
-            depth: Number of samples in a window.
-            samples: Number of samples of cubes that are to come.
+            depth: Number of samples of each cube that a frame has room for.
+            samples: Total number of samples of cubes that will be written.
         """
         (folder / "meta").mkdir(parents=True)
         self.fps, self.depth = fps, depth
         self.frames = 0
         self.episodes: list[dict[str, Any]] = []
-        # Columns of whole numbers beside the stress are not normalised, so they have no statistics.
+        # Integer columns beside the stress (stamps, status bits) have no statistics, because
+        # policies do not normalise them.
         self.widths = {
             TACTILE: len(COMPONENTS),
             f"{TACTILE}.residual": 1,
@@ -106,7 +111,7 @@ class DataSet:
         self._tasks: list[str] = []
         self._calibrations: list[dict[str, Any]] = []
         self._writer: Any = None
-        # A file is created with its first frames, which determine the types of its columns.
+        # There is no file yet: each is created with its first frames, whose types its columns get.
         self._path = folder
         self._file_number = -1
 
@@ -117,10 +122,19 @@ class DataSet:
         self._close_file()
 
     def begin_episode(self, task: str) -> tuple[dict[str, int], int]:
-        """Return the place of the next episode's file, and the number of its task."""
+        """Choose the data file of the next episode.
+
+        Args:
+            task: Task of the episode, as a text.
+
+        Returns:
+            The numbers of the file and of its folder, as the table of episodes states them, and the
+            index of the task.
+        """
         if task not in self._tasks:
             self._tasks.append(task)
-        # The size on disk lags behind by one row group, so files are a little larger.
+        # Parquet writes with a delay of one row group, so the size on disk is a little too small
+        # and files can exceed the limit by as much.
         is_new = self._writer is None
         if is_new or self._path.stat().st_size >= MAX_FILE_MB << 20:
             self._close_file()
@@ -137,13 +151,17 @@ class DataSet:
         return described, self._tasks.index(task)
 
     def write(self, columns: dict[str, AnyArray | list[EncodedImage]]) -> None:
-        """Write frames that follow each other, as one row group."""
+        """Write successive frames as one row group of the current Parquet file.
+
+        Args:
+            columns: Values of each feature (frames, …), by its name; images as a list.
+        """
         arrays = {}
         for name, values in columns.items():
             arrays[name] = _column(values)
         table = pyarrow.table(arrays)
         if self._writer is None:
-            # Measured numbers hardly repeat: a dictionary of them only costs time.
+            # Dictionary encoding saves space only if values repeat. Measured ones rarely do.
             self._writer = pyarrow.parquet.ParquetWriter(
                 self._path,
                 table.schema,
@@ -159,7 +177,13 @@ class DataSet:
         rows: AnyArray,
         of_episode: dict[str, Statistics],
     ) -> None:
-        """Add rows (n, D) of a feature to the statistics of the data set and of an episode."""
+        """Add values of a feature to the statistics of the data set and of an episode.
+
+        Args:
+            key: Name of the feature.
+            rows: (n, D) values of the feature's D columns.
+            of_episode: Statistics of the episode, by the names of the features.
+        """
         self._statistics[key].add(rows)
         of_episode[key].add(rows)
 
@@ -170,7 +194,14 @@ class DataSet:
         place: dict[str, int],
         statistics: dict[str, Statistics],
     ) -> None:
-        """Describe an episode whose frames are written; `place` is that of its file."""
+        """Add an episode whose frames are all written to the table of episodes.
+
+        Args:
+            plan: The bag of the episode.
+            episode: The episode.
+            place: Numbers of its file and folder, as `begin_episode` returned them.
+            statistics: Statistics of the episode, by the names of the features.
+        """
         frames = len(episode.counts)
         described = {
             "episode_index": len(self.episodes),
@@ -179,7 +210,7 @@ class DataSet:
             **place,
             "dataset_from_index": self.frames - frames,
             "dataset_to_index": self.frames,
-            # All descriptions stand in one file: a row takes some kB.
+            # The descriptions of all episodes are in one file, because each takes only some kB.
             "meta/episodes/chunk_index": 0,
             "meta/episodes/file_index": 0,
             "bag": plan.path.name,
@@ -197,8 +228,14 @@ class DataSet:
         since_ns: int,
         ids: list[str],
     ) -> None:
-        """Note with which calibrations of the cubes the stress of a bag is made from a stamp on."""
-        # Only changes are noted: most data sets have one calibration throughout.
+        """Note the calibrations with which the stress of a bag is computed.
+
+        Args:
+            bag: Name of the bag.
+            since_ns: Earliest stamp of the stress, in ns since the Unix epoch.
+            ids: Id of the calibration of each cube, by the cube's index.
+        """
+        # Only changes are noted, because most data sets have the same calibrations throughout.
         if self._calibrations and self._calibrations[-1]["ids"] == ids:
             return
         self._calibrations.append(
@@ -210,7 +247,7 @@ class DataSet:
         )
 
     def write_meta(self) -> None:
-        """Write what describes the data, once it is complete."""
+        """Write episodes, tasks, features and statistics into meta/, after the last episode."""
         meta = self._folder / "meta"
         path = meta / "episodes" / FILE_NAME.format(chunk_index=0, file_index=0)
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -248,19 +285,28 @@ class DataSet:
             self._writer = None
 
     def _as_lists(self, key: str, result: dict[str, AnyArray]) -> dict[str, Any]:
-        """Return statistics as lists; those of images have the shape (bands, 1, 1)."""
+        """Return the statistics of a feature as lists, which JSON and Parquet can contain.
+
+        Those of images get the shape (bands, 1, 1), where bands are colour channels.
+
+        Args:
+            key: Name of the feature.
+            result: Statistics of the feature, by their names such as ``mean``.
+        """
         lists = {}
         for name, values in result.items():
             if key in self._image_keys and name != "count":
-                # LeRobot applies them to images (bands, height, width) by broadcasting.
+                # LeRobot normalises images of the shape (bands, height, width), to which statistics
+                # of the shape (bands, 1, 1) are broadcast.
                 values = values[:, np.newaxis, np.newaxis]
             lists[name] = values.tolist()
         return lists
 
     def _features(self) -> dict[str, Any]:
-        """Describe the features as info.json does.
+        """Return the description of all features (columns of the data set) for info.json.
 
-        The skin is described in ``info`` of a feature, which LeRobot's tools carry on.
+        The skin is described under the key ``info`` of the tactile feature, because LeRobot's tools
+        keep this key when they copy or merge data sets.
         """
         cubes = len(self._skin.cubes)
         window = (self.depth, cubes)
@@ -289,7 +335,7 @@ class DataSet:
 
 
 def describe_skin(skin: Skin) -> dict[str, Any]:
-    """Describe the numbers of `observation.tactile`: components, units, cubes and their poses."""
+    """Describe the feature `observation.tactile`: components, units, and the cubes' poses."""
     cubes = [
         {
             "name": cube.name,
@@ -318,7 +364,13 @@ def _feature(
     shape: tuple[int, ...],
     names: list[str] | None,
 ) -> dict[str, Any]:
-    """Describe a feature as info.json does."""
+    """Return the description of one feature (column of the data set) for info.json.
+
+    Args:
+        dtype: Name of its type, such as ``float32`` or ``image``.
+        shape: Shape of its value in one frame.
+        names: Names of the axes, or of the numbers of a vector; None: it has none.
+    """
     return {
         "dtype": dtype,
         "shape": list(shape),
@@ -327,9 +379,14 @@ def _feature(
 
 
 def _column(values: AnyArray | list[EncodedImage]) -> pyarrow.Array:
-    """Return (n, ...) as lists of lists, (n, 1) as n numbers, and images as their bytes."""
+    """Convert the values of a feature in n frames to a column of a Parquet file.
+
+    Args:
+        values: n images, or an array (n, …). An array (n, 1) becomes n numbers, one with more
+            dimensions becomes nested lists.
+    """
     if isinstance(values, list):
-        # LeRobot reads an image from its bytes where there is no path.
+        # If the path is None, LeRobot reads the image from the bytes.
         images = [{"bytes": image.data, "path": None} for image in values]
         return pyarrow.array(images, _IMAGE)
     flat = np.ascontiguousarray(values).reshape(-1)
@@ -337,7 +394,8 @@ def _column(values: AnyArray | list[EncodedImage]) -> pyarrow.Array:
     shape = values.shape[1:]
     if shape == (1,):
         return array
-    # From the innermost dimension outwards, each list holds `size` lists of the one before.
+    # Lists are nested from the last dimension to the first: each step joins `size` successive
+    # numbers or lists to one list.
     for size in reversed(shape):
         offsets = np.arange(0, len(array) + 1, size, dtype=np.int32)
         array = pyarrow.ListArray.from_arrays(offsets, array)
@@ -345,7 +403,11 @@ def _column(values: AnyArray | list[EncodedImage]) -> pyarrow.Array:
 
 
 def _task_table(tasks: list[str]) -> pyarrow.Table:
-    """Return the numbers of the tasks, with the texts as what pandas reads as the table's index."""
+    """Return the table of tasks: the index of each task, and its text as the row label in pandas.
+
+    Args:
+        tasks: Texts of the tasks, by their indices.
+    """
 
     def column(
         name: str,
@@ -360,7 +422,7 @@ def _task_table(tasks: list[str]) -> pyarrow.Table:
             "metadata": None,
         }
 
-    # The format of this description: https://pandas.pydata.org/docs/development/developer.html
+    # Format of this metadata: https://pandas.pydata.org/docs/development/developer.html
     described = {
         "index_columns": ["task"],
         "column_indexes": [],

@@ -1,4 +1,4 @@
-"""Bags exported to one data set: plan all bags, then reconstruct each and write its frames."""
+"""Export of bags to one data set: all bags are planned, then each is reconstructed and written."""
 
 from __future__ import annotations
 
@@ -25,23 +25,27 @@ from .topics import Topic, TopicReader, find_topics
 from .windows import TACTILE, Windows
 
 MAX_SAMPLED_IMAGES = 20
-"""Largest number of images of an episode whose pixels are used for statistics."""
+"""Largest number of images per episode and topic whose pixels enter the statistics of colours."""
+
 PIXEL_STRIDE = 4
-"""Distance, in pixels along height and width, of the pixels that are used for statistics."""
+"""Step, in pixels, along height and width between the pixels that enter the statistics of colours.
+With 4, one pixel in 16 is used."""
 
 
 @dataclass(frozen=True)
 class Exported:
-    """What was exported, and what was left out.
+    """Size of an exported data set, and of what was left out of it.
 
     Attributes:
-        episodes: Number of episodes.
-        frames: Number of frames.
-        rows: Number of samples of cubes.
-        depth: Number of samples in a window.
-        usual: Number of samples in most windows.
-        features: Names of the features of other topics.
-        outside, unknown, empty: As in `BagPlan`, summed over all bags.
+        episodes: Number of exported episodes.
+        frames: Number of exported frames.
+        rows: Number of exported samples of cubes.
+        depth: Number of samples of each cube that a frame has room for.
+        usual: Number of samples of each cube in most frames.
+        features: Names of the features that come from topics other than stress.
+        outside: Number of samples that lie in no episode.
+        unknown: Number of samples of cubes that the skin does not have.
+        empty: Number of episodes without a sample, which are not exported.
     """
 
     episodes: int
@@ -61,18 +65,18 @@ def export_lerobot(
     choices: Choices,
     report: Report,
 ) -> Exported:
-    """Write a data set, which appears when it is complete.
+    """Write a data set. Its folder gets its final name only when it is complete.
 
     Args:
         bags: Folders or files of bags.
-        folder: Folder of the data set, empty or not there yet.
-        choices: What goes into it, and how.
-        report: Function that is told about progress.
+        folder: Folder of the data set; it must be empty or not exist.
+        choices: Frame rate, tasks, topics and overrides that the user chose.
+        report: Function that displays progress.
 
     Raises:
         BagError: A bag is damaged, the choices do not fit, or the folder cannot be written.
     """
-    # Before the bags are read, which takes long.
+    # The folder is checked before the bags are read, because reading them takes long.
     check_empty(folder)
     plans = [plan_bag(path, choices, report) for path in bags]
     skin = _check_same_skin(plans)
@@ -83,11 +87,11 @@ def export_lerobot(
     depths = [int(episode.counts.max()) for episode in episodes]
     depth = max(depths)
     samples = sum(episode.rows for episode in episodes)
-    # Beside the folder, so that it can be renamed when it is complete.
+    # The incomplete data set lies beside the final folder (same file system) to be renamed.
     partial = folder.absolute()
     partial = partial.with_name(f"{partial.name}.partial")
     try:
-        # What an export that was killed left behind is of no use.
+        # An export that was killed may have left an incomplete data set, which is not continued.
         shutil.rmtree(partial, ignore_errors=True)
         data_set = DataSet(
             partial,
@@ -123,17 +127,17 @@ def export_lerobot(
 
 
 def check_empty(folder: Path) -> None:
-    """Check that a folder for results has no content.
+    """Check that a folder for results is empty or does not exist.
 
     Raises:
-        BagError: It has.
+        BagError: The folder is not empty.
     """
     if folder.is_dir() and any(folder.iterdir()):
         raise BagError(f"{folder} is not empty; name another folder, or remove what is in it")
 
 
 class EpisodeWriter:
-    """Writes one episode: rows of stress go in, frames with all features come out."""
+    """Writes one episode of a data set: it collects rows of stress and writes complete frames."""
 
     def __init__(
         self,
@@ -142,7 +146,14 @@ class EpisodeWriter:
         episode: Episode,
         topics: TopicReader,
     ) -> None:
-        """Prepare an episode of a bag, whose other topics `topics` reads."""
+        """Prepare to write an episode.
+
+        Args:
+            data_set: The data set to write into.
+            plan: The bag of the episode.
+            episode: The episode, with its numbers of samples.
+            topics: Reader of the topics other than stress.
+        """
         self._data_set = data_set
         self._plan = plan
         self._episode = episode
@@ -152,13 +163,17 @@ class EpisodeWriter:
         self._task = 0
         self._statistics = {}
         for key, width in data_set.widths.items():
-            # Stress is counted by samples, everything else by frames.
+            # Statistics of the stress have one row per sample of a cube, all others one per frame.
             is_stress = key.startswith(TACTILE)
             rows = episode.rows if is_stress else len(episode.counts)
             self._statistics[key] = Statistics(width, rows)
 
     def add(self, rows: StressRows) -> int:
-        """Take the rows that belong to the episode, and return their number."""
+        """Add those rows of stress whose stamps lie in the episode.
+
+        Returns:
+            The number of rows that lie in the episode.
+        """
         inside = self._episode.contains(rows.stamp_ns)
         if not inside.any():
             return 0
@@ -171,9 +186,13 @@ class EpisodeWriter:
         return len(rows)
 
     def write(self) -> bool:
-        """Write the frames that are complete, and return whether all are.
+        """Write the frames whose rows are all there.
 
-        Only one episode can be written at a time: the first one that is not complete.
+        The frames of a data set lie episode by episode in its files, so this may only be called for
+        the first episode that is not complete.
+
+        Returns:
+            Whether all frames of the episode have been written.
         """
         for windows in self._windows.complete():
             if not self._place:
@@ -191,7 +210,11 @@ class EpisodeWriter:
         return is_complete
 
     def _write_frames(self, windows: dict[str, AnyArray]) -> None:
-        """Write the frames of windows that have just been made."""
+        """Write successive frames with all of their features, and add them to the statistics.
+
+        Args:
+            windows: Stress of these frames, as `Windows.complete` has just returned it.
+        """
         data_set, last = self._data_set, self._windows.done
         frames = len(windows[TACTILE])
         first = last - frames
@@ -208,13 +231,15 @@ class EpisodeWriter:
             columns[key] = values[:, np.newaxis]
         data_set.write(windows | columns)
 
-        # Some pixels of some images describe the colours well enough; decoding all would be slow.
+        # A few pixels of a few images suffice for the statistics of colours. Decoding every image
+        # would be slow.
         stride = -(-len(self._episode.counts) // MAX_SAMPLED_IMAGES)
         for key, values in columns.items():
             if isinstance(values, np.ndarray):
                 self._count(key, values)
                 continue
-            # The chosen frames are multiples of the stride within the episode, not in this block.
+            # Frames whose number in the episode is a multiple of the stride are chosen, so the
+            # first one in this block depends on the number `first` of the block's first frame.
             for image in values[-first % stride :: stride]:
                 pixels = image.pixels()[::PIXEL_STRIDE, ::PIXEL_STRIDE]
                 bands = pixels.shape[2]
@@ -225,7 +250,11 @@ class EpisodeWriter:
 
 
 def _check_same_skin(plans: list[BagPlan]) -> Skin:
-    """Return the skin of all bags, which must have the same cubes in the same places."""
+    """Return the skin of all bags.
+
+    Raises:
+        BagError: The cubes of two bags differ in their names or poses.
+    """
 
     def places(plan: BagPlan) -> list[Any]:
         cubes = plan.skin.cubes
@@ -252,7 +281,15 @@ def _write_bag(
     choices: Choices,
     report: Report,
 ) -> None:
-    """Write all episodes of a bag."""
+    """Reconstruct the stress of a bag and write its episodes into a data set.
+
+    Args:
+        data_set: The data set to write into.
+        plan: The bag and its episodes.
+        topics: Topics other than stress, by their names.
+        choices: Frame rate, tasks, topics and overrides that the user chose.
+        report: Function that displays progress.
+    """
     with Bag(plan.path) as bag:
         reader = TopicReader(bag, topics)
         waiting = []
@@ -262,9 +299,10 @@ def _write_bag(
         total = sum(episode.rows for episode in plan.episodes)
         done = 0
         for rows in _stress_rows(data_set, plan, choices):
-            # Rows of links that are late may belong to the episode before.
+            # All unfinished episodes are offered the rows, because rows of a hub whose connection
+            # is slow can belong to an earlier episode than those of the other hubs.
             done += sum(writer.add(rows) for writer in waiting)
-            # A data set has its episodes one after the other.
+            # Episodes lie one after the other in a data set, so only the first one is written.
             while waiting and waiting[0].write():
                 waiting.pop(0)
             report(done, total, f"exporting {plan.path}")
@@ -275,7 +313,13 @@ def _stress_rows(
     plan: BagPlan,
     choices: Choices,
 ) -> Iterator[StressRows]:
-    """Yield the stress of all rows of cubes that the skin has."""
+    """Yield the reconstructed stress of a bag, without rows of cubes that the skin does not have.
+
+    Args:
+        data_set: The data set, in which the calibrations are noted.
+        plan: The bag.
+        choices: Topic of the frequencies, and overrides of calibrations and tare.
+    """
     with open_bag(plan.path, choices.frequencies) as source:
         settings = settings_with(source, choices.overrides)
         for segment, rows in reconstruct(source, choices.overrides):

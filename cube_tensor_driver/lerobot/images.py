@@ -1,4 +1,4 @@
-"""Images of a bag as a data set keeps them: compressed ones as they are, raw ones as PNG."""
+"""Conversion of a bag's images for a data set: compressed ones are kept, raw ones become PNG."""
 
 from __future__ import annotations
 
@@ -28,40 +28,42 @@ MODES = {
     "mono8": ("L", "L"),
     "8UC1": ("L", "L"),
 }
-"""Mode of the image in Pillow, and order of the bands in the message, for each encoding of
-sensor_msgs/Image that can be exported."""
+"""Mode of the image in Pillow, and order of the bands (colour channels) in the message, for each
+value of `encoding` in a sensor_msgs/Image that can be exported."""
 
 MODE_OF_BANDS = {1: "L", 3: "RGB", 4: "RGBA"}
 """Mode of an image in Pillow, for each number of bands (colour channels)."""
 
 Shape = tuple[int, int, int]
-"""Height, width and number of bands of an image."""
+"""Height and width of an image in pixels, and its number of bands (colour channels)."""
 
 
 @dataclass(frozen=True)
 class EncodedImage:
-    """An image in a file format.
+    """An image in a file format such as PNG or JPEG.
 
     Attributes:
-        data: Content of the file.
-        shape: Its height, width and number of bands.
+        data: Content of the image file.
+        shape: Height and width of the image in pixels, and its number of bands (colour channels).
     """
 
     data: bytes
     shape: Shape
 
     def pixels(self) -> Single:
-        """Return the pixels (H, W, bands) from 0 to 1."""
+        """Decode the image and return its pixels (height, width, bands), scaled to 0 to 1."""
         with Image.open(io.BytesIO(self.data)) as image:
             pixels: Single = np.asarray(image, np.float32) / np.float32(255)
         return pixels.reshape(self.shape)
 
 
 class ImageStream:
-    """The images on one topic of a bag in the order of recording; none where it lacks the topic.
+    """The images on one topic of a bag, read in the order of recording.
+
+    If the bag does not have the topic, every frame gets a black image.
 
     Attributes:
-        shape: Shape of all images.
+        shape: Height, width and number of bands (colour channels) of every image.
     """
 
     def __init__(
@@ -75,10 +77,11 @@ class ImageStream:
         Args:
             bag: Open bag.
             topic: Topic of the images.
-            shape: Shape that all images must have; None: that of the first.
+            shape: Height, width and number of bands that every image must have; None: those of the
+                first image.
 
         Raises:
-            BagError: The image cannot be read.
+            BagError: The first image cannot be read.
         """
         self._bag = bag
         self._topic = topic
@@ -89,7 +92,7 @@ class ImageStream:
             if self._next:
                 shape = self._encode(self._next[1]).shape
         self.shape = shape
-        # Black stands in the frames before the first image.
+        # Frames that end before the first image get a black image.
         height, width, bands = shape
         black = Image.new(MODE_OF_BANDS[bands], (width, height))
         self._latest = _as_png(black)
@@ -100,39 +103,55 @@ class ImageStream:
         first: int,
         last: int,
     ) -> list[EncodedImage]:
-        """Return the newest image before the end of each frame from first to before last.
+        """Return one image for each of several successive frames: the newest before the frame ends.
+
+        Args:
+            episode: Episode of the frames.
+            first: Number of the first frame in the episode.
+            last: Number of the frame after the last one. Later calls must continue from here.
 
         Raises:
-            BagError: An image cannot be read, or has another shape.
+            BagError: An image cannot be read, or has another shape than `shape`.
         """
         frames = range(first, last)
         return [self._newest_in(episode, frame) for frame in frames]
 
     def _newest_in(self, episode: Episode, frame: int) -> EncodedImage:
-        """Return the newest image before the end of a frame, reading the bag as far as needed."""
+        """Return the newest image that is stamped before the end of a frame.
+
+        The bag is read as far as the first image after the frame.
+
+        Args:
+            episode: Episode of the frame.
+            frame: Number of the frame in the episode, not below that of the call before.
+        """
         message = None
         while self._next:
             stamp = np.array(self._next[0])
             if episode.frame_of(stamp) > frame:
                 break
-            # Only the last image of a frame is encoded, because encoding is slow.
+            # Only the last message before the end of the frame is encoded, because this is slow.
             message = self._next[1]
             self._next = next(self._unread, None)
         if message is not None:
-            # A feature has one shape in the whole data set.
+            # LeRobot requires that all images of a feature have the same shape.
             self._latest = self._encode(message)
             if self._latest.shape != self.shape:
                 self._fail(f"an image of {self._latest.shape} after ones of {self.shape}")
         return self._latest
 
     def _read(self) -> Iterator[tuple[int, Any]]:
-        """Yield stamp and message."""
+        """Yield the stamp, in ns since the Unix epoch, and the message of each image."""
         for entry in self._bag.entries({self._topic}):
             message = self._bag.decode(entry)
             yield stamp_ns(message), message
 
     def _encode(self, message: Any) -> EncodedImage:
-        """Convert a message to an image in a file format."""
+        """Convert an Image or CompressedImage message to an image in a file format.
+
+        Raises:
+            BagError: The image is damaged, or its format is not known.
+        """
         try:
             return encode_raw(message) if hasattr(message, "encoding") else keep_encoded(message)
         except (UnidentifiedImageError, OSError, ValueError) as error:
@@ -146,10 +165,10 @@ class ImageStream:
 
 
 def encode_raw(message: Any) -> EncodedImage:
-    """Encode a sensor_msgs/Image as PNG.
+    """Encode a sensor_msgs/Image (uncompressed pixels) as PNG.
 
     Raises:
-        ValueError: PNG does not have its encoding, or it has too few bytes.
+        ValueError: The encoding is not in `MODES`, or the message has no pixels or too few bytes.
     """
     if message.encoding not in MODES:
         raise ValueError(f"encoding {message.encoding}; known: {', '.join(MODES)}")
@@ -157,7 +176,8 @@ def encode_raw(message: Any) -> EncodedImage:
     size = int(message.width), int(message.height)
     if not all(size):
         raise ValueError(f"an image of {size[0]} x {size[1]} pixels")
-    # Pillow checks the number of bytes. A line may be longer than its pixels: `step` is its length.
+    # `step` is the length of a line in bytes, which may be more than its pixels need. Pillow raises
+    # a ValueError if there are too few bytes.
     image = Image.frombuffer(
         mode,
         size,
@@ -171,25 +191,25 @@ def encode_raw(message: Any) -> EncodedImage:
 
 
 def keep_encoded(message: Any) -> EncodedImage:
-    """Take the image of a sensor_msgs/CompressedImage without decoding it.
+    """Return the image file in a sensor_msgs/CompressedImage unchanged.
 
     Raises:
-        OSError: Pillow does not know the format.
+        OSError: Pillow does not recognise the file format.
     """
     data = bytes(message.data)
-    # Opening reads the head of the file only: the pixels are not decoded here.
+    # Image.open reads only the header of the file, which states the size, and decodes no pixels.
     with Image.open(io.BytesIO(data)) as image:
         return EncodedImage(data, _shape(image))
 
 
 def _as_png(image: Image.Image) -> EncodedImage:
-    """Encode pixels as PNG."""
+    """Encode an image of Pillow as PNG."""
     file = io.BytesIO()
-    # The lowest level takes a fifth of the time of the default, for files that are a fifth larger.
+    # Compression level 1 takes a fifth of the default's time and makes files a fifth larger.
     image.save(file, "PNG", compress_level=1)
     return EncodedImage(file.getvalue(), _shape(image))
 
 
 def _shape(image: Image.Image) -> Shape:
-    """Return height, width and number of bands."""
+    """Return height and width of an image in pixels, and its number of bands (colour channels)."""
     return image.height, image.width, len(image.getbands())

@@ -1,11 +1,11 @@
-"""The first pass over a bag: its episodes, and how many samples of each cube every frame has.
+"""First pass over a bag: it finds the episodes and counts the samples of each cube in every frame.
 
-A frame is one step of a data set. Frame k of an episode contains what was measured in a period::
+A frame is one time step of a data set. Frame k of an episode contains the samples with stamps t::
 
     begin + k / fps <= t < begin + (k + 1) / fps
 
-The window of samples has one size in the whole data set, so this size must be known before the
-first frame is written.
+All frames of a data set have room for the same number of samples (the size of the window), which
+must therefore be known before the first frame is written.
 """
 
 from __future__ import annotations
@@ -27,50 +27,60 @@ from ..core.errors import BagError
 from ..messages.codec import SECOND
 
 MARK = "std_msgs/msg/String"
-"""Message type of marks: texts that divide a bag into episodes and name their tasks."""
+"""Message type of marks: recorded texts that divide a bag into episodes. The text of a mark is the
+task of the episode that begins with it."""
 
 MIN_NS, MAX_NS = -(1 << 63), (1 << 63) - 1
-"""Smallest and largest time in 64 bits, in ns: the bounds of an episode without marks."""
+"""Smallest and largest time in 64 bits, in ns. They bound the single episode of a bag without
+marks."""
 
 MAX_TIME_NS = 1 << 62
-"""Largest allowed product of a time, in ns, and the frame rate, so that it fits 64 bits. Times of
-clocks that were never set are reduced to it."""
+"""Largest absolute value of a time in ns multiplied by the frame rate in Hz, so that the product
+fits 64 bits.
+
+Larger times, which come from clocks that were never set, are limited to this value.
+"""
 
 MAX_STAMP_RATIO = 10
-"""Largest ratio of the time that the stamps of an episode cover to the duration of the recording.
+"""Largest allowed ratio of the time between the first and the last stamp of an episode to the
+duration of the recording. A larger ratio means that a clock was set, and is an error.
 
-It can be above 1, because a bag may be replayed at several times its speed and recorded again.
+The ratio can be above 1, because a bag may be recorded from a replay at several times its speed.
 """
 
 MAX_DEPTH_RATIO = 10
-"""Largest ratio of the number of samples in one frame to the usual number.
+"""Largest allowed ratio of the number of samples of a cube in one frame to the usual number.
 
-Every window of a data set is as long as the fullest frame, so a frame in which wrong stamps collect
-samples would multiply the size of the data set.
+Every frame of a data set has room for as many samples as the fullest frame. If wrong stamps put
+many samples into one frame, the size of the whole data set would be multiplied.
 """
 
 ALWAYS_ALLOWED = 100
-"""Number of frames (or samples in a frame) that is always allowed, in addition to the two ratios:
-in a short recording a few late samples already exceed a ratio."""
+"""Number of frames of an episode, and of samples of a cube in a frame, that is allowed in addition
+to what `MAX_STAMP_RATIO` and `MAX_DEPTH_RATIO` allow.
+
+In a short recording, a few late samples would already exceed these ratios.
+"""
 
 Report = Callable[[float, float, str], None]
-"""Function that displays progress: it gets the amount done, the total amount, and a text that names
-the current step."""
+"""Function that displays progress. Its arguments are the amount done, the total amount (in the same
+unit, messages or samples), and a text that names the current step."""
 
 
 @dataclass(frozen=True)
 class Choices:
-    """What a person chooses for a data set.
+    """Options that the user chooses for a data set.
 
     Attributes:
         fps: Frames per second.
-        task: Task of every episode without a mark.
-        marks: Topic of the marks; None: each bag is one episode.
-        frequencies: Topic of the frequencies, where a bag has those of several skins.
-        topics: Other topics to add; None: all that can be added.
-        state: Topic that becomes observation.state; None: the only topic of joint states.
-        action: Topic that becomes action; None: there is none.
-        overrides: What differs from the recording, as for `reprocess`.
+        task: Text of the task of each bag that has no marks.
+        marks: Topic of the marks (texts that begin episodes); None: each bag is one episode.
+        frequencies: Topic of the frequencies; None: that of the only skin in a bag.
+        topics: Topics to add beside the stress; None: all with images or stamped numbers.
+        state: Topic that becomes the feature observation.state; None: the topic of joint states, if
+            there is only one.
+        action: Topic that becomes the feature action; None: the data set has no actions.
+        overrides: Calibrations and tare that replace those of the recordings.
     """
 
     fps: int
@@ -84,12 +94,13 @@ class Choices:
 
 
 class Episode:
-    """An episode of a bag, and how many samples it has.
+    """An episode of a bag (one execution of a task), and its numbers of samples.
 
     Attributes:
-        task: What was done in it.
-        begin_ns: Stamp of its first sample, in ns, at which frame 0 begins.
-        rows: Number of samples of cubes.
+        task: Text of the task.
+        begin_ns: Time at which frame 0 begins, in ns since the Unix epoch: the earliest stamp among
+            the first samples that are counted.
+        rows: Number of samples of all cubes.
         counts: (frames, cubes) number of samples of each cube in each frame.
     """
 
@@ -100,7 +111,14 @@ class Episode:
         task: str,
         fps: int,
     ) -> None:
-        """Make an episode without samples, of the time since_ns <= t < until_ns."""
+        """Make an episode without samples.
+
+        Args:
+            since_ns: Smallest stamp that belongs to the episode, in ns since the Unix epoch.
+            until_ns: Stamp, in ns, from which on nothing belongs to the episode.
+            task: Text of the task.
+            fps: Frames per second.
+        """
         self.task = task
         self.begin_ns = self.rows = 0
         self.counts: AnyArray = np.zeros((0, 1), np.uint32)
@@ -109,18 +127,29 @@ class Episode:
         self._fps = fps
 
     def contains(self, stamp_ns: Times) -> Mask:
-        """Return which samples (N,) belong to the episode."""
+        """Return whether each stamp (N,), in ns since the Unix epoch, lies in the episode."""
         return (stamp_ns >= self._since_ns) & (stamp_ns < self._until_ns)
 
     def frame_of(self, stamp_ns: Times) -> Index:
-        """Return the frame of each instant (N,); it is below 0 before the episode."""
+        """Return the number of the frame in which each stamp lies.
+
+        Args:
+            stamp_ns: (N,) stamps, in ns since the Unix epoch.
+
+        Returns:
+            (N,) numbers of frames; they are negative for stamps before `begin_ns`.
+        """
         limit = MAX_TIME_NS // self._fps
         since_ns = np.clip(stamp_ns - self.begin_ns, -limit, limit)
         frames: Index = since_ns * self._fps // SECOND
         return frames
 
     def sample_frame_of(self, stamp_ns: Times) -> Index:
-        """Return the frame of each sample (N,); some links sample a little before the first row."""
+        """Return the number of the frame (N,) to which the sample with each stamp (N,) belongs.
+
+        Samples before `begin_ns` belong to frame 0: the samples of some hubs arrive later than the
+        first row but were taken a little earlier.
+        """
         return np.maximum(self.frame_of(stamp_ns), 0)
 
     def count(
@@ -130,23 +159,24 @@ class Episode:
         n_cubes: int,
         max_frames: float,
     ) -> None:
-        """Count samples.
+        """Count those samples whose stamps lie in the episode.
 
         Args:
             cube: (N,) index of the cube of each sample.
-            stamp_ns: (N,) stamps, in ns.
+            stamp_ns: (N,) stamps, in ns since the Unix epoch.
             n_cubes: Number of cubes of the skin.
-            max_frames: Number of frames that the recording can have.
+            max_frames: Largest plausible number of frames for the duration of the recording.
 
         Raises:
-            BagError: A stamp is too far from the first one.
+            BagError: A stamp is so late that the episode would have more frames than `max_frames`.
         """
         inside = self.contains(stamp_ns)
         cube = cube[inside]
         stamp_ns = stamp_ns[inside]
         if not len(cube):
             return
-        # The first rows decide where frame 0 begins; rows that come late are put into it.
+        # The first samples determine the begin of frame 0. Samples that are read later but have
+        # earlier stamps are put into frame 0.
         if not self.rows:
             self.begin_ns = int(stamp_ns.min())
         frame = self.sample_frame_of(stamp_ns)
@@ -158,7 +188,8 @@ class Episode:
                 "which is longer than was recorded: a clock was set; leave it out with --marks"
             )
         if n_frames > len(self.counts):
-            # The number of frames is known only at the end: the table grows by half each time.
+            # The number of frames is not known before the end, so the table grows by half each time
+            # it is full; growing by single frames would copy it too often.
             room = 3 * n_frames // 2
             larger = np.zeros((room, n_cubes), np.uint32)
             larger[: len(self.counts)] = self.counts
@@ -167,7 +198,7 @@ class Episode:
         np.add.at(self.counts, (frame, cube), 1)
 
     def finish(self) -> None:
-        """Remove the empty frames behind the last sample, once all samples are counted."""
+        """Remove the empty frames after the last sample; call it when all samples are counted."""
         has_samples = self.counts.any(axis=1)
         last = np.flatnonzero(has_samples)[-1]
         self.counts = self.counts[: last + 1]
@@ -175,16 +206,16 @@ class Episode:
 
 @dataclass(frozen=True, eq=False)
 class BagPlan:
-    """What is exported of a bag.
+    """Episodes of a bag that are exported, and numbers of the samples that are not.
 
     Attributes:
-        path: The bag.
-        skin: Its skin.
-        episodes: Its episodes that have samples.
-        rate: Samples of a cube per second, the median of all cubes.
-        outside: Number of rows outside of all episodes.
-        unknown: Number of rows of cubes that the skin does not have.
-        empty: Number of marks without a sample.
+        path: Folder or file of the bag.
+        skin: The skin (cubes and their poses) as the bag describes it.
+        episodes: Episodes of the bag that have samples.
+        rate: Sample rate of a cube, in Hz: the median of all cubes.
+        outside: Number of samples that lie in no episode.
+        unknown: Number of samples of cubes that the skin does not have.
+        empty: Number of episodes without a sample, which are not exported.
     """
 
     path: Path
@@ -201,14 +232,19 @@ def plan_bag(
     choices: Choices,
     report: Report,
 ) -> BagPlan:
-    """Count the samples of a bag.
+    """Find the episodes of a bag and count their samples.
+
+    Args:
+        path: Folder or file of the bag.
+        choices: Frame rate, tasks and topics that the user chose.
+        report: Function that displays progress.
 
     Raises:
-        BagError: There are no frequencies or no marks, the stamps do not follow time, or there are
-            more frames than samples.
+        BagError: The bag has no frequencies or no marks, its stamps are implausible, or the frame
+            rate is above the sample rate, so that frames would have no sample.
     """
     with open_bag(path, choices.frequencies) as source:
-        # Number of messages, for the report.
+        # The number of messages is the total amount of the displayed progress.
         counts = {one.topic: one.msgcount for one in source.bag.connections}
         total = counts[source.topic]
         spans = [(MIN_NS, MAX_NS, choices.task)]
@@ -243,7 +279,7 @@ def plan_bag(
         covered_s,
         choices.fps,
     )
-    # A mark at the end of a recording often has no sample behind it.
+    # Episodes without samples are left out; often one begins just before the recording ends.
     used = [episode for episode in episodes if episode.rows]
     for episode in used:
         episode.finish()
@@ -266,16 +302,23 @@ def _check_rate(
     seconds: float,
     fps: int,
 ) -> float:
-    """Return the sample rate of a bag, in Hz, if every frame can have a sample.
+    """Return the sample rate of a bag and check that every frame can have a sample.
 
     Args:
-        source: The bag.
-        samples: (cubes,) number of samples.
-        seconds: Time that the stamps cover, in s.
+        source: Source of the recorded frequencies.
+        samples: (cubes,) number of samples of each cube.
+        seconds: Time between the first and the last stamp, in s.
         fps: Frames per second.
+
+    Returns:
+        The sample rate of a cube, in Hz: the median of all cubes.
+
+    Raises:
+        BagError: No cube has two samples, or the frame rate is above the sample rate.
     """
     path = source.bag.path
-    # One sample tells no rate, and a hub that was unplugged would lower it.
+    # Cubes with fewer than two samples are left out: they have no rate, and a hub that was not
+    # connected would lower the median of all cubes.
     several = samples[samples > 1]
     if not len(several) or seconds <= 0:
         raise BagError(
@@ -283,7 +326,8 @@ def _check_rate(
             "record longer"
         )
     rate = float(np.median(several - 1)) / seconds
-    # n samples bound n - 1 periods.
+    # n samples enclose only n - 1 sampling periods, so n frames can have one sample each even if
+    # the frame rate is higher than the sample rate by the factor 1 + 1/n.
     fewest = int(several.min())
     max_fps = math.floor(rate * (1 + 1 / fewest))
     if max_fps < 1:
@@ -304,7 +348,19 @@ def _check_depth(
     episode: Episode,
     usual: int,
 ) -> None:
-    """Check that no frame has far more samples than usual, which would lengthen every window."""
+    """Check that no frame has far more samples than usual.
+
+    Every frame of the data set gets room for as many samples as the fullest frame has, so such a
+    frame would multiply the size of the data set.
+
+    Args:
+        source: Source of the recorded frequencies.
+        episode: Episode of the bag, with its numbers of samples.
+        usual: Number of samples of a cube in a frame that follows from the sample rate.
+
+    Raises:
+        BagError: A frame has more samples than `MAX_DEPTH_RATIO` and `ALWAYS_ALLOWED` allow.
+    """
     depth = int(episode.counts.max())
     if depth > MAX_DEPTH_RATIO * usual + ALWAYS_ALLOWED:
         deepest = episode.counts.argmax()
@@ -317,10 +373,20 @@ def _check_depth(
 
 
 def _marked_spans(bag: Bag, topic: str) -> list[tuple[int, int, str]]:
-    """Return begin, end and task of the episodes that marks bound.
+    """Return the episodes into which marks divide a bag.
 
-    A mark is a text at the time when it was recorded: it begins an episode with this task, and ends
-    the one before. An empty text only ends one.
+    A mark is a recorded text. At the time of its recording it ends the episode before and begins a
+    new one, whose task is the text. An empty text only ends the episode before.
+
+    Args:
+        bag: Open bag.
+        topic: Topic of the marks.
+
+    Returns:
+        Begin (ns since the Unix epoch), end (ns) and task of each episode.
+
+    Raises:
+        BagError: The topic does not exist, or none of its marks has a text.
     """
     if topic not in bag.topics(MARK):
         names = ", ".join(bag.topics(MARK)) or "none"

@@ -1,4 +1,7 @@
-"""Statistics of a feature, with which policies normalise it. NaN does not count."""
+"""Statistics of a feature (column of a data set), with which policies normalise its values.
+
+NaN, which stands for an unknown value, is left out of all statistics.
+"""
 
 from __future__ import annotations
 
@@ -13,21 +16,32 @@ QUANTILES = {
     "q90": 0.90,
     "q99": 0.99,
 }
-"""Quantiles of a feature that LeRobot expects, by the names that it gives them."""
+"""Quantiles of each feature that LeRobot expects: the name of each in LeRobot, and the fraction of
+the values that lie below it."""
 
 MAX_SAMPLE_ROWS = 10_000
-"""Number of rows from which quantiles are computed. They are a random sample of all rows, because
-quantiles need the sampled rows in memory."""
+"""Approximate number of rows of a feature from which its quantiles are computed.
+
+Quantiles, unlike means, require all values in memory, so they are computed from a random sample of
+the rows.
+"""
 
 
 class Statistics:
-    """Minimum, maximum, mean, standard deviation and quantiles of the columns of rows (n, D).
+    """Minimum, maximum, mean, standard deviation and quantiles of the D columns of a feature.
 
-    The rows come in parts. A column without values has mean 0 and deviation 1.
+    The rows are added in parts, so that they need not be in memory together. A column without any
+    known value has mean 0 and standard deviation 1, which leave values unchanged on normalisation.
     """
 
     def __init__(self, width: int, rows: int) -> None:
-        """Prepare for rows of `width` columns, of which about `rows` are to come."""
+        """Prepare for the rows of a feature.
+
+        Args:
+            width: Number of columns D of the feature.
+            rows: Approximate number of rows that will be added, which determines the fraction of
+                them that is kept for the quantiles.
+        """
         self._count = np.zeros(width)
         self._mean = np.zeros(width)
         self._squares = np.zeros(width)  # sum of squared differences from the mean
@@ -38,7 +52,7 @@ class Statistics:
         self._sample: list[Array] = []
 
     def add(self, rows: AnyArray) -> None:
-        """Add rows (n, D), at least one."""
+        """Add at least one row (n, D); NaN and infinite values are left out."""
         values = rows.astype(np.float64)
         known = np.isfinite(values)
         count = known.sum(axis=0)
@@ -47,15 +61,16 @@ class Statistics:
         deviation = np.where(known, values - mean, 0)
         squares = (deviation**2).sum(axis=0)
 
-        # Means and squares of two parts are joined as in Chan, Golub and LeVeque (1983).
-        # Sums of squares of large numbers would lose the small deviations.
+        # Means and sums of squared deviations of two parts are combined as in Chan, Golub and
+        # LeVeque (1983). The simpler difference of sums of squares would lose small deviations of
+        # large numbers in rounding.
         both = np.maximum(self._count + count, 1)
         difference = mean - self._mean
         self._squares += squares + difference**2 * self._count * count / both
         self._mean += difference * count / both
         self._count += count
 
-        # Values that are not known must not become a minimum or a maximum.
+        # Unknown values are replaced by infinities, which never become the minimum or maximum.
         for_min = np.where(known, values, np.inf)
         for_max = np.where(known, values, -np.inf)
         self._min = np.minimum(self._min, for_min.min(axis=0))
@@ -64,10 +79,13 @@ class Statistics:
         self._sample.append(values[is_chosen])
 
     def result(self, frames: int) -> dict[str, AnyArray]:
-        """Return the statistics by LeRobot's names.
+        """Return the statistics of all rows added so far.
 
         Args:
-            frames: Number of frames, by which LeRobot weighs data sets that it joins.
+            frames: Number of frames, which LeRobot uses as the weight when it merges data sets.
+
+        Returns:
+            An array (D,) for each statistic, by its name in LeRobot, and ``count`` (1,).
         """
         is_empty = self._count == 0
         variance = self._squares / np.maximum(self._count, 1)
@@ -80,7 +98,7 @@ class Statistics:
             "count": np.array([frames]),
         }
         sample = np.concatenate(self._sample)
-        # By chance no row may have been chosen; the mean stands for all quantiles then.
+        # The random sample may be empty by chance; then the mean is used for all quantiles.
         if not len(sample):
             sample = self._mean[np.newaxis]
         columns = [column[np.isfinite(column)] for column in sample.T]

@@ -1,4 +1,5 @@
-"""Other topics of the bags in a data set: images, joint states and numbers with a stamp.
+"""Topics other than stress that become features of a data set: images, joint states and other
+messages of numbers with a stamp.
 
 Each frame gets the newest message that is stamped before the end of the frame.
 """
@@ -22,20 +23,27 @@ from .images import IMAGES, ImageStream, Shape
 from .plan import Choices, Episode
 
 JOINTS = "sensor_msgs/msg/JointState"
+"""Message type of joint states: names, positions, velocities and efforts of a robot's joints."""
+
 HEADER = "std_msgs/msg/Header"
+"""Message type of the header, which contains the stamp of a message."""
+
 JOINT_FIELDS = ("position", "velocity", "effort")
+"""Fields of a JointState message that have one number per joint."""
+
 STATE, ACTION = "observation.state", "action"
+"""Names that LeRobot requires for the features with the robot's state and with its commands."""
 
 
 @dataclass
 class Topic:
-    """A topic that is added to a data set.
+    """A topic of the bags that becomes a feature (column) of a data set.
 
     Attributes:
         msgtype: Type of its messages.
-        shape: Shape of its images; zeros for numbers.
-        names: Names of its numbers; empty for images.
-        key: Name of its feature.
+        shape: Height, width and number of bands of its images; zeros for a topic of numbers.
+        names: Names of the numbers in a message, such as ``wrench.force.x``; empty for images.
+        key: Name of the feature.
     """
 
     msgtype: str
@@ -46,12 +54,12 @@ class Topic:
 
 @dataclass(frozen=True, eq=False)
 class Signal:
-    """The numbers on a topic.
+    """The numbers in all messages on a topic of one bag.
 
     Attributes:
-        names: Names of the D numbers.
-        stamp_ns: (M,) stamps in ascending order, in ns.
-        values: (M, D) values.
+        names: Names of the D numbers in a message, such as ``wrench.force.x``.
+        stamp_ns: (M,) stamps of the M messages in ascending order, in ns since the Unix epoch.
+        values: (M, D) values; NaN for a number that neither the message nor an earlier one has.
     """
 
     names: list[str]
@@ -65,12 +73,20 @@ class Signal:
         last: int,
         names: list[str],
     ) -> Single:
-        """Return the newest values (last - first, len(names)) before the end of each frame.
+        """Return the newest values before the end of each of several successive frames.
 
-        They are NaN before the first message, and for names that the bag does not have.
+        Args:
+            episode: Episode of the frames.
+            first: Number of the first frame in the episode.
+            last: Number of the frame after the last one.
+            names: Names of the wanted numbers.
+
+        Returns:
+            (frames, names) values; NaN before the first message, and for numbers that the bag does
+            not have.
         """
         frames = np.arange(first, last)
-        # What is stamped in a frame belongs to it, as samples do.
+        # A message belongs to the frame in which its stamp lies, as a sample of a cube does.
         frame_of_message = episode.frame_of(self.stamp_ns)
         newest = np.searchsorted(frame_of_message, frames, side="right") - 1
         has_value = newest >= 0
@@ -84,10 +100,10 @@ class Signal:
 
 
 class TopicReader:
-    """Reads the values of the other topics of one bag, frame by frame."""
+    """Reads the topics of one bag that become features of a data set, frame by frame."""
 
     def __init__(self, bag: Bag, topics: dict[str, Topic]) -> None:
-        """Read the numbers, and prepare to read the images.
+        """Read the topics with numbers, and prepare to read those with images.
 
         Args:
             bag: Open bag.
@@ -97,7 +113,8 @@ class TopicReader:
         self._sources: dict[str, Signal | ImageStream] = {}
         for name, topic in topics.items():
             if topic.msgtype in IMAGES:
-                # Images stay in the bag until their frame comes; numbers fit the memory.
+                # Images are read one by one when their frames are written, because a recording of
+                # images can be larger than the memory. Numbers are read at once.
                 self._sources[name] = ImageStream(bag, name, topic.shape)
             else:
                 self._sources[name] = read_signal(bag, name, topic.msgtype)
@@ -108,7 +125,16 @@ class TopicReader:
         first: int,
         last: int,
     ) -> dict[str, Any]:
-        """Return the values in the frames from first to before last, by the features' names."""
+        """Return the values of all features in several successive frames.
+
+        Args:
+            episode: Episode of the frames.
+            first: Number of the first frame in the episode.
+            last: Number of the frame after the last one.
+
+        Returns:
+            By the names of the features: an array (frames, numbers), or a list of images.
+        """
         found: dict[str, Any] = {}
         for name, topic in self._topics.items():
             source = self._sources[name]
@@ -125,10 +151,17 @@ class TopicReader:
 
 
 def find_topics(paths: Sequence[Path], choices: Choices) -> dict[str, Topic]:
-    """Find the topics that are added, by their names.
+    """Find the topics of the bags that become features of a data set.
+
+    Args:
+        paths: Folders or files of the bags.
+        choices: Topics that the user chose.
+
+    Returns:
+        The topics, by their names.
 
     Raises:
-        BagError: A chosen topic is not there, or bags differ in its type.
+        BagError: A chosen topic does not exist in any bag, or its type differs between bags.
     """
     found: dict[str, Topic] = {}
     existing: set[str] = set()
@@ -148,13 +181,13 @@ def find_topics(paths: Sequence[Path], choices: Choices) -> dict[str, Topic]:
             f"{paths[0]}: no images and no stamped numbers on {', '.join(missing)}; there are "
             f"{', '.join(sorted(existing)) or 'none'}"
         )
-    # Joint states may be without any joint.
+    # JointState messages may contain no joints; such a topic has no numbers and is left out.
     used = {}
     for name, described in found.items():
         if described.names or any(described.shape):
             used[name] = described
     joints = [name for name in used if used[name].msgtype == JOINTS]
-    # Of several robots only the user can tell whose state is meant.
+    # If there are several topics of joint states, only the user can decide which one is the state.
     others = [name for name in joints if name != choices.action]
     state = choices.state
     if state is None and len(others) == 1:
@@ -176,7 +209,17 @@ def _describe_topic(
     msgtype: str,
     found: dict[str, Topic],
 ) -> None:
-    """Add what a bag has on a topic to the description of the topic."""
+    """Add the names of the numbers, or the shape of the images, on a topic to its description.
+
+    Args:
+        bag: Open bag that has the topic.
+        name: Name of the topic.
+        msgtype: Type of its messages in this bag.
+        found: Descriptions by the names of the topics; this one is added or extended.
+
+    Raises:
+        BagError: The topic has another type in a bag that was read before.
+    """
     topic = found.setdefault(name, Topic(msgtype))
     if topic.msgtype != msgtype:
         raise BagError(
@@ -184,7 +227,7 @@ def _describe_topic(
             "naming the others with --topics"
         )
     if msgtype not in IMAGES:
-        # Bags may be about different joints: the feature has the names of all.
+        # Bags may contain different joints, so the feature gets the joints of all bags.
         names = read_signal(bag, name, msgtype).names
         topic.names += [one for one in names if one not in topic.names]
     elif not any(topic.shape):
@@ -196,10 +239,15 @@ def read_signal(
     topic: str,
     msgtype: str,
 ) -> Signal:
-    """Read the numbers of all messages on a topic.
+    """Read the numbers in all messages on a topic.
+
+    Args:
+        bag: Open bag.
+        topic: Name of the topic.
+        msgtype: Type of its messages: JointState, or another one with a header and numbers.
 
     Raises:
-        BagError: The bag is damaged, or a joint has no name.
+        BagError: The bag is damaged, or a JointState has more or fewer values than joint names.
     """
     names: dict[str, int] = {}
     messages: list[tuple[int, dict[str, float]]] = []
@@ -218,10 +266,11 @@ def read_signal(
     shape = (len(messages), len(names))
     values = np.full(shape, np.nan, np.float32)
     for row, (_, numbers) in zip(values, messages, strict=True):
-        # Messages may name the joints in different orders.
+        # Each number is put into the column of its name, because the order of the joints may differ
+        # between messages.
         columns = [names[name] for name in numbers]
         row[columns] = list(numbers.values())
-    # A message about some of the joints leaves the others as they were.
+    # A JointState may contain only some of the joints; the others keep their latest values.
     rows = np.arange(len(values))[:, np.newaxis]
     rows_with_value = np.where(np.isnan(values), 0, rows)
     newest = np.maximum.accumulate(rows_with_value, axis=0)
@@ -233,8 +282,12 @@ def read_signal(
 def _stamped_topics(bag: Bag, skin: str) -> list[tuple[str, str]]:
     """Return name and type of the topics with images, joint states or other stamped numbers.
 
-    Topics of single cubes (below ``cubes/`` of the skin with the prefix `skin`) are left out: their
-    content is in the stress, too.
+    Topics of single cubes are left out, because the stress of the skin contains the same numbers.
+
+    Args:
+        bag: Open bag.
+        skin: Common prefix of the names of the skin's topics; those of single cubes have
+            ``cubes/`` after it.
     """
     found = []
     for one in bag.connections:
@@ -247,7 +300,11 @@ def _stamped_topics(bag: Bag, skin: str) -> list[tuple[str, str]]:
 
 
 def _number_names(bag: Bag, msgtype: str) -> list[str]:
-    """Return the names of a type's numbers; none without a header, or with a list of any length."""
+    """Return the names of the numbers in messages of a type, such as ``wrench.force.x``.
+
+    The list is empty if the type has no header (and therefore no stamp), contains a list of
+    variable length, or belongs to this package.
+    """
     fields = bag.fields(msgtype)
     has_header = bool(fields) and fields[0][1] == (Nodetype.NAME, HEADER)
     if not has_header or msgtype.startswith(PACKAGE):
@@ -261,7 +318,17 @@ def _numbers(
     fields: list[tuple[str, Any]],
     prefix: str,
 ) -> Iterator[str | None]:
-    """Yield the names of the numbers in fields; None stands for a list of any length."""
+    """Yield the names of the numbers in a message type, including those in nested messages.
+
+    Args:
+        bag: Open bag, which knows the fields of nested types.
+        fields: Name and kind of each field, as `Bag.fields` returns them.
+        prefix: Path of the fields within the outermost message, ending in "."; "" for its own.
+
+    Yields:
+        Names such as ``wrench.force.x``; None for a field that is not a fixed set of numbers, such
+        as a list of variable length.
+    """
     for name, (node, kind) in fields:
         if node == Nodetype.NAME:
             yield from _numbers(bag, bag.fields(kind), f"{prefix}{name}.")
@@ -275,7 +342,15 @@ def _numbers(
 
 
 def _joint_numbers(message: Any, where: str) -> dict[str, float]:
-    """Return the numbers of a JointState, which may be about some of the joints only."""
+    """Return the numbers in a JointState message by their names, such as ``elbow.position``.
+
+    Args:
+        message: The message, which may contain only some of the robot's joints.
+        where: Bag and topic, for errors.
+
+    Raises:
+        BagError: The message has more or fewer values of a quantity than joint names.
+    """
     numbers = {}
     for quantity in JOINT_FIELDS:
         values = getattr(message, quantity)
@@ -290,9 +365,10 @@ def _joint_numbers(message: Any, where: str) -> dict[str, float]:
 
 
 def _value(message: Any, name: str) -> float:
-    """Return the number of a message that a path such as ``wrench.force.x`` names."""
+    """Return the number in a message that a path such as ``wrench.force.x`` names."""
     for part in name.split("."):
-        # A part of digits is a place in an array; no field has such a name.
+        # A part that consists of digits is an index of an array, because names of fields in ROS
+        # begin with a letter.
         is_place = part.isdigit()
         message = message[int(part)] if is_place else getattr(message, part)
     return float(message)

@@ -1,4 +1,4 @@
-"""Rows of stress arranged in windows: for each frame, all samples of each cube in it."""
+"""Arrangement of stress in windows: all samples of every cube in one frame of a data set."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..core.modes import COMPONENTS
 from ..core.rows import StressRows, concatenate
 
 TACTILE = "observation.tactile"
-"""Name of the feature with the stress of all cubes."""
+"""Name of the feature (column of a data set) that contains the stress of all cubes."""
 
 COLUMNS: dict[str, Any] = {
     "stamp_ns": np.int64,
@@ -22,19 +22,26 @@ COLUMNS: dict[str, Any] = {
     "observed": np.uint16,
     "left_out": np.uint32,
 }
-"""Columns of `StressRows` that a window has beside the stress, with their types."""
+"""Columns of `StressRows` that a data set contains beside stress and gradient, with their types."""
 
 MAX_BLOCK_BYTES = 32 << 20
-"""Largest size, in bytes, of the block of windows that is built and written at a time."""
+"""Largest size, in bytes, of the stress of those frames that are arranged and written together.
+
+At least one frame is written, even if it is larger.
+"""
+
 MAX_BLOCK_FRAMES = 128
-"""Largest number of frames in such a block. Their images are in memory at the same time."""
+"""Largest number of frames that are written together. The images of all these frames are in memory
+at the same time."""
 
 
 class Windows:
-    """The windows of one episode: rows are added in any order, windows come in that of the frames.
+    """The windows (samples of all cubes in one frame) of one episode.
 
-    The samples of a cube stand in the order of recording, the newest at the end. Where a frame has
-    fewer samples than the window, the places in front are NaN, and 0 where numbers are whole.
+    Rows may be added in any order of frames; the windows are made in the order of the frames.
+    Within a window the samples of a cube are in the order of recording, the newest at the end. If a
+    frame has fewer samples than a window has room for, the first entries are NaN (0 in columns of
+    integers).
 
     Attributes:
         done: Number of frames whose windows have been made.
@@ -44,8 +51,8 @@ class Windows:
         """Prepare the windows of an episode.
 
         Args:
-            counts: (frames, cubes) number of samples to come.
-            depth: Number of samples in a window.
+            counts: (frames, cubes) number of samples of each cube in each frame.
+            depth: Number of samples of a cube that a window has room for.
         """
         self.done = 0
         self._counts, self._depth = counts, depth
@@ -56,15 +63,25 @@ class Windows:
         self._waiting: list[tuple[Index, StressRows]] = []
 
     def add(self, frame: Index, rows: StressRows) -> None:
-        """Add rows, each with the frame it belongs to."""
+        """Add N rows of stress.
+
+        Args:
+            frame: (N,) number of the frame in the episode to which each row belongs.
+            rows: The N rows.
+        """
         self._waiting.append((frame, rows))
 
     def complete(self) -> Iterator[dict[str, AnyArray]]:
-        """Yield blocks of windows (n, depth, cubes, ...) by name, as far as rows are there."""
+        """Yield the windows of all further frames whose rows have been added.
+
+        Yields:
+            Arrays (n, depth, cubes, …) by the names of the features, for n successive frames.
+        """
         while self.done < len(self._counts):
             block = self._counts[self.done : self.done + self._block]
             end = self.done + len(block)
-            # Late links are waited for: the first pass has counted how many rows there are.
+            # The first pass over the bag has counted the rows of every frame. A block is complete
+            # only when all of them are there, including those of hubs that deliver late.
             expected = int(block.sum(dtype=np.int64))
             ready = sum(np.count_nonzero(frame < end) for frame, _ in self._waiting)
             if ready < expected:
@@ -88,22 +105,27 @@ class Windows:
         frame: Index,
         rows: StressRows,
     ) -> dict[str, AnyArray]:
-        """Arrange all rows of some frames.
+        """Arrange all rows of n successive frames in windows.
 
         Args:
-            counts: (n, cubes) number of samples in each frame.
-            frame: (N,) frame of each row, counted from the first of these frames.
-            rows: N rows.
+            counts: (n, cubes) number of samples of each cube in each frame.
+            frame: (N,) index of each row's frame, 0 for the first of the n frames.
+            rows: The N rows.
+
+        Returns:
+            Arrays (n, depth, cubes, …) by the names of the features.
         """
         n_frames, n_cubes = counts.shape
-        # A cell is one cube in one frame. The stable order keeps its samples as they came.
+        # A cell is one cube in one frame. Stable sorting keeps its samples in the order of
+        # recording.
         cell = frame * n_cubes + rows.cube
         order = np.argsort(cell, kind="stable")
         cell = cell[order]
-        # Rows of one cell stand together now: a row's rank in it is its distance from the first.
+        # After sorting, the rows of a cell are adjacent, so the rank of a row in its cell is its
+        # distance from the first row of the cell.
         first_of_cell = np.searchsorted(cell, cell)
         rank = np.arange(len(cell)) - first_of_cell
-        # The newest sample stands at the end of the window.
+        # Samples are aligned to the end of the window, so that the newest is always the last entry.
         in_cell = counts.reshape(-1).astype(np.intp)[cell]
         slot = self._depth - in_cell + rank
         place = cell // n_cubes, slot, cell % n_cubes
