@@ -1,5 +1,5 @@
-"""The demo: a simulated skin in real processes, measured against what was sent.
+"""The demo: it runs a simulated skin in real processes and checks the tensors that arrive.
 
-`demo` starts the processes, `watching` shows and measures what arrives, `verification` and
-`load_verification` compare it with the samples that were sent and with the load.
+`demo` starts the processes, and `watching` shows and collects the tensors. `verification` compares
+them with the samples that the simulated hubs sent, `load_verification` with the simulated load.
 """

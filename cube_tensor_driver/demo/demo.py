@@ -1,8 +1,8 @@
 """`./cube demo`: start simulated hubs, driver and reconstruction, and watch what they publish.
 
-The processes need most of a second for their own imports. They are therefore started before this
-process imports numpy, ROS and the display; so only light modules may be imported at the top of
-this file.
+The processes need almost a second for their own imports. They are therefore started before this
+process imports numpy, ROS and the live table, and the top of this file may only import modules that
+import none of these.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from ..processes.skin_processes import Process, SimulatedHubs, skin_processes
 from ..processes.stop_signals import stop_event
 
 MAX_CUBES = 4096
-"""Largest number of cubes of --cubes."""
+"""Maximum number of cubes of a grid that `./cube demo --cubes N` simulates."""
 
 PITCH = 0.012
-"""Distance of neighbouring cubes of --cubes, in metres."""
+"""Distance of neighbouring cubes, in metres, in the grid that `./cube demo --cubes N` simulates."""
 
 DEFAULT_RATE = 100.0
-"""Samples per second where neither the options nor the skin file state a rate."""
+"""Number of samples per second if neither the option --rate nor the skin file states a rate."""
 
 CUBES_PER_HUB = 8
-"""Number of cubes on each simulated hub of --cubes."""
+"""Number of cubes on each simulated hub of the grid that `./cube demo --cubes N` simulates."""
 
 VIEW = Process("view", "cube_tensor_driver.cli", node=False, arguments=("view",))
-"""The process of the browser view."""
+"""The process `./cube view`, which `./cube demo --view` starts beside the nodes."""
 
 INTERRUPTED = 130
-"""Exit code after Ctrl-C: 128 plus the number of SIGINT, as shells count."""
+"""Exit code after Ctrl-C: by the convention of shells, 128 plus the number of the signal SIGINT."""
 
 
 @dataclass(frozen=True)
@@ -44,20 +44,22 @@ class DemoSettings:
     """What a demo simulates, shows and writes.
 
     Attributes:
-        config: Skin file; None: the shipped one, or a grid of `cubes` cubes.
-        cubes: Number of cubes of a grid; None: no grid.
-        load: Load script; None: the shipped one.
-        mujoco: MuJoCo scene that takes the place of a load script. Without `config` it names its
-            skin file itself.
-        rate: Samples per second; None: as the skin file states, else `DEFAULT_RATE`.
-        noise: Noise of the pads relative to their frequencies; None: as the calibrations state.
-        imperfections: File with further faults of the pads; None: no faults.
-        duration: Time to measure, in seconds, after which figures are given; None: run until
-            Ctrl-C, without figures.
-        headless: Whether to show no live table.
+        config: Skin file to simulate; None: the shipped one, or a grid if `cubes` is set.
+        cubes: Number of cubes of a grid to simulate; None: no grid.
+        load: File with the forces that act on the skin over time; None: the shipped one.
+        mujoco: MuJoCo scene whose bodies touch the skin, instead of `load`. If `config` is None,
+            the scene names the skin file.
+        rate: Samples per second of each cube; None: that of the skin file, else `DEFAULT_RATE`.
+        noise: Standard deviation of the pads' frequencies, relative to the frequencies; None: as
+            the calibrations state.
+        imperfections: File with deviations of the pads (gains, dead pads, creep); None: none.
+        duration: Time to measure, in seconds, after which the results are printed; None: the demo
+            runs until Ctrl-C and prints no results.
+        headless: Whether the live table is not shown.
         view: Whether to show the skin in the browser, too.
-        json: File for the figures; None: they are printed.
-        figure: Picture of force and centre of pressure beside those of the load; None: no picture.
+        json: File for the results as JSON; None: they are printed.
+        figure: File for a picture of the applied and the measured force and centre of pressure
+            over time; None: no picture.
     """
 
     config: Path | None = None
@@ -75,21 +77,22 @@ class DemoSettings:
 
 
 def run_demo(settings: DemoSettings) -> int:
-    """Run a simulated skin and show it.
+    """Simulate a skin, run driver and reconstruction on it, and show or measure the tensors.
 
     Returns:
-        The exit code: 0, or `INTERRUPTED` if a measurement was interrupted.
+        The exit code: 0, or `INTERRUPTED` if Ctrl-C ended a measurement before its duration.
 
     Raises:
         CubeError: A file or option cannot be used, a process does not start, or another skin
             publishes in this DDS domain.
     """
-    # From here on Ctrl-C ends the loop that watches, and the processes end in order.
+    # From here on Ctrl-C only sets this event. The loop in `watch` ends by it, and `Children` then
+    # ends all processes.
     interrupted = stop_event()
     with tempfile.TemporaryDirectory(prefix="cube_demo_") as name:
         folder = Path(name)
         skin_file = choose_skin_file(settings, folder)
-        # A hub that is told no rate by anybody sends no samples.
+        # A hub to which the driver sends no rate takes no samples.
         rate = settings.rate or rate_of_file(skin_file) or DEFAULT_RATE
         hubs = SimulatedHubs(
             folder / "ports",
@@ -113,17 +116,21 @@ def run_demo(settings: DemoSettings) -> int:
                     settings, skin_file, rate, children, interrupted, folder / "log.json"
                 )
             except Interrupted:
-                # Without a duration, Ctrl-C is how a demo ends.
+                # Without a duration, Ctrl-C is the normal end of a demo.
                 return 0 if settings.duration is None else INTERRUPTED
     measurement.publish(settings)
     return 0
 
 
 def choose_skin_file(settings: DemoSettings, folder: Path) -> Path:
-    """Return the skin file to simulate; the file of a grid is written into `folder`.
+    """Return the path of the skin file to simulate.
+
+    Args:
+        settings: The settings of the demo.
+        folder: Folder into which the skin file of a grid (`settings.cubes`) is written.
 
     Raises:
-        ConfigError: The options contradict each other.
+        ConfigError: The settings contradict each other.
     """
     if settings.mujoco is not None and settings.load is not None:
         raise ConfigError("--load and --mujoco are two loads for one skin; give one of them")
@@ -145,8 +152,13 @@ def choose_skin_file(settings: DemoSettings, folder: Path) -> Path:
 def write_grid(path: Path, cubes: int, rate: float) -> Path:
     """Write the skin file of a grid that is as nearly square as possible, and return its path.
 
+    Args:
+        path: The file to write.
+        cubes: Number of cubes; the last row of the grid may be incomplete.
+        rate: Samples per second of each cube.
+
     Raises:
-        ConfigError: There are too many cubes.
+        ConfigError: The number of cubes is not from 1 to `MAX_CUBES`.
     """
     if not 1 <= cubes <= MAX_CUBES:
         raise ConfigError(f"--cubes is {cubes}, allowed: 1 to {MAX_CUBES}")
@@ -160,7 +172,7 @@ def write_grid(path: Path, cubes: int, rate: float) -> Path:
         links=links,
         rate=rate,
     )
-    # The last row may be incomplete; a hub that loses all of its cubes goes as well.
+    # Surplus cubes of the last row are removed, and with them links (hubs) without any cube.
     skin["cubes"] = skin["cubes"][:cubes]
     used = {cube["link"] for cube in skin["cubes"]}
     skin["links"] = [link for link in skin["links"] if link["name"] in used]
@@ -169,9 +181,9 @@ def write_grid(path: Path, cubes: int, rate: float) -> Path:
 
 
 def rate_of_file(skin_file: Path) -> float | None:
-    """Return the rate that a skin file states, None if it states no usable one.
+    """Return the samples per second that a skin file states; None if it states no number.
 
-    The file is not checked here, because that needs numpy: `watch` does so.
+    The file is not checked here, because the check needs numpy; `watch` checks it later.
     """
     content = read_yaml(skin_file)
     rate = content.get("rate") if isinstance(content, dict) else None

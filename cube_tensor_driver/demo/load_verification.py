@@ -1,7 +1,7 @@
 """Comparison of the tensors that arrived with the load on the simulated skin.
 
-Only the demo needs it. The comparison of the samples that were sent and received, which bench and
-tests need as well, is in `verification`.
+Only the demo needs this. The module `verification`, which `./cube bench` and the tests use too,
+compares the samples that were sent with those that were received.
 """
 
 from __future__ import annotations
@@ -24,30 +24,36 @@ from ..touch.surface import Contact, Surface
 from .verification import Arrivals, Comparison, compare, percentile
 
 MIN_TIMES_COMPARED = 500
-"""Number of sampling times above which only some, at equal intervals, are compared with the load:
-each costs the solution of a contact problem."""
+"""Minimum number of sampling times that are compared with the load, if there are as many.
+
+Of a longer measurement, every n-th sampling time is compared, because the load at each of them is
+the solution of a contact problem, which takes time.
+"""
 
 RANGE_TIMES = 100
-"""Number of times within a load script from which the range of each component is computed."""
+"""Number of equally spaced times in one period of the load from which the range of each component
+(maximum minus minimum) is computed."""
 
 LOADED_SHARE = 0.2
-"""Share of the largest force above which the skin counts as loaded. The centre of pressure of a
-smaller force is mostly noise."""
+"""Fraction of the largest force of a measurement above which the skin counts as loaded.
+
+The centre of pressure of a smaller force is mostly noise and is not compared.
+"""
 
 
 @dataclass(frozen=True)
 class ForceHistory:
-    """Forces on the whole skin at T times, as applied and as reconstructed from tensors.
+    """Forces on the whole skin at T times, as applied and as computed from the tensors.
 
-    All vectors are in the skin's parent frame. Centres of pressure are NaN where nothing presses.
+    All vectors are in the skin's parent frame. A centre of pressure is NaN at times without load.
 
     Attributes:
-        seconds: (T,) simulated time, in seconds.
+        seconds: (T,) simulated time, in seconds after the start of the simulator.
         force: (T, 3) force that the load applies, in N.
-        centre: (T, 3) its centre of pressure, in metres.
-        normal: (T, 3) direction out of the skin at that centre.
-        measured_force: (T, 3) reconstructed force, in N.
-        measured_centre: (T, 3) reconstructed centre of pressure, in metres.
+        centre: (T, 3) centre of pressure of the load, in metres.
+        normal: (T, 3) unit normal out of the skin at the centre of pressure of the load.
+        measured_force: (T, 3) force computed from the tensors, in N.
+        measured_centre: (T, 3) centre of pressure computed from the tensors, in metres.
     """
 
     seconds: Array
@@ -58,10 +64,11 @@ class ForceHistory:
     measured_centre: Array
 
     def figures(self) -> dict[str, object]:
-        """Return peak and rms error of the force per axis (N), and the error of the centre (mm).
+        """Return peak and rms error of the force per axis (N), and rms error of the centre (mm).
 
-        The error of the centre is taken along the skin, while it is loaded: tensors at one depth
-        say nothing about the height at which the force acts.
+        The error of the centre of pressure is computed from times at which the skin is loaded, and
+        only from its part along the skin: the tensors, which are all measured at one depth, do not
+        determine the height at which the force acts.
         """
         size = np.linalg.norm(self.force, axis=1)
         is_measured = np.isfinite(self.measured_centre).all(axis=1)
@@ -80,9 +87,19 @@ class ForceHistory:
 
 
 class LoadVerification:
-    """Collects rows as they arrive; after `compare` it gives the figures of a span of time."""
+    """Collects the rows that arrive, and compares those of a period with samples and load.
+
+    Call `compare` when the simulator has ended, then `result` or `forces`. The rows are those of
+    messages: one cube at one sampling time.
+    """
 
     def __init__(self, skin: Skin, load: AnyLoad) -> None:
+        """Start without rows.
+
+        Args:
+            skin: The simulated skin.
+            load: The load on the skin, as the simulator computes it.
+        """
         self._skin, self._load = skin, load
         self._frequencies, self._stress = Arrivals(skin), Arrivals(skin)
         self._components: list[AnyArray] = []
@@ -91,23 +108,33 @@ class LoadVerification:
         self._span_ns = (0, 0)
 
     def add_frequencies(self, rows: FrequencyRows) -> None:
-        """Add the rows of one message of frequencies."""
+        """Add the rows of one message of the topic `frequencies`."""
         self._frequencies.add(rows)
 
     def add_stress(self, rows: StressRows, received_ns: int) -> None:
-        """Add the rows of one message of stress, received at `received_ns` of the wall clock."""
+        """Add the rows of one message of the topic `stress`.
+
+        Args:
+            rows: The rows.
+            received_ns: Time of arrival, in ns since the Unix epoch.
+        """
         np.maximum.at(self._newest_ns, rows.cube, rows.stamp_ns)
         self._stress.add(rows, received_ns)
-        # The order is that of `Arrivals`, so that its indices fit.
+        # The rows are stored in the same order as in `Arrivals`, so that indices into its rows can
+        # be used here, too.
         self._components.append(np.concatenate([rows.stress, rows.gradient], axis=1))
 
     @property
     def sampled(self) -> bool:
-        """Whether any frequencies have arrived."""
+        """Whether at least one row of frequencies has arrived."""
         return self._frequencies.rows > 0
 
     def is_beyond(self, end_ns: int) -> bool:
-        """Return whether each cube has a tensor whose stamp is after `end_ns`."""
+        """Return whether a tensor with a stamp after `end_ns` has arrived from each cube.
+
+        Args:
+            end_ns: Time in ns since the Unix epoch.
+        """
         return bool(self._newest_ns.min() > end_ns)
 
     def compare(
@@ -116,19 +143,26 @@ class LoadVerification:
         start_ns: int,
         end_ns: int,
     ) -> None:
-        """Set what is compared: samples taken from `start_ns` to before `end_ns` (wall clock)."""
+        """Set the samples with which `result` and `forces` compare the rows.
+
+        Args:
+            log: Log of the simulator, which contains the samples that its hubs took.
+            start_ns: Beginning of the compared period, in ns since the Unix epoch.
+            end_ns: End of the period; samples taken at this time or later do not count.
+        """
         self._log, self._span_ns = log, (start_ns, end_ns)
 
     def is_complete(self) -> bool:
-        """Return whether a tensor of every sample that was sent has arrived."""
+        """Return whether a tensor has arrived for every sample that was sent in the period."""
         comparison = self._comparison(self._stress)
         return comparison.received >= comparison.sent
 
     def result(self) -> dict[str, object]:
-        """Return the figures of the span.
+        """Return counts, latencies and errors of the compared period, as the JSON file has them.
 
-        Counts are rows (one cube, one sample), times are in ms. Errors are relative to the range
-        of the script, and to the standard deviation that the noise of the pads causes.
+        Counts are rows (one cube at one sampling time), times are in ms. Errors of the tensors are
+        relative to the range that each component has under the load, and relative to the standard
+        deviation that the noise of the pads causes.
         """
         frequencies = self._comparison(self._frequencies)
         stress = self._comparison(self._stress)
@@ -144,24 +178,25 @@ class LoadVerification:
         }
 
     def forces(self) -> ForceHistory:
-        """Return the force on the whole skin and its centre of pressure over time.
+        """Compute the force on the whole skin and its centre of pressure over time.
 
         Raises:
             MessageError: There is no time at which a tensor of every cube has arrived.
         """
         cube, components, taken_ns = self._received(self._comparison(self._stress))
         times_ns, counts = np.unique(taken_ns, return_counts=True)
-        # A force on the whole skin needs a tensor of every cube at the same time.
+        # The force on the whole skin can be computed at times with a tensor of every cube.
         times_ns = thin_out(times_ns[counts == len(self._skin.cubes)])
         if not len(times_ns):
             raise MessageError(
                 "no tensors of all cubes at one time have arrived: there are no forces to draw"
             )
 
-        # The load script runs in simulated time, which began with the simulator.
+        # The load is a function of simulated time, which is 0 at the start of the simulator.
         seconds = (times_ns - self._log.start_time_ns) * 1e-9
         applied = [self._load.total(time) for time in seconds.tolist()]
-        # The contacts are computed as the page and the node `contacts` do without the inverse.
+        # The contacts are found by interpolating the pressure between the cubes, as the node
+        # `contacts` does with the method `interpolation`.
         surface = Surface(self._load.poses, self._load.depth)
         measured = []
         for time_ns in times_ns:
@@ -185,7 +220,15 @@ class LoadVerification:
         return compare(self._log.table, arrivals, *self._span_ns)
 
     def _received(self, comparison: Comparison) -> tuple[Index, AnyArray, Index]:
-        """Return cube (K,), components (K, 15) and time (K,) in ns of the rows that arrived."""
+        """Return the K compared rows of stress that arrived.
+
+        Args:
+            comparison: Result of comparing the rows of stress with the samples.
+
+        Returns:
+            Index of the cube (K,); components (K, 15) in Pa and Pa/m; sampling time (K,), in ns
+            since the Unix epoch.
+        """
         first = comparison.first
         if not len(first):
             return np.empty(0, np.intp), np.empty((0, len(COMPONENTS))), np.empty(0, np.int64)
@@ -193,8 +236,16 @@ class LoadVerification:
         return cube[first], np.concatenate(self._components)[first], comparison.taken_ns
 
     def _errors(self, comparison: Comparison) -> dict[str, object]:
-        """Return rms and largest error relative to the range of each component in the script, and
-        the rms relative to the standard deviation that the noise of the pads causes."""
+        """Compute the errors of the tensors that arrived.
+
+        Args:
+            comparison: Result of comparing the rows of stress with the samples.
+
+        Returns:
+            Rms and largest error relative to the range of each component under the load, and rms
+            error relative to the standard deviation that the noise of the pads causes. All are NaN
+            if no tensor arrived.
+        """
         cube, components, taken_ns = self._received(comparison)
         if not len(cube):
             return dict.fromkeys(("error_rel_rms", "error_rel_worst", "error_over_noise"), np.nan)
@@ -212,7 +263,7 @@ class LoadVerification:
         lowest = np.nanmin(script, axis=(0, 1))
         span = np.nanmax(script, axis=(0, 1)) - lowest
         error = np.concatenate(errors)
-        # A component that the script never changes has no range to compare with.
+        # A component that is constant under the load has a range of 0 and is left out.
         relative = error[:, span > 0] / span[span > 0]
         over_noise = error / np.concatenate(allowed)
         return {
@@ -222,20 +273,24 @@ class LoadVerification:
         }
 
     def _truth(self, seconds: float) -> Array:
-        """Return the components (cubes, 15) that the load causes at a simulated time."""
+        """Return the components (cubes, 15), in Pa and Pa/m, under the load at a simulated time.
+
+        Args:
+            seconds: Time after the start of the simulator, in s.
+        """
         return skin_components(self._skin, *self._load.at(seconds))
 
 
 def rms(values: AnyArray) -> float:
-    """Return the root mean square, without values that are NaN."""
+    """Return the root mean square of all values that are not NaN."""
     return float(np.sqrt(np.nanmean(values**2)))
 
 
 def component_noise(skin: Skin) -> Array:
-    """Return the standard deviations that the noise of its pads causes in what each cube reports.
+    """Compute the standard deviation that the noise of the pads causes in each component.
 
     Returns:
-        (cubes, 15) in Pa and Pa/m; NaN where a component is not observed.
+        Standard deviations (cubes, 15) in Pa and Pa/m; NaN where a component is not observed.
     """
     deviations = np.empty((len(skin.cubes), len(COMPONENTS)))
     is_stress = np.arange(len(COMPONENTS)) < len(STRESS)
@@ -246,19 +301,28 @@ def component_noise(skin: Skin) -> Array:
             calibration.modes,
             neglect=calibration.neglect,
         )
-        # The estimator's gradients are multiplied by the half side, so that all are in Pa.
+        # The estimator multiplies gradients by half the side of the cube, so that they are in Pa
+        # like the stresses; this is undone here.
         scale = np.where(is_stress, 1.0, 1 / calibration.half_side)
         deviations[rows] = np.sqrt(np.diag(estimator.covariance)) * scale
     return deviations
 
 
 def thin_out(times_ns: Index) -> Index:
-    """Return about `MIN_TIMES_COMPARED` of the times at equal intervals, or all of fewer."""
+    """Return every n-th time, so that at least `MIN_TIMES_COMPARED` are left, or all if fewer.
+
+    Args:
+        times_ns: (T,) sampling times, in ns, in ascending order.
+    """
     return times_ns[:: max(1, len(times_ns) // MIN_TIMES_COMPARED)]
 
 
 def total_force(contacts: list[Contact]) -> tuple[Array, Array]:
-    """Return force (3,) in N and centre of pressure (3,) in metres of all contacts together."""
+    """Return the sum of the forces of all contacts and their common centre of pressure.
+
+    Returns:
+        Force (3,) in N; centre of pressure (3,) in metres, NaN if there is no contact.
+    """
     if not contacts:
         return np.zeros(3), np.full(3, np.nan)
     # The centre of pressure is weighted by the normal force.

@@ -1,4 +1,4 @@
-"""What demo, torture and bench share: a node that watches a skin in other processes."""
+"""A node that observes a skin in other processes; `./cube demo`, torture and bench use it."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from ..simulation.sample_log import SampleLog
 
 
 class Interrupted(CubeError):
-    """The user has pressed Ctrl-C, or the process was asked to end."""
+    """The user has pressed Ctrl-C, or another signal asked the process to end."""
 
 
 class Observer:
-    """A node beside the processes that it observes; `observing` makes one.
+    """A ROS node that receives the messages of a skin in child processes; see `observing`.
 
     Attributes:
-        node: The node.
+        node: The ROS node.
     """
 
     def __init__(
@@ -39,7 +39,7 @@ class Observer:
         interrupted: threading.Event | None,
         on_step: Callable[[], None],
     ) -> None:
-        """Args are those of `observing`, and the node with the executor that it is in."""
+        """Store the node, its executor, and the arguments of `observing`."""
         self.node, self._executor = node, executor
         self._children, self._interrupted, self._on_step = children, interrupted, on_step
         self._checked_s = 0.0
@@ -47,7 +47,14 @@ class Observer:
     def listen(
         self, kind: type, topic: str, receive: Callable[[bytes], None], quality: QoSProfile
     ) -> None:
-        """Call `receive` with each message of a topic, in its serialised form."""
+        """Subscribe to a topic.
+
+        Args:
+            kind: Type of the messages.
+            topic: Name of the topic.
+            receive: Function that is called with each message in its serialised form (CDR).
+            quality: Quality of service of the subscription.
+        """
         self.node.create_subscription(kind, topic, receive, quality, raw=True)
 
     def log_error(self, text: str) -> None:
@@ -56,18 +63,23 @@ class Observer:
         logger.error(text)
 
     def spin(self, seconds: float, done: Callable[[], bool] = lambda: False) -> None:
-        """Receive messages for a time, or until `done()`.
+        """Receive messages for a time, or until a condition is met.
+
+        Args:
+            seconds: Maximum time, in s.
+            done: Condition that ends the function earlier when it returns true.
 
         Raises:
-            Interrupted: A signal asked to end.
-            ChildError: A process has ended.
+            Interrupted: The event `interrupted` was set, by Ctrl-C for example.
+            ChildError: One of the observed processes has ended.
         """
 
         def check() -> None:
-            # A signal sets an event only, so that it is handled at this place.
+            # The signal handler only sets the event; the exception is raised here, between two
+            # messages.
             if self._interrupted is not None and self._interrupted.is_set():
                 raise Interrupted("interrupted")
-            # Once per message would cost more than the message.
+            # Checking the processes after each message would take longer than the message.
             if time.monotonic() - self._checked_s > STEP_S:
                 self._checked_s = time.monotonic()
                 self._children.check()
@@ -84,23 +96,27 @@ def observing(
     interrupted: threading.Event | None = None,
     on_step: Callable[[], None] = lambda: None,
 ) -> Iterator[Observer]:
-    """Make a node for the length of a block.
+    """Make an observer inside a `with` block, and destroy its node at the end of the block.
 
     Args:
-        name: Name of the node.
+        name: Name of the ROS node.
         children: The processes that it observes.
-        interrupted: Event that ends `Observer.spin`; None: signals are left as they are.
-        on_step: Called again and again while it spins.
+        interrupted: Event that lets `Observer.spin` raise Interrupted; None: no such event.
+        on_step: Function that `Observer.spin` calls repeatedly while it receives messages.
     """
     with node_session(name) as (node, executor):
         yield Observer(node, executor, children, interrupted, on_step)
 
 
 def end_simulator(children: Children, log: Path) -> SampleLog:
-    """End the simulator and read its log.
+    """End the process of the simulator and read the log that it writes at its end.
+
+    Args:
+        children: The processes, of which one is named "simulator".
+        log: Path of the log.
 
     Raises:
-        CubeError: It wrote none.
+        CubeError: The simulator ended without writing its log.
     """
     children.end(["simulator"])
     if not log.exists():
@@ -109,7 +125,7 @@ def end_simulator(children: Children, log: Path) -> SampleLog:
 
 
 def report(result: dict[str, Any], json_path: Path | None) -> None:
-    """Print figures, and write them to a file as well if one is named."""
+    """Print results as JSON, and write them to a file as well if `json_path` is not None."""
     print(json.dumps(result, indent=2))
     if json_path is not None:
         write_json(json_path, result)

@@ -13,16 +13,24 @@ BYTES_PER_MB = 2**20
 
 
 class Usage:
-    """What processes use of the machine; processor time is counted from the construction on."""
+    """Processor time, memory and threads of child processes.
+
+    The processor time is counted from the moment at which the object is made.
+    """
 
     def __init__(self, children: Children, names: Iterable[str]) -> None:
-        """names: of the processes to look at."""
+        """Start to count processor time.
+
+        Args:
+            children: The child processes.
+            names: Names of the child processes to measure, such as "driver".
+        """
         self._processes = {name: psutil.Process(children.pid(name)) for name in names}
         self._start_s = time.monotonic()
         self._start_cpu_s = self._cpu_seconds()
 
     def cpu_percent(self) -> dict[str, float]:
-        """Return the mean load that each process puts on one core, in percent."""
+        """Return the processor time of each process per elapsed time, in percent of one core."""
         elapsed_s = time.monotonic() - self._start_s
         return {
             name: 100 * (cpu_s - self._start_cpu_s[name]) / elapsed_s
@@ -41,6 +49,6 @@ class Usage:
         return {name: process.num_threads() for name, process in self._processes.items()}
 
     def _cpu_seconds(self) -> dict[str, float]:
-        # User and system time: sending and receiving happens in the kernel.
+        # System time counts as well, because messages are sent and received in the kernel.
         times = {name: process.cpu_times() for name, process in self._processes.items()}
         return {name: float(time.user + time.system) for name, time in times.items()}

@@ -1,7 +1,8 @@
-"""Comparison of what simulated hubs sent with what arrived.
+"""Comparison of the samples that simulated hubs sent with the rows of messages that arrived.
 
-Demo and bench collect what arrives in `Arrivals`, and `compare` it with the sample log at the end.
-Counts are rows: one cube, one sample. Torture checks more, see `workshop/checks/`.
+`./cube demo` and `./cube bench` collect the rows in `Arrivals`, and `compare` them with the log of
+the simulator at the end. A row is one cube at one sampling time. `./cube torture` checks more, see
+`workshop/checks/`.
 """
 
 from __future__ import annotations
@@ -21,21 +22,22 @@ NS_TO_MS = 1e-6
 
 
 class Arrivals:
-    """Collects which rows arrive and when.
+    """Stores which rows (one cube at one sampling time) have arrived, and when.
 
     Attributes:
-        row_count: (cubes,) number of rows that a kept row of each cube stands for; rows of cubes
-            with 0 are not kept.
-        rows: Number of rows that arrived, kept or not.
+        row_count: (cubes,) number of sent rows that one stored row of a cube represents; 0 for
+            cubes whose rows are not stored.
+        rows: Number of rows that have arrived, stored or not.
     """
 
     def __init__(self, skin: Skin, *, one_per_hub: bool = False) -> None:
-        """Start with nothing.
+        """Start without rows.
 
         Args:
             skin: The skin whose rows arrive.
-            one_per_hub: Keep only rows of the first cube of each hub. It saves memory and time
-                where whole samples of a hub arrive or are lost.
+            one_per_hub: Whether to store only rows of the first cube of each hub. This saves memory
+                and time, and gives the same counts if the rows of a hub's cubes at one sampling
+                time either all arrive or are all lost.
         """
         self.row_count = np.ones(len(skin.cubes), np.int64)
         if one_per_hub:
@@ -48,28 +50,39 @@ class Arrivals:
         self._parts: list[tuple[Index, ...]] = []
 
     def keeps(self, cube: AnyArray) -> Mask:
-        """Return, for each of these cubes (N,), whether its rows are kept."""
+        """Return whether the rows of each of the given cubes are stored (N,).
+
+        Args:
+            cube: (N,) indices of cubes in the skin.
+        """
         return np.asarray(self.row_count[cube] > 0)
 
     def add(self, rows: FrequencyRows | StressRows, received_ns: int = 0) -> None:
-        """Add rows that arrived at `received_ns` of the wall clock.
+        """Add the rows of one message.
 
         Args:
-            rows: The rows of one message.
-            received_ns: Time of arrival; 0 where the latency is not asked for.
+            rows: The rows.
+            received_ns: Time of arrival, in ns since the Unix epoch; 0 if the caller does not use
+                the latency.
         """
-        # All rows count, kept or not, because callers ask whether anything has arrived.
+        # Rows that are not stored count as well, because callers test whether any row has arrived.
         self.rows += len(rows)
         cube, sequence, stamp_ns = rows.cube, rows.sequence, rows.stamp_ns
         if not self._keeps_all:
             kept = self.keeps(cube)
             cube, sequence, stamp_ns = cube[kept], sequence[kept], stamp_ns[kept]
-        # `astype` copies: the rows may be views of a message whose memory is used again.
+        # `astype` copies the columns, because the rows may be views of a message whose memory is
+        # reused for the next message.
         part = (cube.astype(np.int64), sequence.astype(np.int64), stamp_ns.astype(np.int64))
         self._parts.append((*part, np.full(len(cube), received_ns)))
 
     def columns(self) -> tuple[Index, ...]:
-        """Return cube, sequence, stamp_ns and received_ns (N,) of the rows kept, in order."""
+        """Return four columns (N,) of the stored rows, in the order of their arrival.
+
+        Returns:
+            Index of the cube; sequence number; stamp and time of arrival, in ns since the Unix
+            epoch.
+        """
         if not self._parts:
             return tuple(np.empty((4, 0), np.int64))
         # The joined parts are stored, so that the next call does not join them again.
@@ -79,15 +92,17 @@ class Arrivals:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What was sent and received of the samples that were taken in a span of time.
+    """The samples that the hubs took in a period, and the rows of them that arrived.
+
+    A row is one cube at one sampling time.
 
     Attributes:
         sent: Number of rows of the samples that the hubs took.
-        received: Number of these rows that arrived; repeated ones count once.
-        first: (K,) indices into the rows kept in `Arrivals` of the first arrival of each row.
-        taken_ns: (K,) wall clock at which these rows were taken, in ns.
-        latency_ms: (K,) time from the sample to its arrival, in ms.
-        stamp_error_ms: (K,) absolute difference between the sample's time and its stamp, in ms.
+        received: Number of these rows that arrived; a row that arrived twice counts once.
+        first: (K,) indices into the rows stored in `Arrivals`: the first arrival of each row.
+        taken_ns: (K,) sampling times of these rows, in ns since the Unix epoch.
+        latency_ms: (K,) time from sampling to arrival, in ms.
+        stamp_error_ms: (K,) absolute difference between sampling time and stamp, in ms.
     """
 
     sent: int
@@ -99,7 +114,7 @@ class Comparison:
 
     @property
     def missing(self) -> int:
-        """Number of rows that were sent and did not arrive."""
+        """Number of rows that were sent in the period but did not arrive."""
         return self.sent - self.received
 
 
@@ -109,7 +124,14 @@ def compare(
     start_ns: int,
     end_ns: int,
 ) -> Comparison:
-    """Compare what arrived with what was taken from `start_ns` to before `end_ns` (wall clock)."""
+    """Compare the rows that arrived with the samples that the hubs took in a period.
+
+    Args:
+        taken: All samples in the log of the simulator.
+        arrivals: The rows that arrived.
+        start_ns: Beginning of the period, in ns since the Unix epoch.
+        end_ns: End of the period; samples taken at this time or later do not count.
+    """
     cube, sequence, stamp_ns, received_ns = arrivals.columns()
     sample = taken.match(SampleKeys(cube, sequence, stamp_ns))
     taken_ns = taken.time_ns[sample] if len(taken) else np.zeros(len(sample), np.int64)
@@ -129,5 +151,10 @@ def compare(
 
 
 def percentile(values: Array, percent: float) -> float:
-    """Return a percentile, rounded to 1e-3; NaN if there are no values."""
+    """Return a percentile of some values, rounded to three decimals; NaN if there are no values.
+
+    Args:
+        values: (N,) the values.
+        percent: The percentile, from 0 to 100.
+    """
     return round(float(np.percentile(values, percent)), 3) if len(values) else float("nan")

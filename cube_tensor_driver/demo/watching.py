@@ -1,4 +1,4 @@
-"""What the demo does while its processes run: a live table, and figures of what arrives."""
+"""The part of the demo that runs beside its processes: live table, and measurement of arrivals."""
 
 from __future__ import annotations
 
@@ -33,33 +33,34 @@ if TYPE_CHECKING:
 __all__ = ["DemoResult", "Interrupted", "watch"]
 
 MAX_START_S = 20.0
-"""Time, in seconds, within which every cube must have a tensor after the start."""
+"""Maximum time, in seconds, from the start until a tensor of every cube must have arrived."""
 
 DISCOVERY_S = 3.5
-"""Time, in seconds, after which DDS has found all other skins in this domain.
+"""Time, in seconds, after which DDS (the middleware of ROS 2) has found all nodes in this domain.
 
 Fast DDS repeats its announcements every 3 s, and the first ones can be lost. A measurement begins
-after this time, because it must not count tensors of another skin.
+only after this time, because otherwise it could count tensors of another skin before it is noticed.
 """
 
 CHECK_PERIOD_S = 1.0
-"""Period, in seconds, at which a demo without measurement looks for another skin."""
+"""Period, in seconds, at which a demo without measurement checks that no other skin publishes in
+its DDS domain."""
 
 MAX_LATE_S = 2.0
-"""Time, in seconds, for which the last tensors of a measurement are waited for."""
+"""Maximum time, in seconds, after the end of a measurement to wait for its last tensors."""
 
 MEASURED_NODES = ("driver", "reconstruction")
-"""Processes whose processor time and memory are measured."""
+"""Names of the processes whose processor time and memory a demo measures."""
 
 
 @dataclass(frozen=True)
 class DemoResult:
-    """The result of a demo that measures.
+    """The result of a demo with a measurement.
 
     Attributes:
-        figures: Content of the JSON file.
-        verification: The samples that arrived, from which the forces are computed.
-        load: What acted on the skin.
+        figures: Counts, latencies, errors and resources: the content of the JSON file.
+        verification: The rows that arrived, from which the forces are computed.
+        load: The simulated load on the skin.
     """
 
     figures: dict[str, Any]
@@ -67,7 +68,7 @@ class DemoResult:
     load: AnyLoad
 
     def publish(self, settings: DemoSettings) -> None:
-        """Draw the forces if a picture is wanted, and print or write the figures."""
+        """Draw the picture if the settings name one, and print the results or write them."""
         figures = self.figures
         if settings.figure is not None:
             figures = figures | self._draw(settings.figure)
@@ -79,7 +80,11 @@ class DemoResult:
         print(f"wrote {settings.json}: {sent} samples sent, {lost} lost")
 
     def _draw(self, path: Path) -> dict[str, object]:
-        """Draw the forces on the whole skin; returns their figures."""
+        """Draw applied and measured force on the whole skin into a file.
+
+        Returns:
+            Peaks and errors of the force, for the JSON file.
+        """
         from ..views.figures.skin_force import draw_forces
         from ..views.figures.style import save
 
@@ -104,26 +109,30 @@ def watch(
     interrupted: threading.Event,
     log: Path,
 ) -> DemoResult:
-    """Show a running skin until Ctrl-C, or measure it for a time.
+    """Show a running skin until Ctrl-C, or measure it for the duration in the settings.
 
     Args:
         settings: The settings of the demo.
         skin_file: The skin file that the processes were started with.
         rate: Samples per second of each cube.
-        children: The processes.
-        interrupted: Set by Ctrl-C.
+        children: The processes of the demo.
+        interrupted: Event that Ctrl-C sets.
         log: File into which the simulator writes its samples when it ends.
 
+    Returns:
+        The result of the measurement. Without a duration the function only ends by an exception.
+
     Raises:
-        Interrupted: Ctrl-C.
-        CubeError: A file cannot be used, tensors do not come, or another skin publishes here.
+        Interrupted: The user pressed Ctrl-C.
+        CubeError: A file cannot be used, a cube sends no tensor within `MAX_START_S`, or another
+            skin publishes in the same DDS domain.
     """
-    # Ctrl-C during the imports must not wait for the display.
+    # If Ctrl-C was pressed during the imports, the demo ends before it draws a table.
     if interrupted.is_set():
         raise Interrupted("interrupted")
     skin = read_skin(skin_file)
     if settings.imperfections is not None:
-        # The simulator reads it, too, but its error would be buried in its log.
+        # The simulator reads the file, too, but would write an error only into its own log.
         read_imperfections(settings.imperfections)
     load = make_load(skin, settings)
     verification = None
@@ -156,10 +165,10 @@ def watch(
 
 
 def make_load(skin: Skin, settings: DemoSettings) -> AnyLoad:
-    """Return what acts on the skin, as the simulator computes it.
+    """Return the load on the skin, as the simulator computes it.
 
     Raises:
-        ConfigError: The script or scene cannot be used with this skin.
+        ConfigError: The load script or the MuJoCo scene cannot be used with this skin.
     """
     if settings.mujoco is not None:
         from ..simulation.mujoco.scene import MujocoLoad
@@ -169,7 +178,7 @@ def make_load(skin: Skin, settings: DemoSettings) -> AnyLoad:
 
 
 class SkinWatcher:
-    """Receives what the running skin publishes, for the table and for the verification."""
+    """Receives the messages of the running skin, for the live table and for the measurement."""
 
     def __init__(
         self,
@@ -180,7 +189,16 @@ class SkinWatcher:
         observer: Observer,
         verification: LoadVerification | None,
     ) -> None:
-        """verification: None where nothing is measured."""
+        """Subscribe to the topics of the skin.
+
+        Args:
+            skin: The skin.
+            rate: Samples per second of each cube.
+            children: The processes of the demo.
+            table: The live table.
+            observer: The node that receives the messages.
+            verification: Collects the rows of a measurement; None if nothing is measured.
+        """
         self._n_cubes = len(skin.cubes)
         self._children, self._table, self._observer = children, table, observer
         self._verification = verification
@@ -197,10 +215,11 @@ class SkinWatcher:
             )
 
     def wait_for_tensors(self) -> None:
-        """Wait until every cube has a tensor, and every topic that is measured has arrived.
+        """Wait until a tensor of every cube, and a message of every measured topic, has arrived.
 
         Raises:
-            CubeError: They did not come within `MAX_START_S`.
+            CubeError: No tensor arrived from some cube within `MAX_START_S`, or another skin
+                publishes in the same DDS domain.
         """
         self._observer.spin(MAX_START_S, self._is_ready)
         self._check_alone()
@@ -216,19 +235,29 @@ class SkinWatcher:
             return True
         if self._verification is None:
             return self._table.seen_all
-        # Discovery takes up to seconds and differs from topic to topic.
+        # DDS connects publishers and subscribers of each topic separately, which takes up to
+        # seconds; so tensors may arrive before the first message of another topic.
         has_samples = self._table.seen_all and self._verification.sampled
         return has_samples and bool(self._crc_errors)
 
     def run(self) -> NoReturn:
-        """Show the skin until Ctrl-C, which raises Interrupted."""
+        """Show the skin in the live table until Ctrl-C.
+
+        Raises:
+            Interrupted: The user pressed Ctrl-C.
+            CubeError: Another skin publishes in the same DDS domain, or a process has ended.
+        """
         while True:
             self._observer.spin(CHECK_PERIOD_S)
             self._check_alone()
 
     def note_address(self) -> None:
-        """Write the address of the browser view above the table."""
-        # The table is drawn while the view starts.
+        """Write the URL of the browser view into the title of the table.
+
+        Raises:
+            ChildError: The view did not print its URL within `MAX_START_S`.
+        """
+        # `spin` draws the table while it waits for the view to start; `wait_for_line` would not.
         self._observer.spin(MAX_START_S, lambda: "http://" in self._children.log("view"))
         address = self._children.wait_for_line("view", "http://", 0.0).split()[0]
         self._table.note = f"\n{address} shows it"
@@ -236,10 +265,15 @@ class SkinWatcher:
     def measure(
         self, verification: LoadVerification, duration: float, log: Path
     ) -> dict[str, object]:
-        """Measure for `duration` seconds, and end the simulator.
+        """Measure the running skin, and end the simulator.
+
+        Args:
+            verification: Collects the rows that arrive.
+            duration: Duration of the measurement, in s.
+            log: File into which the simulator writes its samples when it ends.
 
         Returns:
-            Counts, errors, latencies, and what the nodes use of the machine.
+            Counts, errors, latencies, processor time and memory, as the JSON file has them.
         """
         from .usage import Usage
 
@@ -251,10 +285,11 @@ class SkinWatcher:
         cpu, memory = usage.cpu_percent(), usage.memory_mb()
         end_ns = start_ns + round(duration * 1e9)
 
-        # On a busy machine the simulator takes its samples late; its log must cover the span.
+        # On a busy machine the simulator takes its samples late. It must not end before it has
+        # taken all samples of the measured period.
         spin(MAX_LATE_S, lambda: verification.is_beyond(end_ns))
         verification.compare(end_simulator(self._children, log), start_ns, end_ns)
-        # The last tensors are on their way when the simulator has ended.
+        # The tensors of the last samples may arrive after the simulator has ended.
         spin(MAX_LATE_S, verification.is_complete)
         self._check_alone()
         return {
@@ -265,8 +300,12 @@ class SkinWatcher:
         }
 
     def _check_alone(self) -> None:
-        """Raise CubeError if another skin publishes here: its tensors would be counted."""
-        # Messages of a smaller skin would pass as ours, so publishers are counted as well.
+        """Check that no other skin publishes in this DDS domain; its tensors would be counted.
+
+        Raises:
+            CubeError: Another skin publishes.
+        """
+        # Messages of a smaller skin look like those of this skin, so publishers are counted, too.
         if self._sees_other_skin or self._observer.node.count_publishers("stress") > 1:
             raise CubeError(
                 f"another skin publishes stress in DDS domain {os.environ.get('ROS_DOMAIN_ID', 0)}:"
@@ -280,7 +319,7 @@ class SkinWatcher:
         except MessageError as error:
             self._observer.log_error(str(error))
             return
-        # Our reconstruction sends no such cube.
+        # A cube index beyond the cubes of this skin can only come from another, larger skin.
         if int(rows.cube.max(initial=0)) >= self._n_cubes:
             self._sees_other_skin = True
             return

@@ -1,4 +1,4 @@
-"""How results are shown: the scene of a skin, pictures, and what commands print.
+"""Display of results: the scene of a skin, pictures, and the output of commands to a terminal.
 
-`scene` computes what a skin looks like, for RViz and for the browser. Nothing is measured here.
+`scene` computes the colours and lines that RViz and the browser view draw.
 """

@@ -1,8 +1,8 @@
-"""What a skin looks like: colours, arrows and crosses of its cubes as arrays, for all viewers.
+"""Colours, arrows and crosses that show the stress of each cube, as arrays for all viewers.
 
-Values are (N, 15) in the order of COMPONENTS, in Pa and Pa/m, in the frames of the cubes, NaN where
-they are not observed. Poses and what is drawn are in the parent frame of the skin, in metres.
-Colours are (..., 3) from 0 to 1.
+The values of N cubes are an array (N, 15) in the order of COMPONENTS, in Pa and Pa/m, in the frames
+of the cubes, NaN where a component is not observed. Poses and the coordinates of what is drawn are
+in the parent frame of the skin, in metres. Colours are (..., 3) from 0 to 1.
 """
 
 from __future__ import annotations
@@ -19,14 +19,17 @@ from ..core.poses import CubePoses
 from ..core.tensor import principal_stresses
 
 SEQUENTIAL = "ffffcc ffeda0 fed976 feb24c fd8d3c fc4e2a e31a1c bd0026 800026"
-"""Colours of values from zero on: YlOrRd of ColorBrewer.
+"""Colour scale of values that are never negative, as hexadecimal RGB (YlOrRd of ColorBrewer).
 
-Like `DIVERGING` it is light at zero, and its lightness changes monotonically away from it: so it
-can be read in grey, and a skin at rest is visible.
+It is light at zero, so that a skin at rest is visible, and its lightness falls monotonically, so
+that it can be read in grey.
 """
 
 DIVERGING = "053061 2a71b2 6bacd1 c2ddec f7f6f6 fbccb4 e48066 ba2832 67001f"
-"""Colours of values on both sides of zero: RdBu of ColorBrewer, reversed."""
+"""Colour scale of values on both sides of zero, as hexadecimal RGB (RdBu of ColorBrewer, reversed).
+
+It is light at zero and becomes darker on both sides: blue for negative, red for positive values.
+"""
 
 GREY = (0.55, 0.55, 0.55)
 RED = (0.85, 0.1, 0.1)
@@ -34,20 +37,25 @@ ORANGE = (0.95, 0.55, 0.0)
 WHITE = (0.95, 0.95, 0.95)
 
 MARK = np.array([GREY, ORANGE, RED, WHITE])
-"""Colour of the cross over a cube by its health; a fine cube has no cross."""
+"""Colours (4, 3) of the cross over a cube, indexed by the health of the cube.
+
+The entry for `FINE` is not used, because a cube that is fine has no cross.
+"""
 
 RANGE_DECAY = 0.98
-"""Share of its top that an automatic range keeps from one picture to the next, while the values
-are smaller."""
+"""Ratio of the upper end of an automatic range to that in the picture before, while the values are
+smaller: the range shrinks by 2 % per picture."""
 
 CROSS_SIZE = 1.3
-"""Half the width of the cross over a cube with a fault, in half sides of the cube."""
+"""Half the width of the cross over a cube with a fault, relative to half the side of the cube."""
 
 CROSS_HEIGHT = 1.2
-"""Height of that cross above the centre of the cube, in half sides of the cube."""
+"""Height of the cross over a cube with a fault above the cube's centre, relative to half the side
+of the cube."""
 
 BARB_LENGTH = 0.25
-"""Length of the barbs of an arrow that is drawn as lines, relative to the arrow."""
+"""Length of the two barbs at the tip of an arrow that consists of lines, relative to the length of
+the arrow."""
 
 
 @dataclass(frozen=True)
@@ -55,12 +63,14 @@ class Quantity:
     """A quantity that can be shown in colours.
 
     Attributes:
-        label: Name for people.
-        unit: Name of its unit.
+        label: Name of the quantity that users see.
+        unit: Name of the unit in which users see it.
         size: Size of that unit, in SI units.
-        min_top: Smallest top of an automatic range, in SI units; noise alone gets no strong colour.
-        signed: Whether the colours lie about zero.
-        of: Function of values (N, 15) and residual (N,) that returns (N,) in SI units.
+        min_top: Minimum of the upper end of an automatic range, in SI units. It is so large that
+            noise alone gets no strong colour.
+        signed: Whether the range is symmetrical around zero; otherwise it begins at zero.
+        of: Function that computes the quantity (N,), in SI units, of N cubes from their values
+            (N, 15) and residuals (N,).
     """
 
     label: str
@@ -77,13 +87,17 @@ def _component(name: str) -> Callable[[Array, Array], Array]:
 
 
 def _length(*names: str) -> Callable[[Array, Array], Array]:
-    """Return a function for the length of the vector of some components."""
+    """Return a function that computes the magnitude (N,) of the vector of some components.
+
+    Args:
+        names: Names of the components, of COMPONENTS.
+    """
     columns = [COMPONENTS.index(name) for name in names]
 
     def of(values: Array, residual: Array) -> Array:
         parts = values[:, columns]
         is_observed = np.isfinite(parts)
-        # A part that is not observed counts as 0; without any there is no length.
+        # An unobserved component counts as 0; if all are unobserved, the magnitude is NaN.
         length = np.linalg.norm(np.where(is_observed, parts, 0), axis=1)
         return np.where(is_observed.any(axis=1), length, np.nan)
 
@@ -122,31 +136,35 @@ QUANTITIES = {
         of=lambda values, residual: residual,
     ),
 }
-"""Name -> quantity, of all that markers and the page can show."""
+"""Name -> quantity, for all quantities that markers (RViz) and the page can show in colours."""
 
 
 def automatic(quantity: Quantity, values: Array, last_top: float = 0.0) -> float:
-    """Return the top of an automatic range, which follows a rise at once and falls slowly.
+    """Return the upper end of an automatic range, which follows a rise at once and a fall slowly.
 
     Args:
-        quantity: The quantity.
-        values: What is shown, in SI units.
-        last_top: The top in the picture before.
+        quantity: The quantity that is shown.
+        values: Its values in this picture, in SI units; NaN is ignored.
+        last_top: Upper end of the range in the picture before, in SI units.
     """
     finite = np.abs(values[np.isfinite(values)])
     return max(quantity.min_top, RANGE_DECAY * last_top, float(finite.max(initial=0.0)))
 
 
 def colours(quantity: Quantity, values: Array, top: float) -> Array:
-    """Return the colours (N, 3) of values on the range 0 .. top, or −top .. top if signed.
+    """Return the colours (N, 3) of values.
 
-    Values are in SI units; NaN is grey.
+    Args:
+        quantity: The quantity that is shown.
+        values: (N,) its values, in SI units; NaN is grey.
+        top: Upper end of the range, in SI units. The range begins at 0, or at −top if the quantity
+            is signed.
     """
     share = np.nan_to_num(values) / top
     if quantity.signed:
         share = share / 2 + 0.5
     table = _colour_table(DIVERGING if quantity.signed else SEQUENTIAL)
-    # Colours between two entries of the table are interpolated linearly.
+    # `place` is the position in the table; its fraction interpolates between two entries.
     place = np.clip(share, 0, 1) * (len(table) - 1)
     low = np.minimum(place.astype(int), len(table) - 2)
     part = (place - low)[:, None]
@@ -159,18 +177,18 @@ def _colour_table(hexes: str) -> Array:
 
 
 def traction_arrows(poses: CubePoses, values: Array, length: float) -> Array:
-    """Return arrows of the traction σ·n on the faces +z, the way the load pushes or pulls.
+    """Return one arrow per cube for the traction σ·n on its upper face (+z).
 
-    Pressing arrows point into the skin and end on the face, pulling arrows begin there.
-    Components that are not observed count as 0.
+    An arrow points in the direction in which the load pushes or pulls. If it presses, it ends on
+    the face; otherwise it begins there. Components that are not observed count as 0.
 
     Args:
-        poses: The cubes.
-        values: (N, 15).
-        length: Length in metres per Pa.
+        poses: Poses of the N cubes.
+        values: (N, 15) stress in Pa and gradients in Pa/m.
+        length: Length of the arrows, in metres per Pa.
 
     Returns:
-        (N, 2, 3) tails and tips.
+        Tails and tips (N, 2, 3), in metres.
     """
     traction = np.nan_to_num(values[:, [4, 3, 2]]) * length
     arrow = np.einsum("nij,nj->ni", poses.rotation, traction)
@@ -181,14 +199,17 @@ def traction_arrows(poses: CubePoses, values: Array, length: float) -> Array:
 
 
 def gradient_arrows(poses: CubePoses, values: Array, length: float) -> Array:
-    """Return arrows (N, 2, 3) on the faces +z that point to where the pressure grows.
+    """Return one arrow per cube, on its upper face (+z), in the direction in which pressure grows.
 
     Args:
-        poses: The cubes.
-        values: (N, 15); components that are not observed count as 0.
-        length: Length in metres per Pa/m.
+        poses: Poses of the N cubes.
+        values: (N, 15) stress in Pa and gradients in Pa/m; unobserved components count as 0.
+        length: Length of the arrows, in metres per Pa/m.
+
+    Returns:
+        Tails and tips (N, 2, 3), in metres.
     """
-    # Pressure is −σzz, so that it grows against the gradient of σzz.
+    # Pressure is −σzz, so it grows in the direction opposite to the gradient of σzz.
     columns = [COMPONENTS.index("zz_x"), COMPONENTS.index("zz_y")]
     gradient = -np.nan_to_num(values[:, columns]) * length
     arrow = np.einsum("nij,nj->ni", poses.rotation[:, :, :2], gradient)
@@ -197,20 +218,20 @@ def gradient_arrows(poses: CubePoses, values: Array, length: float) -> Array:
 
 
 def principal_crosses(poses: CubePoses, values: Array, length: float) -> tuple[Array, Mask]:
-    """Return lines along the principal stresses, above the cubes.
+    """Return three lines per cube along its principal stresses, centred on its upper face.
 
-    Components that are not observed count as 0, so that a planar cube shows the cross of its
-    section.
+    Components that are not observed count as 0, so a planar cube shows the principal stresses in
+    the plane that it measures.
 
     Args:
-        poses: The cubes.
-        values: (N, 15).
-        length: Length of the lines in metres per Pa.
+        poses: Poses of the N cubes.
+        values: (N, 15) stress in Pa and gradients in Pa/m.
+        length: Length of the lines, in metres per Pa.
 
     Returns:
-        Lines (N, 3, 2, 3), and whether each is tension (N, 3).
+        Both ends of each line (N, 3, 2, 3), in metres; whether the stress is tension (N, 3).
     """
-    # Directions are rows in the frame of the cube.
+    # Each row of `directions` is one principal direction, in the frame of the cube.
     principal, directions = principal_stresses(np.nan_to_num(values[:, : len(STRESS)]))
     in_parent = np.einsum("nij,nkj->nki", poses.rotation, directions)
     half = in_parent * (0.5 * length * np.abs(principal))[..., None]
@@ -220,13 +241,18 @@ def principal_crosses(poses: CubePoses, values: Array, length: float) -> tuple[A
 
 
 def fault_crosses(poses: CubePoses, health: AnyArray) -> Array:
-    """Return two lines (N, 2, 2, 3) across the face +z of each cube that is not fine.
+    """Return two crossed lines over the upper face (+z) of each cube whose health is not `FINE`.
 
-    The lines of a fine cube have a length of 0.
+    Args:
+        poses: Poses of the N cubes.
+        health: (N,) health of the cubes, as in core/latest_stress.py.
+
+    Returns:
+        Both ends of both lines (N, 2, 2, 3), in metres; the lines of a fine cube have no length.
     """
     diagonals = [[[-1, -1, 0], [1, 1, 0]], [[-1, 1, 0], [1, -1, 0]]]
     has_fault = (health != FINE)[:, None, None, None]
-    # The crosses float a little above the face, and have no size over a fine cube.
+    # The crosses lie a little above the upper face, so that the face does not hide them.
     corner = np.where(has_fault, CROSS_SIZE * np.array(diagonals), 0.0)
     corner += np.array([0, 0, CROSS_HEIGHT])
     scaled = corner * poses.half_side[:, None, None, None]
@@ -235,15 +261,19 @@ def fault_crosses(poses: CubePoses, health: AnyArray) -> Array:
 
 
 def heads(arrows: Array, normal: Array) -> Array:
-    """Return shaft and two barbs (N, 3, 2, 3) of arrows, for viewers that only draw lines.
+    """Return three lines per arrow, shaft and two barbs, for viewers that can only draw lines.
 
     Args:
-        arrows: (N, 2, 3) tails and tips.
-        normal: (N, 3) direction across which the barbs lie.
+        arrows: (N, 2, 3) tails and tips of the arrows.
+        normal: (N, 3) direction perpendicular to the plane in which shaft and barbs lie.
+
+    Returns:
+        Both ends of each line (N, 3, 2, 3).
     """
     tail, tip = arrows[:, 0], arrows[:, 1]
     back = BARB_LENGTH * (tail - tip)
-    # The small part gives a direction to arrows along the normal.
+    # For an arrow along the normal the cross product would be 0. A small vector in another
+    # direction, added to the normal, prevents that.
     across = np.cross(back, normal + 1e-3 * np.roll(normal, 1, axis=1))
     size = np.linalg.norm(across, axis=1, keepdims=True)
     half_width = 0.5 * np.linalg.norm(back, axis=1, keepdims=True)

@@ -1,1 +1,1 @@
-"""Pictures as files. A function takes results and returns a figure of matplotlib."""
+"""Pictures that commands write to files: functions that draw results as matplotlib figures."""

@@ -15,25 +15,25 @@ from ...core.layout import Layout
 from .style import MARKERS, print_style
 
 _VIEW = np.array([0.75, -1.0, 0.75])
-"""Direction from the cube to the viewer."""
+"""Direction, in the frame of the cube, from the cube to the viewer of the picture."""
 
 _SQUARE = ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))
-"""Corners of a square as a closed line."""
+"""Corners of a square with half a side of 1, as a closed line: the last is equal to the first."""
 
 MAX_TWO_COLUMN_PADS = 12
-"""Number of pads whose legend fits into two columns."""
+"""Maximum number of pads for which the legend has two columns; for more pads it has three."""
 
 
 @print_style()
 def draw_layout(layout: Layout) -> Figure:
-    """Draw a cube with its pads: those towards the viewer filled, those behind as an outline."""
+    """Draw a cube with its pads: visible pads are filled, hidden ones are a dashed outline."""
     figure = Figure(figsize=(5, 4.6))
     # The drawing order is set by hand: matplotlib would sort by the centres of the parts.
     axes: Any = figure.add_subplot(projection="3d", computed_zorder=False)
     _draw_edges(axes)
     for name, centre, normal in zip(layout.pads, layout.positions, layout.normals, strict=True):
         _draw_pad(axes, name, centre, normal, layout.pad_size)
-    # matplotlib takes the view as two angles.
+    # matplotlib needs the direction of view as two angles.
     elevation = np.degrees(np.arctan2(_VIEW[2], np.hypot(*_VIEW[:2])))
     azimuth = np.degrees(np.arctan2(_VIEW[1], _VIEW[0]))
     axes.view_init(elev=elevation, azim=azimuth)
@@ -50,13 +50,13 @@ def draw_layout(layout: Layout) -> Figure:
 
 
 def _draw_edges(axes: Any) -> None:
-    """Draw the edges of the cube; those that end in its hidden corner are dotted."""
-    # Two corners are joined by an edge if they differ in one coordinate.
+    """Draw the edges of a cube; the three edges at the corner that is hidden are dotted."""
+    # The hidden corner is the one opposite to the viewer.
     corners = np.array(list(product((-1.0, 1.0), repeat=3)))
     hidden = -np.sign(_VIEW)
     for i, a in enumerate(corners):
         for b in corners[i + 1 :]:
-            # The ends of an edge differ in one coordinate.
+            # Two corners are the ends of an edge if they differ in exactly one coordinate.
             if np.count_nonzero(a != b) != 1:
                 continue
             is_hidden = np.array_equal(a, hidden) or np.array_equal(b, hidden)
@@ -76,7 +76,15 @@ def _draw_pad(
     normal: Array,
     size: float,
 ) -> None:
-    """Draw a square pad with its name; size: side, in units of the half side of the cube."""
+    """Draw a square pad with its name; all lengths are in units of half the side of the cube.
+
+    Args:
+        axes: The 3-D axes of matplotlib.
+        name: Name of the pad.
+        centre: (3,) centre of the pad.
+        normal: (3,) unit normal out of the cube; one coordinate is 1 or −1, the others are 0.
+        size: Length of the sides of the pad.
+    """
     u, w = np.eye(3)[np.flatnonzero(normal == 0)] * size / 2
     outline = np.array([centre + a * u + b * w for a, b in _SQUARE])
     is_in_front = normal @ _VIEW > 0
@@ -98,7 +106,7 @@ def _draw_pad(
             )
         )
     axes.text(
-        # A little above the face, so that the pad does not cover it.
+        # The name is written a little above the face, so that the pad does not cover it.
         *(centre + 0.02 * normal),
         name,
         ha="center",
@@ -111,11 +119,11 @@ def _draw_pad(
 
 @print_style()
 def draw_fit(fit: Fit, measured: Array) -> Figure:
-    """Draw measured over fitted pad stresses, and their differences; outliers are crossed.
+    """Draw measured against fitted pad stresses, and their differences; crosses mark outliers.
 
     Args:
-        fit: The fit.
-        measured: (N, P) pad stresses that were fitted, in Pa.
+        fit: Result of the fit of a calibration to N loads.
+        measured: (N, P) measured stresses of the P pads under each load, in Pa.
     """
     figure = Figure(figsize=(8, 4))
     left, right = figure.subplots(1, 2)
@@ -144,7 +152,7 @@ def draw_fit(fit: Fit, measured: Array) -> Figure:
             ms=7,
             label="outlier",
         )
-    # Points of a perfect fit lie on this diagonal.
+    # The points of a perfect fit lie on the diagonal.
     ends = np.array([np.nanmin(fit.fitted), np.nanmax(fit.fitted)]) * 1e-3
     left.plot(
         ends,

@@ -10,10 +10,11 @@ from ...core.arrays import Array
 from .style import print_style
 
 _AXIS_STYLES = (("x", "o", "C0", "--"), ("y", "s", "C1", ":"), ("z", "D", "black", "-"))
-"""Letter, marker, colour and dashes of each axis; they differ in grey, too."""
+"""Name, marker, colour and line style of each coordinate axis; they can be distinguished in grey,
+too."""
 
 MM = 1e3
-"""Millimetres in a metre."""
+"""Number of millimetres in a metre."""
 
 
 @print_style()
@@ -26,21 +27,21 @@ def draw_forces(
     measured_centre: Array,
     cubes: Array,
 ) -> Figure:
-    """Draw what the load applies (lines) and what was measured (markers).
+    """Draw force and centre of pressure over time, as applied (lines) and measured (markers).
 
     Args:
-        seconds: (N,) times.
-        force: (N, 3) applied force on the skin, in N.
-        measured_force: (N, 3) measured force, in N.
-        centre: (N, 3) applied centre of pressure, in metres.
-        measured_centre: (N, 3) measured centre of pressure, in metres.
+        seconds: (T,) times, in s from any origin.
+        force: (T, 3) force that the load applies to the whole skin, in N.
+        measured_force: (T, 3) force that was computed from the tensors, in N.
+        centre: (T, 3) centre of pressure of the load, in metres.
+        measured_centre: (T, 3) centre of pressure computed from the tensors, in metres.
         cubes: (cubes, 3) positions of the cubes, in metres.
     """
     figure = Figure(figsize=(9, 5))
     panels: Any = figure.subplot_mosaic(
         [["force", "path"], ["centre", "path"]], width_ratios=[2.2, 1]
     )
-    # The time axis begins with the measurement.
+    # The time axis begins at 0 with the first measurement.
     times = seconds - seconds.min()
     _draw_components(panels["force"], times, force, measured_force)
     _draw_components(panels["centre"], times, MM * centre, MM * measured_centre)

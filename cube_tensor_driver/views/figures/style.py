@@ -30,16 +30,20 @@ SETTINGS: Any = {
     "figure.constrained_layout.use": True,
     "savefig.dpi": 200,
 }
-"""Settings of matplotlib for a picture."""
+"""Settings of matplotlib (rcParams) that all pictures share."""
 
 MARKERS = "osD^v<>pP*hX"
-"""Markers in the order in which they are used."""
+"""Markers of matplotlib, in the order in which the curves of a picture use them."""
 
 SIGNED_COLOURS = "cividis"
-"""Colour map of signed values. Its lightness grows from end to end, unlike that of a map from red
-to blue, so that it can be read in grey."""
+"""Name of the colour map of matplotlib for signed values.
 
-# The lists have different lengths, so that no two curves look the same in grey.
+Its lightness grows from end to end, so that it can be read in grey. In a colour map from red to
+blue, both ends would have the same grey.
+"""
+
+# Curves with different colours also have different markers, and curves with the same colour have
+# different line styles (see `curve_style`), so that all can be distinguished in grey.
 _CURVE_COLOURS = (
     "black",
     "tab:red",
@@ -56,16 +60,17 @@ _CURVE_DASHES = ("-", "--", "-.", ":")
 
 @contextmanager
 def print_style() -> Iterator[None]:
-    """Apply `SETTINGS`, in a block or as a decorator."""
+    """Apply `SETTINGS` to matplotlib inside a `with` block or a decorated function."""
     with matplotlib.rc_context(SETTINGS):
         yield
 
 
 def symbol(component: str) -> str:
-    """Return a component or mode in mathematical type.
+    """Return the symbol of a component or mode in matplotlib's notation for mathematics.
 
     Args:
-        component: Such as zz, zz_x (its derivative along x) or xy_y-zx_z (a difference).
+        component: Name such as zz (stress σzz), zz_x (derivative of σzz along x) or xy_y-zx_z
+            (difference of two derivatives).
     """
     if "-" in component:
         return " − ".join(symbol(part) for part in component.split("-"))
@@ -76,9 +81,13 @@ def symbol(component: str) -> str:
 
 
 def curve_style(number: int) -> dict[str, Any]:
-    """Return colour, marker and dashes of the curve with this number in a panel."""
+    """Return the style of one curve as arguments of matplotlib's `plot`.
+
+    Args:
+        number: Number of the curve in its panel, from 0.
+    """
     count = len(_CURVE_COLOURS)
-    # The dashes move on by one each time the colours start again.
+    # When the colours repeat, the line styles are shifted by one, so that no style occurs twice.
     dashes = (number + number // count) % len(_CURVE_DASHES)
     return {
         "color": _CURVE_COLOURS[number % count],
@@ -96,13 +105,13 @@ def save(figure: Figure, path: Path) -> None:
 
     Args:
         figure: The figure.
-        path: The file; its suffix tells the format, and without one it is PNG.
+        path: The file; its suffix determines the format, and without a suffix it is PNG.
 
     Raises:
         ConfigError: The format is unknown, or the file cannot be written.
     """
     check_picture(path)
-    # A picture that was there before stays until the new one is complete.
+    # An existing file stays until the new picture is complete and replaces it.
     with atomic_write(path) as partial:
         figure.savefig(partial, format=path.suffix[1:] or "png")
 
@@ -116,14 +125,22 @@ def png(figure: Figure) -> bytes:
 
 
 def png_of_pixels(pixels: NDArray[np.uint8]) -> bytes:
-    """Return pixels (rows, columns, 4) as the content of a PNG file."""
+    """Return an image as the content of a PNG file.
+
+    Args:
+        pixels: (rows, columns, 4) red, green, blue and opacity from 0 to 255.
+    """
     content = io.BytesIO()
     imsave(content, pixels, format="png")
     return content.getvalue()
 
 
 def check_picture(path: Path) -> None:
-    """Raise ConfigError if the suffix is no picture format that matplotlib can write."""
+    """Check that matplotlib can write the picture format that the suffix of a file names.
+
+    Raises:
+        ConfigError: matplotlib does not know the format.
+    """
     # The list depends on the installed version of matplotlib.
     formats = FigureCanvasAgg.get_supported_filetypes()
     if path.suffix and path.suffix[1:].lower() not in formats:

@@ -20,21 +20,24 @@ from .style import MARKERS, print_style, symbol
 DASHES = ("-", "--", "-.", ":")
 
 MIN_GAP_STEPS = 3.0
-"""Time between two samples, in multiples of the usual one, above which no line connects them."""
+"""Minimum time between two samples, relative to the median of this time, that counts as a gap.
+
+No line connects the two samples at a gap.
+"""
 
 MARKERS_PER_LINE = 12
-"""Number of markers on a line."""
+"""Approximate number of markers on a line; they show which line it is, not single samples."""
 
 MAX_POINTS = 20_000
-"""Approximate number of points of a line; more cannot be distinguished on paper."""
+"""Maximum number of samples of a line that are drawn; more cannot be distinguished on paper."""
 
 MAX_NAMED_CUBES = 20
-"""Number of cubes that an error message names."""
+"""Maximum number of cube names that an error message lists."""
 
 
 @dataclass(frozen=True, eq=False)
 class TimeSeries:
-    """One cube over time, a row per sample.
+    """N samples of one cube with P pads.
 
     Attributes:
         name: Name of the cube.
@@ -44,7 +47,7 @@ class TimeSeries:
         rest: (P,) frequencies of the pads without load, in Hz.
         values: (N, 15) stress in Pa and gradient in Pa/m; NaN where it is not observed.
         residual: (N,) residual relative to the expected noise.
-        status: (N,) bits of core.status.
+        status: (N,) status bits, as in core/status.py.
     """
 
     name: str
@@ -60,7 +63,7 @@ class TimeSeries:
 def cube_series(
     source: BagSource, name: str | None, start_s: float | None, end_s: float | None
 ) -> TimeSeries:
-    """Read a cube of a bag; the stress is reconstructed from the recorded frequencies.
+    """Read the samples of one cube from a bag, and compute the stress from their frequencies.
 
     Args:
         source: The bag.
@@ -87,7 +90,8 @@ def cube_series(
     for segment, rows in reconstruct(source):
         seconds = (rows.stamp_ns - bag.start_ns) * 1e-9
         chosen = (rows.cube == number) & (seconds >= start) & (seconds <= end)
-        # Cubes with fewer pads than others have unused columns behind theirs.
+        # The array has a column for each pad of the cube with the most pads; those behind the
+        # pads of this cube are unused.
         frequency = segment.messages.rows.frequency[chosen, :n_pads]
         values = np.hstack([rows.stress, rows.gradient])[chosen]
         parts.append(
@@ -100,7 +104,7 @@ def cube_series(
             f"the bag is {length:.3f} s long"
         )
     joined = [np.concatenate(column) for column in zip(*parts, strict=True)]
-    # Every n-th sample is kept, which cannot be seen on paper.
+    # Of a long recording only every n-th sample is drawn, see `MAX_POINTS`.
     every = math.ceil(len(joined[0]) / MAX_POINTS)
     seconds, frequency, values, residual, status = (column[::every] for column in joined)
     return TimeSeries(
@@ -117,7 +121,14 @@ def cube_series(
 
 @print_style()
 def draw_series(series: TimeSeries, title: str) -> Figure:
-    """Draw four panels over one time axis, without components that are not observed."""
+    """Draw frequencies, stress, gradients and residual of a cube over one time axis.
+
+    Components that the cube does not observe are left out.
+
+    Args:
+        series: The samples of the cube.
+        title: First part of the title, such as the name of the bag.
+    """
     series = _with_breaks(series)
     figure = Figure(figsize=(8, 9))
     top, stress_axes, gradient_axes, bottom = figure.subplots(4, 1, sharex=True)
@@ -145,7 +156,7 @@ def draw_series(series: TimeSeries, title: str) -> Figure:
     for bit, label, marker in ((RESIDUAL, "residual too large", "x"), (INVALID, "invalid", "v")):
         is_marked = series.status & bit > 0
         if is_marked.any():
-            # An invalid row has no residual and is marked at zero.
+            # The residual of an invalid row is NaN; its mark is drawn at zero.
             residual = np.nan_to_num(series.residual[is_marked])
             bottom.plot(
                 seconds[is_marked],
@@ -161,7 +172,7 @@ def draw_series(series: TimeSeries, title: str) -> Figure:
 
 
 def _with_breaks(series: TimeSeries) -> TimeSeries:
-    """Insert a row of NaN in each gap, because lines end at NaN."""
+    """Insert a sample of NaN into each gap, because matplotlib interrupts a line at NaN."""
     step = np.diff(series.seconds)
     if not len(step):
         return series
@@ -182,13 +193,13 @@ def _draw_columns(
     columns: AnyArray,
     names: list[str],
 ) -> None:
-    """Draw lines that differ in dashes, markers and lightness, so that grey is enough.
+    """Draw lines that differ in dashes, markers and lightness, so that no colour is needed.
 
     Args:
-        axes: The panel.
-        seconds: (N,) times.
-        columns: (N, K) values; columns of NaN are left out.
-        names: K labels.
+        axes: The axes of matplotlib to draw into.
+        seconds: (N,) times, in s.
+        columns: (N, K) values of K lines; a line that is NaN everywhere is left out.
+        names: K labels of the lines.
     """
     shown = [
         (values, name)
@@ -206,7 +217,7 @@ def _draw_columns(
             ms=4,
             marker=MARKERS[number % len(MARKERS)],
             mfc="white",
-            # Each line has its markers at other samples than the others.
+            # The first marker of each line is at another sample, so that markers do not overlap.
             markevery=(number * step // len(shown), step),
             label=name,
         )

@@ -1,1 +1,1 @@
-"""What several commands show in a terminal: progress, tables, the live table of a skin, Ctrl-C."""
+"""Output of commands to a terminal: progress, tables, the live table of a skin; and Ctrl-C."""

@@ -1,8 +1,8 @@
-"""Ctrl-C while the main thread runs C code.
+"""End of a process by Ctrl-C while its main thread runs C code.
 
-Python raises KeyboardInterrupt between two of its own instructions, and a matrix factorisation is
-one instruction that can take many seconds. The signal itself arrives at once and can wake another
-thread, which then ends the process.
+Python raises KeyboardInterrupt only between two of its own instructions, and a matrix factorisation
+is one instruction that can take many seconds. The signal itself arrives at once and can wake
+another thread, which then ends the process.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 GRACE_S = 0.3
-"""Time, in seconds, that the main thread has to end by KeyboardInterrupt after Ctrl-C.
+"""Time, in seconds, from Ctrl-C until the process is ended without running `finally` blocks.
 
-Outside of C code it does so at once, and runs its `finally` blocks.
+Outside of C code, the main thread ends by KeyboardInterrupt within this time and runs them.
 """
 
 INTERRUPTED = 130
@@ -29,10 +29,10 @@ _SHOW_CURSOR = b"\x1b[?25h"
 
 @contextmanager
 def ends_at_once() -> Iterator[None]:
-    """Make Ctrl-C end the process after at most `GRACE_S`, even in the middle of C code.
+    """Let Ctrl-C end the process after at most `GRACE_S`, even in the middle of C code.
 
-    It is meant for work that only computes, because no `finally` runs when the process ends this
-    way. The C code must release Python's lock. Use it in the main thread only.
+    Use it only in the main thread, and for work that only computes: if the process ends in C code,
+    no `finally` block runs. The C code must release Python's global interpreter lock.
     """
     watched, written = os.pipe()
     os.set_blocking(written, False)
@@ -53,14 +53,19 @@ def ends_at_once() -> Iterator[None]:
 
 
 def _end_on_interrupt(watched: int) -> None:
-    """Read signal numbers from a pipe until its other end is closed, and act on SIGINT."""
+    """Wait for SIGINT and end the process if it does not end by itself within `GRACE_S`.
+
+    Args:
+        watched: File descriptor of a pipe into which Python writes the number of each signal. The
+            function returns when the other end of the pipe is closed.
+    """
     while number := os.read(watched, 1):
         if number[0] != signal.SIGINT:
             continue
-        # The pipe becomes readable, here by its end, when the main thread leaves the block itself.
+        # If the main thread leaves `ends_at_once`, it closes the pipe, which makes it readable.
         has_ended, _, _ = select.select([watched], [], [], GRACE_S)
         if not has_ended:
-            # A progress bar hides the cursor, and nothing else gives it back now.
+            # A progress bar hides the cursor, and the code that would show it again does not run.
             if sys.stderr.isatty():
                 os.write(sys.stderr.fileno(), _SHOW_CURSOR)
             os._exit(INTERRUPTED)

@@ -1,4 +1,4 @@
-"""The live table of a skin in a terminal: newest tensor, rate and state of each cube."""
+"""The live table of a skin in a terminal: latest tensor, rate and state of each cube."""
 
 from __future__ import annotations
 
@@ -21,40 +21,50 @@ from ...core.rows import StressRows
 from ...core.status import STATUS
 
 DRAW_PERIOD_S = 0.1
-"""Time, in seconds, from one drawing of the table to the next."""
+"""Minimum time, in seconds, from one drawing of the table to the next."""
 
 RATE_PERIOD_S = 1.0
-"""Time, in seconds, over which the rates are counted."""
+"""Minimum time, in seconds, over which the rows of each cube are counted to compute its rate."""
 
 SHOWN = ("xx", "zz", "zx", "yz", "zz_x", "zz_y", "zz_z")
-"""Components with a column, where a cube observes them: normal stress, shear on the surface of the
-skin, and the gradient of the pressure."""
+"""Names of the components that have a column if at least one cube observes them.
+
+They are normal stresses, the shear stresses at the surface of the skin, and the gradient of σzz.
+"""
 
 UNOBSERVED = "·"
-"""What stands in place of a value that is not observed."""
+"""Character that the table shows instead of a value that is not observed (NaN)."""
 
 BAR_WIDTH = 12
-"""Width, in columns, of the bar of the largest pressure."""
+"""Width, in characters, of the longest bar in the column for the pressure."""
 
 PEAK_DECAY = 0.99
-"""Share of the pressure of a full bar that is kept from one drawing to the next."""
+"""Ratio of the pressure of a full bar to that in the drawing before, while the pressures on the
+skin are smaller: the scale of the bars shrinks by 1 % per drawing."""
 
 MIN_PEAK = 1.0
-"""Smallest pressure of a full bar, in Pa; it avoids a division by zero."""
+"""Minimum pressure, in Pa, of a full bar; it avoids a division by zero without load."""
 
 OTHER_LINES = 8
-"""Number of lines of the terminal that are no rows of cubes: title, headings, frame, prompt."""
+"""Number of lines of the terminal that are needed for title, headings, frame and prompt, and are
+not available for rows of cubes."""
 
 MIN_ROWS = 4
-"""Number of rows that are drawn even in a very low terminal."""
+"""Minimum number of rows (cubes) in the table, even if the terminal has fewer lines."""
 
 UNLIMITED_WIDTH = 1000
-"""Width, in columns, with which the own width of the table is measured."""
+"""Width, in characters, that rich is given while it computes how wide the table would like to be.
+
+It is larger than any table, so that it does not limit the result.
+"""
 
 
 @dataclass(frozen=True)
 class _Form:
-    """The columns and lines of a table, apart from names, rates and states, which it always has."""
+    """A layout of the table: its optional columns, and whether it has lines.
+
+    The columns for names, rates and states are in every layout.
+    """
 
     components: tuple[str, ...]
     has_bar: bool = True
@@ -63,10 +73,14 @@ class _Form:
 
 
 def _forms(components: Sequence[str]) -> Iterator[_Form]:
-    """Yield the possible forms, from the widest to the narrowest."""
+    """Yield the possible layouts of the table, from the widest to the narrowest.
+
+    Args:
+        components: Names of the components that have a column in the widest layout.
+    """
     names = tuple(components)
     yield _Form(names)
-    # Without lines, a planar skin fits into 80 columns.
+    # Without lines, the table of a skin of planar cubes is not wider than 80 characters.
     yield _Form(names, has_lines=False)
     for n in range(len(names), 0, -1):
         yield _Form(names[:n], has_bar=False, has_lines=False)
@@ -80,14 +94,21 @@ def _forms(components: Sequence[str]) -> Iterator[_Form]:
 
 
 class LiveTable:
-    """Draws the table on stderr ten times a second; a context manager that gives the terminal back.
+    """Draws the table on stderr up to ten times a second.
+
+    It is a context manager, which restores the terminal at its exit.
 
     Attributes:
-        note: Text behind the title.
+        note: Text that is appended to the title of the table.
     """
 
     def __init__(self, skin: Skin, show: bool) -> None:
-        """show: whether to draw; without it the table only counts."""
+        """Prepare an empty table.
+
+        Args:
+            skin: The skin whose cubes are shown.
+            show: Whether to draw the table; otherwise it only counts rows.
+        """
         n = len(skin.cubes)
         self.note = ""
         self._skin = skin
@@ -111,34 +132,34 @@ class LiveTable:
     def __exit__(self, *_: object) -> None:
         if self._live:
             self._live.stop()
-            # Where it is no terminal, rich does not end the last line.
+            # If stderr is not a terminal, rich does not end the last line.
             if not self._console.is_terminal:
                 self._console.line()
 
     @property
     def seen(self) -> int:
-        """Number of cubes of which a tensor has arrived."""
+        """Number of cubes from which at least one tensor has arrived."""
         return int(np.count_nonzero(self._count))
 
     @property
     def seen_all(self) -> bool:
-        """Whether a tensor of each cube has arrived."""
+        """Whether at least one tensor has arrived from every cube."""
         return self.seen == len(self._count)
 
     def update(self, rows: StressRows) -> None:
-        """Add the rows of a message of stress; of several rows of a cube the last one is shown."""
+        """Take over the rows of a message; of several rows of a cube the last one is shown."""
         if not self._count.any():
-            # The first tensors are drawn at once.
+            # The next `refresh` draws the first tensors without waiting for `DRAW_PERIOD_S`.
             self._drawn_s = 0.0
         cube = rows.cube
         self._values[cube, : len(STRESS)] = rows.stress
         self._values[cube, len(STRESS) :] = rows.gradient
         self._residual[cube], self._status[cube] = rows.residual, rows.status
-        # `add.at` counts each row where a cube occurs several times in a message.
+        # If a cube occurs several times in a message, `+=` would count it only once.
         np.add.at(self._count, cube, 1)
 
     def refresh(self) -> None:
-        """Count rates and draw the table, if it is time to."""
+        """Compute the rates and draw the table, each if its period is over."""
         now_s = time.monotonic()
         if now_s - self._rate_s >= RATE_PERIOD_S:
             self._rate = (self._count - self._rate_count) / (now_s - self._rate_s)
@@ -149,19 +170,24 @@ class LiveTable:
             self._live.update(self.draw(max_rows, self._console.width), refresh=True)
 
     def draw(self, max_rows: int, width: int) -> Table:
-        """Make the table for a terminal of `width` columns.
+        """Make the table for a terminal.
 
-        Of more than `max_rows` cubes those under the largest normal stress are shown. In a narrow
-        terminal the lines, the bar, and components from the last one on are left out.
+        In a skin of more than `max_rows` cubes, those with the largest absolute σzz are shown. If
+        the table is too wide, the lines, then the bars, then components from the last one on are
+        left out.
+
+        Args:
+            max_rows: Maximum number of cubes in the table.
+            width: Width of the terminal, in characters.
         """
-        # Pressure is compression, which is negative stress.
+        # Tension is positive in the stress tensor, so the pressure is −σzz.
         pressure = np.nan_to_num(-self._values[:, COMPONENTS.index("zz")])
         self._peak = max(self._peak * PEAK_DECAY, float(pressure.max()), MIN_PEAK)
         shown = np.arange(len(pressure))
         caption = None
         if len(shown) > max_rows:
             by_size = np.argsort(-np.abs(pressure), kind="stable")
-            # The rows stay in the order of the skin file.
+            # Sorting the indices keeps the rows in the order of the skin file.
             shown = np.sort(by_size[:max_rows])
             caption = f"the {max_rows} cubes under the greatest normal stress of {len(pressure)}"
 
@@ -169,7 +195,8 @@ class LiveTable:
         options = self._console.options.update(max_width=UNLIMITED_WIDTH)
         table = Table()
         for form in _forms(components):
-            # The width depends on the content, so each form is made and measured.
+            # The width of the table depends on its content, so it is made in each layout and
+            # measured until it fits.
             table = self._table(form, shown, pressure)
             table.caption = caption
             if Measurement.get(self._console, options, table).maximum <= width:
@@ -182,12 +209,12 @@ class LiveTable:
         shown: Index,
         pressure: Array,
     ) -> Table:
-        """Make the table of some cubes.
+        """Make the table in one layout.
 
         Args:
-            form: Its columns.
-            shown: (K,) indices of the cubes.
-            pressure: (N,) pressure on all cubes, in Pa.
+            form: The layout.
+            shown: (K,) indices of the cubes that have a row.
+            pressure: (N,) pressure −σzz at all cubes, in Pa.
         """
         table = self._empty_table(form)
         for number in shown.tolist():
@@ -230,7 +257,7 @@ class LiveTable:
         return self._values[:, COMPONENTS.index(name)]
 
     def _state(self, number: int) -> Text:
-        """Return the status bits of a cube that are set, in words."""
+        """Return the names of the status bits of a cube that are set, or "ok" or "waiting"."""
         bits = self._status[number]
         words = [word.lower().replace("_", " ") for word, bit in STATUS.items() if bits & bit]
         if words:
@@ -244,7 +271,7 @@ def is_gradient(component: str) -> bool:
 
 
 def _in_kpa(component: str, value: float) -> str:
-    """Return Pa as kPa, and Pa/m as kPa/mm."""
+    """Return a stress in Pa as text in kPa, or a gradient in Pa/m as text in kPa/mm."""
     scale = 1e-6 if is_gradient(component) else 1e-3
     return _number(value * scale, "+.2f")
 

@@ -11,7 +11,8 @@ from rich.table import Column, Table
 from rich.text import Text
 
 BAR_WIDTH = 20
-"""Width of a progress bar in columns; the rest of the line is for the name of the step."""
+"""Width of a progress bar, in characters; the rest of the line shows the name of the present step.
+"""
 
 
 def say(text: str, style: str = "", *, stderr: bool = False) -> None:
@@ -49,7 +50,8 @@ def progress_bar() -> Iterator[Callable[[float, float, str], None]]:
     """
     console = Console(stderr=True)
     if not console.is_terminal:
-        # rich 11 (Ubuntu 22.04) prints an empty line at the end even of a disabled bar.
+        # A disabled progress bar would not do: rich 11 (Ubuntu 22.04) prints an empty line at its
+        # end.
         yield lambda done, total, what: None
         return
 
@@ -86,5 +88,8 @@ def progress_bar() -> Iterator[Callable[[float, float, str], None]]:
 
 
 def working(text: str) -> AbstractContextManager[object]:
-    """Show a moving line on stderr, where that is a terminal, during work of unknown progress."""
+    """Show a text with an animation on stderr, if that is a terminal, inside a `with` block.
+
+    It is for work whose progress is unknown.
+    """
     return Console(stderr=True).status(Text(text))
