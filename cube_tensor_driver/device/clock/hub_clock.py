@@ -117,7 +117,7 @@ class HubClock:
     def reset(self) -> None:
         """Restart the line from device time to host time, because the hub restarted.
 
-        The drift is kept as a first guess. Stamps still do not go back.
+        The drift is kept as a first guess. Later stamps are still not earlier than the last one.
         """
         self._count_reset()
         self._restart()
@@ -166,10 +166,11 @@ class HubClock:
         arrival_ns: int,
         numbers: Sequence[int] = (),
     ) -> list[int]:
-        """Fit the line to samples that arrived together, and convert their device times.
+        """Convert the device times of samples that arrived together to host times (stamps).
 
-        Stamps never decrease with increasing device time, unless the host's clock was set back. No
-        stamp is later than the arrival.
+        The clock line (host time over device time) is first fitted to the samples. Stamps never
+        decrease with increasing device time, unless the host's clock was set back, and no stamp is
+        later than the arrival.
 
         Args:
             device_us: Device times of the samples, in µs.
@@ -202,7 +203,7 @@ class HubClock:
         return self._newest == _NEVER
 
     def _restart(self) -> None:
-        """Discard all that was learned from samples, except for the drift and the last stamp."""
+        """Discard the clock line and all samples; keep the drift and the last stamp (host time)."""
         self._first_us = self._first_ns = 0
         self._newest = _NEVER  # device time of the newest sample, in ns since _first_us
         self._line.restart()
@@ -215,7 +216,7 @@ class HubClock:
         self._steps_ns.append(self._last_arrival)
 
     def _convert(self, times: Sequence[int], arrival_ns: int) -> list[int]:
-        """Fit the line to the newest of some samples, and convert the device times of all.
+        """Fit the clock line to the newest of some samples, and convert the device times of all.
 
         Args:
             times: Device times of samples that arrived together, in µs.
@@ -250,7 +251,7 @@ class HubClock:
         return stamps
 
     def _learn(self, newest_us: int, arrival_ns: int) -> bool:
-        """Fit the line to the newest of some samples, and look for steps of the hub's clock.
+        """Fit the clock line to the newest of some samples, and look for steps of the hub's clock.
 
         Args:
             newest_us: Device time of the newest sample, in µs.

@@ -25,11 +25,11 @@ from itertools import pairwise
 from typing import NamedTuple
 
 BUCKET_NS = 1_000_000_000
-"""Length, in ns, of the intervals of time (buckets) of which only one sample each is kept: that
-with the smallest delay."""
+"""Length, in ns, of the time intervals (buckets) into which the samples of a hub are divided. Of
+each bucket only the sample with the smallest delay between sampling and arrival is kept."""
 MAX_BUCKETS = 120
-"""Number of buckets (intervals of 1 s) to whose samples of smallest delay the line is fitted;
-together they are two minutes."""
+"""Number of buckets (intervals of 1 s), together two minutes, whose samples of smallest delay are
+kept. The clock line, that is host time as a linear function of device time, is fitted to them."""
 MIN_BUCKETS_FOR_DRIFT = 5
 """Number of buckets (intervals of 1 s) that must be complete before the drift between hub and host
 clock is estimated. In a shorter time, a change of the delay would look like drift."""
@@ -37,29 +37,31 @@ UNKNOWN_DRIFT = 1e-4
 """Largest assumed error of the relative drift between hub and host clock while the drift is not
 estimated yet. Quartz crystals deviate by less than 100 parts per million."""
 MAX_DRIFT = 1e-3
-"""Largest credible relative drift between hub and host clock, to which the slope of the line is
-limited. A larger slope arises when the host pauses and reads many samples late."""
+"""Largest credible relative drift between hub and host clock, to which the estimated drift is
+limited. A larger value arises when the host pauses and reads many samples late."""
 MAX_RISE_NS = 20e6
-"""Largest delay above the smallest one, in ns, that samples have without a set clock; USB adapters
-delay them by up to 16 ms. If all samples of `MIN_BUCKETS_HIGH` seconds exceed it, or the line falls
-by more at once, a clock was set."""
+"""Largest credible increase or decrease of the smallest delay of samples, in ns; USB adapters delay
+samples by up to 16 ms. If the delays of all samples of `MIN_BUCKETS_HIGH` successive seconds are
+longer than the smallest one by more, or one delay is shorter by more, the hub's or the host's clock
+was set."""
 MAX_FALL_NS = 4e6
-"""Largest sum of the distances, in ns, by which samples lower the line in one bucket (1 s) without
-a set clock. Delays are never negative, so a larger sum shows that a clock was set. Steps of 5 ms
-are found, with 1 ms for the error of the line itself."""
+"""Largest credible decrease of the smallest delay of samples within one bucket (1 s), in ns. The
+smallest delay is known after the first bucket, so a larger decrease shows that the hub's or the
+host's clock was set. Steps of 5 ms are found, with 1 ms for the error of the estimated line."""
 MIN_BUCKETS_HIGH = 2
-"""Number of successive buckets (intervals of 1 s) in which every sample must be delayed by more
-than `MAX_RISE_NS` to show that a clock was set. One alone may come from a pause of the host."""
+"""Number of successive buckets (intervals of 1 s) in which the delays of all samples must exceed
+the smallest delay by more than `MAX_RISE_NS` before the hub's or the host's clock counts as set.
+In a single bucket this may come from a pause of the host."""
 JITTER_POINTS = 64
-"""Number of points over which the jitter (mean height of the points above the line, that is mean
-delay above the smallest one) is averaged."""
+"""Number of reads over which the jitter (mean of the delay minus the smallest delay) is averaged,
+as the time constant of a low-pass filter."""
 MAX_ROUND_TRIPS = 64
 """Number of newest round trips (questions for the hub's time and their answers) that are kept. With
 one per second they cover about one minute."""
 MAX_COMMON_DELAY_NS = 1e9
-"""Longest credible delay, in ns, that all samples have but the answers to the request TIME (for the
-hub's time) do not have. An answer that implies a longer one contradicts the samples and is not
-used."""
+"""Longest credible delay, in ns, that all samples of a hub have in common, for example in a buffer
+of the hub. If an answer to the request TIME (for the hub's time) implies a longer one, the answer
+contradicts the samples and is not used."""
 
 
 class ClockRoundTrip(NamedTuple):
@@ -124,11 +126,20 @@ class ClockLine:
         return height if math.isfinite(height) else 0.0
 
     def height(self, device_ns: float, arrival_ns: float) -> float:
-        """Return the height, in ns, of a point above the line: its delay above the smallest one."""
+        """Return by how much the delay of a sample exceeds the smallest delay, in ns.
+
+        This is the height of the point (device time, arrival time) above the clock line.
+
+        Args:
+            device_ns: Device time of the sample, in ns since the first sample.
+            arrival_ns: Host time of its arrival, in ns since the first sample.
+        """
         return arrival_ns - device_ns - self.offset - self.drift * device_ns
 
     def add(self, device_ns: float, arrival_ns: int) -> bool:
-        """Add a point. It lowers the line if it is below; after each bucket the line is fitted.
+        """Add the point (device time, arrival time) of a sample to the clock line.
+
+        A point below the line lowers it. After each bucket of 1 s the line is fitted anew.
 
         Args:
             device_ns: Device time of the sample, in ns since the first point.
@@ -172,16 +183,16 @@ class ClockLine:
         self._intersect_bounds()
 
     def _lower(self, height: float) -> bool:
-        """Lower the line to a point below it.
+        """Lower the clock line (host time over device time) to a point below it.
 
         Args:
-            height: Height of the point above the line, in ns; negative.
+            height: Height of the point above the line, in ns; negative, because it is below.
 
         Returns:
             Whether this shows that the hub's or the host's clock was set.
         """
-        # In the first bucket, the line falls until the smallest delay is known. This shows nothing
-        # about the clocks and is not added up.
+        # In the first second, the line falls until the smallest delay is known. Such a fall is not
+        # added to _fall, because it does not show that a clock was set.
         self._fall -= height if self._points else 0.0
         was_set = self._fall > MAX_FALL_NS or -height > MAX_RISE_NS
         if was_set:
@@ -193,7 +204,9 @@ class ClockLine:
         return was_set
 
     def _fit(self, arrival_ns: int) -> bool:
-        """Fit the line to the points of smallest delay of all buckets, and begin the next bucket.
+        """Fit the clock line to the points of smallest delay, one per bucket of 1 s.
+
+        The next bucket begins with this call.
 
         Args:
             arrival_ns: Host time, in ns since the first point, at which this bucket ends.
@@ -261,9 +274,9 @@ class ClockLine:
         self._set_bounded_offset()
 
     def _set_bounded_offset(self) -> None:
-        """Set `bounded_offset` to the offset from round trips, but not above the line.
+        """Set `bounded_offset` to the offset from round trips, but not above `offset`.
 
-        Above the line, the delays of some samples would be negative.
+        With a larger offset, the delays of some samples would be negative.
         """
         self.bounded_offset = min(self.offset, self._trip_offset)
 

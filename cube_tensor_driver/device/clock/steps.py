@@ -16,28 +16,29 @@ from collections.abc import Callable
 from ..scans.sequence import MAX_DISORDER, MAX_GAP
 
 MIN_STEP_US = 4000.0
-"""Deviation of a sample's device time from the one expected from its number and the sample period,
-in µs, above which a step of the hub's clock is suspected. Steps of 5 ms are found, with 1 ms for
-the jitter of the hub."""
+"""Smallest deviation, in µs, of the device time of a sample from the time expected from its number
+and the sample period, at which a step of the hub's clock is suspected. Steps of 5 ms are found,
+with 1 ms for the jitter of the hub."""
 PERIOD_TOLERANCE = 1e-3
 """Largest assumed relative error of the estimated sample period. After lost samples, the threshold
 `MIN_STEP_US` is increased by this fraction of the time between the received samples."""
 PERIOD_SAMPLES = 64
 """Time constant, in samples, of the low-pass filter that estimates the sample period of a hub."""
 DECISION_NS = 200_000_000
-"""Time after a suspected step of the hub's clock, in ns, in which a decision is made only if the
-delay of a sample is possible with just one explanation. After this time, the smallest delay since
-the step decides whether the clock was set or the hub sampled late."""
+"""Time, in ns, after which the smallest delay of samples since a suspected step of the hub's clock
+decides whether the clock was set or the hub sampled late. Earlier it is decided only if the delay
+of a sample excludes one of the two."""
 MAX_DECISION_NS = 1_000_000_000
-"""Time after a suspected step of the hub's clock, in ns, at which it is decided in any case. Before
-it, no decision is made if the smallest delay lies about midway between the values expected for a
-set clock and for a late sample."""
+"""Time limit, in ns after a suspected step of the hub's clock, for deciding whether the clock was
+set or the hub sampled late. Until then it is not decided while the smallest delay of samples lies
+about midway between the values expected for the two."""
 MIN_DECISION_READS = 8
 """Number of reads after a suspected step of the hub's clock before the smallest delay decides. The
 samples of a few reads may all be delayed."""
 UNLIKELY_DELAY = 8.0
-"""Ratio of a delay to the mean delay (both above the smallest delay) that hardly any sample
-exceeds. A step larger than this cannot be mistaken for a delayed sample."""
+"""Ratio of the delay of a sample to the mean delay that hardly any sample exceeds (both are counted
+from the smallest delay). A step of the hub's clock that is larger than this is not confused with a
+delayed sample."""
 MIN_HOST_STEP_NS = 1_000_000
 """Smallest step of the host's clock, in ns, that is detected. The host's and the monotonic clock
 are read one after the other, so that smaller differences of the two are not certain."""
@@ -141,8 +142,8 @@ class SampleTiming:
             elif error < -bound:
                 error = -bound
             self._period_us = period + error / PERIOD_SAMPLES
-        # While the hub's clock stands still, the reference stays, so that the deviation grows until
-        # it counts as a step.
+        # While the hub's clock stands still, the reference sample stays the same, so that the
+        # deviation grows with each sample until it counts as a step.
         if interval or is_step or period <= 0.0:
             self._reference, self._reference_us = number, device_us
         return round(error) if is_step else 0
@@ -242,8 +243,8 @@ class StepDecision:
             return step_ns > 0
 
         if abs(step_ns) > UNLIKELY_DELAY * mean_delay_ns:
-            # Hardly any delay is as long as the step. If the shift is near 0 or 1, the other
-            # explanation would need such a delay.
+            # The step is longer than almost any delay. So a shift near 0 shows that the hub sampled
+            # late or early, and one near 1 that its clock was set.
             if abs(shift) < 0.25:
                 return False
             if abs(shift - 1) < 0.25:

@@ -300,12 +300,20 @@ class Session:
         self.set_state(LinkState.SILENT, error)
 
     def _ask_hello(self, now: float) -> None:
-        """Send the request HELLO (identify yourself), and set the time of the next one."""
+        """Send the request HELLO (identify yourself), and schedule the next one.
+
+        Args:
+            now: Monotonic time, in s.
+        """
         self._hello_at = now + HELLO_S
         self.link.write(encode(Request(Command.HELLO)))
 
     def _ask_time(self, now: float) -> None:
-        """Send the request TIME (report your clock), and set the time of the next one."""
+        """Send the request TIME (report your clock), and schedule the next one.
+
+        Args:
+            now: Monotonic time, in s.
+        """
         self._ask_time_at = now + ASK_TIME_S
         self._question = (self._question + 1) % (1 << 32)
         request = encode(Request(Command.TIME, self._question))

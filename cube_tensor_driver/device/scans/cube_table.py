@@ -19,7 +19,7 @@ MAX_NAMES = 8
 """Largest number of cubes that one log message lists by name. If there are more, the message ends
 with their number ("and 3 more")."""
 ABSENT = -1
-"""Value that stands for the index in the skin of a hub's cube that is not in the skin file."""
+"""Value used instead of the index in the skin for a hub's cube that is not in the skin file."""
 _OTHER_LINK_HAS_IT = "left out here: another link has a cube of the same uid"
 
 
@@ -140,8 +140,8 @@ class CubeTable:
     def forget(self, link: int) -> None:
         """Mark the hub of a link as absent, because the link was closed or is silent.
 
-        If the hub of another link then reports the uid of one of its cubes in HELLO, the rows of
-        that hub are used.
+        If another hub has a cube with the same uid as one of the absent hub, the rows of the other
+        hub are used from its next HELLO on.
         """
         self._hubs[link].is_present = False
 

@@ -59,7 +59,7 @@ class RowAccount:
 
     @property
     def counts(self) -> RowCounts:
-        """Numbers of rows until now; `unaccounted` is that of the last call of `check`."""
+        """Numbers of rows until now; only `unaccounted` is as of the last call of `check`."""
         return RowCounts(
             delivered=self.delivered,
             unknown_cube=self._scans.cubes.unknown_cube,

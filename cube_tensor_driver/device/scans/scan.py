@@ -275,7 +275,8 @@ class ScanBuilder:
             if stamp_ns > last_ns:
                 limits_ns.append((stamp_ns + last_ns) / 2)
             else:
-                # This is a further frame of the sample that was built last, so it is late.
+                # A hub with many cubes sends a sample in several frames. This frame belongs to the
+                # same sample as one that was built before, so it is late.
                 limits_ns.append(0.0)
         built_ns = [self._built_ns[link] for link in missing]
         return min(built_ns) > min(limits_ns)

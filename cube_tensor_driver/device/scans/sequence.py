@@ -16,9 +16,9 @@ MAX_GAP = 1 << 20
 """Largest gap in the numbers of successive samples (17 minutes at 1 kHz) that is counted as lost
 samples. A larger gap is taken for a restart of the hub."""
 RESTART_US = 1_000_000
-"""Largest difference of device time, in µs, between the newest sample of a hub and a late sample
-from before the first counted one. If the difference is larger, the late sample is taken for the
-first one after a restart of the hub."""
+"""Largest difference of device time, in µs, between the newest sample of a hub and a sample whose
+number is below that of the first counted one. With a smaller difference the sample is only late;
+with a larger one it is taken for the first sample after a restart of the hub."""
 _WRAP = 1 << 32
 
 

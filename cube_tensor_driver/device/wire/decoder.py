@@ -106,7 +106,10 @@ class PythonDecoder:
         self._discarding = False
 
     def _decode(self, run: bytes) -> Frame | None:
-        """Return the frame of one run, or count it as invalid and return None."""
+        """Return the frame of one run (bytes between two zeros); None if it is invalid.
+
+        The run increases the counter `frames`, or the one of its defect.
+        """
         counters = self.counters
         if len(run) < MIN_RUN:
             counters.length += len(run) > 0
