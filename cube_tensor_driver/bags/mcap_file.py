@@ -161,18 +161,17 @@ class McapReader:
         start_ns: int,
         stop_ns: int,
     ) -> Iterator[StoredMessage]:
-        """Read messages of all channels in the order of time, chunk (block of messages) by chunk.
+        """Read the chunks (blocks of messages) that can contain wanted messages, in order of time.
 
-        Chunks without a wanted channel or outside the span of time are skipped. Messages of chunks
-        whose times overlap are merged.
+        Messages of chunks whose times overlap are merged.
 
         Args:
-            channels: Channels (numbers of topics in the file) of which a chunk must have one.
-            start_ns: Begin of the span of time, in ns since the Unix epoch.
-            stop_ns: End of the span of time, in ns.
+            channels: Wanted channels (numbers of topics in the file).
+            start_ns: Begin of the wanted span of time, in ns since the Unix epoch.
+            stop_ns: End of the wanted span of time, in ns since the Unix epoch.
 
         Yields:
-            All messages of the chunks that were read, also those of other channels and times.
+            All messages of these chunks in the order of time, including unwanted ones.
         """
         chunks = [
             chunk

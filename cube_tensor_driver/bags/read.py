@@ -465,6 +465,7 @@ class Bag:
                     self._refuse_version(f"{one.topic} has another definition of {name}")
 
     def _refuse_version(self, difference: str) -> None:
+        """Raise a BagError that states which message of the bag has another version, and how."""
         raise BagError(
             f"{self.path}: {difference}; this package reads version {VERSION} of its messages: "
             "use the version of the package that recorded the bag"

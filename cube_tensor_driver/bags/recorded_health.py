@@ -81,7 +81,7 @@ class RecordedHealthReader:
         self._unread = self._read()
 
     def health_at(self, rows: FrequencyRows) -> RecordedHealth:
-        """Return the recorded health of the pads for rows of frequencies.
+        """Return the recorded health (which pads were left out, and why) for rows of frequencies.
 
         The row of stress that belongs to a row of frequencies has the same cube, sequence number
         and stamp. Where none was recorded, `known` is false.
@@ -139,6 +139,7 @@ class RecordedHealthReader:
                 yield batch
 
     def _read(self) -> Iterator[_StressBatch]:
+        """Yield the columns of the recorded stress that state the health, from the beginning."""
         names = ("cube", "sequence", "left_out", "status")
         for columns in self._bag.stress_columns(self._topic, names):
             stamp_ns, cube, sequence, left_out, status = columns

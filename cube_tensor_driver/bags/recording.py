@@ -102,7 +102,11 @@ class Recording:
     def health_at(self, rows: FrequencyRows) -> RecordedHealth:
         """Return the health of the pads that the reconstruction found when rows were recorded.
 
-        Calls in the order of recording are fastest, because the bag is then read only once.
+        The health states which pads were left out as faulty, and why. Calls in the order of
+        recording are fastest, because the bag is then read only once.
+
+        Args:
+            rows: Rows of frequencies whose health is wanted.
         """
         return self._health.health_at(rows)
 

@@ -128,6 +128,7 @@ def _storage_files(folder: Path) -> list[Path]:
     """Return the storage files of a folder in the order in which they were written."""
 
     def number(path: Path) -> tuple[int, str]:
+        """Return the number at the end of a file's name (0 if there is none), and the name."""
         digits = path.stem.rpartition("_")[2]  # by number, as text would sort _10 before _2
         return int(digits) if digits.isdigit() else 0, path.name
 
@@ -136,6 +137,7 @@ def _storage_files(folder: Path) -> list[Path]:
 
 
 def _summary(path: Path) -> FileSummary:
+    """Return the topics, times and numbers of messages of a repaired storage file."""
     with closing(open_storage(path)) as file:
         return file.summary
 
@@ -267,7 +269,7 @@ class _Salvaged:
             self._learn(opcode, content)
 
     def _begin_chunk(self, start: int, content: bytes) -> None:
-        """Read a chunk (block of messages), which counts once all of its index records follow.
+        """Read a chunk (block of messages) and remember it until its index records have been read.
 
         Args:
             start: Byte offset of the chunk record from the start of the file.
@@ -324,7 +326,11 @@ class _Salvaged:
     def _learn(self, opcode: int, content: bytes) -> None:
         """Note the message type (schema) or the topic (channel) that a record defines.
 
-        Definitions are repeated in a file; the first one with a number is kept.
+        Definitions can be repeated in a file; the first one with a given number is kept.
+
+        Args:
+            opcode: Type of the record; records of other types are ignored.
+            content: The record without its opcode and length.
         """
         if opcode == Opcode.SCHEMA:
             schema: Schema = _parse(Schema.read, content)

@@ -29,10 +29,11 @@ class CubeSummary:
 
     Attributes:
         name: Name of the cube.
-        uid: Unique number of the cube, as in its SkinInfo message.
+        uid: Unique id of the cube, as in the SkinInfo message; 0 if it is not known.
         samples: Number of recorded samples.
         lost: Number of samples whose sequence numbers are missing.
-        gaps: Number of gaps, which are times between two samples above `MIN_GAP_PERIODS`.
+        gaps: Number of gaps: times between two samples that exceed the median sampling period by
+            more than the factor `MIN_GAP_PERIODS`.
         rate: Samples per second, from the median period; None with fewer than two samples.
         longest_gap: Longest time between two samples, in s; None with fewer than two samples.
     """
@@ -90,7 +91,7 @@ def _summarise(
 
     Args:
         name: Name of the cube.
-        uid: Unique number of the cube.
+        uid: Unique id of the cube.
         sequence: (N,) sequence numbers of its samples in the order of recording.
         stamp_ns: (N,) stamps of its samples, in ns since the Unix epoch.
     """

@@ -20,8 +20,10 @@ ROWS_PER_GROUP = 1 << 16
 """Number of rows that are written together, as one row group (independent block) of a Parquet
 file. Fewer, larger groups compress better and are read faster."""
 
-# Dictionary encoding stores the name of a cube once and only a number in each row.
 _CUBE_NAME = pyarrow.dictionary(pyarrow.int32(), pyarrow.string())
+"""Type of the column with the cubes' names. Dictionary encoding stores each name once, and only a
+number in each row."""
+
 _SCHEMA = pyarrow.schema(
     [
         ("stamp_ns", pyarrow.int64()),
@@ -35,6 +37,7 @@ _SCHEMA = pyarrow.schema(
         ("left_out", pyarrow.uint32()),
     ]
 )
+"""Names and types of the columns of a table of stress; `StressRows` states what they contain."""
 
 
 @contextmanager

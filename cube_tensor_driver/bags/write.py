@@ -117,8 +117,8 @@ class BagWriter:
             storage: Format of the files, ``mcap`` or ``sqlite3``.
             max_bytes: Total size of the messages in a storage file, in bytes, at which a new file
                 begins; 0: no limit.
-            max_seconds: Time between the first and the next message of a storage file, in s, at
-                which a new file begins; 0: no limit.
+            max_seconds: Time since the first message of a storage file, in s, at which a new file
+                begins; 0: no limit.
 
         Raises:
             BagError: The folder exists or cannot be created, or the format is unknown.
@@ -227,6 +227,11 @@ class BagWriter:
             self._attempt(self._finish_part)
 
     def _open_part(self) -> _Part:
+        """Return the current storage file.
+
+        Raises:
+            BagError: The bag has been closed.
+        """
         if self._part is None:
             raise BagError(f"{self.folder} is closed")
         return self._part
@@ -268,6 +273,7 @@ class BagWriter:
         part.counts[one.topic] = 0
 
     def _attempt(self, work: Callable[[], object]) -> None:
+        """Do a step of writing; if it fails, close the file and raise a BagError."""
         try:
             work()
         except WRITE_ERRORS as error:

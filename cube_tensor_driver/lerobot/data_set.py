@@ -133,8 +133,8 @@ class DataSet:
         """
         if task not in self._tasks:
             self._tasks.append(task)
-        # Parquet writes with a delay of one row group, so the size on disk is a little too small
-        # and files can exceed the limit by as much.
+        # The size on disk lags behind what has been written by one row group, so files can exceed
+        # the limit by as much.
         is_new = self._writer is None
         if is_new or self._path.stat().st_size >= MAX_FILE_MB << 20:
             self._close_file()
@@ -182,7 +182,7 @@ class DataSet:
         Args:
             key: Name of the feature.
             rows: (n, D) values of the feature's D columns.
-            of_episode: Statistics of the episode, by the names of the features.
+            of_episode: Statistics of the current episode, by the names of the features.
         """
         self._statistics[key].add(rows)
         of_episode[key].add(rows)
@@ -280,6 +280,7 @@ class DataSet:
         _write_json(meta / "stats.json", statistics)
 
     def _close_file(self) -> None:
+        """Complete the current Parquet file, if there is one."""
         if self._writer is not None:
             self._writer.close()
             self._writer = None
@@ -414,6 +415,7 @@ def _task_table(tasks: list[str]) -> pyarrow.Table:
         pandas_type: str,
         numpy_type: str,
     ) -> dict[str, Any]:
+        """Return pandas' description of a column: its name and types."""
         kinds = {"pandas_type": pandas_type, "numpy_type": numpy_type}
         return {
             "name": name,
@@ -438,6 +440,7 @@ def _task_table(tasks: list[str]) -> pyarrow.Table:
 
 
 def _write_json(path: Path, value: Any) -> None:
+    """Write a value to a JSON file as LeRobot does: indented, in UTF-8."""
     path.write_text(
         json.dumps(
             value,

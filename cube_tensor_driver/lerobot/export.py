@@ -238,25 +238,30 @@ class EpisodeWriter:
             if isinstance(values, np.ndarray):
                 self._count(key, values)
                 continue
-            # Frames whose number in the episode is a multiple of the stride are chosen, so the
-            # first one in this block depends on the number `first` of the block's first frame.
+            # Every stride-th frame of the episode is chosen. This block begins at frame `first`, so
+            # its first chosen frame has the index -first % stride in the block.
             for image in values[-first % stride :: stride]:
                 pixels = image.pixels()[::PIXEL_STRIDE, ::PIXEL_STRIDE]
                 bands = pixels.shape[2]
                 self._count(key, pixels.reshape(-1, bands))
 
     def _count(self, key: str, rows: AnyArray) -> None:
+        """Add values (n, D) of a feature to the statistics of the episode and the data set."""
         self._data_set.count(key, rows, self._statistics)
 
 
 def _check_same_skin(plans: list[BagPlan]) -> Skin:
-    """Return the skin of all bags.
+    """Check that all bags have the same cubes at the same poses, and return their skin.
+
+    Args:
+        plans: The bags, at least one.
 
     Raises:
         BagError: The cubes of two bags differ in their names or poses.
     """
 
     def places(plan: BagPlan) -> list[Any]:
+        """Return name and pose of each cube of a bag."""
         cubes = plan.skin.cubes
         return [(cube.name, cube.xyz, cube.rpy) for cube in cubes]
 

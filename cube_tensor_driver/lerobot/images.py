@@ -119,7 +119,8 @@ class ImageStream:
     def _newest_in(self, episode: Episode, frame: int) -> EncodedImage:
         """Return the newest image that is stamped before the end of a frame.
 
-        The bag is read as far as the first image after the frame.
+        The bag is read as far as the first image after the frame. If there is no image before the
+        end of the frame, the result is a black image.
 
         Args:
             episode: Episode of the frame.
@@ -130,7 +131,7 @@ class ImageStream:
             stamp = np.array(self._next[0])
             if episode.frame_of(stamp) > frame:
                 break
-            # Only the last message before the end of the frame is encoded, because this is slow.
+            # Only the last image before the end of the frame is encoded, because encoding is slow.
             message = self._next[1]
             self._next = next(self._unread, None)
         if message is not None:
@@ -158,6 +159,7 @@ class ImageStream:
             self._fail(str(error))
 
     def _fail(self, reason: str) -> NoReturn:
+        """Raise a BagError that names the bag, the topic, the reason and the remedy."""
         raise BagError(
             f"{self._bag.path}: {self._topic}: {reason}; leave the topic out by naming the others "
             "with --topics"

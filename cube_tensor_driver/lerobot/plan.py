@@ -348,7 +348,7 @@ def _check_depth(
     episode: Episode,
     usual: int,
 ) -> None:
-    """Check that no frame has far more samples than usual.
+    """Check that no frame (time step of the data set) has far more samples than usual.
 
     Every frame of the data set gets room for as many samples as the fullest frame has, so such a
     frame would multiply the size of the data set.

@@ -52,7 +52,11 @@ class Statistics:
         self._sample: list[Array] = []
 
     def add(self, rows: AnyArray) -> None:
-        """Add at least one row (n, D); NaN and infinite values are left out."""
+        """Add n rows of the feature's D columns to the statistics.
+
+        Args:
+            rows: (n, D) values, n at least 1. NaN and infinite values are left out.
+        """
         values = rows.astype(np.float64)
         known = np.isfinite(values)
         count = known.sum(axis=0)

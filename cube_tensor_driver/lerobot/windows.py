@@ -48,7 +48,7 @@ class Windows:
     """
 
     def __init__(self, counts: AnyArray, depth: int) -> None:
-        """Prepare the windows of an episode.
+        """Prepare the windows (samples of all cubes in one frame) of an episode.
 
         Args:
             counts: (frames, cubes) number of samples of each cube in each frame.
@@ -72,10 +72,13 @@ class Windows:
         self._waiting.append((frame, rows))
 
     def complete(self) -> Iterator[dict[str, AnyArray]]:
-        """Yield the windows of all further frames whose rows have been added.
+        """Yield the windows (samples of all cubes in one frame) that have become complete.
+
+        Frames come in order, each once. A window is complete when all of its rows have been added.
 
         Yields:
-            Arrays (n, depth, cubes, …) by the names of the features, for n successive frames.
+            For n successive frames: arrays (n, depth, cubes, …) by the names of the features, where
+            depth is the number of samples that a window has room for.
         """
         while self.done < len(self._counts):
             block = self._counts[self.done : self.done + self._block]
@@ -105,7 +108,7 @@ class Windows:
         frame: Index,
         rows: StressRows,
     ) -> dict[str, AnyArray]:
-        """Arrange all rows of n successive frames in windows.
+        """Arrange all rows of n successive frames in windows (samples of all cubes in one frame).
 
         Args:
             counts: (n, cubes) number of samples of each cube in each frame.
@@ -113,7 +116,8 @@ class Windows:
             rows: The N rows.
 
         Returns:
-            Arrays (n, depth, cubes, …) by the names of the features.
+            Arrays (n, depth, cubes, …) by the names of the features, where depth is the number of
+            samples that a window has room for.
         """
         n_frames, n_cubes = counts.shape
         # A cell is one cube in one frame. Stable sorting keeps its samples in the order of

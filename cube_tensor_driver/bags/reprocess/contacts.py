@@ -33,7 +33,11 @@ class ContactsOverTime:
 
 
 class ContactWriter:
-    """Writes `contacts` and `traction` of one skin into a bag, as the node publishes them."""
+    """Computes the contacts of one skin from its stress and writes them into a bag.
+
+    The topics `contacts` and `traction` (force per area on the surface) have the same messages as
+    those that the node publishes.
+    """
 
     def __init__(
         self,
@@ -61,8 +65,8 @@ class ContactWriter:
     def set_up(self, info: Any) -> None:
         """Use a SkinInfo message (poses and calibrations of the cubes) for the rows that follow.
 
-        If the geometry is that of the message before, the tracked contacts continue. Otherwise
-        contact estimation begins anew. The contact node does the same.
+        If frame, names, poses and sizes of the cubes are those of the message before, the tracked
+        contacts continue. Otherwise contact estimation begins anew. The node does the same.
 
         Raises:
             CubeError: Contacts cannot be computed on a skin with these cubes.

@@ -54,7 +54,9 @@ MAX_NAMED_CUBES = 5
 
 @dataclass(frozen=True)
 class Overrides:
-    """Calibrations and tare that replace those of a recording; None keeps the recorded ones.
+    """Calibrations and tare (rest frequencies) that replace those of a recording.
+
+    None keeps what was recorded.
 
     Attributes:
         calibration: Calibration that is used for every cube.
@@ -363,8 +365,8 @@ def _recalibrate(
             new.check(old.layout, cube.uid or None)
         except CalibrationError as error:
             raise BagError(f"{path}: cube {cube.name}: {error}") from None
-        # A rest frequency that differs from the old calibration was measured by a tare and is kept.
-        # An equal one came from the old calibration and is replaced by that of the new one.
+        # A rest frequency that differs from the old calibration was measured by a tare (without
+        # load) and is kept. An equal one came from the old calibration and is replaced.
         pads = rest[: old.layout.n_pads]
         pads[:] = np.where(pads != old.rest_frequency, pads, new.rest_frequency)
     return Settings(tuple(calibrations), rest_frequency)

@@ -39,7 +39,7 @@ class RecordedReconstruction:
         self._source.bag.close()
 
     def health_at(self, rows: FrequencyRows, reconstructor: Reconstructor) -> RecordedHealth:
-        """Return the recorded health of the pads for the rows of one message.
+        """Return the recorded health (which pads were left out, and why) for rows of one message.
 
         The rest frequencies that were recorded for the time of these rows are set in the
         reconstructor.
