@@ -2,15 +2,15 @@
 
     v_np = g_p sum_k c_k (B_k s_n)_p + noise
 
-    s_n   known state of load n
+    s_n   state (amplitudes of the modes, which are linear stress fields) of the known load n
     v_np  stress that pad p measured under load n
-    B_k   basis matrices of the structure
-    c_k   coefficients
-    g_p   gains
+    B_k   basis matrices (pads x modes) of the responses that the symmetry allows
+    c_k   coefficients of the response
+    g_p   gain, the sensitivity of pad p relative to the symmetric response
 
-Only the product of g and c is determined by loads. So gains average 1 over each set of pads that
-the symmetry maps onto each other. The fit takes Gauss-Newton steps on weighted residuals: with
-equal weights, then with Huber's, and at last with Tukey's, which ignore outliers altogether.
+Loads determine only the product of g and c. So gains average 1 over each set of pads that the
+symmetry maps onto each other. The fit takes Gauss-Newton steps on weighted residuals: with equal
+weights, then with Huber's weights, and at last with Tukey's, which are 0 for outliers.
 
 Source: Huber & Ronchetti, Robust Statistics, ch. 7, also for the covariance.
 """
@@ -41,27 +41,34 @@ from .robust import (
 )
 
 FOLDS = 10
-"""Number of parts of the cross-validation; each part is left out once."""
+"""Number of parts into which the loads are divided for cross-validation. The fit is repeated
+without each of the parts, and its error is measured on the part that was left out."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Result of a fit to N loads.
+    """Result of a fit of K coefficients and P gains to N loads.
+
+    A reading is the measured stress of one pad under one load.
 
     Attributes:
-        structure: Structure of the response.
-        coefficients: Values by name, in Pa per Pa; NaN where the loads do not determine them.
-        deviations: Standard deviations by name, in Pa per Pa.
+        structure: Structure of the response: names of the coefficients and basis matrices.
+        coefficients: Values of the coefficients of the response by name, in Pa per Pa; NaN where
+            the loads do not determine them.
+        deviations: Standard deviations of the coefficients by name, in Pa per Pa.
         covariance: Covariance (K, K) of the coefficients.
-        gain, gain_deviation: Gains and their standard deviations (P,).
-        scale: Scatter of the residuals, in units of the stated noise.
-        chi2, dof: Chi-square and its degrees of freedom, of the readings that are no outliers.
+        gain: Sensitivities of the pads relative to the symmetric response (P,), 1 on average.
+        gain_deviation: Standard deviations of the gains (P,).
+        scale: Standard deviation of the residuals (measured minus fitted), in units of the noise
+            that the caller stated.
+        chi2: Sum of squares of the residuals divided by the stated noise, without outliers.
+        dof: Degrees of freedom of chi2: number of readings minus number of determined parameters.
         held_out: Ratio of the rms error on loads that are left out of the fit (cross-validation) to
             the rms reading, without outliers.
         fitted: Fitted pad stresses (N, P), in Pa.
-        outliers: Which readings had no weight (N, P).
+        outliers: Whether a reading had the weight 0 (N, P).
         undetermined: Names of the coefficients that the loads do not determine.
-        advice: Sentences that tell which loads to add.
+        advice: Sentences that name the loads to add.
     """
 
     structure: Structure
@@ -88,7 +95,8 @@ class Fit:
         """Return a calibration with the fitted values.
 
         Args:
-            base: Calibration with all other values. Its noise is raised to the scatter found.
+            base: Calibration with all other values. Its noise is multiplied by the scatter of the
+                residuals, if that is above 1.
             created: Time of creation, ISO 8601.
             source: Origin of the values.
 
@@ -122,7 +130,7 @@ def measured_stress(
     """Compute pad stresses (N, P), in Pa, by the pad law of a calibration.
 
     Args:
-        base: Calibration with the pad law and the rest frequencies.
+        base: Calibration with the parameters of the pad law and the frequencies without load.
         frequency: Frequencies (N, P), in Hz.
         temperature: Temperatures (N,), in °C, if they are known.
 
@@ -152,10 +160,11 @@ def loads_from_forces(
     force: ArrayLike,
     area: float,
 ) -> Array:
-    """Compute the states of forces that a reference sensor measured on the face +z.
+    """Compute the states of loads that are forces on the face +z of a cube.
 
-    The stress is uniform in zz, yz and zx. The stresses along the skin are taken as 0, because
-    nothing holds the layer sideways.
+    A reference sensor measured the forces. They are taken as a uniform stress with the components
+    zz, yz and zx. The normal stresses along the skin, xx and yy, are taken as 0, because nothing
+    holds the layer sideways.
 
     Args:
         modes: The M modes.
@@ -163,10 +172,10 @@ def loads_from_forces(
         area: Area that the forces act on, in m².
 
     Returns:
-        States (N, M), in Pa.
+        States (amplitudes of the modes) (N, M), in Pa.
 
     Raises:
-        FitError: The shape is wrong, or the area is not above 0.
+        FitError: The forces have the wrong shape, or the area is not above 0.
     """
     f = np.asarray(force, dtype=float)
     if f.ndim != 2 or f.shape[1] != 3 or not area > 0:
@@ -188,16 +197,16 @@ def fit(
     fixed: Mapping[str, float] | None = None,
     gains: bool = True,
 ) -> Fit:
-    """Fit coefficients and gains to loads.
+    """Fit coefficients and gains to known loads.
 
     Args:
-        structure: Structure of the response.
-        loads: Known states (N, M), in Pa.
+        structure: Structure of the response: layout, modes and symmetry.
+        loads: Known states (amplitudes of the modes) (N, M), in Pa.
         measured: Measured pad stresses (N, P), in Pa.
-        noise: Standard deviation of the readings, one number or (P,), in Pa.
-        fixed: Coefficients that are known from elsewhere, by name.
-        gains: Whether gains are fitted. False takes every gain as 1, for loads that reach too few
-            pads to separate gains from coefficients.
+        noise: Standard deviation of the measured pad stresses, one number or (P,), in Pa.
+        fixed: Values of coefficients that are known from elsewhere, by name.
+        gains: Whether gains are fitted. If False, every gain is 1; use it for loads that reach too
+            few pads to separate gains from coefficients.
 
     Raises:
         FitError: Shapes or numbers are invalid, all loads are zero, or the loads determine no
@@ -220,10 +229,11 @@ def fit(
 
     residuals = model.residuals(theta, design, y) / scale
     covariance = robust_covariance(jacobian, residuals, scale)
-    # The pseudo-inverse gives undetermined coefficients a small variance, which means nothing.
+    # The pseudo-inverse in the covariance gives coefficients that the loads do not determine a
+    # small variance, although their variance is unknown.
     covariance[:n_free][is_open] = np.nan
     covariance[:, :n_free][:, is_open] = np.nan
-    # Fixed coefficients have no error.
+    # Coefficients that the caller fixed have the variance 0.
     n = structure.n_coefficients
     of_coefficients = np.zeros((n, n))
     free = np.array(model.free, dtype=int)
@@ -233,7 +243,7 @@ def fit(
     coefficients, gain = model.unpack(theta)
     coefficients[free[is_open]] = np.nan
     deviations = np.sqrt(np.diag(of_coefficients))
-    # Rounding can make the variance of a gain without error slightly negative.
+    # Rounding can make a variance that should be 0 slightly negative.
     gain_variance = np.diag(of_gains).clip(0)
 
     fitted = model.predict(theta, design)
@@ -259,12 +269,15 @@ def fit(
 
 
 class _Model:
-    """The model whose parameters theta are the free coefficients, then coordinates of the gains.
+    """Model of the measured pad stresses (readings) as a function of parameters theta.
+
+    The parameters are the coefficients that are not fixed, then G coordinates of the gains.
 
     Attributes:
         free: Numbers of the coefficients that are not fixed.
-        gains: Changes of the gains (P, G) per coordinate. Each raises one pad and lowers the first
-            pad of its orbit, which keeps the average at 1.
+        gains: Changes of the gains (P, G) per unit of each coordinate. A coordinate raises the gain
+            of one pad, and lowers that of the first pad of its orbit (set of pads that the symmetry
+            maps onto each other) by as much. This keeps the average gain of the orbit at 1.
     """
 
     def __init__(
@@ -285,24 +298,32 @@ class _Model:
                 column = np.zeros(n_pads)
                 column[pad], column[first] = 1, -1
                 columns.append(column)
-        # The reshape gives an empty matrix its width if there are no gains to fit.
+        # The reshape gives the matrix the right shape (P, 0) if there are no gains to fit.
         self.gains: Array = np.array(columns).reshape(-1, n_pads).T
 
     def unpack(self, theta: Array) -> tuple[Array, Array]:
-        """Return the coefficients (K,), including fixed ones, and the gains (P,) of parameters."""
+        """Return all coefficients (K,) and gains (P,) that parameters theta stand for."""
         coefficients = self._fixed.copy()
         coefficients[self.free] = theta[: len(self.free)]
         coordinates = theta[len(self.free) :]
         return coefficients, 1 + self.gains @ coordinates
 
     def design(self, x: Array) -> Array:
-        """Return what each coefficient adds to each reading (N, P, K) for loads (N, M), at gain
-        1."""
+        """Return the contribution of each coefficient to each reading (N, P, K), with gains of 1.
+
+        Args:
+            x: States (amplitudes of the modes) of the loads (N, M), in Pa.
+        """
         by_coefficient = np.tensordot(x, self.structure.basis, axes=(1, 2))
         return np.moveaxis(by_coefficient, 1, 2)
 
     def predict(self, theta: Array, design: Array) -> Array:
-        """Return the predicted readings (N, P), in Pa."""
+        """Return the pad stresses (N, P), in Pa, that the model predicts.
+
+        Args:
+            theta: Parameters.
+            design: Result of `design` for the loads (N, P, K), in Pa.
+        """
         coefficients, gain = self.unpack(theta)
         readings: Array = gain * (design @ coefficients)
         return readings
@@ -313,13 +334,27 @@ class _Model:
         design: Array,
         y: Array,
     ) -> Array:
-        """Return the whitened residuals (N P,)."""
+        """Return the residuals (measured minus predicted) divided by the noise (N P,).
+
+        Args:
+            theta: Parameters.
+            design: Result of `design` for the loads (N, P, K), in Pa.
+            y: Measured pad stresses (N, P), in Pa.
+        """
         difference = y - self.predict(theta, design)
         residuals: Array = difference / self.noise
         return residuals.ravel()
 
     def jacobian(self, theta: Array, design: Array) -> Array:
-        """Return the derivatives (N P, parameters) of the whitened predictions."""
+        """Return the derivatives of the predicted readings, divided by the noise.
+
+        Args:
+            theta: Parameters.
+            design: Result of `design` for the loads (N, P, K), in Pa.
+
+        Returns:
+            Derivatives (N P, parameters) with respect to the parameters.
+        """
         coefficients, gain = self.unpack(theta)
         by_coefficient = design[:, :, self.free] * gain[:, None]
         at_gain_1 = design @ coefficients
@@ -329,10 +364,15 @@ class _Model:
         return whitened.reshape(-1, theta.size)
 
     def solve(self, design: Array, y: Array) -> tuple[Array, Array, float]:
-        """Fit the parameters.
+        """Fit the parameters to readings, in the stages that `STAGES` lists.
+
+        Args:
+            design: Result of `design` for the loads (N, P, K), in Pa.
+            y: Measured pad stresses (N, P), in Pa.
 
         Returns:
-            Parameters, weights of the readings (N, P), and scatter in units of the noise.
+            Parameters, weights of the readings (N, P) from 0 to 1, and scatter (standard deviation)
+            of the residuals in units of the noise.
         """
         n_parameters = len(self.free) + self.gains.shape[1]
         theta = np.zeros(n_parameters)
@@ -342,16 +382,18 @@ class _Model:
             for _ in range(MAX_STEPS):
                 r = self.residuals(theta, design, y)
                 if stage == "huber":
-                    # Tukey's stage keeps the last scale, without which it might not settle.
+                    # Tukey's stage keeps the last scatter of Huber's, because with a new one in
+                    # each step it might not converge.
                     scale = estimate_scatter(r)
                 if stage != "plain":
                     weights = compute_weights(stage, r / scale)
-                # Rows times the roots of their weights make a weighted least squares problem.
+                # Multiplying each row by the root of its weight turns weighted least squares into
+                # ordinary least squares.
                 root = np.sqrt(weights)
                 weighted = root[:, None] * self.jacobian(theta, design)
                 step = least_squares(weighted, root * r)
                 theta = theta + step
-                # The 1 makes the tolerance absolute for parameters near 0.
+                # For parameters near 0, the 1 makes the tolerance absolute.
                 limit = tolerance * (1 + np.linalg.norm(theta))
                 if np.linalg.norm(step) <= limit:
                     break
@@ -365,7 +407,14 @@ def _check_inputs(
     noise: ArrayLike,
     fixed: Mapping[str, float],
 ) -> tuple[Array, Array, Array]:
-    """Return loads (N, M), readings (N, P) and noise (P,). FitError: see `fit`."""
+    """Check the arguments of `fit`, which explains them.
+
+    Returns:
+        Loads (N, M), measured pad stresses (N, P) and noise (P,), in Pa.
+
+    Raises:
+        FitError: An argument is invalid.
+    """
     n_pads, n_modes = structure.basis.shape[1:]
     try:
         x, y, sigma = (np.array(values, dtype=float) for values in (loads, measured, noise))
@@ -400,7 +449,13 @@ def _refuse_unknown(
     values: Array,
     columns: tuple[str, ...],
 ) -> None:
-    """Raise FitError that names the first value that is not finite."""
+    """Raise FitError if a value is not finite; the error names the first such value.
+
+    Args:
+        kind: What a row of the values is called in the error, such as "load".
+        values: Values (N, columns).
+        columns: Names of the columns.
+    """
     for row, column in np.argwhere(~np.isfinite(values)).tolist():
         raise FitError(
             f"{kind} {row + 1}, {columns[column]}: {values[row, column]}; "
@@ -414,17 +469,29 @@ def _cross_validate(
     y: Array,
     is_used: Mask,
 ) -> float:
-    """Return the ratio of the rms error on loads that are left out to the rms reading."""
+    """Measure the error of the fit on loads that it does not know (cross-validation).
+
+    Args:
+        model: The model.
+        design: Result of `_Model.design` for the loads (N, P, K), in Pa.
+        y: Measured pad stresses (N, P), in Pa.
+        is_used: Whether a reading is no outlier (N, P).
+
+    Returns:
+        Ratio of the rms error of predicted pad stresses to the rms of measured ones; NaN with fewer
+        than two loads.
+    """
     if len(y) < 2 or not np.any(y[is_used]):
         return float("nan")
     errors = np.empty_like(y)
-    # Loads are taken in turn, because tables often hold similar loads one after the other.
+    # Successive loads go to different parts, because tables often hold similar loads one after the
+    # other.
     fold = np.arange(len(y)) % min(FOLDS, len(y))
     for k in range(fold.max() + 1):
         is_out = fold == k
         theta, _, _ = model.solve(design[~is_out], y[~is_out])
         errors[is_out] = y[is_out] - model.predict(theta, design[is_out])
-    # Outliers would dominate both means.
+    # Outliers are excluded, because they would dominate both means.
     mean_square_error = np.mean(errors[is_used] ** 2)
     mean_square_reading = np.mean(y[is_used] ** 2)
     return float(np.sqrt(mean_square_error / mean_square_reading))
@@ -437,26 +504,29 @@ def _advise(
     null: Array,
     is_open: Mask,
 ) -> list[str]:
-    """Find loads of a single mode that would determine the undetermined coefficients.
+    """Find loads that, added to the given ones, would determine the remaining coefficients.
+
+    Each advised load has a single mode (linear stress field).
 
     Args:
         model: The model.
         theta: Fitted parameters.
-        x: Loads (N, M), in Pa.
-        null: Directions of the parameters that change no reading.
-        is_open: Which free coefficients the loads do not determine.
+        x: States (amplitudes of the modes) of the given loads (N, M), in Pa.
+        null: Basis (parameters, H) of the changes of the parameters that change no reading.
+        is_open: Whether the loads do not determine a coefficient, for those that are not fixed.
 
     Returns:
         One sentence for each load to add.
     """
     advice = []
-    # As arrays of objects, names can be selected with masks.
+    # An array of objects allows to select names with a mask.
     free = np.array(model.free, dtype=int)
     names = np.array(model.structure.names, dtype=object)[free]
     theta = theta.copy()
-    # At the value 0 of a coefficient, the gains of the new load would seem undetermined.
+    # A coefficient of 0 would give no stress on its pads, so their gains would seem undetermined.
+    # Any other value of the unknown coefficients avoids this.
     theta[: len(names)][is_open] = 0.5
-    # The advised loads are as large as those given, with which the fit was good.
+    # The advised loads get the rms size of the given ones, which the cube is known to bear.
     size = np.sqrt(np.mean(x[x != 0] ** 2))
     single_modes = size * np.eye(x.shape[1])
     loads = x
@@ -465,7 +535,8 @@ def _advise(
         designs = [model.design(candidate) for candidate in candidates]
         null_spaces = [null_space(model.jacobian(theta, design)) for design in designs]
         opens = [find_undetermined(each, len(names)) for each in null_spaces]
-        # The best load determines most coefficients, then most directions of the parameters.
+        # The best load leaves the fewest coefficients undetermined and, among equals, the fewest
+        # independent changes of the parameters that change no reading.
         left = [
             (open_.sum(), each.shape[1]) for open_, each in zip(opens, null_spaces, strict=True)
         ]
@@ -476,7 +547,8 @@ def _advise(
                 "give them as fixed, or choose a larger symmetry"
             )
             break
-        # A load may determine a gain first, and a coefficient only together with the next load.
+        # One more load may not determine a coefficient yet, but only together with the next one.
+        # The sentence then names all undetermined coefficients.
         settled = names[is_open & ~opens[best]]
         subject = settled if len(settled) else names[is_open]
         mode = model.structure.modes.names[best]
@@ -489,7 +561,7 @@ def _advise(
 
 
 def describe_mode(name: str) -> str:
-    """Return a mode's name in words, such as "sigma_zz growing along x"."""
+    """Return a mode in words, such as "sigma_zz growing along x" for the name "zz_x"."""
     terms = []
     for part in name.split("-"):
         place = f" growing along {part[3]}" if "_" in part else ", uniform"

@@ -20,20 +20,20 @@ from ..core.symmetry import default_modes
 from .fit import loads_from_forces
 
 FORCE = ("fx", "fy", "fz")
-"""Names of the columns of a force."""
+"""Names of the columns of a table of loads that hold the force on the cube, in N."""
 
 TEMPERATURE = "temperature"
-"""Name of the column of the temperature."""
+"""Name of the column of a table of loads that holds the temperature, in °C."""
 
 
 @dataclass(frozen=True, eq=False)
 class Loads:
-    """N loads of a cube with P pads and M modes.
+    """N known loads of a cube with P pads and M modes, and what was measured under them.
 
     Attributes:
-        state: Amplitudes of the modes (N, M), in Pa.
-        frequency: Frequencies of the pads (N, P), in Hz.
-        temperature: Temperatures (N,), in °C; None if they are unknown.
+        state: Amplitudes of the modes (linear stress fields) that each load causes (N, M), in Pa.
+        frequency: Frequencies of the pads under each load (N, P), in Hz.
+        temperature: Temperature during each load (N,), in °C; None if it is unknown.
     """
 
     state: Array
@@ -41,7 +41,10 @@ class Loads:
     temperature: Array | None
 
     def unloaded_frequency(self) -> Array | None:
-        """Return the mean frequencies (P,), in Hz, of the rows without load; None without such."""
+        """Return the mean frequencies of the pads in the rows without load (P,), in Hz.
+
+        The result is None if the table has no row without load.
+        """
         is_unloaded = ~self.state.any(axis=1)
         if not is_unloaded.any():
             return None
@@ -54,7 +57,7 @@ def read_loads(
     layout: Layout,
     area: float | None = None,
 ) -> Loads:
-    """Read a table with a line of column names, then one load per line.
+    """Read a table (CSV) with a line of column names, then one load per line.
 
     The columns are:
 
@@ -65,13 +68,14 @@ def read_loads(
     - `temperature` in °C, if it is known.
 
     Args:
-        path: The table.
-        layout: Layout of the cube.
-        area: Area that the force acts on, in m². Forces need it.
+        path: Path of the table.
+        layout: Layout of the cube's pads.
+        area: Area on the face +z that the force acts on, in m². It is needed if the table has
+            forces.
 
     Raises:
-        FitError: The file cannot be read, a column is missing, unknown or there twice, a cell is no
-            number, or forces are given without an area.
+        FitError: The file cannot be read, a column is missing, unknown or present twice, a cell is
+            no number, or the table has forces and no area is given.
     """
     header, cells = _read_cells(path)
     modes = default_modes(layout)
@@ -90,7 +94,8 @@ def _check_columns(
     modes: Modes,
 ) -> None:
     allowed = {*layout.pads, *modes.names, *FORCE, TEMPERATURE}
-    # One message names all columns with the same mistake, so that few attempts are needed.
+    # One error message names all columns with the same mistake, so that a user can correct them at
+    # once.
     mistakes = {
         "unknown": [name for name in header if name not in allowed],
         "twice": sorted({name for name in header if header.count(name) > 1}),
@@ -111,10 +116,15 @@ def _read_states(
     modes: Modes,
     area: float | None,
 ) -> Array:
-    """Return amplitudes (N, M), in Pa, from the columns of modes or of forces."""
+    """Return the amplitudes of the modes (N, M), in Pa, from the columns of modes or of forces.
+
+    Raises:
+        FitError: The table has both kinds of columns or none, not all forces, or forces without an
+            area.
+    """
     forces = [name for name in FORCE if name in columns]
     amplitudes = [name for name in modes.names if name in columns]
-    # Both together could contradict each other.
+    # Amplitudes and forces together could contradict each other.
     if bool(forces) == bool(amplitudes):
         found = "both" if amplitudes else "neither"
         raise FitError(
@@ -136,7 +146,12 @@ def _read_states(
 
 
 def _read_cells(path: Path) -> tuple[list[str], Array]:
-    """Return the column names, and the numbers (lines, columns) below them."""
+    """Return the names of the columns, and the numbers below them (loads, columns).
+
+    Raises:
+        FitError: The file cannot be read, a line has the wrong number of cells, or a cell is no
+            number.
+    """
     lines = _read_lines(path)
     if len(lines) < 2:
         raise FitError(
@@ -160,11 +175,15 @@ def _read_cells(path: Path) -> tuple[list[str], Array]:
 
 
 def _read_lines(path: Path) -> list[list[str]]:
-    """Return the cells of each line, without spaces around them; empty lines are left out."""
+    """Return the cells of each line that is not empty, without spaces around them.
+
+    Raises:
+        FitError: The file cannot be read, or is no CSV file in UTF-8.
+    """
     try:
         # Spreadsheet programs begin a file with a byte order mark, which this encoding removes.
         text = read_bounded(path, MAX_BYTES, "table of loads").decode("utf-8-sig")
-        # The csv module reads the ends of lines itself, also those within quotes.
+        # The csv module must see the ends of lines unchanged, because a quoted cell may hold some.
         file = io.StringIO(text, newline="")
         lines = list(csv.reader(file))
     except ConfigError as error:

@@ -1,7 +1,7 @@
 """Behaviour of the pads while nothing touches them: frequency, noise, drift and faults.
 
 noise    sqrt(mean(e²) / 6),   e[n] = f[n] - 2 f[n-1] + f[n-2]    (`core/health/statistics.py`)
-drift    slope of the straight line through all samples
+drift    slope of the straight line fitted to all samples f[n] of a pad over time
 """
 
 from __future__ import annotations
@@ -14,24 +14,27 @@ from ..core.arrays import Array, Mask
 from ..core.health.diagnosis import NOISY_ENTER
 
 MIN_MEASURED_SHARE = 0.5
-"""Share of samples with a frequency below which a pad is silent."""
+"""Minimum fraction of the samples in which a pad must have a frequency; with less, the pad is
+reported as silent."""
 
 MIN_SAMPLES = 3
-"""Number of samples that one second difference needs."""
+"""Minimum number of samples of the pads: the noise is computed from second differences, each of
+which needs three samples."""
 
 MINUTE_S = 60.0
 
 
 class PadsAtRest(NamedTuple):
-    """Statistics of P pads of C cubes, all of shape (C, P).
+    """Statistics of P unloaded pads of C cubes, all of shape (C, P).
 
     Attributes:
         frequency: Mean frequency, in Hz; NaN for silent pads.
-        noise: Noise relative to the frequency.
-        drift: Drift relative to the frequency, per minute.
-        silent: Whether most samples have no frequency.
-        stuck: Whether the pad shows a single value while others of its cube do not.
-        noisy: Whether the noise is `NOISY_ENTER` times the median of the cube's pads.
+        noise: Standard deviation of the frequency without drift, relative to the mean frequency.
+        drift: Change of the frequency per minute, relative to the mean frequency.
+        silent: Whether most samples of the pad have no frequency.
+        stuck: Whether the pad keeps a single value while other pads of its cube do not.
+        noisy: Whether the noise is more than `NOISY_ENTER` times the median noise of the pads of
+            the cube.
     """
 
     frequency: Array
@@ -43,13 +46,13 @@ class PadsAtRest(NamedTuple):
 
     @property
     def works(self) -> Mask:
-        """Which pads are usable (C, P)."""
+        """Whether each pad can be used: it is neither silent nor stuck (C, P)."""
         works: Mask = ~(self.silent | self.stuck)
         return works
 
 
 def measure_pads_at_rest(frequency: Array, seconds: Array) -> PadsAtRest:
-    """Compute the statistics of S samples.
+    """Compute the statistics of unloaded pads from S samples of C cubes with P pads.
 
     Args:
         frequency: Frequencies (S, C, P), in Hz; NaN where nothing was measured.
@@ -58,7 +61,8 @@ def measure_pads_at_rest(frequency: Array, seconds: Array) -> PadsAtRest:
     is_measured = np.isfinite(frequency)
     counts = is_measured.sum(axis=0)
     total = np.where(is_measured, frequency, 0).sum(axis=0)
-    # A count of at least 1 avoids a division by 0; pads without a sample are silent, see below.
+    # A count of at least 1 avoids a division by 0. Pads without a sample count as silent below, so
+    # their mean is not used.
     mean = total / np.maximum(counts, 1)
     deviation = np.where(is_measured, frequency - mean, 0)
 
@@ -78,7 +82,8 @@ def measure_pads_at_rest(frequency: Array, seconds: Array) -> PadsAtRest:
     lowest = np.where(is_measured, deviation, np.inf).min(axis=0)
     span = highest - lowest
     varies = ~silent & (span > 0)
-    # If all pads of a cube show a single value, it may be a simulated cube without noise.
+    # If all pads of a cube keep a single value, the cube may be a simulated one without noise, so
+    # none of its pads counts as stuck.
     others_vary = varies.any(axis=1, keepdims=True)
     stuck = ~silent & (span == 0) & others_vary
 

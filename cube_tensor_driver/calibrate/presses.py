@@ -1,17 +1,18 @@
-"""Presses beside a cube: how they are detected, and what they tell about pads and rotation.
+"""Presses of a finger beside a cube, from which its rotation and the order of its pads are found.
 
-A press on a known side of a cube gives each pad a share of its force. The shares depend on the
-distance of the press: e_g (P,) for the distance g. A rotated cube shows another pattern, and pads
-with swapped wires show it in another order. For each rotation, an order of the pads has the misfit
+When a new cube is brought up, it may be mounted in a rotated orientation, and the wires of its pads
+may be swapped. A person presses on known sides of the cube. Each press causes stresses on the pads,
+whose pattern depends on the rotation of the cube, the order of the pads, and the distance g of the
+finger. For each rotation, an order of the pads has the misfit
 
     misfit² = sum_k min_g |m_k - a e_g|² / sum_k |m_k|²,   a = max(0, m_k·e_g / e_g·e_g)
 
     m_k   stresses (P,) that the pads measured in press k
-    e_g   stresses expected for that rotation, press and distance, in that order
+    e_g   stresses (P,) expected for this rotation, press k and distance g, in this order of pads
 
-Pads are swapped two at a time as long as a swap reduces misfit² to less than half. Of all
-explanations that fit about as well as the best one, the one with the fewest changes is chosen. A
-rotation is one change, and a swap of two pads is one change.
+Pads are swapped two at a time as long as a swap reduces misfit² to at most `MAX_SWAP_RATIO` of its
+value. Of all explanations (rotation and order) that fit about as well as the best one, the one with
+the fewest changes is chosen. A rotation is one change, and a swap of two pads is one change.
 """
 
 from __future__ import annotations
@@ -31,61 +32,78 @@ from ..core.tensor import rotate_gradient, rotate_stress
 from ..mechanics.contact import disc, field
 
 MIN_PRESS_NOISE_RATIO = 30.0
-"""Smallest frequency change of a press, as a multiple of the median noise of the pads.
+"""Smallest frequency change of a pad that counts as a press, as a multiple of the median noise
+(standard deviation of the frequency) of the pads.
 
 Smaller changes may be noise.
 """
 
 MIN_PRESS_CHANGE = 2e-4
-"""Smallest relative frequency change of a press, whatever the noise is."""
+"""Smallest frequency change of a pad that counts as a press, relative to its frequency without
+load. It holds if the noise of the pads would allow a smaller change."""
 
 STEADY_SHARE = 0.1
-"""Largest difference of two successive averages of a steady press, as a share of the press."""
+"""Largest change of a pad's frequency between two successive averages with which a press is steady,
+as a fraction of the largest frequency change that the press caused."""
 
 RELEASED_SHARE = 0.4
-"""Ratio of the frequency change to the smallest change of a press, below which a press has ended.
+"""Fraction of the smallest frequency change of a press; when the largest change of all pads falls
+below it, the press has ended.
 
-It is below 1, so that a press near the limit is not read twice.
+It is below 1, so that a press near the limit is not counted twice.
 """
 
 FINGER_RADIUS = 3e-3
-"""Radius of the contact of a fingertip, in m."""
+"""Radius of the contact area of a fingertip, in m."""
 
 SIDES = {
     "+x": (1.0, 0.0, 0.0),
     "-x": (-1.0, 0.0, 0.0),
     "+y": (0.0, 1.0, 0.0),
 }
-"""Places to press: directions from the centre of the cube, in the frame of the skin.
+"""Sides of a cube on which a person presses: directions from the centre of the cube, in the frame
+of the skin.
 
-Three of them distinguish all rotations of a cube.
+Presses on three sides distinguish all 24 rotations of a cube.
 """
 
 PRESS_DISTANCES = tuple(0.125 * np.arange(2, 17))
-"""Distances of a press from the cube's centre that are tried, as multiples of the cube's depth.
+"""Distances between a press and the centre of the cube, along the skin, for which stresses are
+computed, as multiples of the depth of the centre below the surface.
 
-People do not press at a measured distance.
+All of them are tried, because people do not press at a measured distance.
 """
 
 MAX_SWAP_RATIO = 0.5
-"""Largest ratio of misfit² after and before a swap with which the swap is accepted."""
+"""Largest ratio of misfit² (unexplained fraction of the squared stresses on the pads) after and
+before two pads are swapped with which the swap is accepted."""
 
 SIMILAR_RATIO = 1.5
-"""Ratio to the lowest misfit up to which an explanation fits as well as the best one."""
+"""Largest ratio of an explanation's misfit to the lowest misfit of all with which the explanation
+counts as equally good.
+
+An explanation is a rotation of the cube and an order of its pads.
+"""
 
 SIMILAR_MISFIT = 0.06
-"""Misfit up to which an explanation fits as well as the best one, whatever that one's misfit is."""
+"""Largest misfit with which an explanation (rotation of the cube, order of its pads) counts as
+equally good as the best one, even if that has a far lower misfit."""
 
 MAX_MISFIT = 0.5
-"""Misfit above which nothing is explained: the presses were elsewhere, or pads do not work."""
+"""Largest misfit (root of the unexplained fraction of the squared stresses on the pads) with which
+a rotation and an order of the pads explain the presses.
+
+If even the best misfit is larger, the presses were elsewhere, or pads do not work.
+"""
 
 
 class SteadyPress(NamedTuple):
-    """A press that can be read.
+    """A press on a cube during which the frequencies have stopped changing.
 
     Attributes:
-        cube: Number of the cube.
-        change: Relative frequency changes of its pads (P,).
+        cube: Number of the cube whose pads changed most.
+        change: Frequency changes of its pads relative to their frequencies without load (P,); NaN
+            for pads that do not work.
     """
 
     cube: int
@@ -93,10 +111,10 @@ class SteadyPress(NamedTuple):
 
 
 class PressDetector:
-    """Detects presses in successive averages of the frequencies.
+    """Detects presses on the cubes of a skin from successive averages of the frequencies.
 
     Attributes:
-        is_held: Whether the press that was read last continues.
+        is_held: Whether the press that was returned last continues.
     """
 
     def __init__(
@@ -108,9 +126,9 @@ class PressDetector:
         """Prepare the detection.
 
         Args:
-            rest: Rest frequencies (C, P), in Hz.
-            noise: Relative noise of the pads (C, P).
-            works: Which pads are used (C, P).
+            rest: Frequencies without load (C, P), in Hz, of the P pads of C cubes.
+            noise: Standard deviations of the frequencies relative to them (C, P).
+            works: Whether a pad works and is used (C, P).
         """
         self._rest, self._works = rest, works
         self._limit = MIN_PRESS_CHANGE
@@ -121,10 +139,13 @@ class PressDetector:
         self.is_held = False
 
     def update(self, mean: Array) -> SteadyPress | None:
-        """Examine the newest average (C, P), in Hz.
+        """Examine the newest average of the frequencies.
+
+        Args:
+            mean: Mean frequencies (C, P), in Hz; NaN where nothing was measured.
 
         Returns:
-            A press when it has become steady, once; otherwise None.
+            A press, once, when it has become steady; otherwise None.
         """
         with np.errstate(invalid="ignore"):  # NaN where nothing was measured
             relative = mean / self._rest - 1
@@ -138,7 +159,7 @@ class PressDetector:
             self.is_held = False
         if self.is_held or before is None or strongest < self._limit:
             return None
-        # While the finger still moves, pads keep changing relative to each other.
+        # While the finger still moves, the frequencies of the pads keep changing.
         movement = np.nanmax(np.abs(change[cube] - before[cube]))
         if movement > STEADY_SHARE * strongest:
             return None
@@ -147,7 +168,7 @@ class PressDetector:
 
 
 def cube_rotations() -> Index:
-    """Return the 24 rotations of a cube (24, 3, 3), the identity first."""
+    """Return the 24 rotations that map a cube onto itself (24, 3, 3), the identity first."""
     elements = find_group("full")
     is_rotation = np.linalg.det(elements) > 0
     rotations: Index = elements[is_rotation]
@@ -168,8 +189,9 @@ def expected_presses(
     Args:
         calibration: Calibration of the cube.
         rotations: Rotations (R, 3, 3) from the frame of the cube to that of the skin.
-        depth: Depth of the cube's centre, in m.
-        distances: Distances of the finger from the cube's centre, as multiples of the depth.
+        depth: Depth of the cube's centre below the surface, in m.
+        distances: Distances of the finger from the cube's centre along the surface, as multiples of
+            the depth.
 
     Returns:
         Stresses (rotations, SIDES, distances, pads), in Pa, tension positive.
@@ -180,7 +202,8 @@ def expected_presses(
     places = depth * np.einsum("g,kj->kgj", distances, directions)
     loaded = finger + places[:, :, None, :]
     stress, slope = field(cube_position, loaded, force, POISSONS_RATIO)
-    # The slope is ordered (..., k, component); a gradient is (..., i, j, k).
+    # The slope has the axes (..., k, component) with the axis k of the derivative; a gradient has
+    # the axes (..., i, j, k).
     by_component = np.moveaxis(slope, -1, -2)
     gradient = np.moveaxis(to_matrix(by_component), -3, -1)
 
@@ -199,13 +222,15 @@ def expected_presses(
 
 @dataclass(frozen=True)
 class Explanation:
-    """Rotation and order of the pads that explain the presses beside a cube.
+    """Rotation of a cube and order of its pads that explain the stresses during presses beside it.
 
     Attributes:
         rotation: Rotation (3, 3) of the cube from its intended to its real orientation.
         places: Number of the pad in the layout to which each wire of the hub leads (P,).
-        misfit: Unexplained share of the measured stresses: 0 is perfect, 1 explains nothing.
-        is_certain: Whether no other explanation with as few changes fits as well.
+        misfit: Root of the unexplained fraction of the squared stresses on the pads: 0 is a perfect
+            explanation, 1 explains nothing.
+        is_certain: Whether no other explanation with as few changes (rotation, swaps of two pads)
+            fits as well.
     """
 
     rotation: Index
@@ -219,27 +244,28 @@ class Explanation:
 
     @property
     def swapped(self) -> list[int]:
-        """Numbers of the pads that are not where the layout has them."""
+        """Numbers of the wires of the hub that lead to another pad than the layout states."""
         is_swapped = self.places != np.arange(len(self.places))
         return [int(pad) for pad in np.flatnonzero(is_swapped)]
 
     @property
     def is_clear(self) -> bool:
-        """Whether the presses determine rotation and order."""
+        """Whether the presses determine the rotation of the cube and the order of its pads."""
         return self.misfit <= MAX_MISFIT and self.is_certain
 
     @property
     def changes(self) -> float:
-        """Number of changes: one for a rotation, and one for each swap of two pads."""
+        """Number of changes to the intended cube: 1 for a rotation, and 1 per two swapped pads."""
         return int(self.is_rotated) + len(self.swapped) / 2
 
 
 def explain_presses(measured: Array, expected: Array) -> Explanation:
-    """Find the simplest explanation of presses.
+    """Find the rotation of a cube and the order of its pads that explain presses most simply.
 
     Args:
         measured: Stresses on the pads in K presses (K, P), in Pa; NaN for a pad that does not work.
-        expected: Stresses (24, K, G, P) for each of `cube_rotations` and G distances, in Pa.
+        expected: Stresses that `expected_presses` computes for the 24 rotations of
+            `cube_rotations`, the K presses and G distances (24, K, G, P), in Pa.
     """
     explanations = []
     for rotation, of_rotation in zip(cube_rotations(), expected, strict=True):
@@ -255,10 +281,16 @@ def explain_presses(measured: Array, expected: Array) -> Explanation:
 
 
 def _find_order(measured: Array, expected: Array) -> tuple[Index, float]:
-    """Find the order of the pads for one rotation by a local search that swaps two pads.
+    """Find the order of the pads, for one rotation of the cube.
+
+    The search swaps two pads at a time, as long as the best swap reduces the misfit enough.
+
+    Args:
+        measured: Stresses on the pads in K presses (K, P), in Pa.
+        expected: Stresses expected for this rotation (K, G, P), in Pa, at G distances.
 
     Returns:
-        Places of the pads (P,), and their misfit.
+        Number of the pad to which each wire leads (P,), and the misfit of this order.
     """
     n_pads = measured.shape[1]
     places = np.arange(n_pads)
@@ -271,7 +303,8 @@ def _find_order(measured: Array, expected: Array) -> tuple[Index, float]:
         candidates[swaps, second] = places[first]
         misfits = _misfit(measured, expected, candidates)
         best = int(misfits.argmin())
-        # A swap of real wires helps a lot; a smaller gain comes from noise.
+        # If two wires really are swapped, correcting them reduces the misfit a lot. A smaller
+        # reduction comes from noise.
         if misfits[best] ** 2 > MAX_SWAP_RATIO * lowest**2:
             break
         places, lowest = candidates[best], float(misfits[best])
@@ -283,11 +316,21 @@ def _misfit(
     expected: Array,
     places: Index,
 ) -> Array:
-    """Compute the misfit (S,) of S orders of the pads (S, P)."""
+    """Compute the misfit of several orders of the pads, as the head of this file defines it.
+
+    Args:
+        measured: Stresses on the pads in K presses (K, P), in Pa.
+        expected: Stresses expected for one rotation (K, G, P), in Pa, at G distances.
+        places: S orders of the pads (S, P).
+
+    Returns:
+        Misfit of each order (S,).
+    """
     works = np.isfinite(measured).all(axis=0)
     m = measured[:, works]
     e = expected[:, :, places][..., works]  # (K, G, S, pads)
-    # The force of a press is unknown but pushes, so only a positive scale is fitted.
+    # The force of a press is unknown, but a finger cannot pull. So the expected stresses are scaled
+    # by a fitted factor that is not negative.
     projection = np.maximum(0, np.einsum("kp,kgsp->kgs", m, e))
     total = (m**2).sum(axis=1)
     explained = projection**2 / (e * e).sum(axis=3)

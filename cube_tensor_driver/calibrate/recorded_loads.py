@@ -1,5 +1,5 @@
-"""Recorded loads: the frequencies of a cube in a bag, and what a reference sensor measured at the
-same time. They are the input of a fit."""
+"""Recorded loads, the input of a fit: the frequencies of a cube in a bag (recording), and the loads
+that a reference sensor measured at the same times."""
 
 from __future__ import annotations
 
@@ -27,19 +27,20 @@ WRENCH_TYPE = "geometry_msgs/msg/WrenchStamped"
 TENSOR_TYPE = "cube_tensor_driver/msg/StressTensorStamped"
 
 MAX_STEP_RATIO = 5.0
-"""Longest step between two messages of the reference, as a multiple of the median step.
+"""Longest time between two messages of the reference sensor over which its load is interpolated, as
+a multiple of the median time between its messages.
 
-Nothing is interpolated over a longer one.
+Samples of the cube within a longer gap are not used.
 """
 
 MAX_LOADS = 4000
-"""Maximum number of loads that a fit is given, because its time grows with them.
+"""Maximum number of loads that a fit gets, because the time of a fit grows with their number.
 
-If there are more samples, neighbouring samples are averaged.
+If there are more samples, groups of successive samples are averaged.
 """
 
 MAX_LISTED_CUBES = 20
-"""Number of cubes that an error message lists."""
+"""Maximum number of names of cubes that an error message lists."""
 
 
 def read_recorded_loads(
@@ -49,25 +50,27 @@ def read_recorded_loads(
     layout: Layout,
     area: float | None,
 ) -> tuple[Loads, Calibration]:
-    """Read the loads of a cube from a bag.
+    """Read the loads of a cube, and its frequencies under them, from a bag (recording).
 
-    Samples and reference are related by their time stamps. Between two messages of the reference,
-    its load is interpolated linearly. Modes that the reference does not measure are taken as 0.
+    A reference sensor measured the loads. Its messages and the samples of the cube are related by
+    their time stamps; between two messages, the load is interpolated linearly. Modes (linear stress
+    fields) that the reference does not measure are taken as 0.
 
     Args:
-        path: The bag.
-        name: Name of the cube; None means the only one.
-        reference: Topic of a WrenchStamped on the face +z, of a StressTensorStamped, or of a
-            SkinStress with a row for the cube.
-        layout: Layout of the cube.
-        area: Area that a WrenchStamped acts on, in m².
+        path: Path of the bag.
+        name: Name of the cube. None means the only cube; the bag must then have just one.
+        reference: Topic on which the reference sensor published: a WrenchStamped (force on the face
+            +z), a StressTensorStamped, or a SkinStress with a row for the cube.
+        layout: Layout that the cube must have.
+        area: Area that the force of a WrenchStamped acts on, in m²; None for other types.
 
     Returns:
-        Loads, and the recorded calibration with the rest frequencies in use.
+        Loads, and the recorded calibration with the rest frequencies that were in use last.
 
     Raises:
-        BagError: There is no such cube or topic, the layout is another, or cube and reference have
-            no time in common.
+        BagError: The bag has no such cube or topic, the area is missing, or no sample of the cube
+            lies between messages of the reference.
+        CalibrationError: The recorded calibration has another layout.
     """
     with open_bag(path) as source:
         number = _find_cube(source, path, name)
@@ -79,7 +82,8 @@ def read_recorded_loads(
         reference_ns, state = _read_reference(
             source.bag, reference, number, layout, area, calibration.half_side
         )
-    # Number of the message after each sample; the first and the last have no neighbour.
+    # For each sample, the number of the next message of the reference. Limiting it to 1 … last
+    # gives every sample a message before it and one after it.
     following = np.searchsorted(reference_ns, stamp_ns)
     following = following.clip(1, len(reference_ns) - 1)
     steps = np.diff(reference_ns)
@@ -94,7 +98,8 @@ def read_recorded_loads(
             "time in common"
         )
 
-    # Seconds from the first message, because a float does not hold nanoseconds since 1970.
+    # Times are computed in seconds from the first message, because a float does not hold the
+    # nanoseconds since 1970 exactly.
     seconds = (stamp_ns[used] - reference_ns[0]) / SECOND
     known = (reference_ns - reference_ns[0]) / SECOND
     by_mode = [np.interp(seconds, known, amplitude) for amplitude in state.T]
@@ -114,7 +119,11 @@ def _find_cube(
     path: Path,
     name: str | None,
 ) -> int:
-    """Return the number of a cube. BagError: there is no such cube, or more than one."""
+    """Return the number of the cube with a name, or of the only cube if the name is None.
+
+    Raises:
+        BagError: No cube has the name, or the name is None and there are several cubes.
+    """
     names = [cube.name for cube in source.skin.cubes]
     listed = ", ".join(names[:MAX_LISTED_CUBES])
     if name is None and len(names) > 1:
@@ -129,9 +138,15 @@ def _read_samples(
     number: int,
     n_pads: int,
 ) -> tuple[Times, AnyArray, AnyArray]:
-    """Return time stamps (N,), frequencies (N, P) and temperatures (N,) of a cube.
+    """Return the samples of a cube, without those with a pad that the device reports as broken.
 
-    Samples with a pad that the device reports as broken are left out.
+    Args:
+        source: The opened bag.
+        number: Number of the cube in the skin.
+        n_pads: Number P of the cube's pads.
+
+    Returns:
+        Time stamps (N,) in ns, frequencies (N, P) in Hz and temperatures (N,) in °C.
     """
     parts = []
     for rows in source:
@@ -154,11 +169,20 @@ def _read_reference(
 ) -> tuple[Times, Array]:
     """Read the loads that a reference sensor measured.
 
+    Args:
+        bag: The bag.
+        topic: Topic of the reference sensor.
+        number: Number of the cube in the skin.
+        layout: Layout of the cube.
+        area: Area that a force acts on, in m²; None for topics without forces.
+        half_side: Half side of the cube, in m.
+
     Returns:
-        Times (N,), rising, in ns, and states (N, M), in Pa.
+        Times (N,), rising, in ns, and states (amplitudes of the modes) (N, M), in Pa.
 
     Raises:
-        BagError: There is no such topic, it has another type, or there are fewer than two messages.
+        BagError: The topic is missing or has another type, has fewer than two messages with
+            different times, or holds forces and no area is given.
     """
     types = {one.msgtype for one in bag.connections if one.topic == topic}
     msgtype = types.pop() if types else None
@@ -178,7 +202,7 @@ def _read_reference(
             f"WrenchStamped, a StressTensorStamped or a SkinStress. Topics: {topics}"
         )
 
-    # Several messages of one time have no order, so the first of them is taken.
+    # The order of messages with equal times is unknown, so only the first of them is used.
     stamp_ns, first = np.unique(stamp_ns, return_index=True)
     if len(stamp_ns) < 2:
         raise BagError(
@@ -193,13 +217,14 @@ def _read_reference(
             )
         return stamp_ns, loads_from_forces(modes, values, area)
 
-    # Amplitudes of gradients are times the half side.
+    # The amplitude of a mode with a gradient is the gradient times the half side of the cube.
     values[:, len(STRESS) :] *= half_side
     state = np.zeros((len(values), modes.n_modes))
     for column, mode in zip(state.T, modes.names, strict=True):
         if mode in COMPONENTS:
             column[:] = values[:, COMPONENTS.index(mode)]
-    # Components that the reference does not observe are taken as 0, as missing modes are.
+    # Components that the reference does not measure (NaN) are taken as 0, like the modes for which
+    # it has no component.
     return stamp_ns, np.nan_to_num(state)
 
 
@@ -208,7 +233,16 @@ def _read_batches(
     topic: str,
     number: int,
 ) -> tuple[Times, Array]:
-    """Return times (N,), in ns, and components (N, 15) of a cube in SkinStress messages."""
+    """Return the stress of a cube that SkinStress messages hold.
+
+    Args:
+        bag: The bag.
+        topic: Topic of the messages.
+        number: Number of the cube in the skin.
+
+    Returns:
+        Time stamps (N,), in ns, and the 15 components (N, 15), in Pa and Pa/m.
+    """
     parts = []
     for messages, _ in bag.stress(topic):
         rows = messages.rows.select(messages.rows.cube == number)
@@ -219,13 +253,14 @@ def _read_batches(
 
 
 def _read_force(message: Any) -> list[float]:
-    """Return the force of a WrenchStamped."""
+    """Return the force x, y, z of a WrenchStamped, in N."""
     force = message.wrench.force
     return [force.x, force.y, force.z]
 
 
 def _read_components(message: Any) -> list[float]:
-    """Return the 15 components of a StressTensorStamped."""
+    """Return the 15 components of a StressTensorStamped, in Pa and Pa/m, in the order of
+    `COMPONENTS`."""
     tensor = message.tensor
     normal, shear = tensor.normal, tensor.shear
     normal_stress = [normal.x, normal.y, normal.z]
@@ -234,9 +269,14 @@ def _read_components(message: Any) -> list[float]:
 
 
 def _average_neighbours(values: Array, size: int) -> Array:
-    """Return the means of `size` neighbours each along the first axis.
+    """Return the means of groups of successive values along the first axis.
 
-    Values at the end that do not fill a group are left out.
+    Args:
+        values: Values (N, ...).
+        size: Number of values in a group. Values at the end that do not fill a group are ignored.
+
+    Returns:
+        Means (N // size, ...).
     """
     n_groups = len(values) // size
     complete = values[: n_groups * size]

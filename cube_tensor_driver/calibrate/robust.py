@@ -1,4 +1,7 @@
-"""Robust least squares: weights that suppress outliers, and the directions that data leave open.
+"""Robust least squares: weights that suppress outliers, and parameters that data do not determine.
+
+A residual is the difference of a measured and a predicted value. Residuals are divided by their
+scatter (standard deviation) before weights are computed.
 
 Source: Huber & Ronchetti, Robust Statistics, ch. 7, also for the covariance.
 """
@@ -10,49 +13,62 @@ import numpy as np
 from ..core.arrays import Array, Mask
 
 HUBER_LIMIT = 1.345
-"""Residual, in units of the scatter, above which Huber's weight falls as 1 / |r|.
+"""Residual r, in units of the residuals' standard deviation, above which Huber's weight of a
+measurement falls as 1 / |r|.
 
-The estimate is 95 % efficient for normal noise.
+With this limit the estimate has 95 % of the efficiency of least squares for normal noise.
 """
 
 TUKEY_LIMIT = 4.685
-"""Residual, in units of the scatter, from which on Tukey's weight is 0.
+"""Residual, in units of the residuals' standard deviation, from which on Tukey's weight of a
+measurement is 0, so that it counts as an outlier.
 
-The estimate is 95 % efficient for normal noise.
+With this limit the estimate has 95 % of the efficiency of least squares for normal noise.
 """
 
 MAX_STEPS = 100
-"""Maximum number of Gauss-Newton steps in one stage."""
+"""Maximum number of Gauss-Newton steps in one stage of the fit (see `STAGES`)."""
 
 STAGES = {"plain": 1e-10, "huber": 1e-3, "tukey": 1e-9}
-"""Stages of the fit in their order, each with the relative change of the parameters that ends it.
+"""Stages of the fit in their order: least squares with equal weights, with Huber's weights, and
+with Tukey's weights. A stage ends when a step changes the parameters, relatively, by at most the
+number that stands with it.
 
-Huber's stage only has to lead into the neighbourhood of the solution. It has one minimum, while
-Tukey's weights find the nearest of several.
+With Huber's weights the fit has a single minimum, with Tukey's it has several. So Huber's stage
+only has to lead near the right one.
 """
 
 DIRECTION_TOLERANCE = 1e-6
-"""Smallest singular value, relative to the largest, of a direction of the parameters that counts as
-determined."""
+"""Smallest singular value of the scaled Jacobian matrix, relative to the largest, that counts as
+not 0.
+
+The measurements do not determine the combinations of parameters that belong to smaller ones.
+"""
 
 NORMAL_MEDIAN_RATIO = 1.4826
-"""Ratio of the standard deviation to the median of |r| for normal noise."""
+"""Ratio of the standard deviation of normally distributed residuals r to the median of |r|."""
 
 
 def estimate_scatter(r: Array) -> float:
-    """Estimate the scatter (standard deviation) of residuals from the median of |r|.
+    """Estimate the scatter (standard deviation) of residuals r (R,) from the median of |r|.
 
-    The result is never 0, so that perfect data have a scale, too.
+    The median is hardly changed by outliers. The result is at least 1e-12, so that residuals can be
+    divided by it even if all of them are 0.
     """
     median = float(np.median(np.abs(r)))
     return max(NORMAL_MEDIAN_RATIO * median, 1e-12)
 
 
 def compute_weights(stage: str, r: Array) -> Array:
-    """Compute the weights, by Huber or by Tukey, of residuals in units of their scatter."""
+    """Compute the weights of measurements (R,), from 0 to 1.
+
+    Args:
+        stage: "huber" for Huber's weights, "tukey" for Tukey's.
+        r: Residuals (R,), in units of their scatter (standard deviation).
+    """
     size = np.abs(r)
     if stage == "huber":
-        # The smallest float above 0 avoids a division by 0 for a perfect fit.
+        # A tiny number avoids a division by 0 where a residual is 0.
         weights: Array = np.minimum(1, HUBER_LIMIT / np.maximum(size, 1e-300))
         return weights
     u = (r / TUKEY_LIMIT) ** 2
@@ -60,9 +76,15 @@ def compute_weights(stage: str, r: Array) -> Array:
 
 
 def least_squares(a: Array, b: Array) -> Array:
-    """Solve a x = b for a (R, C) and b (R,) in the sense of least squares.
+    """Solve the linear least squares problem |a x - b|² = min for x (C,).
 
-    Directions that a does not determine are 0.
+    Args:
+        a: Matrix (R, C).
+        b: Vector (R,).
+
+    Returns:
+        The solution; of all solutions, the one with the smallest parameters, after each is scaled
+        by the length of its column of a.
     """
     scaled, size = _scale_columns(a)
     x, *_ = np.linalg.lstsq(scaled, b, rcond=DIRECTION_TOLERANCE)
@@ -71,10 +93,15 @@ def least_squares(a: Array, b: Array) -> Array:
 
 
 def null_space(jacobian: Array) -> Array:
-    """Return a basis (parameters, H) of the changes of scaled parameters that no reading shows."""
+    """Return a basis (C, H) of the changes of the parameters that change no measured value.
+
+    Args:
+        jacobian: Derivatives (R, C) of the predicted values with respect to the parameters. Its
+            columns are scaled to length 1 first, so the changes are of scaled parameters.
+    """
     scaled, _ = _scale_columns(jacobian)
     _, s, vt = np.linalg.svd(scaled, full_matrices=True)
-    # If no parameter changes a reading, every direction belongs to the null space.
+    # If no parameter changes a predicted value, the rank is 0.
     rank = 0
     if s[0] > 0:
         rank = int(np.sum(s > DIRECTION_TOLERANCE * s[0]))
@@ -83,9 +110,14 @@ def null_space(jacobian: Array) -> Array:
 
 
 def find_undetermined(null: Array, count: int) -> Mask:
-    """Return which of the first parameters (count,) the readings do not determine.
+    """Find the parameters that the measurements do not determine.
 
-    These are the parameters that a direction of the null space changes.
+    Args:
+        null: Basis (C, H) of the changes of the parameters that change no measured value.
+        count: Number of parameters to examine, from the first on.
+
+    Returns:
+        Whether such a change changes the parameter (count,).
     """
     part = np.linalg.norm(null[:count], axis=1)
     undetermined: Mask = part > DIRECTION_TOLERANCE
@@ -97,19 +129,21 @@ def robust_covariance(
     r: Array,
     scale: float,
 ) -> Array:
-    """Compute Huber's covariance scale^2 <psi^2> / <psi'>^2 (J'J)^-1 of Tukey's estimate.
+    """Compute the covariance of parameters that were fitted with Tukey's weights.
 
-    It is corrected for the number of parameters.
+    It is Huber's formula scale^2 <psi^2> / <psi'>^2 (J'J)^-1, corrected for the number of
+    parameters. psi(r) is the residual times its weight, psi' its derivative, <> the mean.
 
     Args:
-        jacobian: Derivatives J (R, C) of the whitened predictions.
-        r: Residuals (R,) in units of the scatter.
-        scale: Scatter.
+        jacobian: Derivatives J (R, C) of the predicted values, divided by their noise, with respect
+            to the parameters.
+        r: Residuals (R,), in units of their scatter.
+        scale: Scatter (standard deviation) of the residuals, in units of the noise.
 
     Returns:
-        Covariance (C, C).
+        Covariance (C, C) of the parameters.
     """
-    # u is 1 for outliers, for which psi and its slope are then 0.
+    # Setting u to 1 for outliers makes psi and psi' 0 for them.
     is_inlier = np.abs(r) < TUKEY_LIMIT
     u = np.where(is_inlier, (r / TUKEY_LIMIT) ** 2, 1)
     psi_squared = np.mean((r * (1 - u) ** 2) ** 2)
@@ -119,16 +153,20 @@ def robust_covariance(
     factor = psi_squared / psi_slope**2 * len(r) / dof
 
     scaled, size = _scale_columns(jacobian)
-    # The tolerance holds for singular values of J, which are squared in J'J.
+    # The singular values of J'J are the squares of those of J, so the tolerance is squared, too.
     inverse = np.linalg.pinv(scaled.T @ scaled, rcond=DIRECTION_TOLERANCE**2)
     covariance: Array = scale**2 * factor * inverse / np.outer(size, size)
     return covariance
 
 
 def _scale_columns(matrix: Array) -> tuple[Array, Array]:
-    """Return a matrix with columns of length 1, and their lengths before; zero columns stay.
+    """Scale the columns of a matrix (R, C) to length 1.
 
-    Without it, the units of the parameters would decide which of them count as determined.
+    Without the scaling, the units of the parameters would decide which of them count as determined.
+
+    Returns:
+        Scaled matrix, and the lengths of the columns before (C,). A column of zeros is unchanged,
+        and its length is returned as 1.
     """
     size = np.linalg.norm(matrix, axis=0)
     size[size == 0] = 1
