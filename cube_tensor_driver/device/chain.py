@@ -391,7 +391,13 @@ class LiveLinks:
         return self._configs[link].is_simulated and not self._records[link].was_open
 
     def _report(self, link: Link, record: _LinkRecord, logger: LinkLogger) -> LinkReport:
-        """Return the report of one link, and clear its problems and past states."""
+        """Return the report of one link, and clear its problems and past states.
+
+        Args:
+            link: The link.
+            record: Data that is kept for the link.
+            logger: Logger of the link, which counts the lines that it left out.
+        """
         notes = [*record.problems, *record.account_errors]
         if link.error is not None:
             notes.insert(0, str(link.error))

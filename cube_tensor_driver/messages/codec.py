@@ -159,7 +159,11 @@ class Decoded(Generic[AnyRows]):
         return len(self.stamp_ns)
 
     def select(self, chosen: slice) -> Decoded[AnyRows]:
-        """Return the successive messages that a slice without a step selects."""
+        """Return some successive messages.
+
+        Args:
+            chosen: Numbers of the first message and of the one after the last; no step.
+        """
         n_rows = len(self.rows) // len(self)
         begin, end, _ = chosen.indices(len(self))
         rows = self.rows.select(slice(begin * n_rows, end * n_rows))

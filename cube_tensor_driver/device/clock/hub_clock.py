@@ -71,7 +71,7 @@ class HubClock:
         self._timing = SampleTiming()
         self._last_us = -1  # newest device time, in µs, in the last read
         self._moved_ns = 0  # arrival time at which _last_us changed last
-        self._n_still = 0  # number of reads since then
+        self._n_still = 0  # number of reads since _last_us changed
         self._steps_ns: deque[int] = deque(maxlen=MAX_STEPS)
         self._n_bad_answers = 0
         self._last_arrival = _NEVER
@@ -111,7 +111,11 @@ class HubClock:
 
     @property
     def bound_ns(self) -> float | None:
-        """Bound of the error of stamps that are not in doubt, in ns; None without round trips."""
+        """Largest error of stamps (host times), in ns; None without round trips.
+
+        It holds for stamps that are not in doubt. A round trip is a question for the hub's time and
+        its answer.
+        """
         return self._line.error_bound
 
     def reset(self) -> None:
@@ -314,7 +318,13 @@ class HubClock:
         return CLOCK_KEEPS_JUMPING if len(steps_ns) == MAX_STEPS else ""
 
     def _stands_still(self, arrival_ns: int) -> bool:
-        """Return whether the device time has not changed for `MIN_STILL_NS` and enough reads."""
+        """Return whether the device time has stayed the same for too long.
+
+        It has if it did not change for `MIN_STILL_NS` and in `MIN_STILL_READS` successive reads.
+
+        Args:
+            arrival_ns: Host time of the newest read, in ns.
+        """
         still_ns = arrival_ns - self._moved_ns
         return self._n_still >= MIN_STILL_READS and still_ns > MIN_STILL_NS
 

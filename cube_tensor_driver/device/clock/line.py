@@ -118,9 +118,9 @@ class ClockLine:
 
     @property
     def recent_min_height(self) -> float:
-        """Smallest height (delay), in ns, of a point in this and the previous bucket of 1 s.
+        """Smallest delay, in ns, of the samples of this and the previous bucket of 1 s.
 
-        It is 0 if there is no point.
+        It is counted from the clock line; without a sample it is 0.
         """
         height = min(self._bucket_height, self._previous_height)
         return height if math.isfinite(height) else 0.0
@@ -175,8 +175,11 @@ class ClockLine:
         return True
 
     def discard_round_trips_after(self, arrival_ns: float) -> None:
-        """Discard the round trips whose answer arrived after this host time (ns since the first
-        point)."""
+        """Discard the round trips (question for the hub's time, answer) that ended after a time.
+
+        Args:
+            arrival_ns: This host time, in ns since the first sample.
+        """
         trips = self._round_trips
         while trips and trips[-1].device_ns + trips[-1].high_ns > arrival_ns:
             trips.pop()
@@ -237,9 +240,10 @@ class ClockLine:
         return was_set
 
     def _drift_error(self) -> float:
-        """Return the largest assumed error of the estimated relative drift.
+        """Return the largest assumed error of the estimated relative drift between the clocks.
 
-        It is the jitter divided by the time that the points cover, and at most `UNKNOWN_DRIFT`.
+        It is the jitter of the delays divided by the time between the first and the last kept
+        sample, and at most `UNKNOWN_DRIFT`.
         """
         if len(self._points) < MIN_BUCKETS_FOR_DRIFT:
             return UNKNOWN_DRIFT
@@ -250,9 +254,11 @@ class ClockLine:
         return min(UNKNOWN_DRIFT, self.jitter_ns / (last - first))
 
     def _intersect_bounds(self) -> None:
-        """Compute the offset from the bounds of all kept round trips, and its largest error.
+        """Compute the offset (host minus device time) from all kept round trips, and its error.
 
-        Both are stored; without round trips the offset is infinite and the error None.
+        The offset is the centre between the highest lower and the lowest upper bound of the round
+        trips, and the largest possible error half their distance. Both are stored. Without round
+        trips, the offset is infinite (not bounded) and the error None.
         """
         self._trip_offset, self.error_bound = math.inf, None
         low, high = -math.inf, math.inf
@@ -293,8 +299,8 @@ def _slope_at_centre(points: list[tuple[float, float]]) -> float:
             (x0, y0), (x1, y1) = hull[-2:]
             turns_left = (x1 - x0) * (y - y0) > (x - x0) * (y1 - y0)
             if turns_left:
-                # The last hull point lies below the straight line from the one before to the new
-                # point, so it remains on the hull.
+                # The last point of the hull lies below the straight line between its predecessor
+                # and the new point, so it remains on the hull.
                 break
             hull.pop()
         hull.append((x, y))

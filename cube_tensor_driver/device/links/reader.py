@@ -201,8 +201,8 @@ class Reader:
 
     def _wake(self) -> None:
         """Wake up the reader's thread if it waits for data."""
-        # Without the lock, this thread could write to the pipe just after the reader's thread has
-        # closed it, when its file descriptor may already belong to another file.
+        # The reader's thread closes the pipe under the same lock. Without the lock, the byte could
+        # be written after that, to another file that has got the same file descriptor.
         with self._wake_lock:
             if self._wake_write >= 0:
                 with contextlib.suppress(BlockingIOError):
@@ -227,7 +227,11 @@ class Reader:
                 self._on_end()
 
     def _loop(self, wake_read: int) -> None:
-        """Wait for data and handle them until `close` is called."""
+        """Wait for data of the links and handle them, until `close` is called.
+
+        Args:
+            wake_read: File descriptor of the pipe by which other threads wake up this one.
+        """
         tick_at = 0.0
         while not self._stopping:
             now = time.monotonic()

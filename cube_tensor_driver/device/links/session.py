@@ -80,7 +80,8 @@ class Session:
         self._has_hello = False  # whether HELLO has come since the port was opened
         self._opened_at = self._last_sample = 0.0
         self._retry_at = self._check_port_at = self._hello_at = self._ask_time_at = 0.0
-        self._knows_time = True  # False once the hub has answered TIME by an ACK: it has no TIME
+        # Whether the hub supports the request TIME. One that does not answers it by an ACK.
+        self._knows_time = True
         self._question = 0  # number of the last request TIME
         self._ports: tuple[object, ...] = ()
 

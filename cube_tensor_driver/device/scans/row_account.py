@@ -71,7 +71,9 @@ class RowAccount:
         )
 
     def count_lost(self, error: Exception) -> int:
-        """Count all rows that have become unaccounted for since the last `check` as lost.
+        """Count all rows that have gone missing since the last `check` as lost.
+
+        Missing rows were received, but are neither delivered nor left out and do not wait.
 
         It must be called before further rows are counted as received.
 

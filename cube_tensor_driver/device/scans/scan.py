@@ -30,9 +30,9 @@ MAX_SPAN_NS = 2_000_000_000
 CACHED_SHAPES = 4
 """Number of different shapes (rows, pads) for which a buffer is kept and used again."""
 MAX_PERIODS_EARLIER = 0.75
-"""Largest time, in sample periods, by which a scan that waits for samples may be earlier than a
-sample that joins it. It is less than one period, so that a sample does not join the scan before its
-own, and well above 0, because the hubs do not sample at the same instant."""
+"""Largest time, in sample periods, by which an incomplete scan (one sample of each link) may be
+earlier than a sample that is put into it. It is less than one period, so that no sample is put into
+the scan before its own, and well above 0, because the hubs do not sample at the same instant."""
 
 # This table holds the temperature, in °C, for each of the 65536 bit patterns that a SAMPLE frame
 # may contain, so that the conversion is one look-up.

@@ -190,7 +190,11 @@ class SequenceTracker:
         return fits_before or fits_after
 
     def _restart(self, sequence: int, device_us: int) -> Arrival:
-        """Begin a new count with the first sample after a restart of the hub."""
+        """Begin a new count with the first sample after a restart of the hub.
+
+        Earlier samples since power-up count as missing, because numbers begin at 0 with power-up.
+        A number above `MAX_GAP` is too large for that, and then nothing counts as missing.
+        """
         self.counters.resets += 1
         self._seen.clear()
         arrival = self._begin(sequence, device_us, Arrival.RESET)
@@ -201,14 +205,26 @@ class SequenceTracker:
         return arrival
 
     def _begin(self, sequence: int, device_us: int, arrival: Arrival) -> Arrival:
-        """Begin a new count with this sample, and return `arrival`."""
+        """Begin a new count with this sample: it becomes the first and the newest one.
+
+        Args:
+            sequence: Number of the sample.
+            device_us: Device time of the sample, in µs.
+            arrival: Class of the sample (new or reset), which is returned.
+        """
         self._first = self._set_back = sequence
         self._next = sequence + 1
         self._newest_us = device_us
         return self._deliver(sequence, device_us, arrival)
 
     def _deliver(self, number: int, device_us: int, arrival: Arrival) -> Arrival:
-        """Count a sample as delivered and keep its number and time, and return `arrival`."""
+        """Count a sample as delivered, and keep its number and time for later comparisons.
+
+        Args:
+            number: Unwrapped number of the sample.
+            device_us: Device time of the sample, in µs.
+            arrival: Class of the sample (new, late …), which is returned.
+        """
         self.counters.delivered += 1
         self._seen.append((number, device_us))
         return arrival

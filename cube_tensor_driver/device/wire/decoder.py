@@ -166,14 +166,18 @@ class NativeDecoder:
 
     @property
     def other_version(self) -> int | None:
-        """Protocol version of the last frame with a correct checksum and another version.
+        """Protocol version of the last valid frame with another version than the driver's.
 
         It is None if there was no such frame.
         """
         return self.wire.other_version()
 
     def feed(self, data: bytes | bytearray) -> list[Frame]:
-        """Return the frames that are complete with these bytes, in order."""
+        """Return the frames that are complete with these bytes, in order. Never raises.
+
+        Args:
+            data: The next received bytes. An unfinished frame at their end is kept.
+        """
         return unpack_all(self.wire.feed(data))
 
     def reset(self) -> None:
