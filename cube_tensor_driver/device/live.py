@@ -96,7 +96,10 @@ def link_configs(
 
 
 def cube_addresses(skin: Skin) -> list[CubeAddress]:
-    """Return, for each cube of a skin in order, by which number or index it is found on a hub."""
+    """Return how each cube of a skin is found on a hub, in the order of the skin.
+
+    A cube is found by its unique number, or by its link and its index on the hub of this link.
+    """
     number_of = {link.name: number for number, link in enumerate(skin.links)}
     return [
         CubeAddress(

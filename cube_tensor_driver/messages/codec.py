@@ -47,8 +47,8 @@ _FRAME_LENGTH_AT = _NANOSECONDS_AT + 4
 _FRAME_AT = _FRAME_LENGTH_AT + 4
 
 SHAPE_AT = _FRAME_LENGTH_AT
-"""Byte offset, from the start of the serialised message, of the bytes that
-`MessageCodec.shape_bytes` returns."""
+"""Byte offset, from the start of the serialised message, of the frame id and the number of rows,
+whose bytes `MessageCodec.shape_bytes` returns."""
 
 AnyRows = TypeVar("AnyRows", FrequencyRows, StressRows)
 
@@ -125,7 +125,7 @@ class _Layout(NamedTuple):
     """Layout of all messages with the same numbers of rows and pads and length of the frame id.
 
     Attributes:
-        shape: These three lengths.
+        shape: The numbers of rows and pads and the length of the frame id.
         record: Structured dtype of numpy that describes a whole message.
         sequences: Names of the fields that are sequences, `frame_id` first.
         counts: Numbers of values that these sequences must have.
@@ -506,7 +506,8 @@ class MessageCodec(Generic[AnyRows]):
         for field in self._fields[:n_fields]:
             count_at, values = None, 1
             if field.width != PER_MESSAGE:
-                # The values follow their number without a gap, as none is wider than 4 bytes.
+                # The values follow their number (4 bytes) without a gap, because CDR aligns values
+                # to their size, and no value is larger than 4 bytes.
                 count_at = _align(end)
                 end = count_at + 4
                 width = shape.pads if field.width == PER_PAD else field.width

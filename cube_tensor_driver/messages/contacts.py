@@ -49,7 +49,7 @@ _VECTORS = {
     "normal": "Vector3",
     "force": "Vector3",
 }
-_FLOAT32 = 7  # sensor_msgs/msg/PointField.FLOAT32
+_FLOAT32 = 7  # value of the constant FLOAT32 of sensor_msgs/msg/PointField
 
 
 def contacts_message(

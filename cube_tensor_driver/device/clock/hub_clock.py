@@ -331,7 +331,7 @@ class HubClock:
     def _begin_decision(self, step_us: int, arrival_ns: int) -> None:
         """Begin to decide whether the hub's clock was set, or the hub sampled late or early.
 
-        If a decision is pending, the step is added to its step.
+        If a decision about an earlier step is pending, the two steps are decided as one.
 
         Args:
             step_us: Deviation of the device time from the sample period, in µs.
@@ -358,7 +358,7 @@ class HubClock:
         )
 
     def _decide(self, decision: StepDecision, newest_us: int, arrival_ns: int) -> None:
-        """Decide whether the hub's clock was set, if the samples so far are sufficient.
+        """Decide whether the hub's clock was set or the hub sampled late, if that is possible now.
 
         Args:
             decision: The pending decision.

@@ -93,7 +93,10 @@ class HostClockWatch:
 
 
 class SampleTiming:
-    """Finds samples of one hub whose device times deviate from number times sample period."""
+    """Finds samples whose device times are not as expected from their numbers.
+
+    The expected device time of a hub's sample grows by the estimated sample period with each number.
+    """
 
     def __init__(self) -> None:
         self.restart()

@@ -431,6 +431,6 @@ def _identify_file(path: str) -> tuple[object, ...] | None:
         status = Path(path).stat()
     except OSError:
         return None
-    # Permissions are included, because after a change of them the port may be allowed to open.
+    # Permissions are included, because a change of them may make it possible to open the port.
     permissions = status.st_mode, status.st_uid, status.st_gid
     return path, status.st_ino, status.st_rdev, permissions

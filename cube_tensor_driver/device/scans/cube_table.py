@@ -319,7 +319,7 @@ def _join_names(what: str, names: Sequence[str], text: str) -> str:
     Args:
         what: Noun of the cubes, in the singular.
         names: Names of the cubes.
-        text: What is the same for all of these cubes.
+        text: Statement about all of these cubes, such as "not in the skin file: add it there".
     """
     plural = "s" if len(names) > 1 else ""
     listed = ", ".join(names[:MAX_NAMES])

@@ -259,12 +259,12 @@ class ScanBuilder:
         return parts
 
     def _holds_late_sample(self, missing: set[int]) -> bool:
-        """Return whether the only pending scan holds a sample that came too late for the last one.
+        """Return whether the pending scan holds a sample that came after its own scan was built.
 
-        Such a sample belongs to the scan that was built last. If it waited for the next samples of
-        the other links, its link would stay one sample behind from then on. A sample counts as late
-        if the newest built sample of every missing link is nearer to it in time than the last
-        sample of its own link.
+        If such a late sample waited for the next samples of the other links, its link would stay
+        one sample behind from then on. A sample counts as late if, for every missing link, the
+        newest built sample of this link is nearer to it in time than the newest built sample of its
+        own link.
 
         Args:
             missing: Links that deliver but have no sample in the pending scan.

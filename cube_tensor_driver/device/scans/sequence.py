@@ -10,8 +10,9 @@ from enum import Enum
 from ..wire.protocol import Sample, Stats
 
 MAX_DISORDER = 64
-"""Number of the newest samples of a hub whose numbers are kept in memory. A sample whose number is
-further behind than this is taken for the first one after a restart of the hub."""
+"""Number of the newest samples of a hub whose numbers are kept, to recognise late and duplicate
+ones. A sample whose number is smaller than that of the newest one by more than this is taken for
+the first one after a restart of the hub."""
 MAX_GAP = 1 << 20
 """Largest gap in the numbers of successive samples (17 minutes at 1 kHz) that is counted as lost
 samples. A larger gap is taken for a restart of the hub."""

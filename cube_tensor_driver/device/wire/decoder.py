@@ -60,7 +60,8 @@ class PythonDecoder:
     """Decodes the bytes of one link; keeps at most `MAX_RUN` bytes between two calls.
 
     Attributes:
-        counters: Numbers of bytes, frames and invalid runs since the decoder was made.
+        counters: Numbers of bytes, frames and invalid runs (bytes between two zeros) since the
+            decoder was made.
         other_version: Protocol version of the last frame with a correct checksum and another
             version than `VERSION`; None if there was no such frame.
     """

@@ -289,7 +289,7 @@ _Fixed = TypeVar("_Fixed", bound="_FixedFrame")
 
 
 class _FixedFrame:
-    """Base of frames whose payload is a fixed sequence of numbers: their fields, in order."""
+    """Base class of frames whose payload is a fixed sequence of numbers: the fields, in order."""
 
     __slots__ = ()
     _PAYLOAD: ClassVar[struct.Struct]
