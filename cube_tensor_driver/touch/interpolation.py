@@ -1,9 +1,11 @@
 """Hermite interpolation between cubes by radial basis functions.
 
-Every cube has a patch of points, whose values come from its nearest neighbours. The interpolant
-matches the value of every cube and, along the cube's own x and y where it observes them, the
-derivatives (gradient-enhanced interpolation; in statistics, co-kriging with derivatives). With a
-length c and the quantity p at the positions a and b::
+Every cube has a patch, a grid of points around it. The quantity p (for example the pressure) at
+these points is interpolated from the cube and its nearest neighbours. The interpolant has the
+measured value at every cube and also, where the cube observes them, the measured derivatives along
+the cube's x and y axes (gradient-enhanced interpolation; in statistics, co-kriging with
+derivatives). With the length c of the basis function φ, the distance r of two positions a and b,
+and directions u and v of derivatives::
 
     φ(r) = (1 + r²/c²)^(−5/2)
     cov(p(a), p(b)) = φ,   cov(p(a), ∂_v p(b)) = ∂φ/∂b·v,   cov(∂_u p(a), ∂_v p(b)) = u·∂²φ/∂a∂b·v
@@ -22,11 +24,13 @@ from ..core.arrays import Array, Index, Mask
 from ..core.poses import CubePoses
 
 NEIGHBOURS = 9
-"""Number of nearest cubes, including the own one, that determine the points of a patch."""
+"""Number of cubes from which the points of a patch are interpolated: the cube in the centre of the
+patch and those nearest to it."""
 
 RIDGE = 1e-6
-"""Variance that is added to φ(0) = 1, so that the equations of close cubes stay solvable. A
-thousandth of a value then counts as noise."""
+"""Variance added to the diagonal of the covariance matrix of the values, whose entries there are
+φ(0) = 1. It keeps the equations solvable if two cubes are close to each other, and is equal to
+noise with a standard deviation of a thousandth of the values'."""
 
 
 class Interpolation:
@@ -52,15 +56,15 @@ class Interpolation:
         self._weights: dict[tuple[int, ...], _Weights] = {}
 
     def values(self, values: Array, columns: list[int]) -> Array:
-        """Interpolate one quantity.
+        """Interpolate one quantity to the M points of all patches.
 
         Args:
-            values: Values (cubes, C), NaN where unknown.
-            columns: Column of the quantity, followed by those of its derivatives along the cubes' x
-                and y, if they are to be used.
+            values: Values and derivatives (cubes, C), NaN where unknown.
+            columns: Column of the quantity in `values`. To use its derivatives along the cubes' x
+                and y axes, their two columns follow.
 
         Returns:
-            Values (M,) on all points; NaN on patches of which no neighbour has a value.
+            Values (M,) on all points; NaN on patches for which no neighbouring cube has a value.
         """
         n_cubes, n_points, _ = self._patches.shape
         known = np.isfinite(values)
@@ -77,7 +81,7 @@ class Interpolation:
         return result
 
     def uncertainty(self, values: Array, columns: list[int]) -> Array:
-        """Compute the uncertainty of `values`, with the same arguments.
+        """Compute the uncertainty of the result of `values`, with the same arguments.
 
         Returns:
             Standard deviation (M,) of each interpolated value divided by the standard deviation of
@@ -86,16 +90,20 @@ class Interpolation:
         return self._solve_weights(np.isfinite(values), columns).uncertainty.ravel()
 
     def _solve_weights(self, known: Mask, columns: list[int]) -> _Weights:
-        """Return the weights for these columns.
+        """Return the interpolation weights for some columns of the values.
 
-        They depend only on which values are known; patches are solved again only where that
-        changed.
+        The weights depend only on which values are known. They are computed again only for patches
+        with a neighbouring cube of which other values are known than in the previous call.
+
+        Args:
+            known: Whether each value and derivative (cubes, C) is known.
+            columns: Columns as in `values`.
         """
         wanted = known[:, columns]
         key = tuple(columns)
         if key not in self._weights:
             n_points = self._patches.shape[1]
-            # `known` of new weights differs everywhere, so that all patches are solved below.
+            # New weights start with the opposite of `wanted`, so that all patches are solved below.
             self._weights[key] = _Weights(self._near, n_points, ~wanted)
 
         weights = self._weights[key]
@@ -112,10 +120,12 @@ class Interpolation:
 
         Args:
             chosen: Indices (patches,) of the patches.
-            known: Which values and derivatives are known (cubes, width).
+            known: Whether the value, and each derivative in use, is known (cubes, width). The width
+                is 1 without derivatives and 3 with both.
 
         Returns:
-            Weights (patches, points, neighbours x width), relative uncertainty (patches, points).
+            Weights (patches, points, neighbours x width) of the neighbours' values, and the
+            uncertainty (patches, points) as from `uncertainty`.
         """
         near = self._near[chosen]
         n, n_near = near.shape
@@ -136,7 +146,7 @@ class Interpolation:
             axes[:, None],
         )
         matrix = np.moveaxis(matrix, 3, 2).reshape(n, size, size)
-        # Unknown values become independent of all others and get the weight 0.
+        # Unknown values have no covariance with others, so that they get the weight 0.
         matrix *= is_known[:, :, None] & is_known[:, None]
         diagonal = np.arange(size)
         matrix[:, diagonal, diagonal] += np.where(is_known, RIDGE, 1.0)
@@ -157,13 +167,14 @@ class Interpolation:
 
 
 class _Weights:
-    """Sparse matrix from cubes to points, whose entries can be replaced patch by patch.
+    """Interpolation weights as a sparse matrix, whose entries can be replaced patch by patch.
 
     Attributes:
-        matrix: Matrix (M, cubes x width).
-        data: Its entries (cubes, points, neighbours x width), a view.
-        known: Which values and derivatives (cubes, width) it was solved for.
-        uncertainty: Relative uncertainty (cubes, points).
+        matrix: Matrix (M, cubes x width) from the value and derivatives of all cubes to all points.
+        data: View (cubes, points, neighbours x width) of the entries of `matrix`.
+        known: Whether each value and derivative (cubes, width) was known when the weights were
+            computed.
+        uncertainty: Uncertainty (cubes, points) as from `Interpolation.uncertainty`.
         empty: Whether no neighbour of a cube (cubes,) has a value.
     """
 
@@ -173,7 +184,13 @@ class _Weights:
         points: int,
         known: Mask,
     ) -> None:
-        """Create a matrix of zeros for neighbours (cubes, neighbours) and `points` per patch."""
+        """Create a matrix of zeros.
+
+        Args:
+            near: Indices (cubes, neighbours) of the cubes from which each patch is interpolated.
+            points: Number of points of a patch.
+            known: Initial value (cubes, width) of the attribute `known`.
+        """
         n, width = known.shape
         columns = near[:, :, None] * width + np.arange(width)
         columns = columns.reshape(n, -1)
@@ -185,7 +202,7 @@ class _Weights:
         self.uncertainty = np.zeros((n, points))
         self.data = np.zeros((n, points, per_row))
         indices = np.repeat(columns, points, axis=0).ravel()
-        # CSR format: every row has the same number of entries.
+        # Row starts of the CSR format (compressed sparse rows); all rows have equally many entries.
         starts = np.arange(rows + 1) * per_row
         self.matrix = csr_matrix(
             (
@@ -199,10 +216,14 @@ class _Weights:
 
 
 def _nearest_cubes(poses: CubePoses) -> Index:
-    """Return the nearest cubes (cubes, neighbours); of cubes at equal distances, the first ones."""
+    """Return the indices (cubes, neighbours) of the cubes nearest to each cube, itself included.
+
+    Of several cubes at the same distance, those with the lower indices are chosen.
+    """
     n = len(poses.position)
     count = min(NEIGHBOURS, n)
-    # More than wanted: the tree may drop any of several cubes at the same distance.
+    # More cubes than needed are requested, because of several cubes at the same distance the tree
+    # returns arbitrary ones.
     candidates = min(3 * count, n)
     distance, near = cKDTree(poses.position).query(poses.position, candidates)
     distance = distance.reshape(n, -1)
@@ -219,15 +240,16 @@ def _covariance(
     u: Array,
     v: Array,
 ) -> Array:
-    """Compute the covariances of value and derivatives at two positions.
+    """Compute the covariances of a quantity and its derivatives at two positions (file head).
 
     Args:
-        d: First position minus the second (..., 3), divided by c.
+        d: First position minus the second (..., 3), divided by the length c.
         u: Directions (..., A, 3) of the derivatives at the first position.
         v: Directions (..., B, 3) of the derivatives at the second position.
 
     Returns:
-        Covariances (..., 1 + A, 1 + B).
+        Covariances (..., 1 + A, 1 + B). Rows: value and A derivatives at the first position;
+        columns: value and B derivatives at the second one. Derivatives are by position / c.
     """
     # φ = b^(-5/2) and its first two derivatives by b
     b = 1 + np.einsum("...i,...i->...", d, d)

@@ -1,20 +1,25 @@
-"""Measurement model of cubes in a layer, from the influence functions of their pads.
+"""Measurement model of cubes in an elastic layer, from the influence functions of their pads.
 
-A cube is not rotationally symmetric, but the influence functions of its pads are sums of circular
-components (circular.py). With the direction phi from the force to the cube, each pad stress is::
+The influence function of a pad (one of a cube's sensing elements) is the stress that it measures
+under a force of 1 N on the surface, as a function of the force's position. A cube is not
+rotationally symmetric, but its influence functions are sums of circular components (circular.py).
+With the distance r and direction phi from the force to the cube, and the force's components F_r
+along this direction, F_t across it and F_z along the normal, each pad stress v is::
 
     v = sum_m Re(w c),   c = exp(i m phi) (R(r) F_r + Z(r) F_z + i T(r) F_t)
 
 A Fourier series over phi gives the functions R, Z and T of every pad and order m. The functions of
-all pads are combinations of a few components of each order, found by singular value decomposition.
-The spectra of these components (spectra.py) are Hankel transforms::
+all pads are combinations, with complex weights w, of a few circular components of each order, found
+by singular value decomposition. The spectra of these components as functions of the wave number k
+(spectra.py) are Hankel transforms::
 
     P = 2 pi int (R + T) J_{m-1}(kr) r dr,   M = 2 pi int (R - T) J_{m+1}(kr) r dr,
     N = 2 pi int Z J_m(kr) r dr
 
 In contrast to cubes that are modelled as points, no Taylor series of the stress is involved, and
-the pads respond to the stiffness of the cube, the surface and the ground. The components of a cube
-follow from its pads by its calibration (estimator.py).
+the pads' stresses include the effects of the cube's stiffness, of the surface and of the ground.
+The measured components of a cube (stresses and their gradients) follow from its pads by its
+calibration (estimator.py).
 """
 
 from __future__ import annotations
@@ -32,34 +37,40 @@ from ..mechanics.kernels import MeasurementModel
 from ..mechanics.spectra import BesselTable, Spectra, tabulate_bessel, wavenumber_quadrature
 
 N_DIRECTIONS = 32
-"""Number of directions from force to cube, from which the Fourier series is computed."""
+"""Number of equally spaced directions from the force to the cube at which the influence functions
+are evaluated for their Fourier series."""
 
 N_ORDERS = 9
-"""Number of orders of the series, 0 to 8. The field of a point force has orders up to 4 at a point;
-the four-fold symmetry of a cube adds up to 4."""
+"""Number of orders m of the Fourier series over the direction, 0 to 8. The stress and its gradients
+at a point under a point force have orders up to 4; the four-fold symmetry of a cube adds up to
+4."""
 
 MIN_SINGULAR_VALUE = 1e-3
-"""Smallest singular value of a component that is kept, divided by the largest one."""
+"""Threshold of the singular values of the influence functions, divided by the largest one. Circular
+components with smaller singular values are left out."""
 
 _N_DISTANCES = 400
-"""Number of Gauss points in r. They resolve the oscillations of the Bessel functions over the half
-width of the body."""
+"""Number of Gauss points in r, the distance between force and cube. They resolve the oscillations
+of the Bessel functions up to the largest distance (half the width of the finite element body)."""
 
 _LENGTH_TOLERANCE = 1e-6
-"""Relative difference below which lengths and pad positions count as equal."""
+"""Difference below which two sides of cubes (relative difference) or two pad positions, normals or
+sizes (in units of half a side) count as equal."""
 
 
 def model_pads(influence: Influence, calibrations: Sequence[Calibration]) -> MeasurementModel:
-    """Build the measurement model of cubes with these calibrations.
+    """Build the measurement model of the cubes of a skin.
 
     Args:
-        influence: Influence functions of the pads of one cube in its layer.
+        influence: Influence functions of the pads of one cube in its layer: stress of each pad
+            under a force of 1 N, as a function of the force's position.
         calibrations: Calibration of each cube.
 
     Raises:
-        ElasticError: The influence functions belong to a cube of another size, or lack a pad.
+        ElasticError: The influence functions belong to a cube of another size, or there is none
+            for a pad of a calibration.
     """
-    # Cubes with the same file share one calibration object.
+    # Cubes with the same calibration file share one object, so identity finds the distinct ones.
     variants = list({id(one): one for one in calibrations}.values())
     variant_numbers = {id(one): number for number, one in enumerate(variants)}
     spectra, all_pads = _decompose(influence)
@@ -87,7 +98,11 @@ def model_pads(influence: Influence, calibrations: Sequence[Calibration]) -> Mea
 
 
 def _match_pads(influence: Influence, calibration: Calibration) -> list[int]:
-    """Return the index of the influence function of each pad of a calibration."""
+    """Return, for each pad of a calibration, the index of the influence function of this pad.
+
+    Raises:
+        ElasticError: The size of the cube differs, or a pad has no influence function.
+    """
     layout = calibration.layout
     given = influence.layout
     side = 2 * calibration.half_side
@@ -122,15 +137,15 @@ def _decompose(influence: Influence) -> tuple[Spectra, Array]:
     """Decompose the influence functions into n circular components.
 
     Returns:
-        Spectra of the components, and the matrix (2 n, P) from their real and imaginary parts to
-        the pad stresses.
+        Spectra (Hankel transforms) of the components, and the matrix (2 n, P) from the real parts
+        and then the imaginary parts of the components to the stresses of P pads.
     """
     nodes, weights = np.polynomial.legendre.leggauss(_N_DISTANCES)
     half_reach = influence.reach / 2
     r = (nodes + 1) * half_reach
     weight = weights * half_reach
 
-    # With sqrt(r dr) as weight, the singular values measure the norm in the plane.
+    # With sqrt(r dr) as weight, the singular values are norms of functions over the whole plane.
     root = np.sqrt(r * weight)
     decompositions = [
         np.linalg.svd(
@@ -175,7 +190,17 @@ def _hankel_transforms(
     bessel: BesselTable,
     weight: Array,
 ) -> tuple[Array, Array, Array]:
-    """Return the spectra P, M and N (waves, n) of functions R, Z and T (n, 3, distances)."""
+    """Compute the spectra of n circular components of one order m.
+
+    Args:
+        functions: Radial functions R, Z and T (n, 3, distances), see the head of this file.
+        order: Order m.
+        bessel: Function that returns the Bessel function J_m(k r) (distances, waves) of an order.
+        weight: Quadrature weights r dr (distances,) in m^2.
+
+    Returns:
+        Hankel transforms P, M and N (waves, n) at the wave numbers of `bessel`.
+    """
     along, normal, across = np.moveaxis(functions, 1, 0)
 
     def transform(function: Array, shift: int) -> Array:
@@ -188,7 +213,16 @@ def _hankel_transforms(
 
 
 def _fourier_series(influence: Influence, r: Array) -> list[Array]:
-    """Return R, Z and T (2 P, 3, distances) of every pad for each order, real parts of w first."""
+    """Compute the Fourier series of the influence functions over the direction.
+
+    Args:
+        influence: Influence functions of P pads.
+        r: Distances (distances,) between force and cube, in m.
+
+    Returns:
+        For each order m, the functions R, Z and T (2 P, 3, distances): of all pads for the real
+        part of the weight w, then of all pads for its imaginary part.
+    """
     angle = 2 * np.pi * np.arange(N_DIRECTIONS) / N_DIRECTIONS
     cosine = np.cos(angle)
     sine = np.sin(angle)

@@ -1,12 +1,13 @@
-"""Noise of the components of a cube, caused by the noise of its pads and errors of their gains.
+"""Noise of the components (stresses and their gradients) that a cube measures.
 
-B is the matrix from the noise of the pads, in units of its standard deviation, to the components.
-The error of a gain counts in proportion to the stress u on the pad, also in these units. The
-covariance of the components is then::
+It has two causes: the noise of the cube's pads (sensing elements) and the errors of their gains. B
+is the matrix from the pads' noise, in units of its standard deviation, to the components. A gain
+error causes an error in proportion to the stress u on the pad, which is given in the same units.
+The covariance N of the components is then::
 
     N = B diag(1 + GAIN_ERROR^2 u^2) B',     u = B' (B B')^-1 y
 
-u are the smallest pad stresses that explain the components y.
+The pads' stresses u are those with the smallest norm that explain the components y.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from ..core.modes import COMPONENTS
 from ..core.pipeline import Pipeline
 
 GAIN_ERROR = 0.01
-"""Relative standard deviation of the gain of a pad from its calibrated value."""
+"""Relative standard deviation of a pad's true gain (sensitivity) from its calibrated value."""
 
 
 def noise_by_pad(
@@ -29,12 +30,12 @@ def noise_by_pad(
     cubes: Index,
     left_out: PadMasks,
 ) -> Array:
-    """Return the noise matrices B of n cubes.
+    """Return the noise matrices B (from the noise of P pads to 15 components) of n cubes.
 
     Args:
         pipeline: Pipeline that computes the components of all cubes of the skin.
         cubes: Indices (n,) of the cubes.
-        left_out: Bits (n,) of the pads that are left out.
+        left_out: Bit masks (n,), in which bit k is set if pad k of the cube is not used.
 
     Returns:
         Change (n, 15, P) of each component, in Pa or Pa/m, for one standard deviation of the noise
@@ -48,7 +49,7 @@ def noise_by_pad(
             pipeline.n_pads,
         )
     )
-    # Cubes may have different numbers of pads; the places beyond them stay 0.
+    # Cubes may have different numbers of pads; the columns of pads that a cube lacks stay 0.
     cube_masks = zip(cubes.tolist(), left_out.tolist(), strict=True)
     for row, (cube, mask) in enumerate(cube_masks):
         own = pipeline.matrix(cube, mask) * pipeline.calibrations[cube].noise
@@ -57,7 +58,10 @@ def noise_by_pad(
 
 
 def noise_of_all_pads(calibrations: Sequence[Calibration]) -> Array:
-    """Return the noise matrices (cubes, 15, P) as `noise_by_pad`, for cubes that use all pads."""
+    """Return the noise matrices (cubes, 15, P) as `noise_by_pad`, one for each calibration.
+
+    All pads of every cube are used.
+    """
     n = len(calibrations)
     no_pads = np.zeros(n, np.uint32)
     return noise_by_pad(Pipeline(calibrations), np.arange(n), no_pads)
@@ -68,20 +72,21 @@ def pad_stresses(
     known: Mask,
     values: Array,
 ) -> Array:
-    """Estimate the stresses u of the pads from the components of n cubes.
+    """Estimate the stresses u of P pads from C components, for each of n cubes.
 
     Args:
-        by_pad: Noise matrices B (n, C, P).
-        known: Whether each component (n, C) is known.
+        by_pad: Noise matrices B (n, C, P): change of each component for one standard deviation of
+            the noise of each pad.
+        known: Whether each component (n, C) is known; the others are ignored.
         values: Components (n, C), in the units of `by_pad`.
 
     Returns:
-        Stresses u (n, P), in units of the noise of each pad.
+        Stresses u (n, P), each divided by the standard deviation of the noise of its pad.
     """
     by_pad = np.where(known[:, :, None], by_pad, 0.0)
     transposed = by_pad.swapaxes(1, 2)
 
-    # Unknown components get a 1 on the diagonal, so that B B' stays regular.
+    # An unknown component has a row of zeros in B. A 1 on the diagonal keeps B B' invertible.
     unknown = np.eye(known.shape[1]) * ~known[:, None, :]
     right = np.where(known, values, 0.0)[..., None]
     weights = np.linalg.solve(by_pad @ transposed + unknown, right)

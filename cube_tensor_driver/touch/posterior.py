@@ -1,17 +1,20 @@
 """Posterior of the traction on the surface, from windows of neighbouring cubes.
 
-With the Gaussian prior of prior.py and the noise covariance N, the measured values y give the
-posterior of the traction t::
+K are prior covariances (prior.py) of the traction t (force per area on the surface) and of the
+values y that the cubes measure; N is the covariance of the values' noise. The posterior of the
+traction has the mean t and the covariance::
 
     t = G y,   G = K_ty P,   P = (K_yy + N)^-1,   covariance K_tt - G K_yt
 
-The patch of each cube takes its traction from the window of the nearest cubes. The matrices of a
-window are computed once, so that a scan costs one product. Windows of the same kind (same relative
-poses and noise) share their matrices.
+The traction on the patch of surface points around a cube is computed from its window, the cubes
+nearest to it. The matrices of a window are computed once, so that every scan (set of values of all
+cubes) needs only one product. Windows of the same kind (same relative poses and noise) share their
+matrices.
 
-The amplitude of the prior adapts to the data. All prior variances are those of `AMPLITUDE` times a
-scale s^2. Noise and gain errors of the pads have the covariance M (pad_noise.py) and add diag(G M
-G')::
+The standard deviation of the prior adapts to the data: all prior variances are those with the
+pressure `AMPLITUDE`, multiplied by a scale s^2. The noise and the gain errors of the pads cause the
+covariance M of the values (pad_noise.py), which adds diag(G M G') to the variances of the traction.
+With n values, the scale is::
 
     s^2 = (y' P y - tr P M) / n
 
@@ -36,33 +39,37 @@ from .surface import square_points
 from .unrolled_skin import unroll
 
 WINDOW_CUBES = 25
-"""Number of cubes of a window, 5 x 5 on a square grid."""
+"""Number of cubes in a window (nearest cubes from which the traction around a cube is computed):
+5 x 5 on a square grid."""
 
 INNER_CUBES = 13
-"""Number of cubes at the centre of a window that determine the scale of the prior and predict
-missing values of the centre. The precision matrices P of all 25 cubes would take most of the
-memory."""
+"""Number of inner cubes, those nearest to the centre of a window. From them, the scale of the prior
+and missing values of the centre cube are computed. With all 25 cubes of a window, the precision
+matrices P (inverse covariances of the values) would take most of the memory."""
 
 MODEL_ERROR = 0.01
-"""Standard deviation of a component divided by its prior standard deviation, for what response,
-depth and the noise of the load leave uncertain."""
+"""Standard deviation of the error of the measurement model (calibration, depth) in one component,
+divided by the prior standard deviation of this component."""
 
 ROWS_PER_POINT = 4
-"""Number of results per point: the traction along x, y, z, and the pressure at the cubes' depth."""
+"""Number of results per surface point: the traction along x, y and z, and the pressure below the
+point at the depth of the cubes' centres."""
 
 _POSE_TOLERANCE = 1e-5
-"""Difference of positions (m), and of sines and cosines of rotations, below which the poses of
-cubes in their windows count as equal."""
+"""Rounding step of the poses of cubes in their windows: in m for positions, without a unit for the
+sines and cosines of angles. Windows with equal rounded poses share their matrices."""
 
 
 class ObservationModel(NamedTuple):
-    """Which components n cubes observe, and how noisy.
+    """Components (stresses and gradients) that n cubes observe, and their noise.
 
     Attributes:
         columns: Indices (C,) in `COMPONENTS` of the components that some cube of the skin observes.
-        known: Whether each cube observes them (n, C).
-        by_pad: Noise matrices (n, C, P) as from `noise_by_pad`, all in Pa.
-        variant: Variants (n,) of the cubes in the measurement model.
+        known: Whether each cube observes each of these components (n, C).
+        by_pad: Noise matrices (n, C, P) as from `noise_by_pad`: change of each component, in Pa,
+            for one standard deviation of the noise of each pad. Gradients are multiplied by half
+            the side of a cube, so that they are in Pa, too.
+        variant: Index (n,) of each cube's calibration in the measurement model.
     """
 
     columns: Index
@@ -71,26 +78,35 @@ class ObservationModel(NamedTuple):
     variant: Index
 
     def select(self, cubes: Index) -> ObservationModel:
-        """Return the model of some cubes; the shape of their indices becomes the leading axes."""
+        """Return the model of the cubes with these indices (...).
+
+        The leading axis n of every array is replaced by the axes of the indices.
+        """
         return ObservationModel(
             self.columns, self.known[cubes], self.by_pad[cubes], self.variant[cubes]
         )
 
 
 class WindowPosteriors:
-    """Matrices of the windows of all cubes; each kind of window is stored once.
+    """Matrices of the windows of all cubes, for the formulas at the head of this file.
+
+    The window of a cube is the cube and its nearest neighbours, W cubes in total. Windows of the
+    same kind (same relative poses and noise) share their matrices.
 
     Attributes:
-        near: Indices (cubes, W) of the cubes of each window: its own cube, then the inner ones.
-        inner: Number of inner cubes.
-        kind: Index (cubes,) of the matrices of each window.
-        gain: Matrix G (kinds, rows, W C), single precision.
-        precision: Matrix P (kinds, inner C, inner C) of the inner cubes.
-        prior: Posterior variance (kinds, points x 2) of the pressure on the surface and at the
-            cubes' depth, at the scale s = 1 and without pad noise.
-        by_pad: Derivative (kinds, points x 2, W P) of these variances by the variance of each pad.
-        trace: Derivative (kinds, inner P) of tr P M by the variance of each pad.
-        pads: Noise matrices (cubes, C, P) of all cubes, 0 where nothing is observed.
+        near: Indices (cubes, W) of the cubes of each window, sorted by their distance from its
+            centre cube, which comes first.
+        inner: Number of inner cubes: the first ones of each window.
+        kind: Index (cubes,) of the kind of each window.
+        gain: Matrix G (kinds, rows, W C) from values to traction, in single precision.
+        precision: Matrix P (kinds, inner C, inner C), the inverse covariance of the values of the
+            inner cubes.
+        prior: Posterior variance (kinds, points x 2) in Pa^2 of the pressure on the surface and at
+            the cubes' depth, at the scale s = 1 and without pad noise.
+        by_pad: Variance (kinds, points x 2, W P) in Pa^2 of these pressures that the noise of each
+            pad causes.
+        trace: Contribution (kinds, inner P) of the noise of each pad to tr P M.
+        pads: Noise matrices (cubes, C, P) of all cubes in Pa, 0 where nothing is observed.
     """
 
     def __init__(
@@ -101,12 +117,12 @@ class WindowPosteriors:
         spacing: float,
         side: int,
     ) -> None:
-        """Compute the matrices or load them from the cache.
+        """Compute the matrices, or load them from the cache on disk.
 
         Args:
-            kernels: Kernels of the layer.
+            kernels: Covariances between components and traction in the elastic layer.
             poses: Poses of the cubes.
-            model: What the cubes observe.
+            model: Components that the cubes observe, and their noise.
             spacing: Distance of the points on the patch of a cube, in m.
             side: Number of points along a side of the patch.
         """
@@ -131,9 +147,10 @@ class WindowPosteriors:
         points = square_points(spacing, side)
 
         def solve_kinds() -> Arrays:
-            """Solve all kinds of windows."""
+            """Compute the matrices of all kinds of windows, with an axis of kinds in front."""
             solved: dict[str, AnyArray] = {}
-            # Each kind is written into its place in the result: copies would double the memory.
+            # The matrices of a kind are copied into the result as soon as they are computed,
+            # because a list of all of them would double the memory.
             for number, one in enumerate(first):
                 own = model.select(self.near[one])
                 window = _solve_window(kernels, own, place[one], angle[one], points)
@@ -151,7 +168,7 @@ class WindowPosteriors:
         self.by_pad = solved["by_pad"]
         self.trace = solved["trace"]
 
-        # Kinds with one window are multiplied together, the others one kind at a time.
+        # Kinds with one window each are multiplied in one batch, the others one kind at a time.
         self._rows = [(kind, np.flatnonzero(self.kind == kind)) for kind in kinds]
         self._shared_kinds = [(kind, rows) for kind, rows in self._rows if len(rows) > 1]
         counts = np.bincount(self.kind)
@@ -164,10 +181,10 @@ class WindowPosteriors:
         place: Array,
         angle: Array,
     ) -> Index:
-        """Find windows that are alike in the relative poses and the noise of their cubes.
+        """Number the kinds of windows: same relative poses, noise and calibrations of the cubes.
 
         Args:
-            model: What all cubes observe.
+            model: Components that all cubes observe, and their noise.
             place: Positions (cubes, W, 2) of the cubes of each window, in m.
             angle: Rotations (cubes, W) of these cubes, in rad.
 
@@ -175,7 +192,8 @@ class WindowPosteriors:
             Number (cubes,) of the kind of each window.
         """
         n = len(place)
-        # -1, because components that are not observed differ from those without noise.
+        # Noise is NaN for components that are not observed. They become -1 instead of 0, because
+        # they differ from components without noise.
         noise = np.nan_to_num(model.by_pad, nan=-1.0)
         noise_kind = _number_distinct(noise.reshape(n, -1))
         poses = np.concatenate(
@@ -201,9 +219,10 @@ class WindowPosteriors:
             y: Values (cubes, C) in Pa, 0 where unknown.
 
         Returns:
-            Posterior mean (cubes, rows) in Pa; `ROWS_PER_POINT` rows for each point.
+            Posterior mean (cubes, rows) in Pa. There are `ROWS_PER_POINT` rows for each point of
+            the patch of a cube.
         """
-        # The values of each window in one row, as the columns of G expect them.
+        # All values of a window form one row, in the order of the columns of G.
         gathered = y[self.near].reshape(len(self.near), -1)
         n_rows = self.gain.shape[1]
         result = np.empty((len(self.near), n_rows), np.float32)
@@ -220,12 +239,16 @@ class WindowPosteriors:
         pad_variance: Single,
         known: Mask,
     ) -> Array:
-        """Compute the scale s^2 (cubes,) of the prior in each window; 1 where nothing is known.
+        """Compute the factor s^2 of the prior variances in each window from its inner cubes.
 
         Args:
-            y: Values (cubes, C).
-            pad_variance: Variance (cubes, P) of each pad divided by that of its noise.
+            y: Values (cubes, C) in Pa.
+            pad_variance: Variance (cubes, P) of the error of each pad, divided by the variance of
+                its noise.
             known: Whether each value is known (cubes, C).
+
+        Returns:
+            Factors s^2 (cubes,); 1 in windows without a known value.
         """
         inner = self.near[:, : self.inner]
         n = len(inner)
@@ -246,10 +269,15 @@ class WindowPosteriors:
         )
 
     def noise(self, pad_variance: Single) -> Array:
-        """Compute the variances (cubes, points x 2) of both pressures that the pad noise causes.
+        """Compute the variances of the pressures that the errors of the pads cause.
 
         Args:
-            pad_variance: Variance (cubes, P) of each pad divided by that of its noise.
+            pad_variance: Variance (cubes, P) of the error of each pad, divided by the variance of
+                its noise.
+
+        Returns:
+            Variances (cubes, points x 2) in Pa^2 of the pressure on the surface and of the pressure
+            at the cubes' depth.
         """
         gathered = pad_variance[self.near].reshape(len(self.near), -1)
         noise = np.empty((len(gathered), self.by_pad.shape[1]))
@@ -278,8 +306,8 @@ def _solve_window(
     """Compute the matrices of one window.
 
     Args:
-        kernels: Kernels of the layer.
-        model: What the W cubes of the window observe.
+        kernels: Covariances between components and traction in the elastic layer.
+        model: Components that the W cubes of the window observe, and their noise.
         place: Positions (W, 2) of the cubes in m.
         angle: Rotations (W,) of the cubes in rad.
         points: Positions (points, 2) on the patch of the centre cube, in m.
@@ -308,7 +336,7 @@ def _solve_window(
     gain = np.zeros((len(cross), n * width), np.float32)
     gain[:, known] = known_gain
 
-    # diag(G M G') is a sum over the pads of (G B)^2.
+    # With the noise matrix B of the pads, diag(G M G') is a sum of (G B)^2 over the pads.
     by_point = gain.reshape(-1, ROWS_PER_POINT, n, width)
     rows = by_point[:, 2:].reshape(-1, n, width)  # on the surface and at depth
     by_pad = np.einsum("rwc,wcp->rwp", rows, pads, optimize=True) ** 2
@@ -317,7 +345,8 @@ def _solve_window(
     size = inner * width
     precision = _invert_known(total[:size, :size], known[:size])
     cubes = np.arange(inner)
-    # M is block diagonal, so tr P M needs only the diagonal blocks of P.
+    # The noise covariance M has no entries between different cubes, so the trace of P M depends
+    # only on the diagonal blocks of P.
     diagonal = precision.reshape(inner, width, inner, width)[cubes, :, cubes]
     inner_pads = pads[:inner]
     trace = np.einsum("wcp,wcd,wdp->wp", inner_pads, diagonal, inner_pads, optimize=True)
@@ -337,7 +366,18 @@ def _cross_covariance(
     angle: Array,
     points: Array,
 ) -> Array:
-    """Return the prior covariance K_ty (points x ROWS_PER_POINT, W C), in Pa^2."""
+    """Compute the prior covariance K_ty of the results at all points with the values of W cubes.
+
+    Args:
+        kernels: Covariances between components and traction in the elastic layer.
+        model: Components that the W cubes of the window observe.
+        place: Positions (W, 2) of the cubes in m.
+        angle: Rotations (W,) of the cubes in rad.
+        points: Positions (points, 2) on the patch of the centre cube, in m.
+
+    Returns:
+        Covariance (points x ROWS_PER_POINT, W C) in Pa^2.
+    """
     columns = model.columns
     n = len(place)
     n_points = len(points)
@@ -356,7 +396,10 @@ def _cross_covariance(
 
 
 def _invert_known(matrix: Array, known: Mask) -> Array:
-    """Invert the known rows and columns of a covariance matrix; the others become 0."""
+    """Invert the part of a covariance matrix (D, D) that belongs to known values (D,).
+
+    The rows and columns of unknown values are 0 in the result (D, D).
+    """
     inverse = np.zeros_like(matrix)
     block = np.ix_(known, known)
     factor = cho_factor(matrix[block])
@@ -365,28 +408,36 @@ def _invert_known(matrix: Array, known: Mask) -> Array:
 
 
 def select_pressure(rows: Array) -> Array:
-    """Select pressure on the surface and pressure at depth (..., points x 2) from all rows."""
+    """Select the rows of the pressure on the surface and of the pressure at the cubes' depth.
+
+    Args:
+        rows: Results (..., points x ROWS_PER_POINT).
+
+    Returns:
+        Both pressures of every point (..., points x 2).
+    """
     leading = rows.shape[:-1]
     chosen = rows.reshape(*leading, -1, ROWS_PER_POINT)[..., 2:]
     return chosen.reshape(*leading, -1)
 
 
 def _nearest_cubes(poses: CubePoses) -> Index:
-    """Return the nearest cubes (cubes, W) of each cube, itself first.
+    """Return the indices (cubes, W) of the cubes nearest to each cube, which itself comes first.
 
-    Cubes at equal distances are sorted by their position in the frame of the cube, so that windows
-    that are alike have the same order.
+    Neighbours at equal distances are sorted by their position in the frame of the cube, so that
+    windows of the same kind list their cubes in the same order.
     """
     n = len(poses.position)
     count = min(WINDOW_CUBES, n)
-    # More than wanted: the tree may drop any of several cubes at the same distance.
+    # More cubes than needed are requested, because of several cubes at the same distance the tree
+    # returns arbitrary ones.
     candidates = min(3 * count, n)
     tree = cKDTree(poses.position)
     near = tree.query(poses.position, candidates)[1].reshape(n, -1)
 
     offset = poses.position[near] - poses.position[:, None]
     local = np.einsum("nji,nkj->nki", poses.rotation, offset)
-    # Rounding errors must not decide the order.
+    # Rounded, because otherwise rounding errors would decide the order of equally distant cubes.
     local = np.round(local / poses.pitch, 4)
     distance = np.round(np.linalg.norm(local, axis=2), 4)
     order = np.lexsort(

@@ -1,4 +1,4 @@
-"""Prior covariance of what several cubes measure under a random traction on the surface."""
+"""Prior covariance of the values that several cubes measure under a random surface traction."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from ..core.arrays import Array, Index
 from ..mechanics.kernels import Kernels
 
 AMPLITUDE = 20e3
-"""Prior standard deviation of the pressure on the surface in Pa, that of a firm touch."""
+"""Prior standard deviation of the pressure on the surface, in Pa: the pressure of a firm touch."""
 
 _EXTRA_VARIANCES = (1e-6, 1e-3, 1e-2, 1e-1)
-"""Relative increases of the variances that `make_positive_definite` tries in turn."""
+"""Factors, tried one after the other, by which `make_positive_definite` increases the variances of
+a covariance matrix until a Cholesky factor of it exists: 1e-3 adds a thousandth."""
 
 
 def covariance_matrix(
@@ -21,17 +22,18 @@ def covariance_matrix(
     angle: Array,
     variant: Index,
 ) -> Array:
-    """Compute the prior covariance of the components of n cubes, for a pressure of unit variance.
+    """Compute the prior covariance of C components of n cubes.
 
     Args:
-        kernels: Kernels of the layer.
+        kernels: Covariances between components and traction in the elastic layer.
         columns: Indices (C,) of the components in `COMPONENTS`.
-        place: Positions (n, 2) of the cubes on the unrolled skin, in m.
+        place: Positions (n, 2) of the cubes on the unrolled (flattened) skin, in m.
         angle: Rotations (n,) of the cubes about z, in rad.
-        variant: Variants (n,) of the cubes in the measurement model.
+        variant: Index (n,) of each cube's calibration in the measurement model of `kernels`.
 
     Returns:
-        Covariance matrix (n C, n C).
+        Covariance matrix (n C, n C) for a surface pressure of variance 1 Pa^2; all components of
+        the first cube come first.
     """
     n = len(place)
     width = len(columns)
@@ -58,8 +60,9 @@ def covariance_matrix(
 def make_positive_definite(covariance: Array) -> Array:
     """Increase the variances of a covariance matrix until it is positive definite.
 
-    `Kernels` counts the covariance of cubes that are far apart as zero, and a matrix that is cut
-    off in this way may have negative eigenvalues.
+    `Kernels` sets the covariance of cubes that are far apart to zero, and a matrix that is cut off
+    in this way may have negative eigenvalues. If even the largest of `_EXTRA_VARIANCES` does not
+    suffice, the matrix with this increase is returned nevertheless.
     """
     variances = np.diag(np.diag(covariance))
     for share in _EXTRA_VARIANCES:

@@ -1,9 +1,11 @@
 """Pressure and shear over a skin by interpolation between its cubes, and the contacts in it.
 
-The pressure p = −σzz in the plane of the cubes, `depth` below the surface, is interpolated from the
-values and gradients of the cubes (interpolation.py). The length c = 3 depth was the best of those
-tried for indenters of 2 to 20 mm at pitches of 6 to 24 mm (`./cube pictures` draws the errors). The
-shear (σzx, σyz) has no measured gradients and is interpolated from values.
+The pressure p = −σzz in the plane of the cubes' centres, `depth` below the surface, is interpolated
+from the stresses σzz and their gradients that the cubes measure (interpolation.py). The length c of
+the radial basis functions is 3 depth. Of the lengths that were tried for indenters of 2 to 20 mm at
+pitches (distances of neighbouring cubes) of 6 to 24 mm, it gave the smallest errors (`./cube
+pictures` draws them). The shear (σzx, σyz) has no measured gradients and is interpolated from its
+values alone.
 
 Force and position of a contact follow from the equilibrium of the layer above the cubes.
 """
@@ -30,18 +32,21 @@ SHEAR = [COMPONENTS.index(name) for name in ("zx", "yz")]
 """Columns of σzx and σyz in `COMPONENTS`."""
 
 RELATIVE_THRESHOLD = 0.2
-"""Fraction of the largest pressure on the skin above which a point counts as in contact."""
+"""Pressure above which a point of the skin counts as in contact, divided by the largest pressure on
+the skin. An absolute threshold applies in addition."""
 
 LENGTH_PER_DEPTH = 3.0
-"""Length c of the radial basis function divided by the depth of the cubes."""
+"""Length c of the radial basis function (1 + r²/c²)^(−5/2) of the interpolation, divided by the
+depth of the cubes' centres below the surface."""
 
 
 class Field(NamedTuple):
-    """Pressure and shear on the M points of a surface.
+    """Pressure and shear at the M points of a `Surface`, in the plane of the cubes' centres.
 
     Attributes:
-        pressure: Pressure (M,) in Pa.
-        shear: σzx and σyz (M, 2) in Pa, in the frame of the cube on whose patch the point lies.
+        pressure: Pressure (M,) in Pa, positive in compression.
+        shear: Shear stresses σzx and σyz (M, 2) in Pa, in the frame of the cube around which the
+            point lies.
     """
 
     pressure: Array
@@ -55,8 +60,8 @@ class Contact(NamedTuple):
         position: Position (3,) in m, where the line of action of the force meets the surface.
         normal: Unit normal (3,) out of the skin.
         force: Force (3,) in N on the skin.
-        normal_force: Normal force in N; pressing is positive.
-        shear_force: Tangential force in N; NaN if no cube observes shear.
+        normal_force: Normal force in N, positive for a body that presses on the skin.
+        shear_force: Length of the tangential force in N; NaN if no cube observes shear.
         area: Area in m^2 on which the pressure exceeds half of its maximum.
         position_uncertainty: Standard deviation of the position along each axis, in m.
         force_uncertainty: Standard deviation of the normal force, in N.
@@ -73,17 +78,19 @@ class Contact(NamedTuple):
 
 
 class Surface:
-    """Points of a skin in the plane of its cubes, and the field on them.
+    """Points of a skin in the plane of its cubes' centres, and pressure and shear at them.
+
+    Each cube has a patch, a square grid of `side` x `side` points around it.
 
     Attributes:
         poses: Poses of the cubes.
         depth: Distance from the centres of the cubes to the surface, in m.
         pitch: Typical distance of neighbouring cubes, in m.
-        points: Positions (M, 3) in the parent frame, in m: `side` x `side` around each cube.
+        points: Positions (M, 3) of the points of all patches in the skin's parent frame, in m.
         cube: Index (M,) of the cube on whose patch a point lies.
         middle: Index (cubes,) of the point nearest to each cube.
         spacing: Distance of neighbouring points, in m.
-        area: Area that a point stands for, in m^2.
+        area: Area of the square that each point represents in integrals, in m^2.
     """
 
     def __init__(
@@ -98,8 +105,8 @@ class Surface:
         Args:
             poses: Poses of the cubes.
             depth: Distance from the centres of the cubes to the surface, in m.
-            side: Number of points along a side of the patch of a cube.
-            gradients: Whether the gradients that the cubes observe are used.
+            side: Number of points along a side of the patch (square grid) of a cube.
+            gradients: Whether the measured gradients of σzz are used besides its values.
 
         Raises:
             ElasticError: `depth` is not positive, or `side` is below 1.
@@ -122,40 +129,51 @@ class Surface:
 
         self._interpolation = Interpolation(poses, self._patches, LENGTH_PER_DEPTH * depth)
         self._pressure_columns = PRESSURE if gradients else PRESSURE[:1]
-        # Pairs (pairs, 2) of neighbouring points, diagonal ones included.
+        # Pairs (pairs, 2) of neighbouring points. A distance of 1.5 includes diagonal neighbours.
         tree = cKDTree(self.points)
         self._pairs = tree.query_pairs(1.5 * self.spacing, output_type="ndarray")
 
     def field(self, values: Array) -> Field:
-        """Interpolate pressure and shear, in O(M) time.
+        """Interpolate pressure and shear; the time grows linearly with the number M of points.
 
         Args:
-            values: Components (cubes, 15), NaN where unknown. Neighbours replace a missing cube.
+            values: Components (cubes, 15) in the order of `COMPONENTS`, in Pa and Pa/m; NaN where
+                unknown. The values around a cube without any come from its neighbours.
         """
         return Field(self._pressure(values), self._shear(values))
 
     def uncertainty(self, values: Array) -> Array:
-        """Compute the standard deviation (M,) of the pressure relative to its own size, 0 to 1."""
+        """Compute the standard deviation (M,) of the interpolated pressure at each point.
+
+        It is divided by the standard deviation of the pressure over the skin: 0 at a cube with a
+        value, 1 far from all cubes. Arguments as in `field`.
+        """
         return self._interpolation.uncertainty(values, self._pressure_columns)
 
     def contacts(self, values: Array, threshold: float) -> list[Contact]:
-        """Find contacts, where the pressure exceeds a threshold and a fraction of its maximum.
+        """Find contacts: regions in which the pressure is above two thresholds.
 
-        The layer above the cubes is in equilibrium: the integral of the pressure is the force. The
-        first moment of the pressure is that of the load plus depth × shear force, which is
-        subtracted again. For this moment, pressure and shear are interpolated alike, from values.
-        Below a point force on an incompressible body, (σzx, σyz, σzz) points away from the force,
-        so that each cube by itself gives the position, and so does any weighted mean.
+        These are the absolute `threshold` and the fraction `RELATIVE_THRESHOLD` of the largest
+        pressure on the skin.
 
-        What spreads beyond the edge of the skin is lost: hardly any pressure, but a fraction of the
-        shear of about 1.5 depth / distance to the edge.
+        The elastomer above the plane of the cubes is in equilibrium. So the integral of the
+        pressure in this plane is the normal force. The first moment of the pressure is the first
+        moment of the load plus depth × shear force; this product is subtracted again. For this
+        moment, pressure and shear are interpolated by the same method, from values without
+        gradients. Below a point force on an incompressible body, the vector (σzx, σyz, σzz) points
+        away from the force, so that each single cube gives the correct position, and so does every
+        weighted mean over cubes.
+
+        The part of the stress that spreads beyond the edge of the skin is not measured: hardly any
+        of the pressure, but a fraction of about 1.5 depth / distance to the edge of the shear.
 
         Args:
             values: Components (cubes, 15) as in `field`.
-            threshold: Pressure in Pa at the depth of the cubes.
+            threshold: Smallest pressure in Pa, at the depth of the cubes, of a point in contact.
 
         Returns:
-            Contacts, strongest first. Each patch counts for the contact nearest to it.
+            Contacts, strongest first. Every patch of the skin belongs to the contact nearest to it,
+            and its whole pressure and shear are part of the force of this contact.
         """
         # Around cubes without any value, the pressure is unknown and counts as zero.
         pressure = np.nan_to_num(self._pressure(values))
@@ -185,13 +203,20 @@ class Surface:
         return np.stack(columns, axis=1)
 
     def _by_patch(self, on_points: Array) -> Array:
-        """Arrange values (M,) as (cubes, points of a patch)."""
+        """Reshape values (M,) at all points to (cubes, points of a patch)."""
         return on_points.reshape(len(self._patches), -1)
 
     def _assign_patches(self, inside: Mask) -> Index:
-        """Return the number (cubes,) of the contact that each patch counts for.
+        """Assign the patch of each cube to a contact.
 
         Points in contact belong to one contact if they are neighbours or lie on one patch.
+
+        Args:
+            inside: Whether each point (M,) is in contact; at least one is.
+
+        Returns:
+            Number (cubes,) of the contact of each patch. A patch without a point in contact belongs
+            to the contact of the nearest cube that has one.
         """
         n = len(self._patches)
         first, second = self._pairs.T
@@ -202,13 +227,18 @@ class Surface:
         component = connected_components(links, directed=False)[1]
 
         is_touched = inside.reshape(n, -1).any(axis=1)
-        # A patch without contact counts for the nearest one with contact.
+        # A patch without a point in contact joins the contact of the nearest patch that has one.
         touched = cKDTree(self.poses.position[is_touched])
         nearest = touched.query(self.poses.position)[1]
         return np.asarray(component[is_touched][nearest], np.intp)
 
     def _contact(self, loaded: _LoadedSurface, chosen: Mask) -> Contact:
-        """Compute the contact of the chosen patches (cubes,)."""
+        """Compute force, position and uncertainty of the contact on some patches.
+
+        Args:
+            loaded: Pressure and shear at the points of all patches.
+            chosen: Whether the patch of each cube (cubes,) belongs to the contact.
+        """
         rotation = self.poses.rotation[chosen]
         points = self._patches[chosen]
         pressure = loaded.pressure[chosen]
@@ -220,11 +250,13 @@ class Surface:
 
         shear = self._shear_force(loaded.shear[:, chosen], rotation)
         shear -= normal * (shear @ normal)
-        # Moments about the surface: depth × shear force is subtracted from the centre of pressure.
+        # The shear force acts on the surface, `depth` above the cubes' plane, and so shifts the
+        # centre of pressure in this plane by depth × shear force / normal force.
         centre = _weighted_sum(weight, points) / weight.sum()
         position = centre + self.depth * (normal - shear / weight.sum())
 
-        # Interpolation errors are correlated over one pitch: so many points err together.
+        # Interpolation errors are correlated over one pitch (distance of neighbouring cubes), so
+        # the errors of the pitch / spacing points along each axis add up instead of averaging out.
         deviation = loaded.uncertainty[chosen] * pressure * self.pitch * self.spacing
         variance = deviation**2
         lever = ((points - centre) ** 2).sum(axis=2) / 2
@@ -241,11 +273,15 @@ class Surface:
         )
 
     def _shear_force(self, shear: Array, rotation: Array) -> Array:
-        """Return the shear force (3,) in N.
+        """Integrate the shear stress over some patches.
 
         Args:
-            shear: Shear (2, patches, points) in Pa, in the frames of the cubes.
+            shear: Shear stresses σzx and σyz (2, patches, points) in Pa, in the frames of the
+                cubes.
             rotation: Rotations (patches, 3, 3) of these frames.
+
+        Returns:
+            Shear force (3,) in N, in the skin's parent frame.
         """
         by_patch = shear.sum(axis=2)
         along_x = _weighted_sum(by_patch[0], rotation[:, :, 0])
@@ -254,13 +290,15 @@ class Surface:
 
 
 class _LoadedSurface(NamedTuple):
-    """Quantities from which contacts are computed, (cubes, points of a patch), in Pa.
+    """Quantities at the points of all patches from which contacts are computed.
 
     Attributes:
-        pressure: Pressure, interpolated from values and gradients.
-        shear: σzx and σyz (2, cubes, points).
-        moment_pressure: Pressure, interpolated from values alone, as the shear is.
-        uncertainty: Standard deviation of the pressure relative to its own size.
+        pressure: Pressure (cubes, points) in Pa, interpolated from values and gradients.
+        shear: Shear stresses σzx and σyz (2, cubes, points) in Pa.
+        moment_pressure: Pressure (cubes, points) in Pa, interpolated from values alone, as the
+            shear is.
+        uncertainty: Relative standard deviation (cubes, points) of the pressure, 0 to 1, as from
+            `Surface.uncertainty`.
         sees_shear: Whether some cube observes shear.
     """
 
@@ -272,7 +310,15 @@ class _LoadedSurface(NamedTuple):
 
 
 def square_points(spacing: float, side: int) -> Array:
-    """Return the points (side^2, 2) of a square grid with this spacing around the origin, in m."""
+    """Return a square grid of points that is centred on the origin of the x-y plane.
+
+    Args:
+        spacing: Distance of neighbouring points in m.
+        side: Number of points along a side of the grid.
+
+    Returns:
+        Positions (side^2, 2) in m.
+    """
     line = (np.arange(side) - (side - 1) / 2) * spacing
     x, y = np.meshgrid(line, line)
     return np.stack([x.ravel(), y.ravel()], axis=1)
@@ -283,7 +329,7 @@ def patches(
     spacing: float,
     side: int,
 ) -> Array:
-    """Return the points on the patches of all cubes.
+    """Return the points on the patches (square grids around the cubes) of all cubes.
 
     Args:
         poses: Poses of the cubes.
@@ -291,7 +337,8 @@ def patches(
         side: Number of points along a side of a patch.
 
     Returns:
-        Positions (cubes, side^2, 3) in m: a square grid in the x-y plane of each cube.
+        Positions (cubes, side^2, 3) in the skin's parent frame, in m. Each grid lies in the x-y
+        plane of its cube.
     """
     in_plane = poses.rotation[:, :, :2]
     offset = np.einsum("nij,qj->nqi", in_plane, square_points(spacing, side))
@@ -301,7 +348,8 @@ def patches(
 def _weighted_sum(weights: Array, vectors: Array) -> Array:
     """Return the sum (3,) of weights (...) times vectors (..., 3).
 
-    Einsum, because the threads of a BLAS product would occupy a second core.
+    The function uses einsum, because a BLAS matrix product would start threads that occupy a second
+    core.
     """
     result: Array = np.einsum("n,ni->i", weights.ravel(), vectors.reshape(-1, 3))
     return result

@@ -1,4 +1,4 @@
-"""Unrolling of bent skins: a surface is laid flat around one cube, distances from it are kept."""
+"""Unrolling of bent skins: neighbours of a cube are laid flat and keep their distance from it."""
 
 from __future__ import annotations
 
@@ -13,30 +13,32 @@ def unroll(
     centres: Index,
     near: Index,
 ) -> tuple[Array, Array]:
-    """Lay the surroundings of n cubes flat, each in the x-y plane of its own frame.
+    """Lay the neighbours of n cubes flat, each time in the x-y plane of the cube in the centre.
 
-    The kernels hold for a flat layer. A neighbour keeps its distance from the centre and the
-    direction in which it lies; on a flat skin, nothing changes.
+    This is necessary because the kernels (covariances between the cubes' values and the surface
+    traction) hold for a flat layer. A neighbour keeps its distance from the centre cube, and its
+    direction within the x-y plane. On a flat skin, nothing changes.
 
     Args:
         poses: Poses of all cubes.
         centres: Indices (n,) of the cubes around which the skin is unrolled.
-        near: Indices (n, W) of the cubes in the surroundings of each centre.
+        near: Indices (n, W) of the neighbours of each centre cube that are laid flat.
 
     Returns:
-        Positions (n, W, 2) in m and rotations (n, W) about z in rad, in the frame of the centre.
+        Positions (n, W, 2) in m and rotations (n, W) about z in rad, in the frame of the centre
+        cube.
     """
     to_centre = poses.rotation[centres]
     offset = poses.position[near] - poses.position[centres][:, None]
     local = np.einsum("nji,nkj->nki", to_centre, offset)
 
-    # The direction in the plane stays, the length becomes the distance in space.
+    # The direction in the x-y plane stays, the length becomes the distance in space.
     distance = np.linalg.norm(local, axis=2)
     in_plane = np.hypot(local[..., 0], local[..., 1])
     stretch = distance / np.where(in_plane > 0, in_plane, 1.0)
     place = local[..., :2] * stretch[..., None]
 
-    # The rotation about z that is closest to the relative rotation.
+    # A tilted neighbour gets the rotation about z that is closest to its rotation in space.
     relative = np.einsum("nji,nkjl->nkil", to_centre, poses.rotation[near])
     sine = relative[..., 1, 0] - relative[..., 0, 1]
     cosine = relative[..., 0, 0] + relative[..., 1, 1]
