@@ -95,7 +95,7 @@ class HostClockWatch:
 class SampleTiming:
     """Finds samples whose device times are not as expected from their numbers.
 
-    The expected device time of a hub's sample grows by the estimated sample period with each number.
+    The expected device time grows by the estimated sample period of the hub with each number.
     """
 
     def __init__(self) -> None:
