@@ -36,7 +36,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def repair_bag(path: Path) -> None:
-    """Make a bag readable and print what was lost."""
+    """Make a damaged bag readable, and print how many messages are left and what was lost."""
     from ..bags.repair import REST, repair
     from ..views.terminal.output import say
 
@@ -49,7 +49,10 @@ def repair_bag(path: Path) -> None:
 
 
 def show_bag(path: Path) -> None:
-    """Print topics, skins, cubes, calibrations, rates, gaps and the last diagnostics.
+    """Print what a bag contains: topics, skins with their cubes and gaps, and last diagnostics.
+
+    Args:
+        path: Folder or file of the bag.
 
     Raises:
         BagError: The bag cannot be read.
@@ -67,7 +70,7 @@ def show_bag(path: Path) -> None:
         # The start and end time of a bag without messages are undefined.
         if any(connection.msgcount for connection in bag.connections):
             duration_s = (bag.end_ns - bag.start_ns) * 1e-9
-            # Milliseconds are enough for people.
+            # The start is printed in ms, because its nanoseconds are of no interest to a reader.
             start = np.datetime64(bag.start_ns, "ns").astype("datetime64[ms]")
             console.print(f"{path}: {duration_s:.3f} s from {start} UTC")
         else:
@@ -81,7 +84,12 @@ def show_bag(path: Path) -> None:
 
 
 def topic_table(bag: Bag, duration_s: float) -> Table:
-    """Return a table of the topics with their types, message counts and mean rates."""
+    """Return a table of the topics of a bag with their types, message counts and mean rates.
+
+    Args:
+        bag: The bag.
+        duration_s: Time from the first to the last message, in s.
+    """
     from rich.table import Table
 
     table = Table("topic")
@@ -90,14 +98,20 @@ def topic_table(bag: Bag, duration_s: float) -> Table:
         table.add_column(heading, justify="right")
     for connection in sorted(bag.connections, key=lambda connection: connection.topic):
         count = connection.msgcount
-        # One message has no rate.
+        # A rate needs at least two messages.
         rate = f"{count / duration_s:.1f}" if duration_s and count > 1 else ""
         table.add_row(connection.topic, connection.msgtype, str(count), rate)
     return table
 
 
 def show_skin(bag: Bag, topic: str, console: Console) -> None:
-    """Print the skin whose frequencies are on this topic, its calibrations and its cubes."""
+    """Print a recorded skin with its calibrations, and for each cube its rate, losses and gaps.
+
+    Args:
+        bag: The bag.
+        topic: Topic with the frequencies of the skin's pads.
+        console: Console to print to.
+    """
     from ..bags.recording import skin_infos
     from ..bags.summary import cube_summaries
     from ..core.errors import BagError
@@ -106,7 +120,7 @@ def show_skin(bag: Bag, topic: str, console: Console) -> None:
     try:
         info = skin_infos(bag, topic)[-1]
     except BagError as error:
-        # The other topics of the bag can still be shown.
+        # A skin that cannot be shown must not keep the other skins of the bag from being shown.
         console.print(str(error), style="red", markup=False)
         return
     frame, version = info.header.frame_id, info.version
@@ -115,7 +129,7 @@ def show_skin(bag: Bag, topic: str, console: Console) -> None:
         markup=False,
     )
     for name, count in Counter(cube.calibration_id for cube in info.cubes).items():
-        # Cubes of one calibration have one layout, unless the file was edited.
+        # All cubes with the same calibration have the same layout, unless a file was edited.
         layouts = sorted({cube.layout for cube in info.cubes if cube.calibration_id == name})
         cubes = cubes_text(count)
         console.print(f"  calibration {name}, layout {', '.join(layouts)}: {cubes}")
@@ -132,7 +146,11 @@ def show_skin(bag: Bag, topic: str, console: Console) -> None:
 
 
 def diagnostics_line(status: Any) -> str:
-    """Return the message of a diagnostic status and those of its values that are not zero."""
+    """Return one line for a diagnostic status: its name, its message, and all values except zeros.
+
+    Args:
+        status: A message diagnostic_msgs/DiagnosticStatus.
+    """
     values = [
         f"{pair.key} {pair.value}" for pair in status.values if pair.value not in ("0", "0.0", "")
     ]
@@ -140,5 +158,5 @@ def diagnostics_line(status: Any) -> str:
 
 
 def cubes_text(count: int) -> str:
-    """Return "1 cube" or "5 cubes"."""
+    """Return a number of cubes as text, such as "1 cube" or "5 cubes"."""
     return f"{count} {'cube' if count == 1 else 'cubes'}"

@@ -1,7 +1,8 @@
 """./cube bringup: check the pads of a new hub, find swapped ones by presses, write a skin file.
 
-The command first watches the pads at rest, then asks a person to press beside each cube. From the
-presses it computes how each cube is rotated and whether wires of its pads are swapped.
+The command first measures the pads without load, then asks the user to press beside each cube. From
+the presses it computes how each cube is rotated in the skin, and whether wires of its pads are
+swapped.
 """
 
 from __future__ import annotations
@@ -22,24 +23,33 @@ if TYPE_CHECKING:
     from ..device.live import LinkSource
 
 REST_S = 5.0
-"""Duration, in seconds, of the measurement of noise and drift before the presses."""
+"""Duration, in seconds, of the measurement of the pads without load, which precedes the presses.
+
+It determines the rest frequency, noise and drift of each pad.
+"""
 
 AVERAGE_S = 0.25
-"""Period, in seconds, at which the table of pads is drawn, and length of the averages of the
-frequencies in which presses are found."""
+"""Time, in seconds, over which frequencies are averaged to detect presses.
+
+The live table of the pads is drawn with the same period.
+"""
 
 PITCH = 0.012
 """Distance of neighbouring cubes in the written file, in metres.
 
-A placeholder: the hub does not know where its cubes are, so the user writes the positions.
+It is a placeholder, because the hub does not know where its cubes are: the user replaces the
+positions in the file.
 """
 
 PPM = 1e6
-"""Parts per million in 1."""
+"""Number of ppm (parts per million) in 1."""
 
 UNKNOWN_MISFIT = 0.5
-"""Misfit (0: perfect, 1: nothing is explained) below which presses that say nothing certain are
-reported as ambiguous, and above which they are reported as unexplained."""
+"""Misfit that decides how presses are reported that do not determine the rotation of a cube.
+
+The misfit is 0 if a rotation explains the measurement completely and 1 if it explains nothing.
+Below this value the report is that several rotations fit, above it that none does.
+"""
 
 
 def arguments(parser: Parser) -> None:
@@ -65,7 +75,11 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Return 1 if a pad does not work, pads are swapped, or presses are not explained; else 0."""
+    """Check the hub, and write the skin file unless pads are swapped or a press is unexplained.
+
+    Returns:
+        1 if a pad does not work or is noisy, or if no file was written; otherwise 0.
+    """
     import numpy as np
 
     from ..config.yaml import write_yaml
@@ -83,14 +97,14 @@ def run(options: argparse.Namespace) -> int:
         rest = watch_rest(source, screen)
         explanations = press_cubes(source, rest)
 
-    # All findings are printed, even if no file is written in the end.
+    # The findings about all cubes are printed before it is decided whether a file is written.
     for cube, explanation in explanations.items():
         data["cubes"][cube]["pose"]["rpy"] = rpy(explanation.rotation)
         show_explanation(names[cube], explanation, pads)
     if any(each.swapped or not each.is_clear for each in explanations.values()):
         say("no file written: swap the wires, or press again, and run this command again", "red")
         return 1
-    # The header of the file says where it comes from.
+    # The header of the file contains the command that wrote it.
     header = f"./cube bringup {options.port}. Write the positions of the cubes into xyz."
     write_yaml(options.output, data, header)
     say(f"wrote {options.output}: write the positions of the cubes into it")
@@ -98,10 +112,13 @@ def run(options: argparse.Namespace) -> int:
 
 
 def skin_of_hub(options: argparse.Namespace) -> tuple[dict[str, Any], Skin]:
-    """Ask the hub at the port for its cubes and describe them as a skin.
+    """Ask the hub at the port for its cubes, and describe them as a skin.
+
+    Args:
+        options: The options of the command.
 
     Returns:
-        The content of a skin file, and the skin that it describes.
+        Content of a skin file; the skin that it describes.
 
     Raises:
         CubeError: The hub does not answer, or there is no calibration for its number of pads.
@@ -123,7 +140,8 @@ def skin_of_hub(options: argparse.Namespace) -> tuple[dict[str, Any], Skin]:
             port.problem or f"{port.path}: no answer within 1 s; not a hub, or no power"
         )
 
-    # Built-in layouts differ in their number of pads, which HELLO states.
+    # The answer of the hub states the number of pads per cube. It determines the built-in layout,
+    # because no two of these have the same number.
     shipped = {layout.n_pads: name for name, layout in LAYOUTS.items()}
     name = options.calibration or shipped.get(hello.n_pads)
     if name is None:
@@ -133,10 +151,11 @@ def skin_of_hub(options: argparse.Namespace) -> tuple[dict[str, Any], Skin]:
         )
     file = find_calibration(name, Path())
     if options.calibration == str(file):
-        # A relative path would be searched from the folder of the skin file.
+        # A relative path in a skin file is relative to the folder of that file, so the path that
+        # the user gave is made absolute.
         name = str(file.resolve())
     calibration = read_calibration(file)
-    # A row of cubes: the hub does not know how they are arranged.
+    # The cubes are written as one row, because the hub does not know how they are arranged.
     data = grid(
         options.name,
         nx=hello.n_cubes,
@@ -148,7 +167,8 @@ def skin_of_hub(options: argparse.Namespace) -> tuple[dict[str, Any], Skin]:
         port=options.port,
     )
 
-    # The hub knows the uids of its cubes; they stay right when cubes are connected otherwise.
+    # Cubes are identified by their unique ids (uid) instead of their index on the hub, so that the
+    # file stays valid if they are connected in another order.
     for cube, uid in zip(data["cubes"], hello.cube_uids.tolist(), strict=True):
         del cube["index"]
         cube["uid"] = f"{uid:#x}"
@@ -159,7 +179,15 @@ def skin_of_hub(options: argparse.Namespace) -> tuple[dict[str, Any], Skin]:
 
 
 def watch_rest(source: LinkSource, screen: PadScreen) -> PadsAtRest:
-    """Measure the pads for `REST_S` while nothing touches them."""
+    """Measure the pads for `REST_S` while nothing touches them, and show them in the live table.
+
+    Args:
+        source: Connection to the hub.
+        screen: The live table of the pads.
+
+    Returns:
+        Rest frequency, noise, drift and state of each pad.
+    """
     import numpy as np
 
     from ..calibrate.pad_rest import MIN_SAMPLES, measure_pads_at_rest
@@ -170,7 +198,8 @@ def watch_rest(source: LinkSource, screen: PadScreen) -> PadsAtRest:
     for rows in source:
         parts.append(split_into_scans(rows, len(source.skin.cubes)))
         now_s = float(parts[-1][1][-1] - parts[0][1][0])
-        # The time is that of the samples, so that a slow computer measures as long as a fast one.
+        # The duration is measured by the stamps of the samples and not by the computer's clock, so
+        # that a slow computer collects as many samples as a fast one.
         is_over = now_s >= REST_S
         has_enough = sum(len(each) for each, _ in parts) >= MIN_SAMPLES
         if not has_enough or not (is_over or now_s >= next_shown_s):
@@ -186,7 +215,15 @@ def watch_rest(source: LinkSource, screen: PadScreen) -> PadsAtRest:
 
 
 def press_cubes(source: LinkSource, rest: PadsAtRest) -> dict[int, Explanation]:
-    """Ask for presses beside each cube that has working pads, and explain them, by cube."""
+    """Ask the user to press beside each cube, and find the rotation of each cube from the presses.
+
+    Args:
+        source: Connection to the hub.
+        rest: The pads without load. Cubes without any working pad are left out.
+
+    Returns:
+        Index of a cube -> rotation and swapped pads that explain the presses best.
+    """
     import numpy as np
 
     from ..calibrate.presses import (
@@ -222,12 +259,12 @@ def press_cubes(source: LinkSource, rest: PadsAtRest) -> dict[int, Explanation]:
     while waiting:
         which = "a cube that was not pressed yet," if explanations else "a cube"
         first_side, *other_sides = SIDES
-        # The first press chooses the cube, the others belong to it.
+        # The cube that the first press loads is the one that the other presses must load, too.
         presses = [wait_for_press(waiting, f"{which} on its {first_side} side")]
         cube = presses[0].cube
         for side in other_sides:
             presses.append(wait_for_press({cube}, f"{cubes[cube].name} on its {side} side"))
-        # The pad law turns changes of frequency into pad stresses.
+        # The pad law (docs/physics.md) converts relative changes of frequency into pad stresses.
         ratio = 1 + np.array([each.change for each in presses])
         measured = pad_stress(ratio, 1.0, calibration.beta, calibration.modulus)
         explanations[cube] = explain_presses(measured, expected)
@@ -236,10 +273,18 @@ def press_cubes(source: LinkSource, rest: PadsAtRest) -> dict[int, Explanation]:
 
 
 class PadScreen:
-    """Shows a table of the pads on stdout, live where that is a terminal; a context manager."""
+    """Shows a table of the pads on stdout, which is updated live if stdout is a terminal.
+
+    It is a context manager, which restores the terminal at its exit.
+    """
 
     def __init__(self, cubes: Sequence[str], pads: Sequence[str]) -> None:
-        """Args are the names of the cubes and of the pads of each cube."""
+        """Prepare the table.
+
+        Args:
+            cubes: Names of the cubes.
+            pads: Names of the pads, which are the same for all cubes.
+        """
         from rich.console import Console
         from rich.live import Live
 
@@ -256,12 +301,12 @@ class PadScreen:
         self._live.stop()
 
     def show(self, rest: PadsAtRest) -> None:
-        """Draw the live table."""
+        """Draw the live table; nothing is drawn if stdout is no terminal."""
         if self._live.is_started:
             self._live.update(self._table(rest), refresh=True)
 
     def finish(self, rest: PadsAtRest) -> None:
-        """End the live table and print it once more, to stay."""
+        """End the live table, and print it once more as text that stays on the screen."""
         self._live.stop()
         self._console.print(self._table(rest))
 
@@ -273,7 +318,7 @@ class PadScreen:
         table = make_table(("cube", "pad"), ("f / Hz", "noise / ppm", "drift / (ppm/min)"))
         table.add_column("state")
         for cube, pad in np.ndindex(rest.frequency.shape):
-            # A silent pad has no numbers.
+            # A silent pad (no frequency measured) has empty cells.
             numbers = ("", "", "")
             if np.isfinite(rest.frequency[cube, pad]):
                 numbers = (
@@ -289,13 +334,19 @@ class PadScreen:
 
 
 def pad_fault(rest: PadsAtRest, cube: int, pad: int) -> str:
-    """Return what is wrong with a pad: silent, stuck or noisy; empty if nothing is."""
+    """Return the fault of a pad: "silent", "stuck" or "noisy"; an empty text if it has none."""
     faults = [name for name in ("silent", "stuck", "noisy") if getattr(rest, name)[cube, pad]]
     return faults[0] if faults else ""
 
 
 def show_explanation(name: str, explanation: Explanation, pads: Sequence[str]) -> None:
-    """Print what the presses tell about a cube: its rotation and its swapped pads."""
+    """Print the rotation and the swapped pads of a cube, as found from the presses.
+
+    Args:
+        name: Name of the cube.
+        explanation: Rotation and swapped pads, and how well they explain the presses.
+        pads: Names of the pads.
+    """
     from ..views.terminal.output import say
 
     if not explanation.is_clear:
@@ -322,12 +373,12 @@ def rpy(rotation: np.ndarray) -> list[float]:
     from ..core.tensor import quaternion_from_rotation, rpy_from_quaternion
 
     angles = rpy_from_quaternion(quaternion_from_rotation(rotation))
-    # Adding 0.0 turns -0.0 into 0.0.
+    # Adding 0.0 turns -0.0 into 0.0, so that no "-0.0" is written into the file.
     return [round(float(angle) + 0.0, 9) for angle in angles]
 
 
 def rotation_text(rotation: np.ndarray) -> str:
-    """Return roll, pitch and yaw of a rotation matrix (3, 3) in degrees."""
+    """Return roll, pitch and yaw of a rotation matrix (3, 3) as text in degrees."""
     import math
 
     return " ".join(f"{math.degrees(angle):.0f}°" for angle in rpy(rotation))

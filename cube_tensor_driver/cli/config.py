@@ -63,10 +63,10 @@ def run(options: argparse.Namespace) -> int:
 
 
 def write_grid(options: argparse.Namespace) -> int:
-    """Write the skin file of a grid.
+    """Write the skin file of a grid, and return the exit code 0.
 
     Raises:
-        ConfigError: The file exists, or `config check` would refuse it.
+        ConfigError: The file exists already, or `./cube config check` would find a mistake in it.
     """
     from ..config.grid import grid
     from ..config.skin import check_skin_data
@@ -87,12 +87,13 @@ def write_grid(options: argparse.Namespace) -> int:
         rate=options.rate,
         port=options.port,
     )
-    # Checking all cubes of a large grid would take longer than writing them.
+    # Only a few cubes are checked, because checking all cubes of a large grid would take longer
+    # than writing the file.
     _, mistakes = check_skin_data(ends_of_links(skin), options.output.parent)
     if mistakes:
         raise ConfigError(f"grid: {mistakes[0]}")
     size = f"{options.nx} x {options.ny} cubes, {1e3 * options.pitch:g} mm apart"
-    # The same text stands at the top of the file.
+    # The text is printed, and written into the header of the file.
     text = f"{size}, on {options.links} {'link' if options.links == 1 else 'links'}"
     with working(f"writing {len(skin['cubes'])} cubes"):
         write_yaml(options.output, skin, f"{text}. docs/config.md describes the keys.")
@@ -101,9 +102,10 @@ def write_grid(options: argparse.Namespace) -> int:
 
 
 def ends_of_links(skin: dict[str, Any]) -> dict[str, Any]:
-    """Return the content of the file of a grid with the first and last cube of each link only.
+    """Return the content of a grid's skin file, reduced to the first and last cube of each link.
 
-    It is enough to check these: the other cubes have no mistake that these do not have.
+    Checking these cubes is enough, because all cubes between them are described alike. A link is
+    the connection to one hub.
     """
     first: dict[str, Any] = {}
     last: dict[str, Any] = {}
@@ -115,7 +117,11 @@ def ends_of_links(skin: dict[str, Any]) -> dict[str, Any]:
 
 
 def check_file(path: Path) -> int:
-    """Print what is wrong with a skin file and return 1, or print what it contains."""
+    """Print the mistakes in a skin file, or what it contains if there are none.
+
+    Returns:
+        The exit code: 1 if there are mistakes, otherwise 0.
+    """
     from ..config.pose_check import pose_doubts
     from ..config.skin import check_skin
     from ..device.links.line_load import line_doubts
@@ -124,14 +130,15 @@ def check_file(path: Path) -> int:
     # A skin of thousands of cubes takes seconds to check.
     with working(f"checking {path}"):
         skin, mistakes = check_skin(path)
-        # Doubts about poses and lines make sense only for a file without mistakes.
+        # Doubtful poses, and lines that are too slow for the sample rate, can be found only in a
+        # file without mistakes.
         if skin is not None:
             mistakes = [*pose_doubts(skin), *line_doubts(skin)]
     for mistake in mistakes:
         print(f"cube: {path}: {mistake}", file=sys.stderr)
     if skin is None or mistakes:
         return 1
-    # A skin may have cubes of several layouts.
+    # The cubes are counted by layout, because a skin may have cubes of several layouts.
     layouts = Counter(cube.calibration.layout.name for cube in skin.cubes)
     by_layout = ", ".join(f"{number} {name}" for name, number in layouts.items())
     cubes = f"{len(skin.cubes)} {'cube' if len(skin.cubes) == 1 else 'cubes'} ({by_layout})"

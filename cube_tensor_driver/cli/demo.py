@@ -8,7 +8,7 @@ from pathlib import Path
 from .parser import Parser, count, not_negative, positive, sample_rate
 
 DEFAULT_DURATION_S = 10.0
-"""Duration, in seconds, of a demo that measures and is given no --duration."""
+"""Duration, in seconds, of a demo with --headless, --json or --figure but without --duration."""
 
 
 def arguments(parser: Parser) -> None:
@@ -77,11 +77,11 @@ def run(options: argparse.Namespace) -> int:
 
     from ..demo.demo import DemoSettings, run_demo
 
-    # A demo that shows nothing must end by itself.
+    # A demo that shows no table or writes a file must end by itself.
     measures = options.headless or options.json or options.figure
     if options.duration is None and measures:
         options.duration = DEFAULT_DURATION_S
-    # Every setting is an option of the same name.
+    # Each field of DemoSettings has the value of the option with the same name.
     return run_demo(
         DemoSettings(**{field.name: getattr(options, field.name) for field in fields(DemoSettings)})
     )

@@ -23,7 +23,11 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Print until Ctrl-C, or until the reader of a pipe closes it: neither is an error."""
+    """Print messages until Ctrl-C, or until the reader of the output closes the pipe.
+
+    Returns:
+        0, because both are normal ends.
+    """
     from ..config.yaml import to_yaml
     from ..ros.commands.echo import StressReading, listen
 
@@ -36,16 +40,20 @@ def run(options: argparse.Namespace) -> int:
                     print(message_json(item))
                 else:
                     print(f"{to_yaml(item)}---")
-            # A reader of a pipe sees each message at once.
+            # Without this, Python would hold messages back if stdout is a pipe.
             sys.stdout.flush()
     except BrokenPipeError:
-        # Python flushes stdout once more when it ends, which must not fail again.
+        # Python flushes stdout once more when it ends; without this redirection that would fail.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return 0
 
 
 def reading_line(reading: StressReading) -> str:
-    """Return time, cube, observed components with units, residual and status as one line."""
+    """Return a line of text: time, cube, observed components with units, residual and status.
+
+    Args:
+        reading: One row of a stress message: one cube at one time.
+    """
     from ..core.modes import COMPONENTS, STRESS
 
     pairs = zip(COMPONENTS, reading.values, strict=True)
@@ -53,7 +61,7 @@ def reading_line(reading: StressReading) -> str:
     stress = [f"{name} {value:9.1f}" for name, value in observed.items() if name in STRESS]
     gradient = [f"{name} {value:10.0f}" for name, value in observed.items() if name not in STRESS]
     parts = [f"{reading.stamp_ns * 1e-9:.3f} s", reading.cube]
-    # The unit stands once, behind the last value.
+    # All stresses have one unit, which stands only behind the last of them; so have gradients.
     if stress:
         parts += [*stress[:-1], f"{stress[-1]} Pa"]
     if gradient:
@@ -65,7 +73,10 @@ def reading_line(reading: StressReading) -> str:
 
 
 def reading_json(reading: StressReading) -> str:
-    """Return a reading as a JSON object on one line; components not observed are null."""
+    """Return a row of a stress message as a JSON object on one line.
+
+    Components that are not observed are null.
+    """
     from ..core.modes import COMPONENTS, STRESS
 
     values = dict(zip(COMPONENTS, reading.values, strict=True))
@@ -81,8 +92,10 @@ def reading_json(reading: StressReading) -> str:
 
 
 def status_words(status: int) -> list[str]:
-    """Return the names of the status bits that are set, as in SkinStress.msg, and why pads were
-    left out."""
+    """Return the names of the status bits that are set, as in SkinStress.msg.
+
+    They are followed by the reasons for which pads were left out of the computation.
+    """
     from ..core.status import STATUS, WORDS
 
     names = [name for name, bit in STATUS.items() if status & bit]
@@ -90,12 +103,15 @@ def status_words(status: int) -> list[str]:
 
 
 def message_json(content: Mapping[str, Any]) -> str:
-    """Return a message of plain values as JSON on one line."""
+    """Return a message, given as names and plain values, as a JSON object on one line."""
     return json.dumps(without_nan(content))
 
 
 def without_nan(value: Any) -> Any:
-    """Replace NaN and infinity by None, because JSON has no word for them."""
+    """Replace NaN and infinity, also inside lists and mappings, by None.
+
+    JSON can represent neither of them; None becomes null.
+    """
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, Mapping):

@@ -10,7 +10,7 @@ import sys
 from .parser import Parser
 
 NOT_FOUND = 127
-"""Exit code that shells give for a command that is not found."""
+"""Exit code if the command cannot be executed; shells use it for a command that is not found."""
 
 
 def arguments(parser: Parser) -> None:
@@ -23,12 +23,13 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Replace this process by the command."""
-    # Python ignores SIGPIPE, and the command would inherit that.
+    """Replace this process by the command; returns only if the command cannot be executed."""
+    # Python ignores SIGPIPE. The command would inherit this, and would not end when the reader of
+    # its output closes the pipe.
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)
     name = options.words[0]
     try:
-        # The command takes the place of this process, with its signals and its exit code.
+        # The command keeps the process id, so signals reach it and its exit code is passed on.
         os.execvp(name, options.words)
     except OSError as error:
         print(f"cube: exec: {name}: {error.strerror}", file=sys.stderr)

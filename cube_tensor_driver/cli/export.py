@@ -13,15 +13,18 @@ if TYPE_CHECKING:
     from ..lerobot.export import Exported
 
 UNUSUAL_DEPTH = 2
-"""Ratio of the largest number of samples in a frame to the usual one, above which it is reported:
-every window of the data set is as long as the largest."""
+"""Ratio of the largest to the usual number of samples in a frame above which a warning is printed.
+
+Every window of the data set (the samples that belong to one frame) is as long as the largest one,
+so a single unusual frame enlarges the whole data set.
+"""
 
 TABLES = {
     "parquet": "one Parquet table per bag",
     "csv": "one CSV table per bag",
     "zarr": "one Zarr group per bag",
 }
-"""Formats of tables, with the help of their commands."""
+"""Name of a table format, which is also a subcommand -> help text of the subcommand."""
 
 
 def arguments(parser: Parser) -> None:
@@ -57,7 +60,8 @@ def arguments(parser: Parser) -> None:
     for name, text in TABLES.items():
         table = parser.add_subcommand(name, text)
         _add_common(table)
-        # Tables are made by `reprocess`, whose other options have their defaults here.
+        # The command `reprocess` makes the tables. Its options that these subcommands do not have
+        # are set to their defaults.
         table.set_defaults(format=name, contacts=None, scheduler=None)
         table.add_argument(
             "--jobs", type=count, metavar="N", help="number of processes (default: one per core)"
@@ -75,10 +79,13 @@ def _add_common(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Return 1 if a table could not be made, else 0.
+    """Export the bags.
+
+    Returns:
+        1 if the table of a bag could not be made, otherwise 0.
 
     Raises:
-        CubeError: The options or the output cannot be used; nothing was begun.
+        CubeError: A bag, an option or the output folder cannot be used.
     """
     from ..bags.reprocess.all_bags import RECIPE
     from ..lerobot.export import check_empty, export_lerobot
@@ -86,12 +93,13 @@ def run(options: argparse.Namespace) -> int:
     from ..views.terminal.output import progress_bar
 
     if options.what in TABLES:
-        # A folder with a recipe is an export that was interrupted: it is continued.
+        # A folder that contains the file RECIPE belongs to an export that was interrupted, which
+        # is continued; any other folder must be empty.
         if not (options.output / RECIPE).exists():
             check_empty(options.output)
         return reprocess.run(options)
 
-    # All bags become one data set, so the choices hold for all of them.
+    # All bags become one data set, so these choices apply to every bag.
     choices = Choices(
         fps=options.fps,
         task=options.task,
@@ -109,7 +117,12 @@ def run(options: argparse.Namespace) -> int:
 
 
 def show_exported(folder: Path, exported: Exported) -> None:
-    """Print what the data set holds, and how much of each kind of data was left out."""
+    """Print what a LeRobot data set contains, and how much data was left out of it and why.
+
+    Args:
+        folder: Folder of the data set.
+        exported: Counts of what was exported and left out.
+    """
     from ..views.terminal.output import say
 
     others = ", ".join(exported.features) or "no other topics"

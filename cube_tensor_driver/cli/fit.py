@@ -77,10 +77,11 @@ def run(options: argparse.Namespace) -> int:
 
     layout = named_layout(options.layout)
     loads, base, rest, rest_source = read_inputs(options, layout)
-    # A calibration with a uid is used for that cube only.
+    # A calibration with a uid (unique id of a cube) can only be used for that cube.
     base = replace(base, rest_frequency=rest, uid=options.uid)
 
-    # Rows without load say nothing about the response: they were averaged to the rest frequencies.
+    # Rows without load are left out of the fit, because they contain no information about the
+    # response of the pads. Their average has given the rest frequencies.
     loaded = loads.state.any(axis=1)
     temperature = None if loads.temperature is None else loads.temperature[loaded]
     measured = measured_stress(base, loads.frequency[loaded], temperature)
@@ -91,7 +92,7 @@ def run(options: argparse.Namespace) -> int:
     if options.json is not None:
         write_json(options.json, figures(result))
     save(draw_fit(result, measured), options.figure)
-    # The time and the source are part of the file, so that it can be traced back.
+    # The calibration file contains time and source, so that its origin can be found later.
     created = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
     table = options.loads.name
     calibration = result.calibration(base, created, f"fit of {table}, {len(measured)} loads")
@@ -104,10 +105,14 @@ def run(options: argparse.Namespace) -> int:
 def read_inputs(
     options: argparse.Namespace, layout: Layout
 ) -> tuple[Loads, Calibration, Array, str]:
-    """Read the loads and the calibration that the fit starts from.
+    """Read the loads, and the calibration from which the fit takes beta, modulus and half side.
+
+    Args:
+        options: The options of the command.
+        layout: Layout of the cube's pads.
 
     Returns:
-        Loads; base calibration; rest frequencies (pads,) in Hz; where these come from, in words.
+        Loads; base calibration; rest frequencies (pads,) in Hz; origin of the latter, in words.
 
     Raises:
         CubeError: The table or bag cannot be used, or there is no base calibration.
@@ -124,10 +129,10 @@ def read_inputs(
         loads, base = read_recorded_loads(
             options.loads, options.cube, options.reference, layout, options.area
         )
-        # A reference sensor never reads exactly 0, so that only the tare of the recorded skin
-        # tells when there was no load.
+        # A reference sensor never measures exactly 0, so no recorded row counts as unloaded. The
+        # rest frequencies are those that the recorded skin used after its last tare.
         rest, rest_source = base.rest_frequency, "of the bag, after tare"
-    # A bag without --reference does not say what the loads were.
+    # A bag contains no loads; --reference names the topic with the loads.
     elif is_bag(options.loads):
         raise ConfigError(
             f"{options.loads} is a bag: name the topic to fit to with --reference; "
@@ -140,7 +145,7 @@ def read_inputs(
     if options.base is not None:
         base = read_calibration(find_calibration(options.base, Path()))
         base.check(layout, options.uid)
-    # A layout of the user's own has no shipped calibration to start from.
+    # The package contains calibrations only for the built-in layouts.
     if base is None:
         raise ConfigError(
             f"layout {layout.name!r} is not a built-in one: name a calibration for it with --base"
@@ -152,11 +157,11 @@ def read_inputs(
 
 
 def show_fit(result: Fit, remark: str) -> None:
-    """Print coefficients, gains, how well they fit, and which loads would determine more.
+    """Print coefficients and gains of a fit, its quality, and which loads would improve it.
 
     Args:
-        result: The fit.
-        remark: Where the rest frequencies come from.
+        result: Result of the fit.
+        remark: Origin of the rest frequencies, in words.
     """
     from rich.console import Console
 
@@ -166,7 +171,7 @@ def show_fit(result: Fit, remark: str) -> None:
     console.print(f"coefficients, {result.structure.symmetry} symmetry, Pa per Pa; {remark}")
     table = make_table(("coefficient",), ("value", "standard deviation"))
     for name, value in result.coefficients.items():
-        # Loads that do not excite a coefficient leave it undetermined.
+        # A coefficient that the loads do not determine is NaN.
         if math.isfinite(value):
             table.add_row(name, f"{value:+.5f}", f"{result.deviations[name]:.2g}")
         else:
@@ -191,7 +196,10 @@ def show_fit(result: Fit, remark: str) -> None:
 
 
 def figures(result: Fit) -> dict[str, object]:
-    """Return the content of the JSON file; outliers are pairs (row among those with load, pad)."""
+    """Return the result of a fit as the content of the JSON file.
+
+    Each outlier is a pair: index of the row among the rows with load, index of the pad.
+    """
     rows, pads = result.outliers.nonzero()
     return {
         "coefficients": result.coefficients,

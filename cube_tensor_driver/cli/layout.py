@@ -51,7 +51,7 @@ def run(options: argparse.Namespace) -> int:
     calibration = shipped_calibration(layout)
     if options.calibration is not None:
         calibration = read_calibration(find_calibration(options.calibration, Path()))
-        # A calibration of another layout has another number of pads.
+        # A calibration for another layout is refused.
         calibration.check(layout)
     if options.symmetry is not None:
         symmetry = options.symmetry
@@ -59,11 +59,11 @@ def run(options: argparse.Namespace) -> int:
         symmetry = calibration.symmetry
     else:
         symmetry = largest_symmetry(layout)
-    # The symmetry decides how many coefficients the response has.
+    # The symmetry determines how many independent coefficients the response matrix has.
     structure = find_structure(layout, symmetry)
     if calibration is None:
-        # Every response of this structure has the same ranks, but condition numbers and noise
-        # depend on the values of the response.
+        # Almost every response matrix with this symmetry has the same ranks, so they can be given
+        # without a calibration. Condition numbers and noise depend on the values of the matrix.
         result = summarize_response(structure, generic_response(structure))
         result |= {
             "condition_uniform": None,
@@ -82,13 +82,13 @@ def run(options: argparse.Namespace) -> int:
 
 
 def show_layout(layout: Layout, symmetry: str, result: dict[str, Any], source: str) -> None:
-    """Print what a layout can measure.
+    """Print what the pads of a layout can measure: ranks, condition numbers and noise.
 
     Args:
-        layout: The layout.
-        symmetry: Symmetry group of the response.
-        result: What `core.estimator.summary` found; None stands for unknown values.
-        source: Where the response comes from, in words.
+        layout: The layout of the pads.
+        symmetry: Name of the symmetry that the response matrix is assumed to have.
+        result: Result of `core.estimator.summarize_response`; unknown values are None.
+        source: Origin of the response matrix, in words.
     """
     from rich.console import Console
 
@@ -118,7 +118,12 @@ def show_layout(layout: Layout, symmetry: str, result: dict[str, Any], source: s
 
 
 def noise_text(result: dict[str, Any], mode: str) -> str:
-    """Return the noise of a mode per unit of pad noise, or why there is no number."""
+    """Return the noise of a mode per unit of pad noise as text, or why it is not known.
+
+    Args:
+        result: Result of `core.estimator.summarize_response`; unknown values are None.
+        mode: Name of the mode (linear stress field whose amplitude a cube measures).
+    """
     if mode in result["unobservable"]:
         return "not observed"
     noise = result["noise"][mode]

@@ -1,6 +1,7 @@
-"""The command line: words become options, errors become exit codes.
+"""Main function of the command line, which runs a command and turns errors into exit codes.
 
-Exit codes: 0 done, 1 an error (CubeError) or a check that failed, 2 usage, 130 Ctrl-C.
+The exit code is 0 after success, 1 after an error (CubeError) or a failed check, 2 if the command
+line is wrong, and 130 after Ctrl-C.
 """
 
 from __future__ import annotations
@@ -22,10 +23,10 @@ from .table import COMMANDS, GROUPS, PACKAGES
 PROGRAM = "./cube"
 
 INTERRUPTED = 130
-"""Exit code after Ctrl-C: 128 plus the number of SIGINT, as shells count."""
+"""Exit code after Ctrl-C: by the convention of shells, 128 plus the number of the signal SIGINT."""
 
 RESEND_S = 0.01
-"""Time, in seconds, after which a lost Ctrl-C is sent again."""
+"""Time, in seconds, from a Ctrl-C that Python has lost until SIGINT is sent again."""
 
 WHEELS = {
     "PIL": "pillow",
@@ -33,23 +34,26 @@ WHEELS = {
     "skfem": "scikit-fem",
     "yaml": "pyyaml",
 }
-"""Name of a module -> name of its package on PyPI, where they differ."""
+"""Name of a Python module -> name of its package on PyPI, for modules whose names differ."""
 
 DEBIAN_MODULES = {
     *("PIL", "jsonschema", "matplotlib", "numpy", "psutil", "rich", "scipy", "serial"),
     *("transforms3d", "websockets", "yaml", "zstandard"),
 }
-"""Modules that Debian and Ubuntu have as python3-MODULE, in small letters."""
+"""Names of Python modules that Debian and Ubuntu offer as a package.
+
+The name of the package is "python3-" and the name of the module in lower case.
+"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return its exit code.
 
     Args:
-        arguments: The words of the command; None: those of this process.
+        arguments: The command and its options; None: those with which this process was started.
 
     Raises:
-        SystemExit: Help or the version was printed, or the usage is wrong.
+        SystemExit: Help or the version was printed, or the command line is wrong.
     """
     options = parse(sys.argv[1:] if arguments is None else arguments)
     from ..core.errors import CubeError
@@ -61,7 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"cube: {error}", file=sys.stderr)
         return 1
     except ModuleNotFoundError as error:
-        # Libraries that only some commands need are not installed with the package.
+        # The package does not require libraries that only some commands need.
         print(f"cube: {missing_module_text(error.name or '')}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
@@ -69,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def missing_module_text(name: str) -> str:
-    """Return what to install where a module is missing, as one line."""
+    """Return an error message of one line that tells how to install a missing Python module."""
     module = name.partition(".")[0]
     needs = f"this command needs the Python module {module}, which is not installed: "
     if module in ("rclpy", __package__.partition(".")[0]) or module.endswith("_msgs"):
@@ -82,15 +86,18 @@ def missing_module_text(name: str) -> str:
 
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
-    """Return the options of a command; its function is `options.run`.
+    """Return the options of a command, with the function that executes it as `options.run`.
 
-    It needs the standard library only.
+    It needs only the standard library.
+
+    Args:
+        arguments: The command and its options.
 
     Raises:
-        SystemExit: Help or the version was printed, or the usage is wrong.
+        SystemExit: Help or the version was printed, or the command line is wrong.
     """
     words = list(arguments)
-    # ./cube help demo is the same as ./cube demo --help.
+    # ./cube help COMMAND is the same as ./cube COMMAND --help.
     if words[:1] == ["help"]:
         words = [*words[1:], "--help"]
     if not words or words[0] in ("-h", "--help"):
@@ -108,7 +115,8 @@ def command_parser(name: str) -> Parser:
     Raises:
         SystemExit: There is no such command.
     """
-    # ./cube handles --distro before Python starts; without the checkout nobody does.
+    # The script ./cube of a checkout handles --distro before it starts Python. If the option
+    # arrives here, the package was started without that script.
     if name.startswith("--distro"):
         Parser(prog=PROGRAM).error("--distro is an option of ./cube in a checkout")
     if name not in COMMANDS:
@@ -116,10 +124,10 @@ def command_parser(name: str) -> Parser:
         close = nearest(name, [*COMMANDS, "help", "--help", "--version", "--distro"])
         Parser(prog=PROGRAM).error(f"unknown {kind} {name}; {close}")
 
-    # Commands for designers and developers are in packages of their own.
+    # Commands for designers and developers are not part of the driver's package, see `PACKAGES`.
     package = PACKAGES.get(name, __package__.partition(".")[0])
     try:
-        # Only the module of this command is imported, to start quickly.
+        # Importing the modules of all commands would make the start slow.
         module = importlib.import_module(f"{package}.cli.{name}")
     except ModuleNotFoundError as error:
         if error.name != package:
@@ -134,7 +142,7 @@ def command_parser(name: str) -> Parser:
 
 
 def help_text() -> str:
-    """Return the list of all commands in groups, as wide as the terminal."""
+    """Return the text of ./cube --help: all commands in groups, wrapped to the terminal's width."""
     width = columns()
     indent = max(map(len, COMMANDS)) + 4
     lines = [
@@ -159,8 +167,8 @@ def help_text() -> str:
 def version() -> str:
     """Return the version of the package.
 
-    In a checkout and in an install space package.xml states it; where pip installed the package
-    without its data, the metadata do.
+    In a checkout and in an install space of ROS, it is read from package.xml. If pip installed the
+    package without its data files, it is read from the metadata of pip.
     """
     from importlib import metadata
 
@@ -175,13 +183,16 @@ def version() -> str:
 
 
 def interrupt_again(lost: Any) -> None:
-    """Send SIGINT again where Python has lost it; a value for `sys.unraisablehook`.
+    """Send SIGINT again after Python has lost a Ctrl-C; a function for `sys.unraisablehook`.
 
     Python drops the KeyboardInterrupt of a Ctrl-C that arrives in a destructor or at the end of an
     import.
+
+    Args:
+        lost: The exception that Python could not raise, as it passes it to the hook.
     """
     if lost.exc_type is KeyboardInterrupt:
-        # Sent at once, it would arrive in this hook and be lost as well.
+        # A signal that is sent at once would arrive inside of this hook and be lost as well.
         threading.Timer(RESEND_S, os.kill, (os.getpid(), signal.SIGINT)).start()
     else:
         sys.__unraisablehook__(lost)

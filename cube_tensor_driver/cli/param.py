@@ -28,8 +28,9 @@ def run(options: argparse.Namespace) -> int:
 
 
 def shown(value: object) -> str:
-    """Return a value as it is written in YAML."""
+    """Return the value of a parameter as YAML on one line."""
     from ..config.yaml import to_yaml
 
-    # A single text would be followed by an end-of-document mark, a list is not.
+    # As a document of its own, a text would be followed by an end-of-document mark ("...").
+    # Therefore it is written as a list of one entry, whose brackets are removed.
     return to_yaml([value]).strip()[1:-1]

@@ -1,4 +1,4 @@
-"""Parsing of the words of a command: a parser with short errors, and the types of arguments."""
+"""Parser for the options of a command, with short error messages, and types of arguments."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from typing import Any, NoReturn, TypeVar
 Number = TypeVar("Number", int, float)
 
 MAX_WIDTH = 100
-"""Width of a help text in columns, however wide the terminal is: longer lines are hard to read."""
+"""Maximum width of help texts, in characters; longer lines are hard to read on wide terminals."""
 
 MAX_UID = (1 << 64) - 1
-"""Largest uid of a hub or cube."""
+"""Maximum of the unique id (uid) of a hub or cube, which has 64 bits."""
 
 
 @dataclass(frozen=True)
 class Output:
-    """A file or folder that a command writes, to be checked before any work.
+    """An option that names a file or folder to write; `check_outputs` checks it before any work.
 
     Attributes:
-        flag: Option that names it.
-        name: Name of the option in the parsed options.
-        kind: `file`, `yaml` (it must have that suffix), `picture` (its suffix must be a format) or
-            `folder`.
+        flag: The option, such as "--output".
+        name: Name of its value in the parsed options.
+        kind: `file`, `yaml` (a file with the suffix of YAML), `picture` (a file whose suffix names
+            a picture format) or `folder`.
     """
 
     flag: str
@@ -38,7 +38,7 @@ class Output:
 
 
 class Parser(argparse.ArgumentParser):
-    """An ArgumentParser whose errors are two lines and suggest the nearest word."""
+    """An ArgumentParser with error messages of two lines, which suggest similar known words."""
 
     def __init__(self, **settings: Any) -> None:
         self._flags: list[str] = []
@@ -55,20 +55,31 @@ class Parser(argparse.ArgumentParser):
         return action
 
     def add_output(self, *flags: str, kind: str = "file", **settings: Any) -> None:
-        """Add an argument that names an output; its default may be a function of the options."""
+        """Add an option or argument that names a file or folder to write.
+
+        Args:
+            flags: Names of the option.
+            kind: Kind of the output, see `Output`.
+            settings: Further arguments of `add_argument`. The default may be a function that
+                computes the path from the parsed options.
+        """
         metavar = "DIR" if kind == "folder" else "FILE"
         action = self.add_argument(*flags, **{"type": Path, "metavar": metavar} | settings)
         self._outputs.append(Output(flags[0], action.dest, kind))
         self.set_defaults(outputs=self._outputs)
 
     def add_json(self) -> None:
-        """Add --json FILE, which has one meaning in all commands."""
+        """Add the option --json FILE, which writes the printed results to a file as JSON."""
         self.add_output("--json", help="write the figures to FILE as well")
 
     def add_subcommand(self, name: str, text: str) -> Parser:
-        """Add a word that can follow this command, and return its parser.
+        """Add a subcommand, such as `grid` in ./cube config grid, and return its parser.
 
-        The word becomes `options.what`.
+        Its name becomes the value of `options.what`.
+
+        Args:
+            name: Name of the subcommand.
+            text: Its line of help, without a capital letter and a full stop.
         """
         if self._subcommands is None:
             self._subcommands = self.add_subparsers(dest="what", metavar="WHAT", required=True)
@@ -76,13 +87,13 @@ class Parser(argparse.ArgumentParser):
         return added
 
     def add_words(self, name: str, metavar: str, text: str, missing: str = "") -> None:
-        """Take all words that follow, options too, as those of another program.
+        """Pass on all words that follow the command, including options, to another program.
 
         Args:
-            name: Name of the words in the parsed options.
-            metavar: Their name in the help.
-            text: Their help.
-            missing: Error message if there are no words; empty: none are needed.
+            name: Name of the list of words in the parsed options.
+            metavar: Name of the words in the help text.
+            text: Help text about the words.
+            missing: Error message if no word follows; empty if none is needed.
         """
         self.add_argument(name, nargs=argparse.REMAINDER, metavar=metavar, help=text)
         self.usage = f"%(prog)s {metavar} ..."
@@ -96,7 +107,7 @@ class Parser(argparse.ArgumentParser):
         if words[:1] in (["-h"], ["--help"]):
             self.print_help()
             self.exit()
-        # argparse accepts no words as an empty remainder.
+        # argparse would accept a missing word as an empty list.
         if self._missing and not words:
             self.exit(2, f"{self._prefix()}{self._missing}\n")
         namespace, _ = super().parse_known_args([], namespace)
@@ -104,7 +115,13 @@ class Parser(argparse.ArgumentParser):
         return namespace, []
 
     def _refuse_unknown(self, words: list[str]) -> None:
-        """Refuse unknown words, before argparse reports a mistyped option as a missing one."""
+        """Report unknown subcommands and options before argparse parses them.
+
+        argparse would report a mistyped option as a missing one.
+
+        Raises:
+            SystemExit: A word is unknown, or a subcommand is missing.
+        """
         if self._subcommands is not None:
             known = list(self._subcommands.choices)
             word = next((word for word in words if not word.startswith("-")), None)
@@ -119,7 +136,7 @@ class Parser(argparse.ArgumentParser):
             flag = word.partition("=")[0]
             if flag.startswith("--"):
                 fits = any(known.startswith(flag) for known in self._flags)
-            # A negative number begins with a dash, too, and is no option.
+            # A word such as -5 is a negative number and no option.
             elif flag[:1] == "-" and flag[1:2].isalpha():
                 fits = flag[:2] in self._flags
             else:
@@ -128,7 +145,7 @@ class Parser(argparse.ArgumentParser):
                 self.error(f"unknown option {flag}; {nearest(flag, self._flags)}")
 
     def error(self, message: str) -> NoReturn:
-        """Print what is wrong and where the help is, and exit with 2."""
+        """Print an error message and the command that prints the help, and exit with code 2."""
         message = self._prefix() + message.removeprefix("argument ")
         self.exit(2, f"{message}\n      {self.prog} --help lists what is possible\n")
 
@@ -138,24 +155,29 @@ class Parser(argparse.ArgumentParser):
 
 
 def formatter(prog: str) -> argparse.HelpFormatter:
-    """Return a formatter for the width of the terminal."""
+    """Return a formatter of help texts for the width of the terminal."""
     return argparse.HelpFormatter(prog, width=columns() - 2)
 
 
 def columns() -> int:
-    """Return the width of help texts."""
+    """Return the width of help texts, in characters: that of the terminal, or `MAX_WIDTH`."""
     return min(shutil.get_terminal_size().columns, MAX_WIDTH)
 
 
 def sentence(text: str) -> str:
-    """Return a line of the table of commands as a sentence."""
+    """Return a line of help with a capital letter at its beginning and a full stop at its end."""
     return f"{text[0].upper()}{text[1:]}."
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """Return a question that suggests close words, or the list of all known words."""
-    # The words are compared without dashes, which all options have in common.
-    # Short options such as -o are close to everything.
+    """Return a question that suggests similar words, or else the list of all known words.
+
+    Args:
+        word: The unknown word.
+        known: The known commands or options.
+    """
+    # The words are compared without their dashes, which would make all options similar. Short
+    # options such as -o are left out, because they are similar to every short word.
     names = {one.lstrip("-"): one for one in known if len(one) > 2}
     close = difflib.get_close_matches(word.lstrip("-"), names, n=2)
     if close:
@@ -164,10 +186,15 @@ def nearest(word: str, known: Iterable[str]) -> str:
 
 
 def check_outputs(options: argparse.Namespace) -> None:
-    """Check all outputs before any work, and fill in defaults that are functions.
+    """Check that all outputs of a command can be written, before it begins its work.
+
+    Defaults of outputs that are functions of the options are replaced by their values.
+
+    Args:
+        options: The parsed options of the command, which this function changes.
 
     Raises:
-        ConfigError: An output cannot be written.
+        ConfigError: A file or folder cannot be written, or its suffix is wrong.
     """
     from ..config.output_files import check_folder, check_outputs, check_yaml
 
@@ -175,7 +202,7 @@ def check_outputs(options: argparse.Namespace) -> None:
     pictures: list[Path] = []
     for output in getattr(options, "outputs", ()):
         value = getattr(options, output.name)
-        # A default such as the name of a picture depends on other options.
+        # A default that depends on other options is a function, see `Parser.add_output`.
         if callable(value):
             value = value(options)
             setattr(options, output.name, value)
@@ -188,7 +215,7 @@ def check_outputs(options: argparse.Namespace) -> None:
         if output.kind == "picture" and value is not None:
             pictures.append(value)
     check_outputs(files)
-    # matplotlib, which knows the formats, is imported only where there is a picture.
+    # Checking a picture format needs matplotlib, whose import is slow.
     if pictures:
         from ..views.figures.style import check_picture
 
@@ -201,12 +228,12 @@ def _number_type(
     what: str,
     is_allowed: Callable[[Number], bool],
 ) -> Callable[[str], Number]:
-    """Return a function that converts the text of an argument into a number.
+    """Return a function that converts the text of an argument into a number and checks its range.
 
     Args:
-        kind: Function that converts any number.
-        what: What is expected, for the error message.
-        is_allowed: Whether the option takes a number.
+        kind: Function that converts a text into a number, such as `float`.
+        what: Description of the allowed numbers, for the error message.
+        is_allowed: Function that returns whether a number is in the allowed range.
     """
 
     def convert(text: str) -> Number:
@@ -225,14 +252,14 @@ not_negative = _number_type(float, "a number of at least 0", lambda x: 0 <= x < 
 sample_rate = _number_type(
     float,
     "a rate from 0.1 to 10000 samples per second",
-    # These are the limits of hubs and skin files.
+    # Hubs and skin files have the same limits.
     lambda rate: 0.1 <= rate <= 10_000,
 )
 count = _number_type(int, "a whole number of at least 1", lambda n: n >= 1)
 whole_number = _number_type(int, "a whole number of at least 0", lambda n: n >= 0)
 tcp_port = _number_type(int, "a TCP port, 1 to 65535", lambda n: 1 <= n <= 65535)
 uid = _number_type(
-    # Base 0 takes decimal numbers, and hexadecimal ones with 0x in front.
+    # With base 0, `int` accepts decimal numbers, and hexadecimal numbers that begin with 0x.
     lambda text: int(text, 0),
     "a uid, 0 to 2^64 - 1",
     lambda n: 0 <= n <= MAX_UID,

@@ -15,10 +15,10 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Print one line per port.
+    """Print one line per serial port: the hub that answers on it, or why none does.
 
     Raises:
-        CubeError: There is no serial port.
+        CubeError: This machine has no serial port.
     """
     from ..core.errors import CubeError
     from ..device.links.search import ask_ports, find_ports
@@ -35,7 +35,7 @@ def run(options: argparse.Namespace) -> int:
                 f"{name}: hub 0x{hello.hub_uid:x}, {hello.n_cubes} cubes of {hello.n_pads} pads, "
                 f"{rate(hello.period_us)}, firmware 0x{hello.firmware:x}"
             )
-        # A port that a driver has open, or that this user must not open.
+        # The port could not be opened: a driver uses it, or this user has no permission.
         elif port.problem:
             print(port.problem)
         else:
@@ -44,5 +44,9 @@ def run(options: argparse.Namespace) -> int:
 
 
 def rate(period_us: int) -> str:
-    """Return the rate of a hub with a sample period in µs; 0: it has none yet."""
+    """Return the sample rate of a hub as text.
+
+    Args:
+        period_us: Time between two samples, in µs; 0 if the hub has not been given a rate yet.
+    """
     return f"{1e6 / period_us:.4g} Hz" if period_us else "rate not set"

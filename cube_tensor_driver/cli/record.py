@@ -51,7 +51,7 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Return 1 if messages were dropped, else 0."""
+    """Record, and return the exit code: 1 if messages were dropped, otherwise 0."""
     from ..ros.commands.record import record
 
     status = RecordingStatus(options.output)
@@ -60,7 +60,7 @@ def run(options: argparse.Namespace) -> int:
             options.output,
             options.topics,
             storage=options.storage,
-            # 0 stands for no limit.
+            # A limit of 0 means that the file is never split for this reason.
             max_bytes=round((options.split_size or 0) * 1e6),
             max_seconds=options.split_time or 0.0,
             duration=options.duration,
@@ -71,17 +71,17 @@ def run(options: argparse.Namespace) -> int:
 
 
 class RecordingStatus:
-    """Shows on stderr how a recording goes on.
+    """Shows the progress of a recording on stderr.
 
-    One line is updated; a red line is added for each topic that cannot be recorded, and whenever
-    more messages were dropped.
+    One line with duration and number of messages is updated. A red line is added for each topic
+    that cannot be recorded, and each time more messages were dropped.
 
     Attributes:
-        line: Context manager during which the line is shown.
+        line: Context manager that shows the line while it is active.
     """
 
     def __init__(self, path: Path) -> None:
-        """path: folder of the bag."""
+        """Prepare the line; `path` is the folder of the bag, whose name the line contains."""
         from rich.console import Console
 
         self._path = path
@@ -91,11 +91,16 @@ class RecordingStatus:
         self._dropped = 0
 
     def show(self, recorder: Recorder, seconds: float) -> None:
-        """Update the line; seconds: since the first message."""
+        """Update the line, and print topics that were refused and messages that were dropped.
+
+        Args:
+            recorder: The recorder, which counts the messages.
+            seconds: Time since the first message, in s.
+        """
         missing, refused = recorder.missing, recorder.refused
         waiting = f"; waiting for {', '.join(missing)}" if missing else ""
         self.line.update(f"{self._path}: {seconds:.0f} s, {recorder.received} messages{waiting}")
-        # Each refusal is printed once.
+        # A topic that cannot be recorded is reported once, not with every update.
         for topic in refused.keys() - self._refused:
             self._console.print(f"not recorded: {refused[topic]}", style="red")
         self._refused |= refused.keys()
@@ -106,7 +111,7 @@ class RecordingStatus:
             )
 
     def print_summary(self, recorder: Recorder) -> None:
-        """Print how many messages of each topic were recorded, dropped or not offered."""
+        """Print the number of messages of each topic, topics without a publisher, and drops."""
         counts, dropped = recorder.counts, recorder.dropped
         self._console.print(f"{self._path}: {sum(counts.values()) - dropped} messages")
         for topic, count in sorted(counts.items()):

@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from ..ros.commands.replay import Player
 
 MAX_START_S = 30.0
-"""Time, in seconds, that the browser view may take to start."""
+"""Maximum time, in seconds, from the start of the browser view until it prints its URL."""
 
 KEYS = "space: pause, s: step, q: quit"
-"""The line of help beside the bar."""
+"""Text beside the progress bar that tells which keys control the replay."""
 
 
 def arguments(parser: Parser) -> None:
@@ -64,7 +64,7 @@ def run(options: argparse.Namespace) -> int:
         with replay_bar(has_keys) as bar:
             task = bar.add_task("replaying", total=length_s)
 
-            # It runs in the main thread, between two spins of the node.
+            # `replay` calls this function repeatedly in the main thread, between two messages.
             def each(player: Player) -> None:
                 children.check()
                 if has_keys:
@@ -78,7 +78,8 @@ def run(options: argparse.Namespace) -> int:
                 loop=options.loop,
                 start=options.start,
                 clock=options.clock,
-                # The view shows the recorded stress, not one that is computed again.
+                # The browser view needs stress; no node computes it again here, so the recorded
+                # stress is published.
                 stress=options.stress or options.view,
                 hold=options.view,
                 each=each,
@@ -87,7 +88,12 @@ def run(options: argparse.Namespace) -> int:
 
 
 def obey(key: str, player: Player) -> None:
-    """Do what a key stands for; other keys do nothing."""
+    """Control a replay by a key of `KEYS`; other keys do nothing.
+
+    Args:
+        key: The character of the key; empty: no key was pressed.
+        player: The replay.
+    """
     if key == " ":
         player.pause(not player.paused)
     elif key == "s":
@@ -98,10 +104,12 @@ def obey(key: str, player: Player) -> None:
 
 @contextmanager
 def single_keys() -> Iterator[bool]:
-    """Let keys arrive one by one, without Enter and without echo.
+    """Set the terminal so that each key can be read at once, without Enter and without echo.
+
+    The terminal is restored at the end of the `with` block.
 
     Yields:
-        Whether there are keys; there are none where stdin is no terminal.
+        Whether keys can be read; they cannot if stdin is not a terminal.
     """
     import termios
     import tty
@@ -109,7 +117,7 @@ def single_keys() -> Iterator[bool]:
     if not sys.stdin.isatty():
         yield False
         return
-    # `cbreak` leaves Ctrl-C as it is.
+    # The mode `cbreak`, unlike `raw`, still turns Ctrl-C into a signal.
     number = sys.stdin.fileno()
     before = termios.tcgetattr(number)
     try:
@@ -120,15 +128,19 @@ def single_keys() -> Iterator[bool]:
 
 
 def pressed_key() -> str:
-    """Return the next key that was pressed, empty if none was."""
+    """Return the character of the next key that was pressed, or an empty text if there is none."""
     if not select.select([sys.stdin], [], [], 0)[0]:
         return ""
-    # Not sys.stdin.read, whose buffer would hide further keys from select.
+    # sys.stdin.read would move further keys into its own buffer, where `select` does not find them.
     return os.read(sys.stdin.fileno(), 1).decode(errors="replace")
 
 
 def replay_bar(has_keys: bool) -> Progress:
-    """Return a bar on stderr for the time within the bag; has_keys: with the help for keys."""
+    """Return a progress bar on stderr that shows the time within the bag.
+
+    Args:
+        has_keys: Whether to show the keys that control the replay beside the bar.
+    """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn
 
@@ -143,10 +155,18 @@ def replay_bar(has_keys: bool) -> Progress:
 
 @contextmanager
 def browser(bag: Bag, wanted: bool) -> Iterator[Children]:
-    """Start the browser view as a child process, if wanted.
+    """Run the browser view as a child process inside a `with` block, if it is wanted.
+
+    Args:
+        bag: The bag that is replayed.
+        wanted: Whether to start the view.
+
+    Yields:
+        The child processes: the view, or none.
 
     Raises:
-        BagError: The bag has no stress, which is all that the view shows.
+        BagError: The bag contains no stress, which the view would show.
+        ChildError: The view did not start within `MAX_START_S`.
     """
     import tempfile
 
@@ -160,13 +180,14 @@ def browser(bag: Bag, wanted: bool) -> Iterator[Children]:
         Children(Path(name)) as children,
     ):
         if wanted:
-            # The view does not compute stress.
+            # The view can only show stress that is published; it does not compute any.
             if not bag.topics(f"{PACKAGE}/msg/SkinStress"):
                 raise BagError(
                     f"{bag.path}: no stress to show; "
                     "./cube reprocess computes it from the frequencies"
                 )
-            # The page needs seconds to start; the replay begins when it can be opened.
+            # The view needs seconds to start. Waiting for its URL makes the replay begin when the
+            # page can be opened.
             children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view",)))
             print(children.wait_for_line("view", "http://", MAX_START_S), file=sys.stderr)
         yield children

@@ -1,6 +1,7 @@
 """./cube reprocess: compute the stress of bags again, in parallel, here or on a Dask cluster.
 
-It needs no ROS. What it computes has the same bits as what the reconstruction node published.
+It needs no ROS. From the same frequencies and calibrations, it computes exactly the same numbers
+(bit by bit) as the reconstruction node.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ def arguments(parser: Parser) -> None:
 
 
 def add_overrides(parser: Parser) -> None:
-    """Add the options that replace parts of the recording; `overrides_of` reads them."""
+    """Add the options that replace recorded calibrations or the tare; `overrides_of` reads them."""
     parser.add_argument(
         "--calibration", metavar="FILE", help="calibration of all cubes (default: as recorded)"
     )
@@ -75,10 +76,13 @@ def add_overrides(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Return 1 if a bag could not be reprocessed, else 0.
+    """Reprocess the bags.
+
+    Returns:
+        1 if a bag could not be reprocessed, otherwise 0.
 
     Raises:
-        CubeError: The options cannot be used; nothing was begun.
+        CubeError: The options cannot be used. In this case no bag was reprocessed.
     """
     from rich.console import Console
     from rich.progress import Progress
@@ -96,14 +100,14 @@ def run(options: argparse.Namespace) -> int:
     overrides, contacts = overrides_of(options), contacts_of(options)
     jobs = make_jobs(options.bags, options.output, options.format, overrides, contacts)
     write_recipe(options.output, options.format, overrides, contacts)
-    # Results that are complete are kept, so that an interrupted run can be continued.
+    # A bag whose result exists is skipped, so that an interrupted run can be continued.
     waiting = [job for job in jobs if not job.output.exists()]
     console = Console(stderr=True, highlight=False)
     if len(waiting) < len(jobs):
         done = len(jobs) - len(waiting)
         console.print(f"{done} of {len(jobs)} bags are there already in {options.output}")
 
-    # More processes than bags would only cost memory.
+    # Each bag is one job, so more processes than bags would be useless.
     processes = useful_workers(options.jobs, len(waiting))
     bar = Progress(console=console, disable=not waiting)
     task = bar.add_task("reprocessing", total=len(waiting))
@@ -118,7 +122,7 @@ def run(options: argparse.Namespace) -> int:
                     console.print(result_line(job.output, result))
                 bar.advance(task)
     finally:
-        # An interrupted bag must not look like a result.
+        # The folder of a bag that was interrupted must not look like a complete result.
         remove_without_results(options.output)
     if failed:
         console.print(f"{failed} of {len(jobs)} bags could not be reprocessed", style="red")
@@ -126,12 +130,15 @@ def run(options: argparse.Namespace) -> int:
 
 
 def result_line(output: Path, result: ReprocessResult) -> str:
-    """Return what was computed of one bag, and the time that the bag covers."""
+    """Return a line with the numbers of messages and rows computed from a bag, and its duration."""
     return f"{output}: {result.messages} messages, {result.rows} rows, {result.seconds:.1f} s"
 
 
 def overrides_of(options: argparse.Namespace) -> Overrides:
-    """Return what the options replace of a recording.
+    """Return the calibrations and the tare that the options set instead of the recorded ones.
+
+    Args:
+        options: The parsed options, see `add_overrides`.
 
     Raises:
         ConfigError: Options contradict each other, or a file cannot be used.
@@ -145,7 +152,7 @@ def overrides_of(options: argparse.Namespace) -> Overrides:
         raise ConfigError("found both --calibration and --skin; give one")
     calibration = skin = tare = None
     if options.tare_from is not None:
-        # The times are relative to the start of each bag.
+        # Both times are in s after the start of each bag.
         begin, end = tare = tuple(options.tare_from)
         if not 0 <= begin < end:
             raise ConfigError(f"--tare-from {begin:g} {end:g}: needed is 0 <= T0 < T1, in s")
@@ -157,11 +164,11 @@ def overrides_of(options: argparse.Namespace) -> Overrides:
 
 
 def contacts_of(options: argparse.Namespace) -> ContactsOverTime | None:
-    """Return how contacts are to be computed; None: they are not wanted.
+    """Return the settings for computing contacts, or None without the option --contacts.
 
     Raises:
-        ConfigError: The format holds no contacts, or the node `contacts` would refuse the method
-            or a value.
+        ConfigError: The output format cannot contain contacts, or the node `contacts` would refuse
+            the method or the value of a parameter.
     """
     from ..bags.reprocess.contacts import ContactsOverTime
     from ..config.parameters import CONTACTS
@@ -176,7 +183,8 @@ def contacts_of(options: argparse.Namespace) -> ContactsOverTime | None:
     if method not in CONTACT_METHODS:
         raise ConfigError(f"--contacts {method}: the methods are {', '.join(CONTACT_METHODS)}")
 
-    # The numbers and the influence file; other parameters of the node concern its topics.
+    # Of the parameters of the node `contacts`, only the numbers and the influence table affect the
+    # result; the others concern its topics.
     known = {one.name: one for one in CONTACTS if one.span is not None or one.name == "influence"}
     values = {name: one.default for name, one in known.items()}
     for text in assignments:
@@ -191,7 +199,7 @@ def contacts_of(options: argparse.Namespace) -> ContactsOverTime | None:
             values[name] = float(value)
         except ValueError:
             values[name] = math.nan
-        # NaN fails the comparison, too.
+        # A text that is no number became NaN, which fails this comparison, too.
         if not low <= values[name] <= high:
             raise ConfigError(f"--contacts {text}: needed is a number from {low:g} to {high:g}")
     rate = values.pop("rate")

@@ -1,4 +1,4 @@
-"""The table of commands, which ./cube --help prints. The module of a command has its name."""
+"""The table of commands, which ./cube --help prints. Each command has a module of the same name."""
 
 from __future__ import annotations
 
@@ -49,7 +49,10 @@ GROUPS = {
         "exec": "run any command inside the built environment",
     },
 }
-"""Heading -> command -> one line of help, in the order in which a user needs them."""
+"""Heading of a group -> name of a command -> its line of help.
+
+Groups and commands are in the order in which a user needs them.
+"""
 
 PACKAGES = {
     "fem": "cube_tensor_design",
@@ -64,6 +67,6 @@ PACKAGES = {
     "lint": "workshop",
     "docs": "workshop",
 }
-"""Command -> package of its module, for commands that are not part of the driver."""
+"""Name of a command -> Python package that contains its module, for commands outside the driver."""
 
 COMMANDS = {name: text for group in GROUPS.values() for name, text in group.items()}

@@ -20,11 +20,15 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Return 1 if a reconstruction node refuses, else 0."""
+    """Request the tare, and return the exit code: 1 if a node refuses it, otherwise 0.
+
+    Raises:
+        TareError: Cubes are named together with --clear, which applies to all cubes.
+    """
     from ..core.errors import TareError
     from ..ros.commands.services import request_tare
 
-    # The service that clears a tare takes no names.
+    # The service that clears a tare has no field for names of cubes.
     if options.clear and options.cubes:
         raise TareError(
             f"--clear with {' '.join(options.cubes)}: it clears the tare of all cubes; "

@@ -18,7 +18,7 @@ def run(options: argparse.Namespace) -> int:
     from ..ros.commands.topics import list_topics
 
     topics = list_topics()
-    # The columns are aligned, so that rates can be compared.
+    # All names are padded to the same width, so that the rates stand in one column.
     width = max(len(topic.name) for topic in topics)
     for topic in topics:
         rate = "not installed here" if topic.rate is None else f"{topic.rate:.0f} Hz"
@@ -28,7 +28,11 @@ def run(options: argparse.Namespace) -> int:
 
 
 def cubes_text(cubes: list[str]) -> str:
-    """Return the cubes whose topics a line stands for, empty for a topic of the whole skin."""
+    """Return the number and the names of the cubes whose topics one line of the list represents.
+
+    Args:
+        cubes: Names of the cubes; empty for a topic of the whole skin, which gives an empty text.
+    """
     if not cubes:
         return ""
     names = ", ".join(cubes) if len(cubes) < 3 else f"{cubes[0]} … {cubes[-1]}"

@@ -9,7 +9,7 @@ from ..core.defaults import SURFACE_DEPTH
 from .parser import Parser, positive, tcp_port
 
 RECORDINGS = Path("~/cube_recordings")
-"""Folder for bags that are recorded from the page, unless another one is named."""
+"""Default folder for the bags that users record from the page; --recordings names another one."""
 
 
 def arguments(parser: Parser) -> None:
@@ -44,7 +44,7 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    # viser is imported only by this command.
+    # The module imports viser, which the other commands do not need.
     from ..browser.viewer import run_view
 
     return run_view(options.host, options.port, options.depth, options.recordings.expanduser())
