@@ -526,7 +526,8 @@ def _advise(
     # A coefficient of 0 would give no stress on its pads, so their gains would seem undetermined.
     # Any other value of the unknown coefficients avoids this.
     theta[: len(names)][is_open] = 0.5
-    # The advised loads get the rms size of the given ones, which the cube is known to bear.
+    # The advised loads are as large (rms) as the given ones, for which the signals of the pads were
+    # large enough.
     size = np.sqrt(np.mean(x[x != 0] ** 2))
     single_modes = size * np.eye(x.shape[1])
     loads = x

@@ -39,10 +39,10 @@ only has to lead near the right one.
 """
 
 DIRECTION_TOLERANCE = 1e-6
-"""Smallest singular value of the scaled Jacobian matrix, relative to the largest, that counts as
-not 0.
+"""Smallest singular value of the Jacobian matrix (derivatives of predictions with respect to
+parameters, columns scaled to length 1) that counts as not 0, relative to the largest.
 
-The measurements do not determine the combinations of parameters that belong to smaller ones.
+Measurements do not determine a combination of parameters that belongs to a smaller singular value.
 """
 
 NORMAL_MEDIAN_RATIO = 1.4826

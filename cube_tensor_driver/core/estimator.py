@@ -181,7 +181,7 @@ def make_estimator(
     size = np.linalg.norm(targets, axis=1)
     observed = (size > 0) & (unseen + neglected <= LEAK_TOLERANCE * size)
 
-    # half @ half.T is the covariance, as the whitened pads have unit variance.
+    # Pad stresses divided by their noise have the variance 1, so half @ half.T is the covariance.
     half = kept_targets @ v1 / s[:rank]
     matrix = np.zeros((n_targets, n_pads))
     matrix[:, present] = half @ u[:, :rank].T / noise[present]

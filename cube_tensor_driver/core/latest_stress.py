@@ -81,7 +81,7 @@ class LatestStress:
         self.arrived[cube] = now
 
         self._close_window_when_over(now)
-        # If a cube has several of these rows, `count[cube] += 1` would count only one of them.
+        # If a cube has several of the new rows, `count[cube] += 1` would count only one of them.
         np.add.at(self.count, cube, 1)
         is_over_limit = rows.status & RESIDUAL != 0
         if is_over_limit.any():

@@ -262,7 +262,7 @@ def _make_layout(name: str, pads: str) -> Layout:
     names = pads.split()
     normals = np.array([_parse_axis(pad[:2]) for pad in names])
     sides = np.array([_parse_axis(pad[2:]) for pad in names])
-    # The face lies at the distance 1 from the centre, in units of d0.
+    # Each face of the cube is at the distance 1 from its centre, in units of d0.
     positions = normals + PAD_OFFSET * sides
     return Layout(name, positions, normals)
 

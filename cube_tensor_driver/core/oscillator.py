@@ -51,8 +51,8 @@ def pad_stress(
     with np.errstate(all="ignore"):
         # The difference is formed first, because f / f0 - 1 would lose digits in float32.
         u = (f - f0) / f0
-        # At the highest frequency that the pad law allows, the foam is infinitely thick and this
-        # is zero.
+        # The denominator is zero at the highest frequency that the pad law allows, at which the
+        # foam is infinitely thick.
         denominator = 1 - beta * u
         v = modulus * (1 + beta) * u / denominator
         is_possible = (f > 0) & np.isfinite(f) & (denominator > 0)

@@ -13,11 +13,11 @@ import numpy as np
 
 from .arrays import AnyArray
 
-MAX_SKINS = 4
-"""Maximum number of cube numbers in all cached patterns, as a multiple of the cubes of the skin.
+MAX_ROWS_PER_CUBE = 4
+"""Maximum total length of the cached columns of cube numbers, per cube of the skin.
 
-This is enough for the columns of cube numbers (patterns) of a message of the whole skin, of a
-message of each hub, and of a message of a few scans.
+This is enough for the columns of a message of the whole skin, of a message of each hub, and of a
+message of a few scans (a scan has one row per cube).
 """
 
 Computed = TypeVar("Computed")
@@ -31,7 +31,7 @@ class PatternCache(Generic[Computed]):
 
     def __init__(self, compute: Callable[[AnyArray], Computed], n_cubes: int) -> None:
         self._compute = compute
-        self._max_rows = MAX_SKINS * n_cubes
+        self._max_rows = MAX_ROWS_PER_CUBE * n_cubes
         self._entries: dict[tuple[int, ...], tuple[bytes, Computed]] = {}
         self._rows = 0
 

@@ -32,8 +32,9 @@ from .status import INVALID, PAD_FAULT, RESIDUAL, STAMP, TEMPERATURE
 
 N_COMPONENTS = len(COMPONENTS)
 
-MAX_CACHED_MASKS = 1024
-"""Maximum number of matrices from pads to components that are kept in memory.
+MAX_CACHED_ESTIMATORS = 1024
+"""Maximum number of estimators (matrices from the pads of a cube to components of stress) that are
+kept in memory.
 
 There is one for each combination of a calibration and a set of bad pads that has occurred.
 """
@@ -182,8 +183,8 @@ class Pipeline:
         self._is_thermal = np.array([c.temperature is not None for c in self._groups])
         self._any_thermal = bool(self._is_thermal.any())
 
-        self._estimator = lru_cache(maxsize=MAX_CACHED_MASKS)(self._make_estimator)
-        self._table = lru_cache(maxsize=MAX_CACHED_MASKS)(self._make_table)
+        self._estimator = lru_cache(maxsize=MAX_CACHED_ESTIMATORS)(self._make_estimator)
+        self._table = lru_cache(maxsize=MAX_CACHED_ESTIMATORS)(self._make_table)
         groups = range(len(self._groups))
         # Even if no calibration has a residual, the tables have one row for it, which is NaN.
         most_dof = max(self._estimator(group, 0).dof for group in groups)
@@ -566,10 +567,13 @@ class Pipeline:
         )
 
     def _make_blocks(self, group: Index) -> list[_Block]:
-        """Divide the rows of a scan into blocks that share a matrix product.
+        """Divide the rows of a scan into blocks that are computed in one matrix product each.
 
-        A block holds the rows of one calibration or, if there are many calibrations, all rows with
-        the same number of pads.
+        A block holds the rows of one calibration or, with more than `MAX_SEPARATE_PRODUCTS`
+        calibrations, all rows with the same number of pads.
+
+        Args:
+            group: Number of the calibration of each row of the scan (N,).
         """
         is_separate = len(self._groups) <= MAX_SEPARATE_PRODUCTS
         n_pads = self._exists.sum(axis=1)[group]
@@ -648,8 +652,8 @@ class Pipeline:
             matrix[N_COMPONENTS:, :n_pads] = 0
             matrix[N_COMPONENTS:end, :n_pads] = null / np.sqrt(dof)
             limit = np.sqrt(chi2_limit(dof, FALSE_ALARM) / dof)
-        # Rows hold pad stresses divided by the stiffness, so the matrix is multiplied by the
-        # stiffness.
+        # The matrix will be applied to pad stresses divided by the stiffness, so the stiffness is
+        # included in it.
         matrix *= self._stiffness[group]
         observed = int(_pack_bits(estimator.observed))
         return _Table(matrix.astype(self.dtype, order="F"), limit, observed)

@@ -10,10 +10,11 @@ the pads found it stuck or noisy.
 """
 
 RESIDUAL = 2
-"""Status bit: the residual (what the reconstructed stress leaves unexplained in the pads' signals)
-is larger than the noise of the pads makes it in all but one of a thousand rows.
+"""Status bit: the residual is above its limit.
 
-Either the load causes a stress field that the modes do not express, or a pad is broken.
+The residual measures how far the signals of a cube's pads contradict each other. Noise alone
+exceeds the limit in one row (sample of a cube) of a thousand. If many rows exceed it, the load
+causes a stress field that the reconstruction cannot express, or a pad is broken.
 """
 
 INVALID = 4
@@ -51,7 +52,8 @@ survive."""
 STUCK = 128
 """Condition of a pad: its frequency does not change while the other pads of the cube move."""
 NOISY = 256
-"""Condition of a pad: it is much noisier than its calibration and the other pads of the cube."""
+"""Condition of a pad: the noise of its frequency is much larger than its calibration states, and
+larger than that of the other pads of the cube."""
 REPORTED = 512
 """Condition of a pad: the hub reports a fault."""
 DRIFT = 1024

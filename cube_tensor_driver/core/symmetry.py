@@ -154,11 +154,11 @@ def map_pads(layout: Layout, rotation: Array | Index) -> Index:
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """All response matrices that a symmetry allows: sum_k coefficient_k basis_k.
+    """All response matrices (pads x modes) that a symmetry allows: sum_k coefficient_k basis_k.
 
     Attributes:
         layout: Layout of the P pads.
-        modes: The M modes.
+        modes: The M modes (linear stress fields).
         symmetry: Name of the symmetry group.
         names: Names of the K coefficients. A name such as "+z-x:zz" means the entry of the response
             for the pad "+z-x" and the mode "zz".
@@ -200,12 +200,12 @@ def find_structure(
     symmetry: str = "full",
     modes: Modes | None = None,
 ) -> Structure:
-    """Derive the response matrices that a symmetry allows for a layout.
+    """Derive the response matrices (pads x modes) that a symmetry allows for a layout.
 
     Args:
         layout: Layout of the pads.
-        symmetry: Name of the symmetry group.
-        modes: Modes; by default `default_modes` of the layout.
+        symmetry: Name of the symmetry group, a key of `GENERATORS`.
+        modes: Modes (linear stress fields); by default `default_modes` of the layout.
 
     Raises:
         SymmetryError: The layout does not have this symmetry.

@@ -16,7 +16,7 @@ HOLD_WINDOWS = 3
 ends. Several are needed, so that the condition of a pad with an intermittent contact does not
 flicker."""
 
-MIN_COUNT = 20
+MIN_ROWS = 20
 """Minimum number of rows (samples of a cube) in a window of 0.5 s for its statistics to be used.
 
 With fewer rows, the measured noise is too uncertain to be compared with limits.
@@ -42,7 +42,7 @@ MAX_SECOND_DIFFERENCE = 60.0
 the noise is computed, as a multiple of the pad's usual noise.
 
 One jump of the frequency gives two large second differences. Cut to this limit, they raise the
-noise of `MIN_COUNT` rows by less than `NOISY_ENTER`, so one jump does not make a pad noisy.
+noise of `MIN_ROWS` rows by less than `NOISY_ENTER`, so one jump does not make a pad noisy.
 """
 
 STUCK_MIN_SPAN = 5.0
@@ -187,7 +187,7 @@ class PadDiagnosis:
         Returns:
             Conditions found in the window (cubes, P).
         """
-        has_enough_rows = window.rows >= MIN_COUNT
+        has_enough_rows = window.rows >= MIN_ROWS
         span = window.highest - window.lowest
         found = np.zeros(state.shape, np.uint16)
         with np.errstate(invalid="ignore"):  # NaN where a cube has no such pad, or no rows

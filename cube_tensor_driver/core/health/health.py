@@ -225,7 +225,7 @@ class Health:
             np.add.at(self._over_limit, cube[is_over_limit], 1)
 
     def collect(self) -> tuple[StatusBits, Mask, Index]:
-        """Return the results of the time since the last call, and start again.
+        """Return what was found and counted since the last call of this method.
 
         Returns:
             All conditions that a pad had (cubes, P), whether the residual was ever high (cubes,),
@@ -365,8 +365,8 @@ class Health:
         if repeats:
             scan = cubes = cube[: len(cube) // repeats].copy()
             first, last = int(scan[0]), int(scan[-1])
-            # The cube numbers of a scan rise, so they are consecutive if the first and the last
-            # differ by their number minus 1.
+            # The cube numbers of a scan rise, so they have no gaps if the range from the first to
+            # the last is as long as the scan.
             if last - first + 1 == len(scan):
                 cubes = slice(first, last + 1)
         return _Pattern(

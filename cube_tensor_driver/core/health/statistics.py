@@ -53,7 +53,7 @@ GAP_NS = 50_000_000
 """Interval between the time stamps of two rows of a cube, in ns, from which on the interval counts
 as a gap: how the frequencies changed within it is unknown.
 
-A cube with the minimum rate for statistics (`MIN_COUNT` rows in 0.5 s) has intervals of half this.
+Statistics need at least `MIN_ROWS` rows in 0.5 s, so intervals are usually at most 25 ms.
 """
 
 MAX_JITTER_RATIO = 1.5

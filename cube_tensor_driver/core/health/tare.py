@@ -20,7 +20,7 @@ from ..arrays import Array, Index, Mask, pad_table
 from ..errors import TareError
 from ..pipeline import Pipeline
 from ..status import LEFT_OUT
-from .diagnosis import MIN_COUNT
+from .diagnosis import MIN_ROWS
 from .health import HISTORY_WINDOWS, Health
 from .statistics import WINDOW_S, Window
 
@@ -28,14 +28,14 @@ MAX_DURATION_S = HISTORY_WINDOWS * WINDOW_S
 """Longest duration over which a tare can average, in s, limited by the windows that `Health`
 keeps."""
 
-MAX_SPAN = 12.0
+MAX_SPAN_RATIO = 12.0
 """Span (highest minus lowest frequency of a pad) above which a tare is refused because the load
 moves, as a multiple of the noise (standard deviation) in the calibration.
 
 In 10000 rows, noise alone spans 9 times its standard deviation.
 """
 
-MAX_NOISE = 4.0
+MAX_NOISE_RATIO = 4.0
 """Measured noise of a pad above which a tare is refused because a mean would be unreliable, as a
 multiple of the noise (standard deviation of the frequency) in the calibration."""
 
@@ -46,7 +46,7 @@ with which a tare is accepted.
 A larger difference shows that a load is on the cube, or that the calibration is of another cube.
 """
 
-JUMP_SPAN = 10.0
+JUMP_SPAN_RATIO = 10.0
 """Span (highest minus lowest frequency of a pad), as a multiple of the measured noise, above which
 the frequency has jumped.
 
@@ -185,7 +185,7 @@ def _select_windows(
     rows = np.array([window.rows[chosen] for window in windows])
     total = rows.sum(axis=0)
     has_empty_window = (rows[:count] == 0).any(axis=0)
-    has_too_few = has_empty_window | (total < MIN_COUNT)
+    has_too_few = has_empty_window | (total < MIN_ROWS)
     for cube in chosen[has_too_few].tolist():
         raise TareError(
             f"cube {names[cube]}: no data, or gaps in it, in the last {duration:g} s; see its link"
@@ -230,7 +230,7 @@ def _average(windows: Sequence[Window], chosen: Index) -> _Means:
     """Combine the statistics of several windows, each weighted with its number of rows.
 
     Args:
-        windows: Windows to average.
+        windows: Statistics of the windows to average.
         chosen: Numbers of the cubes to tare.
     """
     rows = np.array([window.rows[chosen] for window in windows])
@@ -267,18 +267,18 @@ def _list_checks(
     frequencies = [calibration.rest_frequency for calibration in calibrations]
     calibrated = pad_table(frequencies, pipeline.n_pads, np.nan)
     noise = health.noise[chosen]
-    jumped = means.span > JUMP_SPAN * means.noise
+    jumped = means.span > JUMP_SPAN_RATIO * means.noise
     return [
         _Check(
             values=np.where(jumped, 0, means.noise / noise),
-            limit=MAX_NOISE,
+            limit=MAX_NOISE_RATIO,
             problem="is noisy",
             unit="times its noise",
             fix="look for loose leads and interference",
         ),
         _Check(
             values=means.span / noise,
-            limit=MAX_SPAN,
+            limit=MAX_SPAN_RATIO,
             problem="moves",
             unit="times its noise peak to peak",
             fix="let it come to rest",
