@@ -59,7 +59,10 @@ class RowAccount:
 
     @property
     def counts(self) -> RowCounts:
-        """Numbers of rows until now; only `unaccounted` is as of the last call of `check`."""
+        """Numbers of rows until now, by what happened to them.
+
+        Only `unaccounted`, the number of missing rows, is that of the last call of `check`.
+        """
         return RowCounts(
             delivered=self.delivered,
             unknown_cube=self._scans.cubes.unknown_cube,
