@@ -30,7 +30,7 @@ from mcap.writer import CompressionType, Writer
 from ..config.yaml import parse_yaml, to_yaml
 from .metadata import Connection, FileSummary, QosProfile, bag_information
 
-MAGIC = b"\x89MCAP0\r\n"
+MCAP_MAGIC = b"\x89MCAP0\r\n"
 """The bytes with which every complete MCAP file begins and ends."""
 
 RECORD_HEAD = struct.Struct("<BQ")
@@ -62,13 +62,13 @@ The topics of frequencies and of stress are read in turn by two iterators, whose
 the same chunks. Without this cache each chunk would be read and decompressed twice.
 """
 
-ROSBAG2 = "rosbag2"
+ROSBAG2_RECORD = "rosbag2"
 """Name of the MCAP metadata record from which rosbag2 reads the description of a file (topics,
 times, numbers of messages) if there is no metadata.yaml."""
 
 _FOOTER_BYTES = RECORD_HEAD.size + 20
 """Size, in bytes, of the footer record of an MCAP file with its opcode and length. The footer
-stands just before the closing `MAGIC` bytes and states where the summary begins."""
+stands just before the closing `MCAP_MAGIC` bytes and states where the summary begins."""
 
 CHECKSUM_BYTES = 4
 """Size, in bytes, of the checksum (CRC-32) of the summary, with which the footer record of an MCAP
@@ -322,7 +322,7 @@ class McapWriter:
         """
         # MCAP allows no metadata record within a chunk, so the current chunk is completed first.
         self.flush()
-        self._writer.add_metadata(ROSBAG2, rosbag2_metadata(summary))
+        self._writer.add_metadata(ROSBAG2_RECORD, rosbag2_metadata(summary))
         self._writer.finish()  # type: ignore[no-untyped-call]
         self._stream.close()
 
@@ -420,16 +420,16 @@ def _check_summary(stream: BinaryIO) -> None:
         McapError: The file is cut off, or its summary is damaged.
     """
     size = stream.seek(0, SEEK_END)
-    tail_start = size - len(MAGIC) - _FOOTER_BYTES
+    tail_start = size - len(MCAP_MAGIC) - _FOOTER_BYTES
     stream.seek(max(0, tail_start))
     tail = stream.read()
-    if tail_start < 0 or not tail.endswith(MAGIC):
+    if tail_start < 0 or not tail.endswith(MCAP_MAGIC):
         raise McapError("the file does not end as an MCAP file does")
     footer = Footer.read(ReadDataStream(BytesIO(tail[RECORD_HEAD.size :])))
     if not footer.summary_crc:  # 0 states that the writing program computed no checksum
         return
     # The checksum covers the summary and that part of the footer which precedes the checksum.
-    end = size - len(MAGIC) - CHECKSUM_BYTES
+    end = size - len(MCAP_MAGIC) - CHECKSUM_BYTES
     stream.seek(footer.summary_start)
     checked = stream.read(max(0, end - footer.summary_start))
     if crc32(checked) != footer.summary_crc:

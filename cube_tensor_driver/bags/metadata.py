@@ -32,7 +32,7 @@ METADATA_VERSION = 9
 SUFFIXES = {"mcap": ".mcap", "sqlite3": ".db3"}
 """File name suffix of each storage format; the keys are rosbag2's names of the formats."""
 
-_UNLIMITED = {"sec": 9223372036, "nsec": 854775807}
+_UNLIMITED_DURATION = {"sec": 9223372036, "nsec": 854775807}
 """Duration that states "no limit" in a quality of service profile of DDS (the middleware of ROS 2):
 the largest number of nanoseconds in 64 bits, divided into seconds and nanoseconds."""
 
@@ -128,10 +128,10 @@ def quality(
         "depth": depth,
         "reliability": "reliable" if reliable else "best_effort",
         "durability": "transient_local" if latched else "volatile",
-        "deadline": dict(_UNLIMITED),
-        "lifespan": dict(_UNLIMITED),
+        "deadline": dict(_UNLIMITED_DURATION),
+        "lifespan": dict(_UNLIMITED_DURATION),
         "liveliness": "automatic",
-        "liveliness_lease_duration": dict(_UNLIMITED),
+        "liveliness_lease_duration": dict(_UNLIMITED_DURATION),
         "avoid_ros_namespace_conventions": False,
     }
 

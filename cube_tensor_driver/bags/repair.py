@@ -44,9 +44,9 @@ from mcap.summary import Summary
 from ..core.errors import BagError
 from .mcap_file import (
     CHECKSUM_BYTES,
-    MAGIC,
+    MCAP_MAGIC,
     RECORD_HEAD,
-    ROSBAG2,
+    ROSBAG2_RECORD,
     McapReader,
     chunk_records,
     rosbag2_metadata,
@@ -56,7 +56,7 @@ from .mcap_file import (
 from .metadata import FILE_NAME, SUFFIXES, FileSummary, write_metadata
 from .read import READ_ERRORS, open_storage, report_damage
 
-REST = ".rest"
+REST_SUFFIX = ".rest"
 """Suffix of the file that keeps the bytes that a repair cut off; it is appended to the name of the
 storage file."""
 
@@ -81,7 +81,7 @@ def repair(path: Path, keep_rest: bool = True) -> Repaired:
     Args:
         path: Folder of the bag, or one of its files.
         keep_rest: Whether the bytes that are cut off are kept in a file beside the storage file,
-            whose name ends in `REST`.
+            whose name ends in `REST_SUFFIX`.
 
     Raises:
         BagError: There is no bag, it has no complete message, or it cannot be written.
@@ -165,7 +165,8 @@ def _repair_mcap(path: Path, keep_rest: bool) -> tuple[int, int]:
 
     Args:
         path: The MCAP file; it is removed if it has no complete chunk.
-        keep_rest: Whether the bytes that are cut off are kept in a file whose name ends in `REST`.
+        keep_rest: Whether the bytes that are cut off are kept in a file beside it, whose name ends
+            in `REST_SUFFIX`.
 
     Returns:
         Number of bytes that were cut off, and number of damaged chunks that were left out.
@@ -180,7 +181,7 @@ def _repair_mcap(path: Path, keep_rest: bool) -> tuple[int, int]:
         if keep_rest and not is_complete and size > salvaged.end:
             # The rest is copied before the file is cut, so that a full disk cannot lose it.
             stream.seek(salvaged.end)
-            rest_path = path.with_name(path.name + REST)
+            rest_path = path.with_name(path.name + REST_SUFFIX)
             with rest_path.open("wb") as rest:
                 shutil.copyfileobj(stream, rest)
         if salvaged.index.chunk_indexes:
@@ -228,7 +229,7 @@ class _Salvaged:
         self._open_chunk: ChunkIndex | None = None
         self._open_counts: Counter[int] = Counter()
         stream.seek(0)
-        if stream.read(len(MAGIC)) != MAGIC:
+        if stream.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
             raise BagError(
                 f"{stream.name}: does not begin as an MCAP file does; nothing can be read"
             )
@@ -240,12 +241,12 @@ class _Salvaged:
             # A damaged record is left out. The records after it are still used, because their
             # offsets do not depend on its content.
             try:
-                self._take(opcode, start, content)
+                self._read_record(opcode, start, content)
             except READ_ERRORS:
                 self._open_chunk = None
                 self.damaged += 1
 
-    def _take(
+    def _read_record(
         self,
         opcode: int,
         start: int,
@@ -266,7 +267,7 @@ class _Salvaged:
         elif opcode == Opcode.MESSAGE_INDEX and self._open_chunk is not None:
             self._add_message_index(start, content)
         else:
-            self._learn(opcode, content)
+            self._note_definition(opcode, content)
 
     def _begin_chunk(self, start: int, content: bytes) -> None:
         """Read a chunk (block of messages) and remember it until its index records have been read.
@@ -284,7 +285,7 @@ class _Salvaged:
             if opcode == Opcode.MESSAGE:
                 counts[int.from_bytes(record[:2], "little")] += 1
             else:
-                self._learn(opcode, record)
+                self._note_definition(opcode, record)
         self._open_counts = counts
         self._open_chunk = ChunkIndex(
             chunk_length=RECORD_HEAD.size + len(content),
@@ -323,7 +324,7 @@ class _Salvaged:
             self.counts += counts
             self._open_chunk = None
 
-    def _learn(self, opcode: int, content: bytes) -> None:
+    def _note_definition(self, opcode: int, content: bytes) -> None:
         """Note the message type (schema) or the topic (channel) that a record defines.
 
         Definitions can be repeated in a file; the first one with a given number is kept.
@@ -367,9 +368,9 @@ def _write_summary(
     # rosbag2 reads no messages from a file without this metadata record, although it takes the
     # topics from the summary.
     about = rosbag2_metadata(summarise(name, index))
-    metadata = Metadata(ROSBAG2, about)
+    metadata = Metadata(ROSBAG2_RECORD, about)
     metadata_length = len(_bytes_of([metadata]))
-    metadata_index = MetadataIndex(stream.tell(), metadata_length, ROSBAG2)
+    metadata_index = MetadataIndex(stream.tell(), metadata_length, ROSBAG2_RECORD)
     stream.write(_bytes_of([metadata, DataEnd(0)]))
 
     summary_start = stream.tell()
@@ -395,7 +396,7 @@ def _write_summary(
     footer = _bytes_of([Footer(summary_start, offsets_start, 0)])
     footer = footer[:-CHECKSUM_BYTES]
     checksum = struct.pack("<I", crc32(summary + footer))
-    stream.write(summary + footer + checksum + MAGIC)
+    stream.write(summary + footer + checksum + MCAP_MAGIC)
 
 
 def _records(stream: BinaryIO) -> Iterator[tuple[int, int, bytes]]:

@@ -11,7 +11,7 @@ import numpy as np
 from ..core.arrays import AnyArray, Times
 from .read import Bag
 
-DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
+DIAGNOSTICS_TYPE = "diagnostic_msgs/msg/DiagnosticArray"
 """Message type of the diagnostics, which state the condition of each node and cube."""
 
 MIN_GAP_PERIODS = 1.5
@@ -74,7 +74,7 @@ def last_diagnostics(bag: Bag) -> list[Any]:
     """Return the last recorded DiagnosticStatus of each name, sorted by name."""
     # Entries come in the order of recording, so a later status replaces an earlier one.
     last = {}
-    topics = set(bag.topics(DIAGNOSTICS))
+    topics = set(bag.topics(DIAGNOSTICS_TYPE))
     for entry in bag.entries(topics) if topics else ():
         for status in bag.decode(entry).status:
             last[status.name] = status

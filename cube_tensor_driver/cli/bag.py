@@ -37,13 +37,16 @@ def run(options: argparse.Namespace) -> int:
 
 def repair_bag(path: Path) -> None:
     """Make a damaged bag readable, and print how many messages are left and what was lost."""
-    from ..bags.repair import REST, repair
+    from ..bags.repair import REST_SUFFIX, repair
     from ..views.terminal.output import say
 
     done = repair(path)
     print(f"{path}: {done.messages} messages can be read")
     if done.cut:
-        print(f"moved {done.cut} bytes behind the last complete chunk to files ending in {REST}")
+        print(
+            f"moved {done.cut} bytes behind the last complete chunk to files ending in "
+            f"{REST_SUFFIX}"
+        )
     if done.damaged:
         say(f"left out {done.damaged} damaged chunks", "red")
 

@@ -87,15 +87,15 @@ def run(options: argparse.Namespace) -> int:
     Raises:
         CubeError: A bag, an option or the output folder cannot be used.
     """
-    from ..bags.reprocess.all_bags import RECIPE
+    from ..bags.reprocess.all_bags import RECIPE_NAME
     from ..lerobot.export import check_empty, export_lerobot
     from ..lerobot.plan import Choices
     from ..views.terminal.output import progress_bar
 
     if options.what in TABLES:
-        # A folder that contains the file RECIPE belongs to an export that was interrupted, which
+        # A folder that contains the file RECIPE_NAME belongs to an export that was interrupted and
         # is continued; any other folder must be empty.
-        if not (options.output / RECIPE).exists():
+        if not (options.output / RECIPE_NAME).exists():
             check_empty(options.output)
         return reprocess.run(options)
 

@@ -16,11 +16,11 @@ import pyarrow.parquet
 from ..config.skin import Skin
 from ..core.arrays import AnyArray
 from ..core.modes import COMPONENTS, STRESS
-from .images import IMAGES, EncodedImage
+from .images import IMAGE_TYPES, EncodedImage
 from .plan import BagPlan, Episode
 from .statistics import Statistics
 from .topics import Topic
-from .windows import COLUMNS, TACTILE
+from .windows import TACTILE, WINDOW_COLUMNS
 
 VERSION = "v3.0"
 """Version of the format LeRobotDataset in which data sets are written."""
@@ -37,7 +37,7 @@ An episode is never divided between files, so a file can become larger than this
 FILE_NAME = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 """Pattern (for `str.format`) of a Parquet file's path, relative to data/ or meta/episodes/."""
 
-COUNTED = {
+COUNTER_FEATURES = {
     "timestamp": "float32",
     "frame_index": "int64",
     "episode_index": "int64",
@@ -100,11 +100,11 @@ class DataSet:
         for topic in topics:
             bands = topic.shape[2]
             self.widths[topic.key] = bands or len(topic.names)
-        self.widths |= dict.fromkeys(COUNTED, 1)
+        self.widths |= dict.fromkeys(COUNTER_FEATURES, 1)
         self._folder = folder
         self._skin = skin
         self._topics = topics
-        self._image_keys = {topic.key for topic in topics if topic.msgtype in IMAGES}
+        self._image_keys = {topic.key for topic in topics if topic.msgtype in IMAGE_TYPES}
         self._statistics = {}
         for key, width in self.widths.items():
             self._statistics[key] = Statistics(width, samples)
@@ -318,7 +318,7 @@ class DataSet:
             ["sample", "cube", "component"],
         )
         features = {TACTILE: tactile | {"info": about}}
-        for name, kind in COLUMNS.items():
+        for name, kind in WINDOW_COLUMNS.items():
             dtype = np.dtype(kind).name
             features[f"{TACTILE}.{name}"] = _feature(dtype, window, ["sample", "cube"])
         names = list(self._skin.names)
@@ -330,7 +330,7 @@ class DataSet:
             else:
                 width = len(topic.names)
                 features[topic.key] = _feature("float32", (width,), topic.names)
-        for key, dtype in COUNTED.items():
+        for key, dtype in COUNTER_FEATURES.items():
             features[key] = _feature(dtype, (1,), None)
         return features
 

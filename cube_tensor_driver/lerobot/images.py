@@ -16,10 +16,10 @@ from ..core.arrays import Single
 from ..core.errors import BagError
 from .plan import Episode
 
-IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 """ROS message types that contain one image."""
 
-MODES = {
+PILLOW_MODES = {
     "rgb8": ("RGB", "RGB"),
     "8UC3": ("RGB", "RGB"),
     "bgr8": ("RGB", "BGR"),
@@ -170,11 +170,12 @@ def encode_raw(message: Any) -> EncodedImage:
     """Encode a sensor_msgs/Image (uncompressed pixels) as PNG.
 
     Raises:
-        ValueError: The encoding is not in `MODES`, or the message has no pixels or too few bytes.
+        ValueError: The encoding is not in `PILLOW_MODES`, or the message has no pixels or too few
+            bytes.
     """
-    if message.encoding not in MODES:
-        raise ValueError(f"encoding {message.encoding}; known: {', '.join(MODES)}")
-    mode, order = MODES[message.encoding]
+    if message.encoding not in PILLOW_MODES:
+        raise ValueError(f"encoding {message.encoding}; known: {', '.join(PILLOW_MODES)}")
+    mode, order = PILLOW_MODES[message.encoding]
     size = int(message.width), int(message.height)
     if not all(size):
         raise ValueError(f"an image of {size[0]} x {size[1]} pixels")

@@ -26,19 +26,20 @@ from ..core.arrays import AnyArray, Index, Mask, Times
 from ..core.errors import BagError
 from ..messages.codec import SECOND
 
-MARK = "std_msgs/msg/String"
+MARK_TYPE = "std_msgs/msg/String"
 """Message type of marks: recorded texts that divide a bag into episodes. The text of a mark is the
 task of the episode that begins with it."""
 
-MIN_NS, MAX_NS = -(1 << 63), (1 << 63) - 1
-"""Smallest and largest time in 64 bits, in ns. They bound the single episode of a bag without
-marks."""
+MIN_NS = -(1 << 63)
+"""Smallest time in 64 bits, in ns: the begin of the single episode of a bag without marks."""
 
-MAX_TIME_NS = 1 << 62
-"""Largest absolute value of a time in ns multiplied by the frame rate in Hz, so that the product
-fits 64 bits.
+MAX_NS = (1 << 63) - 1
+"""Largest time in 64 bits, in ns: the end of the last episode of a bag."""
 
-Larger times, which come from clocks that were never set, are limited to this value.
+MAX_NS_TIMES_FPS = 1 << 62
+"""Largest product of a time in ns and the frame rate in Hz, chosen so that it fits 64 bits.
+
+Times whose product would be larger, which come from clocks that were never set, are reduced.
 """
 
 MAX_STAMP_RATIO = 10
@@ -55,7 +56,7 @@ Every frame of a data set has room for as many samples as the fullest frame. If 
 many samples into one frame, the size of the whole data set would be multiplied.
 """
 
-ALWAYS_ALLOWED = 100
+ALWAYS_ALLOWED_COUNT = 100
 """Number of frames of an episode, and of samples of a cube in a frame, that is allowed in addition
 to what `MAX_STAMP_RATIO` and `MAX_DEPTH_RATIO` allow.
 
@@ -139,7 +140,7 @@ class Episode:
         Returns:
             (N,) numbers of frames; they are negative for stamps before `begin_ns`.
         """
-        limit = MAX_TIME_NS // self._fps
+        limit = MAX_NS_TIMES_FPS // self._fps
         since_ns = np.clip(stamp_ns - self.begin_ns, -limit, limit)
         frames: Index = since_ns * self._fps // SECOND
         return frames
@@ -253,7 +254,7 @@ def plan_bag(
         episodes = [Episode(*span, choices.fps) for span in spans]
         n_cubes = len(source.skin.cubes)
         recorded_s = (source.bag.end_ns - source.bag.start_ns) / SECOND
-        max_frames = MAX_STAMP_RATIO * recorded_s * choices.fps + ALWAYS_ALLOWED
+        max_frames = MAX_STAMP_RATIO * recorded_s * choices.fps + ALWAYS_ALLOWED_COUNT
 
         samples = np.zeros(n_cubes, np.int64)
         first_ns, last_ns = MAX_NS, MIN_NS
@@ -359,10 +360,10 @@ def _check_depth(
         usual: Number of samples of a cube in a frame that follows from the sample rate.
 
     Raises:
-        BagError: A frame has more samples than `MAX_DEPTH_RATIO` and `ALWAYS_ALLOWED` allow.
+        BagError: A frame has more samples than `MAX_DEPTH_RATIO` and `ALWAYS_ALLOWED_COUNT` allow.
     """
     depth = int(episode.counts.max())
-    if depth > MAX_DEPTH_RATIO * usual + ALWAYS_ALLOWED:
+    if depth > MAX_DEPTH_RATIO * usual + ALWAYS_ALLOWED_COUNT:
         deepest = episode.counts.argmax()
         frame, cube = np.unravel_index(deepest, episode.counts.shape)
         raise BagError(
@@ -388,9 +389,11 @@ def _marked_spans(bag: Bag, topic: str) -> list[tuple[int, int, str]]:
     Raises:
         BagError: The topic does not exist, or none of its marks has a text.
     """
-    if topic not in bag.topics(MARK):
-        names = ", ".join(bag.topics(MARK)) or "none"
-        raise BagError(f"{bag.path}: no marks ({MARK}) on {topic}; topics of that type: {names}")
+    if topic not in bag.topics(MARK_TYPE):
+        names = ", ".join(bag.topics(MARK_TYPE)) or "none"
+        raise BagError(
+            f"{bag.path}: no marks ({MARK_TYPE}) on {topic}; topics of that type: {names}"
+        )
     marks = []
     for entry in bag.entries({topic}):
         text = bag.decode(entry).data.strip()

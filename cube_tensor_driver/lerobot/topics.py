@@ -19,20 +19,24 @@ from ..bags.recording import stamp_ns
 from ..core.arrays import Single, Times
 from ..core.errors import BagError
 from ..messages.types import PACKAGE
-from .images import IMAGES, ImageStream, Shape
+from .images import IMAGE_TYPES, ImageStream, Shape
 from .plan import Choices, Episode
 
-JOINTS = "sensor_msgs/msg/JointState"
+JOINT_STATE_TYPE = "sensor_msgs/msg/JointState"
 """Message type of joint states: names, positions, velocities and efforts of a robot's joints."""
 
-HEADER = "std_msgs/msg/Header"
+HEADER_TYPE = "std_msgs/msg/Header"
 """Message type of the header, which contains the stamp of a message."""
 
 JOINT_FIELDS = ("position", "velocity", "effort")
 """Fields of a JointState message that have one number per joint."""
 
-STATE, ACTION = "observation.state", "action"
-"""Names that LeRobot requires for the features with the robot's state and with its commands."""
+STATE_FEATURE = "observation.state"
+"""Name that LeRobot requires for the feature (column) with the robot's state, such as joint
+positions."""
+
+ACTION_FEATURE = "action"
+"""Name that LeRobot requires for the feature (column) with the commands to the robot."""
 
 
 @dataclass
@@ -112,7 +116,7 @@ class TopicReader:
         self._topics = topics
         self._sources: dict[str, Signal | ImageStream] = {}
         for name, topic in topics.items():
-            if topic.msgtype in IMAGES:
+            if topic.msgtype in IMAGE_TYPES:
                 # Images are read one by one when their frames are written, because a recording of
                 # images can be larger than the memory. Numbers are read at once.
                 self._sources[name] = ImageStream(bag, name, topic.shape)
@@ -186,7 +190,7 @@ def find_topics(paths: Sequence[Path], choices: Choices) -> dict[str, Topic]:
     for name, described in found.items():
         if described.names or any(described.shape):
             used[name] = described
-    joints = [name for name in used if used[name].msgtype == JOINTS]
+    joints = [name for name in used if used[name].msgtype == JOINT_STATE_TYPE]
     # If there are several topics of joint states, only the user can decide which one is the state.
     others = [name for name in joints if name != choices.action]
     state = choices.state
@@ -194,12 +198,12 @@ def find_topics(paths: Sequence[Path], choices: Choices) -> dict[str, Topic]:
         state = others[0]
     for name, described in used.items():
         dotted = name.strip("/").replace("/", ".")
-        kind = "images" if described.msgtype in IMAGES else "topics"
+        kind = "images" if described.msgtype in IMAGE_TYPES else "topics"
         described.key = f"observation.{kind}.{dotted}"
         if name == choices.action:
-            described.key = ACTION
+            described.key = ACTION_FEATURE
         if name == state:
-            described.key = STATE
+            described.key = STATE_FEATURE
     return used
 
 
@@ -226,7 +230,7 @@ def _describe_topic(
             f"{bag.path}: {name} is {msgtype}, in other bags {topic.msgtype}; leave it out by "
             "naming the others with --topics"
         )
-    if msgtype not in IMAGES:
+    if msgtype not in IMAGE_TYPES:
         # Bags may contain different joints, so the feature gets the joints of all bags.
         names = read_signal(bag, name, msgtype).names
         topic.names += [one for one in names if one not in topic.names]
@@ -254,7 +258,7 @@ def read_signal(
     fixed = _number_names(bag, msgtype)
     for entry in bag.entries({topic}):
         message = bag.decode(entry)
-        if msgtype == JOINTS:
+        if msgtype == JOINT_STATE_TYPE:
             numbers = _joint_numbers(message, f"{bag.path}: {topic}")
         else:
             numbers = {name: _value(message, name) for name in fixed}
@@ -292,7 +296,7 @@ def _stamped_topics(bag: Bag, skin: str) -> list[tuple[str, str]]:
     found = []
     for one in bag.connections:
         is_of_cube = one.topic.startswith(f"{skin}cubes/")
-        is_known = one.msgtype in (JOINTS, *IMAGES)
+        is_known = one.msgtype in (JOINT_STATE_TYPE, *IMAGE_TYPES)
         is_usable = is_known or _number_names(bag, one.msgtype)
         if one.msgcount and is_usable and not is_of_cube:
             found.append((one.topic, one.msgtype))
@@ -306,7 +310,7 @@ def _number_names(bag: Bag, msgtype: str) -> list[str]:
     variable length, or belongs to this package.
     """
     fields = bag.fields(msgtype)
-    has_header = bool(fields) and fields[0][1] == (Nodetype.NAME, HEADER)
+    has_header = bool(fields) and fields[0][1] == (Nodetype.NAME, HEADER_TYPE)
     if not has_header or msgtype.startswith(PACKAGE):
         return []
     names = list(_numbers(bag, fields[1:], ""))

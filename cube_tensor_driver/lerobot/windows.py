@@ -14,7 +14,7 @@ from ..core.rows import StressRows, concatenate
 TACTILE = "observation.tactile"
 """Name of the feature (column of a data set) that contains the stress of all cubes."""
 
-COLUMNS: dict[str, Any] = {
+WINDOW_COLUMNS: dict[str, Any] = {
     "stamp_ns": np.int64,
     "sequence": np.uint32,
     "residual": np.float32,
@@ -56,7 +56,7 @@ class Windows:
         """
         self.done = 0
         self._counts, self._depth = counts, depth
-        columns = len(COMPONENTS) + len(COLUMNS)
+        columns = len(COMPONENTS) + len(WINDOW_COLUMNS)
         frame_bytes = 4 * columns * depth * counts.shape[1]
         fitting = max(1, MAX_BLOCK_BYTES // frame_bytes)
         self._block = min(MAX_BLOCK_FRAMES, fitting)
@@ -140,7 +140,7 @@ class Windows:
         tactile[:] = np.nan
         tactile[place] = components[order]
         windows: dict[str, AnyArray] = {TACTILE: tactile}
-        for name, kind in COLUMNS.items():
+        for name, kind in WINDOW_COLUMNS.items():
             empty = np.nan if kind is np.float32 else 0
             column = np.full(shape, empty, kind)
             column[place] = getattr(rows, name)[order]

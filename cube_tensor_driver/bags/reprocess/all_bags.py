@@ -15,7 +15,7 @@ from typing import Any
 from ...config.yaml import read_yaml, write_yaml
 from ...core.errors import BagError, ConfigError, CubeError
 from .contacts import ContactsOverTime
-from .job import PARTIAL, Overrides, ReprocessJob, ReprocessResult, reprocess
+from .job import PARTIAL_FOLDER, Overrides, ReprocessJob, ReprocessResult, reprocess
 
 SUFFIXES = {
     "bag": "",
@@ -25,7 +25,7 @@ SUFFIXES = {
 }
 """Suffix of a reprocessed result for each output format."""
 
-RECIPE = "reprocess.yaml"
+RECIPE_NAME = "reprocess.yaml"
 """Name of the file in the folder of the results that states their format, calibrations, tare and
 settings of contacts."""
 
@@ -71,7 +71,7 @@ def write_recipe(
     overrides: Overrides,
     contacts: ContactsOverTime | None = None,
 ) -> None:
-    """Create the folder of the results and write into it how they are made (`RECIPE`).
+    """Create the folder of the results and write into it how they are made (`RECIPE_NAME`).
 
     With it, an interrupted run is only continued with the same options.
 
@@ -94,7 +94,7 @@ def write_recipe(
     if contacts is not None:
         settings = asdict(contacts.settings)
         recipe["contacts"] = {**settings, "rate": contacts.rate}
-    path = folder / RECIPE
+    path = folder / RECIPE_NAME
     # A recipe without results was left by a run that failed before its first result, so it may be
     # replaced.
     if path.exists() and has_results(folder):
@@ -113,7 +113,7 @@ def write_recipe(
 def has_results(folder: Path) -> bool:
     """Return whether a folder contains at least one complete result."""
     names = {path.name for path in folder.iterdir()}
-    return bool(names - {RECIPE, PARTIAL})
+    return bool(names - {RECIPE_NAME, PARTIAL_FOLDER})
 
 
 def remove_without_results(folder: Path) -> None:

@@ -36,11 +36,11 @@ from .contacts import ContactsOverTime, ContactWriter
 if TYPE_CHECKING:
     from ..zarr_table import ZarrWriter
 
-PARTIAL = ".partial"
+PARTIAL_FOLDER = ".partial"
 """Name of the folder, beside the results, in which incomplete results lie. After an interruption
 they are made again from the start."""
 
-WORKING_BYTES = 30 << 20
+WORKING_BLOCK_BYTES = 30 << 20
 """Size, in bytes, of a memory block that is allocated and freed once before reprocessing.
 
 The allocator of glibc keeps freed memory up to twice the size of the largest block freed so far.
@@ -122,9 +122,9 @@ def reprocess(job: ReprocessJob) -> ReprocessResult:
             written.
     """
     # Freeing this block makes the allocator keep the memory of one batch for the next.
-    np.empty(WORKING_BYTES, np.uint8)
+    np.empty(WORKING_BLOCK_BYTES, np.uint8)
     # The incomplete output must lie in the same file system as the final one to be renamed.
-    partial = job.output.parent / PARTIAL / job.output.name
+    partial = job.output.parent / PARTIAL_FOLDER / job.output.name
     try:
         partial.parent.mkdir(parents=True, exist_ok=True)
         if partial.is_dir():
