@@ -328,7 +328,7 @@ class McapWriter:
 
     def abort(self) -> None:
         """Close the file without a summary, after writing failed."""
-        # Closing writes buffered bytes again, which fails again on a full disk.
+        # Closing tries to write the buffered bytes, which fails again on a full disk.
         with suppress(OSError):
             self._stream.close()
 

@@ -113,7 +113,7 @@ class BagSource:
             bounds = [0, *ends.tolist(), len(messages)]
             for begin, end in pairwise(bounds):
                 # Messages are reconstructed together only if each consists of whole scans (the same
-                # cubes in the same order); otherwise the results can differ in the last bits.
+                # cubes in the same order); otherwise the results can differ from those one by one.
                 step = end - begin if count_repeats(cube[begin]) else 1
                 for first in range(begin, end, step):
                     chosen = slice(first, first + step)

@@ -154,7 +154,8 @@ class DataSet:
         """Write successive frames as one row group of the current Parquet file.
 
         Args:
-            columns: Values of each feature (frames, …), by its name; images as a list.
+            columns: By the names of the features (columns of the data set): arrays whose first
+                dimension is the frames, or a list of images with one per frame.
         """
         arrays = {}
         for name, values in columns.items():

@@ -91,7 +91,8 @@ def export_lerobot(
     partial = folder.absolute()
     partial = partial.with_name(f"{partial.name}.partial")
     try:
-        # An export that was killed may have left an incomplete data set, which is not continued.
+        # An export that was killed may have left an incomplete data set here. It cannot be
+        # continued, so it is removed.
         shutil.rmtree(partial, ignore_errors=True)
         data_set = DataSet(
             partial,
@@ -186,7 +187,7 @@ class EpisodeWriter:
         return len(rows)
 
     def write(self) -> bool:
-        """Write the frames whose rows are all there.
+        """Write the frames of which all rows of stress have been added.
 
         The frames of a data set lie episode by episode in its files, so this may only be called for
         the first episode that is not complete.
