@@ -12,7 +12,7 @@ Value = str | float | bool
 """Value of a ROS parameter of a node."""
 
 RECORDED = ("frequencies", "stress", "info", "driver/info", "/diagnostics")
-"""Topics of a skin that `./cube record` and the demo record.
+"""Topics of a skin that `./cube record` records by default.
 
 From `frequencies` and `info` the stress can be computed again; `driver/info` replaces `info` while
 no reconstruction runs. `stress` is recorded to keep the published results, and `/diagnostics` to

@@ -1,4 +1,5 @@
-"""Nodes and messages: the only folder that publishes, subscribes or offers services.
+"""ROS nodes and messages: the only folder that publishes, subscribes or offers services.
 
-Nodes are thin: parameters, topics and services here, the work in `core`, `device` and `bags`.
+The nodes contain only parameters, topics and services; the computations are in `core`, `device` and
+`bags`.
 """

@@ -1,8 +1,8 @@
-"""Callbacks of a node, run so that no error in them ends the process.
+"""Wrappers of a node's callbacks that catch all exceptions, so that none ends the process.
 
-Whatever a callback raises is caught here and nowhere else: it is logged from time to time, counted,
-and shown in diagnostics. A service whose callback raised still answers, with the response as it was
-made, whose `success` is false.
+An exception in a callback is logged at most every `LOG_PERIOD_S`, counted, and shown in the
+diagnostics of the node. A service whose callback raised an exception still sends its response, in
+which `success` is false by default.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from typing import Any
 from rclpy.node import Node
 
 LOG_PERIOD_S = 5.0
-"""Minimum time, in seconds, between two lines of the log about errors that repeat."""
+"""Minimum time, in seconds, between two log messages about errors that occur repeatedly."""
 
 
 class CallbackErrors:
-    """Catches and counts the errors of a node's callbacks.
+    """Catches, logs and counts the exceptions of a node's callbacks.
 
     Attributes:
-        count: Number of calls that have raised.
+        count: Number of calls of callbacks that have raised an exception.
     """
 
     def __init__(self, node: Node) -> None:
@@ -29,7 +29,7 @@ class CallbackErrors:
         self._node = node
 
     def catch(self, callback: Callable[..., Any]) -> Callable[..., Any]:
-        """Return the callback of a subscription or a timer, with its errors caught."""
+        """Wrap the callback of a subscription or a timer so that its exceptions are caught."""
 
         @wraps(callback)
         def call(*arguments: Any) -> Any:
@@ -42,7 +42,10 @@ class CallbackErrors:
         return call
 
     def catch_in_service(self, callback: Callable[..., Any]) -> Callable[..., Any]:
-        """Return the callback of a service, which after an error sends the response as it is."""
+        """Wrap the callback of a service so that its exceptions are caught.
+
+        After an exception the response is sent with the values that it has by then.
+        """
 
         @wraps(callback)
         def call(request: Any, response: Any) -> Any:
@@ -63,7 +66,12 @@ class CallbackErrors:
 
 
 def refuse_on_error(callback: Callable[..., Any], errors: type[Exception]) -> Callable[..., Any]:
-    """Return the callback of a service in which such an error refuses the request."""
+    """Wrap the callback of a service so that certain exceptions give a response without success.
+
+    Args:
+        callback: The callback of the service.
+        errors: Type of the exceptions after which `success` of the response is set to false.
+    """
 
     @wraps(callback)
     def call(request: Any, response: Any) -> Any:

@@ -1,9 +1,9 @@
-"""What rclpy has in one ROS 2 and lacks in another, and what is done without it.
+"""Features of rclpy that some releases of ROS 2 lack, with a replacement for each.
 
-A feature is looked for, never the name of a distribution: so a backport is used, and later releases
-work. Humble lacks all of these: the EventsExecutor, the event that a subscriber came or went, the
-callback after parameters were set, the sequence numbers of messages, and the module
-`event_handler`.
+The code tests for the feature and not for the name of the release, so that a feature which was
+added to an older release is used. ROS 2 Humble lacks all of them: the EventsExecutor, the event
+that a subscriber was matched, the callback after parameters were set, the sequence numbers of
+messages, and the module `event_handler`.
 """
 
 from __future__ import annotations
@@ -34,7 +34,10 @@ __all__ = [
 
 
 def make_executor() -> Any:
-    """Return an EventsExecutor, which costs a third of the default one, if this rclpy has it."""
+    """Return a new executor: an EventsExecutor if this rclpy has it, else a SingleThreadedExecutor.
+
+    The EventsExecutor takes a third of the CPU time of the other one.
+    """
     try:
         from rclpy.experimental.events_executor import EventsExecutor
     except ImportError:
@@ -45,10 +48,14 @@ def make_executor() -> Any:
 
 
 def on_matched(callback: Callable[[int], None]) -> PublisherEventCallbacks | None:
-    """Return events of a publisher that tell the number of its subscribers when that changes.
+    """Return event callbacks for a publisher that report each change of its subscribers.
 
-    None means that this rclpy has no such event; then call `get_subscription_count` from time to
-    time.
+    Args:
+        callback: Called with the number of subscribers after each change of this number.
+
+    Returns:
+        The argument `event_callbacks` of `create_publisher`, or None if this rclpy has no such
+        event. The caller must then poll `get_subscription_count`.
     """
     if "matched" not in inspect.signature(PublisherEventCallbacks).parameters:
         return None
@@ -60,36 +67,44 @@ def on_matched(callback: Callable[[int], None]) -> PublisherEventCallbacks | Non
 
 
 def with_number(callback: Callable[[Any, int | None], None]) -> Callable[..., None]:
-    """Return the callback of a subscription that also takes the sequence number of each message.
+    """Make the callback of a subscription that also gets the sequence number of each message.
 
-    DDS numbers the messages of each publisher. The number is None where this rclpy, or this DDS,
-    does not tell it.
+    Args:
+        callback: Called with a message and its number. DDS numbers the messages of each publisher
+            consecutively. The number is None if this rclpy or this DDS does not report it.
     """
     if not hasattr(Subscription, "CallbackType"):
-        # Without the info of a message there is no number.
+        # This rclpy passes no MessageInfo, which contains the number, to callbacks.
         return lambda message: callback(message, None)
 
     def call(*arguments: Any) -> None:
-        # The EventsExecutor of Jazzy gives both as one tuple.
+        # The EventsExecutor of ROS 2 Jazzy passes message and MessageInfo as one tuple.
         message, info = arguments if len(arguments) == 2 else arguments[0]
         callback(message, info.get("publication_sequence_number"))
 
-    # rclpy looks at the number of parameters to see that the callback takes the info, too.
+    # rclpy passes the MessageInfo only to callbacks whose signature has two parameters.
     call.__signature__ = inspect.signature(lambda message, info: None)  # type: ignore[attr-defined]
     return call
 
 
 def after_parameters_are_set(node: Node, callback: Callable[[list[Any]], None]) -> None:
-    """Call back with the parameters of a node that have been set, after each change.
+    """Register a callback that is called after parameters of a node have been set.
 
-    Call this before adding callbacks that may refuse a change: rclpy asks the newest one first.
+    This function must be called before callbacks that may refuse a change are added to the node.
+    rclpy calls the one added last first, so the replacement for older releases runs only if the
+    others have accepted the change.
+
+    Args:
+        node: The node.
+        callback: Called with the list of the parameters that were set.
     """
     if hasattr(node, "add_post_set_parameters_callback"):
         node.add_post_set_parameters_callback(callback)
         return
 
     def before_change(parameters: list[Any]) -> SetParametersResult:
-        # A parameter that the node does not have yet is being declared, not changed.
+        # rclpy also calls this while a parameter is declared. The node does not have the parameter
+        # yet, so it is left out.
         known = [parameter for parameter in parameters if node.has_parameter(parameter.name)]
 
         def after_change() -> None:
@@ -97,7 +112,7 @@ def after_parameters_are_set(node: Node, callback: Callable[[list[Any]], None]) 
             callback(known)
 
         if known:
-            # The executor comes to the timer when this change is done.
+            # The executor runs the timer only after the parameter has its new value.
             timer = node.create_timer(0.0, after_change)
         return SetParametersResult(successful=True)
 

@@ -1,7 +1,7 @@
-"""What the launch files need beside the actions of launch.
+"""Functions of the launch files: they check launch arguments and make texts from the skin file.
 
-These are arguments that are checked, and texts and commands that are made from the skin file. This
-module imports launch, which every ROS 2 installation has. The ROS 2 wheels lack it.
+This module imports the package `launch`, which every installation of ROS 2 has, but not the Python
+wheels of ROS 2. So only the launch files import it.
 """
 
 from __future__ import annotations
@@ -35,26 +35,26 @@ from ..core.errors import ConfigError
 _CONFIG = package_data() / "config"
 
 SINGLE_CUBE = _CONFIG / "cube.yaml"
-"""Skin file of a single cube."""
+"""Path of the skin file of a single cube, the default of cube.launch.py."""
 
 DEMO_SKIN = _CONFIG / "skin_demo.yaml"
-"""Skin file of the demo."""
+"""Path of the skin file of the demo."""
 
 DEMO_LOAD = _CONFIG / "load_demo.yaml"
-"""Load script of the demo."""
+"""Path of the load script of the demo, which states the forces on the simulated skin over time."""
 
 SKIN_LAUNCH = package_data() / "launch" / "skin.launch.py"
-"""Launch file of a skin."""
+"""Path of the launch file that starts the nodes of a skin."""
 
 RECORD_QOS = _CONFIG / "record_qos.yaml"
-"""Quality of service with which topics are recorded."""
+"""Path of the file that lists the recorded topics and the quality of service (QoS) of each."""
 
 NEEDED_PACKAGES = {
     "rviz": ("rviz2", "robot_state_publisher"),
     "state_publisher": ("robot_state_publisher",),
     "record": ("ros2bag", "rosbag2_storage_mcap"),
 }
-"""Launch argument -> the ROS packages that it needs beyond our own."""
+"""Launch argument -> the ROS packages that must be installed if the argument is true."""
 
 
 def declare_text(
@@ -62,7 +62,13 @@ def declare_text(
     description: str,
     default: str = "",
 ) -> DeclareLaunchArgument:
-    """Declare a launch argument that is a text."""
+    """Return the declaration of a launch argument that takes any text.
+
+    Args:
+        name: Name of the argument.
+        description: Text that `ros2 launch --show-args` shows.
+        default: Default value.
+    """
     return DeclareLaunchArgument(
         name,
         default_value=default,
@@ -75,7 +81,14 @@ def declare_switch(
     description: str,
     default: str = "false",
 ) -> DeclareLaunchArgument:
-    """Declare a launch argument that is true or false, or empty if that is the default."""
+    """Return the declaration of a launch argument that is true or false.
+
+    Args:
+        name: Name of the argument.
+        description: Text that `ros2 launch --show-args` shows.
+        default: "true" or "false". An empty text allows an empty value, too, which leaves the
+            decision to the parameter of the same name.
+    """
     choices = ["true", "false"] if default else ["", "true", "false"]
     return DeclareLaunchArgument(
         name, default_value=default, choices=choices, description=description
@@ -83,9 +96,10 @@ def declare_switch(
 
 
 class FromSkin(Substitution):  # type: ignore[misc]
-    """A text that is made from the skin file of the launch argument `config`."""
+    """A launch substitution whose text is made from the skin file in the argument `config`."""
 
     def __init__(self, make: Callable[[Skin], str]) -> None:
+        """Store `make`, which returns the text for a skin."""
         super().__init__()
         self._make = make
 
@@ -93,15 +107,19 @@ class FromSkin(Substitution):  # type: ignore[misc]
         return f"{self._make.__name__} of config"
 
     def perform(self, context: LaunchContext) -> str:
-        """Return the text. ConfigError: the skin file is wrong."""
+        """Return the text.
+
+        Raises:
+            ConfigError: The skin file cannot be read or has mistakes.
+        """
         return self._make(_read_skin(context))
 
 
 class GivenParameters(Substitution):  # type: ignore[misc]
-    """The path of a parameter file with the launch arguments of these names that are not empty.
+    """A launch substitution that writes launch arguments into a parameter file.
 
-    The others are left to the including launch file: what a node is passed overrides the
-    SetParameter of that file.
+    Its text is the path of the file. Arguments that are empty are left out, because a value that a
+    node gets from a file overrides the value that an including launch file sets with SetParameter.
     """
 
     def __init__(self, *names: str) -> None:
@@ -112,7 +130,11 @@ class GivenParameters(Substitution):  # type: ignore[misc]
         return f"parameters {', '.join(parameter.name for parameter in self._parameters)}"
 
     def perform(self, context: LaunchContext) -> str:
-        """Write the file and return its path. ConfigError: a text is not of its type."""
+        """Write the parameter file and return its path.
+
+        Raises:
+            ConfigError: The text of an argument is no number although its parameter is one.
+        """
         given = {
             parameter.name: _convert(parameter.name, text, type(parameter.default))
             for parameter in self._parameters
@@ -124,17 +146,18 @@ class GivenParameters(Substitution):  # type: ignore[misc]
 
 
 def rviz_file(skin: Skin) -> str:
-    """Write a configuration of RViz for this skin, and return its path."""
+    """Write a configuration file of RViz for a skin, which is temporary, and return its path."""
     path = temporary_folder("cube_rviz_") / "skin.rviz"
     write_yaml(path, rviz_view(skin))
     return str(path)
 
 
 def record_skin(context: LaunchContext) -> list[Action]:
-    """Return the action that starts `ros2 bag record` for the skin's topics.
+    """Return the action that starts `ros2 bag record` for the topics of the skin.
 
-    A namespace, remaps and the parameter `qos_reliability` that the including launch file sets
-    around the skin are applied here, because `ros2 bag` is no action of launch_ros.
+    An including launch file may set a namespace, remaps and the parameter `qos_reliability` for all
+    its nodes. launch_ros applies them to actions of the type Node only, so they are applied to the
+    arguments of `ros2 bag` here.
     """
     surroundings: dict[str, Any] = context.launch_configurations
     outer_namespace = surroundings.get("ros_namespace", "")
@@ -149,7 +172,7 @@ def record_skin(context: LaunchContext) -> list[Action]:
     folder = Path("_".join(part for part in parts if part)).absolute()
     command = ["ros2", "bag", "record", "--storage", "mcap", "--output", str(folder)]
     command += ["--qos-profile-overrides-path", str(overrides)]
-    # The option --topics does not exist in Humble, --regex does everywhere.
+    # `ros2 bag record` of Humble lacks the option --topics; all releases have --regex.
     command += ["--regex", f"^({'|'.join(qualities)})$"]
     return [
         ExecuteProcess(
@@ -161,9 +184,15 @@ def record_skin(context: LaunchContext) -> list[Action]:
 
 
 def _recorded_topics(surroundings: dict[str, Any], namespace: str) -> dict[str, dict[str, str]]:
-    """Return the full names of the recorded topics and the quality of service of each."""
+    """Return the full names of the recorded topics and the quality of service of each.
+
+    Args:
+        surroundings: Launch configurations, in which launch_ros stores remaps and parameters that
+            an including launch file has set.
+        namespace: Namespace of the skin, without slashes at its ends.
+    """
     remaps: dict[str, str] = dict(surroundings.get("ros_remaps") or [])
-    # Beside pairs of name and value there may be paths of parameter files.
+    # The list of global parameters holds pairs of name and value, and paths of parameter files.
     given = [pair for pair in surroundings.get("global_params", []) if isinstance(pair, tuple)]
     parameters: dict[str, str] = dict(given)
     reliability = parameters.get("qos_reliability", "reliable")
@@ -174,22 +203,22 @@ def _recorded_topics(surroundings: dict[str, Any], namespace: str) -> dict[str, 
         name = remaps.get(name, name)
         prefix = f"/{namespace}" if namespace else ""
         full_name = name if name.startswith("/") else f"{prefix}/{name}"
-        # These two have the reliability that a parameter of the nodes gives them.
+        # The nodes publish these two topics with the reliability of the parameter qos_reliability.
         is_batch = topic in ("/frequencies", "/stress")
         qualities[full_name] = quality | ({"reliability": reliability} if is_batch else {})
     return qualities
 
 
 def check_arguments(context: LaunchContext) -> list[Action]:
-    """Check all arguments, as the first action of a launch file, before anything starts.
+    """Check all launch arguments. It is the first action of a launch file, before nodes start.
 
     Returns:
-        Actions that set `config` to the path of the skin file, and `port_directory` to a new folder
-        if hubs are simulated.
+        Actions that set the launch configuration `config` to the absolute path of the skin file,
+        and `port_directory` to a new temporary folder if hubs are simulated, else to "".
 
     Raises:
-        ConfigError: An argument, the skin file or the load script is wrong, or a ROS package that
-            is asked for is not installed. This ends the launch.
+        ConfigError: An argument, the skin file or the load script has a mistake, or a ROS package
+            that an argument needs is not installed. The error ends the launch.
     """
     is_simulated = _argument(context, "simulate") == "true"
     config = _argument(context, "config") or (str(DEMO_SKIN) if is_simulated else "")
@@ -210,7 +239,8 @@ def check_arguments(context: LaunchContext) -> list[Action]:
         if _argument(context, name) == "true":
             _check_installed(name, packages)
 
-    # Two simulated skins on one host must not share their ports.
+    # The folder is a new one for each launch, so that two simulated skins on one host do not make
+    # pseudo-terminals with the same path.
     ports = str(temporary_folder("cube_ports_")) if is_simulated else ""
     return [
         SetLaunchConfiguration("config", str(path)),
@@ -227,7 +257,11 @@ def _read_skin(context: LaunchContext) -> Skin:
 
 
 def _convert(name: str, text: str, kind: type) -> Any:
-    """Return the value of a launch argument. ConfigError: it is not of this type."""
+    """Convert the text of a launch argument to a type.
+
+    Raises:
+        ConfigError: The type is float, and the text is no number.
+    """
     if kind is bool:
         return text == "true"
     try:

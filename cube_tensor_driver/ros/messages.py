@@ -1,6 +1,7 @@
-"""Messages of rclpy that are made or read one by one: info, single tensors and wrenches, times.
+"""Makes and reads rclpy messages: SkinInfo, tensors and wrenches of single cubes, time stamps.
 
-The batch messages go through `messages/codec.py`, as serialised bytes.
+The messages SkinFrequencies and SkinStress, which hold the rows of all cubes, are not made here:
+`messages/codec.py` writes and reads them as serialised bytes.
 """
 
 from __future__ import annotations
@@ -45,7 +46,13 @@ def log_refused_message(
     topic: str,
     error: CubeError,
 ) -> None:
-    """Log from time to time that messages of a topic are damaged or contradict themselves."""
+    """Log that a message of a topic was refused, at most every `LOG_PERIOD_S`.
+
+    Args:
+        node: The node that writes the log message.
+        topic: The topic.
+        error: States what is wrong with the message.
+    """
     node.get_logger().error(f"{topic}: {error}", throttle_duration_sec=LOG_PERIOD_S)
 
 
@@ -57,7 +64,7 @@ def message_class(topic: str, type_name: str) -> Any:
         type_name: Full name of the type, as in std_msgs/msg/Header.
 
     Raises:
-        BagError: The package of the message is not installed here.
+        BagError: The ROS package of the message is not installed, or does not contain the type.
     """
     package, _, name = type_name.split("/")
     try:
@@ -70,8 +77,13 @@ def message_class(topic: str, type_name: str) -> Any:
 
 
 def make_message(type_name: str, **fields: Any) -> Any:
-    """Return a message of rclpy. Fields may be numpy arrays."""
-    # The type code of numpy is that of the module array.
+    """Return an rclpy message.
+
+    Args:
+        type_name: Full name of the type, as in std_msgs/msg/Header.
+        fields: Values of the fields. Fields that are arrays of numbers may be numpy arrays.
+    """
+    # numpy and the module `array` use the same letters for types, such as "d" for float64.
     arrays = {
         name: pack_array(value.dtype.char, value)
         for name, value in fields.items()
@@ -81,25 +93,25 @@ def make_message(type_name: str, **fields: Any) -> Any:
 
 
 def pack_array(code: str, values: AnyArray) -> array[Any]:
-    """Return values as an array field of a message, row by row.
+    """Return values as an `array.array`, which rclpy takes for a field that is a list of numbers.
 
     Args:
-        code: Type of the field, as a type code of the module `array`.
-        values: The values, which are converted to this type.
+        code: Type of the field, as a type code of the module `array`, such as "d" for float64.
+        values: The values, of any shape, which are converted to this type and stored row by row.
     """
-    # rclpy takes an array of the field's type as it is; it looks at each item of a list.
+    # rclpy checks every item of a list but none of an `array.array` of the right type.
     field = array(code)
     field.frombytes(np.ascontiguousarray(values, dtype=code).tobytes())
     return field
 
 
 def to_time(stamp_ns: int) -> Time:
-    """Return a time in ns as a message."""
+    """Convert a time in ns since the Unix epoch to a message."""
     return Time(sec=stamp_ns // SECOND, nanosec=stamp_ns % SECOND)
 
 
 def to_ns(stamp: Time) -> int:
-    """Return the time of a message in ns."""
+    """Convert a time of a message to ns since the Unix epoch."""
     return int(stamp.sec) * SECOND + int(stamp.nanosec)
 
 
@@ -109,7 +121,14 @@ def tensor_message(
     row: int,
     covariance: Array,
 ) -> StressTensorStamped:
-    """Return one row as a message of its own. The covariance is (15, 15)."""
+    """Return the stress of one cube at one instant as a message.
+
+    Args:
+        header: Header of the message.
+        rows: Rows of stress.
+        row: Index of the row that the message contains.
+        covariance: Covariance of the 6 stress components and 9 gradients, (15, 15), in SI units.
+    """
     xx, yy, zz, yz, zx, xy = rows.stress[row].tolist()
     tensor = StressTensor(
         normal=Vector3(
@@ -136,7 +155,13 @@ def wrench_message(
     force_n: Array,
     torque_nm: Array,
 ) -> WrenchStamped:
-    """Return a wrench of a force (3,) in N and a torque (3,) in N m."""
+    """Return a message with a wrench.
+
+    Args:
+        header: Header of the message.
+        force_n: Force (3,), in N.
+        torque_nm: Torque (3,), in N m.
+    """
     message = WrenchStamped(header=header)
     force, torque = message.wrench.force, message.wrench.torque
     force.x, force.y, force.z = force_n.tolist()
@@ -151,15 +176,16 @@ def info_message(
     uids: Mapping[int, int] = MappingProxyType({}),
     sender: str = "reconstruction",
 ) -> SkinInfo:
-    """Return what is fixed about a skin, with the rest frequencies that the pipeline uses now.
+    """Return a SkinInfo message: cubes, poses, calibrations and present rest frequencies of a skin.
 
     Args:
         skin: The skin.
-        pipeline: Gives the rest frequencies and covariances.
-        stamp_ns: Time from which on this holds, in ns.
-        uids: Index of a cube in the skin -> the uid that its hub reports, which fills the gaps of
-            the skin file.
-        sender: driver or reconstruction.
+        pipeline: Computation of the stress, which has the present rest frequencies (frequencies
+            without load) and the covariances.
+        stamp_ns: Time from which on the content is valid, in ns since the Unix epoch.
+        uids: Index of a cube in the skin -> the uid that its hub reports. It is used for cubes
+            whose uid is not in the skin file.
+        sender: Name of the node that publishes the message: driver or reconstruction.
     """
     message = SkinInfo(
         version=SkinInfo.VERSION,
@@ -176,7 +202,8 @@ def info_message(
         info.uid = cube.uid or uids.get(number, 0)
         info.rest_frequency = rest_frequency[number, :n_pads].tolist()
         message.cubes.append(info)
-        # Most skins have few calibrations, so that each is sent once and named by its id.
+        # Cubes usually share few calibrations, so each calibration is sent once, and cubes refer to
+        # it by its id.
         if calibration.id not in message.calibration_ids:
             message.calibration_ids.append(calibration.id)
             message.calibrations.append(calibration_text(calibration))
@@ -186,11 +213,12 @@ def info_message(
 
 
 def _cube_info(cube: SkinCube, frame_id: str) -> CubeInfo:
-    """Return what the skin file says of a cube."""
+    """Return the part of a SkinInfo message about one cube, as stated in the skin file."""
     calibration = cube.calibration
     px, py, pz = cube.xyz
     x, y, z, w = quaternion_from_rpy(*cube.rpy).tolist()
-    # A message has no word for what the skin file leaves out: it says 0, or an empty text.
+    # Fields of a message cannot be None. A link or index that the skin file leaves out is sent as
+    # an empty text or 0.
     return CubeInfo(
         name=cube.name,
         frame_id=frame_id,

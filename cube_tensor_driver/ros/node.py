@@ -1,4 +1,4 @@
-"""What all nodes share: parameters, lifecycle and clean-up, and how nodes are started and ended."""
+"""The base class of all nodes (parameters, lifecycle, clean-up), and `run`, which runs nodes."""
 
 from __future__ import annotations
 
@@ -44,42 +44,45 @@ from .qos import SERVICES, batch_profile, scans_per_message
 from .session import spin_until, start_ros
 
 MAX_BUFFERS = 4
-"""Number of message sizes for which a publisher keeps a buffer, to fill it again."""
+"""Number of different message sizes for which a publisher keeps a buffer to use it again."""
 
 STEP_S = 0.2
-"""Maximum time, in seconds, that the executor of nodes waits, and so how late it sees a signal."""
+"""Maximum duration, in seconds, of one step of the executor. A signal that asks the process to end
+takes effect after at most this time."""
 
 THREAD_SWITCH_S = 1e-3
-"""Time, in seconds, for which a thread may keep Python's lock while others wait for it.
+"""Time, in seconds, after which a thread must release Python's global interpreter lock (GIL) if
+another thread waits for it (`sys.setswitchinterval`).
 
-The reader's thread gives the lock up at each read. With Python's own 5 ms it would wait that long
-whenever the main thread computes.
+The thread that reads the links releases the lock at each read. With the default of 5 ms it would
+have to wait that long for the lock whenever the main thread computes.
 """
 
 GC_THRESHOLDS = (20_000, 20, 20)
-"""Thresholds of Python's garbage collector.
+"""Thresholds of the three generations of Python's garbage collector (`gc.set_threshold`).
 
-A scan leaves no garbage, but with Python's own 700 objects the collector would run every scan or
-two.
+Processing a scan leaves no cyclic garbage. With the default of 700 new objects the collector would
+run at every scan or every second one for nothing.
 """
 
 Entity = TypeVar("Entity", Publisher, Subscription, Timer, Service)
 
 
 class CubeNode(LifecycleNode):
-    """A lifecycle node whose errors end neither a callback nor the process.
+    """A lifecycle node in which exceptions of callbacks and transitions do not end the process.
 
-    Subclasses write `configure`, and `activate` and `deactivate` where they need them. What
-    `configure` makes is handed to `own` or `call_at_cleanup`, so that the base class ends it. An
-    error in a transition is one line in the log, and the transition fails.
+    Subclasses implement `configure`, and `activate` and `deactivate` if they need them. They pass
+    each object that `configure` makes to `own` or `call_at_cleanup`, so that this class destroys it
+    at clean-up. If a transition raises an error, the error is logged and the transition fails.
 
     Attributes:
-        callback_errors: Catches and counts errors of callbacks.
-        is_configured: Whether the state is inactive or active.
-        is_active: Whether the state is active.
+        callback_errors: Catches and counts the exceptions of callbacks.
+        is_configured: Whether the lifecycle state is inactive or active.
+        is_active: Whether the lifecycle state is active.
     """
 
     def __init__(self, name: str, parameters: Sequence[Parameter]) -> None:
+        """Make the node, and declare its parameters."""
         self.callback_errors = CallbackErrors(self)
         super().__init__(name)
         self.is_configured = False
@@ -92,31 +95,47 @@ class CubeNode(LifecycleNode):
         for parameter in parameters:
             self._declare(parameter)
 
-    # What subclasses write.
+    # Methods that subclasses override.
 
     def configure(self) -> None:
-        """Make all that the node needs, without opening a device. CubeError: it cannot be made."""
+        """Make the publishers, subscriptions and other objects of the node; open no device.
+
+        Raises:
+            CubeError: An object cannot be made, for example because the skin file has a mistake.
+        """
 
     def activate(self) -> None:
-        """Begin to work. CubeError: it cannot begin."""
+        """Start the work of the node, such as opening devices.
+
+        Raises:
+            CubeError: The work cannot start.
+        """
 
     def deactivate(self) -> None:
-        """End what `activate` began. Safe to call without `activate`."""
+        """End the work that `activate` started. It may also be called without `activate`."""
 
     def on_parameter_change(self, name: str) -> None:
-        """Take over the new value of a live parameter. Called only while configured."""
+        """Take over the new value of a live parameter.
+
+        Called only while the node is configured, for parameters that may change in this state.
+        """
 
     @property
     def failure(self) -> Exception | None:
-        """Error after which the node cannot go on and the process ends; None: there is none."""
+        """Error after which the node cannot work any more, so that `run` ends the process; None:
+        there was no such error."""
         return None
 
-    # What subclasses use.
+    # Methods that subclasses call.
 
     def own(self, entity: Entity) -> Entity:
-        """Have a publisher, subscription, timer or service destroyed at clean-up, and return it."""
+        """Register a publisher, subscription, timer or service to be destroyed at clean-up.
+
+        Returns:
+            The same object.
+        """
         destroyers: tuple[tuple[type, Callable[[Any], object]], ...] = (
-            # A publisher of the first kind is also one of the second.
+            # LifecyclePublisher derives from Publisher, so it must be tested first.
             (LifecyclePublisher, self.destroy_lifecycle_publisher),
             (Publisher, self.destroy_publisher),
             (Subscription, self.destroy_subscription),
@@ -130,31 +149,40 @@ class CubeNode(LifecycleNode):
         return entity
 
     def call_at_cleanup(self, function: Callable[[], object]) -> None:
-        """Call a function at clean-up, in the reverse order of these calls and those of `own`."""
+        """Register a function to be called at clean-up.
+
+        Functions and the objects of `own` are handled in the reverse order of their registration.
+        """
         self._resources.callback(function)
 
     def value(self, name: str) -> Any:
-        """Return the value of a parameter."""
+        """Return the present value of a parameter of the node."""
         return self.get_parameter(name).value
 
     def config(self) -> Path:
-        """Return the path in the parameter `config`. ConfigError: it is not given."""
+        """Return the path in the parameter `config`.
+
+        Raises:
+            ConfigError: The parameter is empty.
+        """
         if not self.value("config"):
             raise ConfigError("parameter config is empty: name a skin file, -p config:=skin.yaml")
         return Path(self.value("config")).expanduser()
 
     def batch_profile(self, rate_hz: float | None, n_cubes: int) -> QoSProfile:
-        """Return the profile of the batch topics, as parameters of the node demand it.
+        """Return the quality of service of the topics `frequencies`, `stress` and `forces`.
+
+        It depends on the parameters `publish_period` and `qos_reliability` of the node.
 
         Args:
-            rate_hz: Samples per second of each cube; None: not known.
-            n_cubes: Number of cubes.
+            rate_hz: Sampling rate of each cube, in Hz; None: not known.
+            n_cubes: Number of cubes of the skin.
         """
         scans = scans_per_message(self.value("publish_period"), rate_hz)
         message_rate = None if rate_hz is None else rate_hz / scans
         return batch_profile(message_rate, self.value("qos_reliability"), scans * n_cubes)
 
-    # Callbacks, whose errors are caught.
+    # Methods of rclpy that register callbacks; here they catch the callbacks' exceptions.
 
     def create_subscription(self, *arguments: Any, **options: Any) -> Any:
         message_type, topic, callback, *others = arguments
@@ -190,10 +218,10 @@ class CubeNode(LifecycleNode):
         )
 
     def _protect_lifecycle_services(self) -> None:
-        """Catch errors of the lifecycle services, which rclpy makes without `create_service`.
+        """Catch exceptions in the lifecycle services, which rclpy makes without `create_service`.
 
-        rclpy raises RCLError, a RuntimeError, when a transition is asked for that is not possible
-        now.
+        If a client requests a transition that the present state does not allow, rclpy raises
+        RCLError, which derives from RuntimeError. The client gets a response without success.
         """
         for service in self.services:
             if service.srv_type is ChangeState:
@@ -226,8 +254,8 @@ class CubeNode(LifecycleNode):
         return SetParametersResult(successful=True)
 
     def _refusal(self, name: str, value: Any) -> str:
-        """Return why a parameter cannot have a value now, or an empty text if it can."""
-        # rclpy also asks about parameters of its own, such as use_sim_time.
+        """Return why a parameter must not get a value now, or "" if it may."""
+        # rclpy also calls this for its own parameters, such as use_sim_time, which have no entry.
         known = self._parameters_by_name.get(
             name,
             Parameter(
@@ -265,7 +293,7 @@ class CubeNode(LifecycleNode):
         result = self._attempt(self.configure)
         self.is_configured = result == TransitionCallbackReturn.SUCCESS
         if not self.is_configured:
-            self._resources.close()  # what was made before the error
+            self._resources.close()  # destroys the objects that were made before the error
         return result
 
     def on_activate(self, state: Any) -> TransitionCallbackReturn:
@@ -283,7 +311,7 @@ class CubeNode(LifecycleNode):
 
     def on_cleanup(self, state: Any) -> TransitionCallbackReturn:
         self.end()
-        gc.collect()  # now, because `run` lets the collector run rarely
+        gc.collect()  # explicitly, because the thresholds that `run` sets make it rare
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, state: Any) -> TransitionCallbackReturn:
@@ -291,7 +319,7 @@ class CubeNode(LifecycleNode):
         return TransitionCallbackReturn.SUCCESS
 
     def end(self) -> None:
-        """End all that the node has begun and made, whatever its state."""
+        """End the work of the node and destroy its objects, in any lifecycle state."""
         self.is_active = False
         if self.is_configured:
             self.deactivate()
@@ -299,7 +327,10 @@ class CubeNode(LifecycleNode):
         self._resources.close()
 
     def _attempt(self, work: Callable[[], None]) -> TransitionCallbackReturn:
-        """Do the work of a transition. An error becomes a line in the log and a failure."""
+        """Call the function of a transition, and return FAILURE if it raises an exception.
+
+        The exception is logged.
+        """
         try:
             work()
         except CubeError as error:
@@ -312,13 +343,13 @@ class CubeNode(LifecycleNode):
 
 
 class NodeClock:
-    """The clock of a node, read quickly.
+    """The clock of a node, with a faster way to read it.
 
-    Without simulated time that is the system's clock, which is read directly in a tenth of the
-    time.
+    Unless time is simulated (`use_sim_time`), the clock of a node is the system clock. Reading that
+    directly takes a tenth of the time of a call of rclpy.
 
     Attributes:
-        is_simulated: Whether time was simulated at the last `update`.
+        is_simulated: Whether time was simulated when `update` was called last.
     """
 
     def __init__(self, node: Node) -> None:
@@ -326,12 +357,12 @@ class NodeClock:
         self.update()
 
     def update(self) -> None:
-        """Look whether time is simulated. Call this from time to time."""
+        """Find out whether time is simulated. It should be called regularly, e.g. once a second."""
         clock = self._node.get_clock()
         self.is_simulated = isinstance(clock, ROSClock) and clock.ros_time_is_active
 
     def now_ns(self) -> int:
-        """Return the time of the node's clock, in ns."""
+        """Return the time of the node's clock, in ns since the Unix epoch or of simulated time."""
         if self.is_simulated:
             return int(self._node.get_clock().now().nanoseconds)
         return time.time_ns()
@@ -340,11 +371,14 @@ class NodeClock:
 def run(make: Callable[[], Sequence[CubeNode]]) -> None:
     """Run nodes until a signal asks the process to end, and exit.
 
-    They start in order and end in reverse. The exit code is 1 if a node cannot start, or fails
-    later.
+    The nodes start in their order and end in the reverse order. The exit code is 1 if a node cannot
+    start or reports a `failure` later, else 0.
 
     Args:
-        make: Makes the nodes, once rclpy has started.
+        make: Returns the nodes. It is called after rclpy has started.
+
+    Raises:
+        SystemExit: Always, with the exit code.
     """
     stopping = stop_event()
     sys.setswitchinterval(THREAD_SWITCH_S)
@@ -360,7 +394,11 @@ def run(make: Callable[[], Sequence[CubeNode]]) -> None:
 
 
 def _run_nodes(nodes: Sequence[CubeNode], stopping: threading.Event) -> bool:
-    """Start nodes, spin them until `stopping` is set, end them; return whether all went well."""
+    """Start nodes, spin them until `stopping` is set, and end them.
+
+    Returns:
+        Whether all nodes could start and none has reported a `failure`.
+    """
     executor = make_executor()
     is_good = True
     for node in nodes:
@@ -370,7 +408,8 @@ def _run_nodes(nodes: Sequence[CubeNode], stopping: threading.Event) -> bool:
             if not is_good:
                 stopping.set()
 
-    # All objects made until now will stay. Looking at them would take a collection 20 ms.
+    # The objects that exist now live until the end of the process. Frozen, they are not visited by
+    # the garbage collector, which saves 20 ms per collection.
     gc.collect()
     gc.freeze()
     gc.set_threshold(*GC_THRESHOLDS)
@@ -398,7 +437,7 @@ def _run_nodes(nodes: Sequence[CubeNode], stopping: threading.Event) -> bool:
 
 
 def _start(node: CubeNode) -> bool:
-    """Configure and activate a node, and return whether it could."""
+    """Configure and activate a node, and return whether both transitions succeeded."""
     return all(
         transition() == TransitionCallbackReturn.SUCCESS
         for transition in (node.trigger_configure, node.trigger_activate)

@@ -1,4 +1,7 @@
-"""Quality of service of all topics and services of the package."""
+"""Quality of service (QoS) of all topics and services of the package.
+
+The batch topics are `frequencies`, `stress` and `forces`, whose messages hold rows of all cubes.
+"""
 
 from __future__ import annotations
 
@@ -11,36 +14,42 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from ..core.errors import ConfigError
 
 MAX_PAUSE_S = 2.0
-"""Time, in seconds, for which a subscriber may pause without losing messages of a batch topic.
+"""Longest pause, in seconds, of a subscriber after which no message of a batch topic is lost.
 
-The depth of a queue is this time multiplied by the rate of messages.
+The depth of a queue is this time multiplied by the rate of messages, unless `MAX_QUEUE_BYTES`
+limits it.
 """
 
 MAX_QUEUE_BYTES = 64_000_000
-"""Maximum size of a queue, in bytes, so that no process grows beyond 200 MB.
+"""Maximum size of the queue of a batch topic, in bytes. It keeps the processes below 200 MB.
 
-The queues of the largest skins hold less than `MAX_PAUSE_S`.
+On the largest skins a queue of this size holds less than `MAX_PAUSE_S` of messages.
 """
 
 MIN_BATCH_DEPTH = 10
 """Minimum depth of the queue of a batch topic, in messages."""
 
 ROW_BYTES = 78
-"""Size of a row of `stress` in a message, in bytes. A row of `frequencies` of 8 pads is smaller."""
+"""Size of the row of one cube in a message of `stress`, in bytes.
+
+It is used for all batch topics, because a row of `frequencies` of a cube with 8 pads is smaller.
+"""
 
 DEFAULT_RATE_HZ = 1000.0
-"""Rate of messages, in Hz, that is assumed where it is not known."""
+"""Rate, in Hz, that is assumed for samples or messages if the rate is not known."""
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-"""For `info` topics: whoever subscribes late still gets the last message."""
+"""Profile of `info` topics. A node that subscribes after the last message still gets it."""
 
 NEWEST = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""For viewers, which want the newest messages and not all: a slow viewer holds up nobody."""
+"""Profile of subscribers that need only the newest messages, such as viewers.
+
+With best effort, a slow subscriber does not make the publisher wait.
+"""
 
 SERVICES = QoSProfile(depth=1000)
-"""For services. ROS's own depth is 10: with more calls at once DDS silently drops the oldest.
-
-Parameter services have a depth of 1000 anyway.
+"""Profile of services. It is deeper than the default of ROS, 10 requests, beyond which DDS silently
+drops the oldest. The parameter services of rclpy have a depth of 1000, too.
 """
 
 _RELIABILITIES = {
@@ -52,32 +61,32 @@ _RELIABILITIES = {
 def batch_profile(
     rate_hz: float | None, reliability: str = "reliable", rows: int = 1
 ) -> QoSProfile:
-    """Return the profile of a batch topic, `frequencies` or `stress`.
+    """Return the profile of a batch topic: `frequencies`, `stress` or `forces`.
 
     Args:
-        rate_hz: Messages per second; None: not known.
+        rate_hz: Rate of the messages, in Hz; None: not known, `DEFAULT_RATE_HZ` is assumed.
         reliability: reliable or best_effort.
-        rows: Number of rows of each message.
+        rows: Number of rows in each message. A row is one sample of one cube.
 
     Raises:
-        ConfigError: There is no such reliability.
+        ConfigError: The reliability is another text.
     """
     if reliability not in _RELIABILITIES:
         allowed = ", ".join(_RELIABILITIES)
         raise ConfigError(f"parameter qos_reliability is {reliability!r}, allowed: {allowed}")
     wanted_depth = (rate_hz or DEFAULT_RATE_HZ) * MAX_PAUSE_S
-    # A large skin with a deep queue would fill the memory of a robot.
+    # The messages of a large skin are so large that the wanted depth might exceed the memory.
     affordable_depth = MAX_QUEUE_BYTES / (rows * ROW_BYTES)
     depth = max(MIN_BATCH_DEPTH, math.ceil(min(wanted_depth, affordable_depth)))
     return QoSProfile(depth=depth, reliability=_RELIABILITIES[reliability])
 
 
 def scans_per_message(publish_period_s: float, rate_hz: float | None) -> int:
-    """Return how many scans a message holds that covers a publish period, at least one.
+    """Return the number of scans (samples of all cubes) that one message holds, at least one.
 
     Args:
-        publish_period_s: Time that a message covers, in seconds.
-        rate_hz: Samples per second; None: not known.
+        publish_period_s: Time, in seconds, whose scans are sent in one message.
+        rate_hz: Rate of scans, in Hz; None: not known, `DEFAULT_RATE_HZ` is assumed.
     """
     return max(1, round(publish_period_s * (rate_hz or DEFAULT_RATE_HZ)))
 
@@ -88,7 +97,13 @@ def make_profile(
     is_latched: bool,
     is_best_effort: bool,
 ) -> QoSProfile:
-    """Return the profile of a topic with a queue of `depth` messages."""
+    """Return the profile of a topic.
+
+    Args:
+        depth: Depth of the queue, in messages.
+        is_latched: Whether a late subscriber still gets the last message (transient local).
+        is_best_effort: Whether lost messages are not sent again (best effort).
+    """
     profile = QoSProfile(depth=depth)
     if is_latched:
         profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
@@ -98,19 +113,19 @@ def make_profile(
 
 
 def offered_profile(offers: Sequence[TopicEndpointInfo], depth: int) -> QoSProfile:
-    """Return the profile of a subscription that fits all publishers of a topic.
+    """Return the profile of a subscription that matches all publishers of a topic.
 
-    It is latched only if all publishers are, and best effort as soon as one of them is: a stricter
-    subscription would get nothing from that publisher.
+    The subscription is latched (transient local) only if all publishers are, and it is best effort
+    if at least one publisher is. Otherwise DDS would not connect it to some of the publishers.
 
     Args:
-        offers: The publishers.
+        offers: The publishers of the topic, as `get_publishers_info_by_topic` returns them.
         depth: Depth of the queue, in messages.
     """
     profiles = [offer.qos_profile for offer in offers]
-    # A latched subscription does not match a publisher that is not.
+    # DDS does not connect a transient-local subscription with a volatile publisher.
     are_latched = [one.durability == DurabilityPolicy.TRANSIENT_LOCAL for one in profiles]
-    # A reliable subscription does not match a publisher of best effort.
+    # DDS does not connect a reliable subscription with a best-effort publisher.
     are_reliable = [one.reliability == ReliabilityPolicy.RELIABLE for one in profiles]
     return make_profile(
         depth,

@@ -1,4 +1,4 @@
-"""rclpy started and ended, and the one loop that spins an executor."""
+"""Starts and ends rclpy, and spins executors; nodes and commands share these functions."""
 
 from __future__ import annotations
 
@@ -17,18 +17,20 @@ from ..processes.domain import VARIABLE, check_domain
 from .compat import make_executor
 
 STEP_S = 0.05
-"""Maximum time, in seconds, that a spinning loop waits before it looks whether it is done."""
+"""Default of the maximum duration, in seconds, of one step of `spin_until`."""
 
 
 def start_ros() -> None:
-    """Start rclpy in this process and leave signals to us.
+    """Start rclpy in this process without its signal handlers.
+
+    The program handles SIGINT and SIGTERM itself, see `processes/stop_signals.py`.
 
     Raises:
         ConfigError: rclpy does not start, for example because of a wrong environment variable.
     """
     check_domain()
     try:
-        # rclpy's own handlers would end the context under a thread that publishes.
+        # The signal handlers of rclpy would shut down the context while a thread still publishes.
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:  # RCLError, from a wrong variable or argument of ROS
         reason = " ".join(str(error).split())
@@ -37,9 +39,13 @@ def start_ros() -> None:
 
 @contextmanager
 def node_session(name: str) -> Iterator[tuple[Node, Any]]:
-    """Give a node, and the executor that it is in, for the length of a block.
+    """Start rclpy with a node for a `with` block, and shut rclpy down at its end.
 
-    The executor is to be spun in the main thread.
+    Args:
+        name: Name of the node.
+
+    Yields:
+        The node, and an executor that contains it. The executor must be spun in the main thread.
 
     Raises:
         ConfigError: rclpy does not start.
@@ -65,24 +71,24 @@ def spin_until(
     step_s: float = STEP_S,
     on_step: Callable[[], None] | None = None,
 ) -> bool:
-    """Spin an executor in this thread until something is done.
+    """Spin an executor in this thread until a condition is true.
 
-    `EventsExecutor.spin` can burn a core and does not return on a signal. Many short `spin_once` in
-    the main thread do neither.
+    The loop calls `spin_once` for short steps. `EventsExecutor.spin` is not used, because it can
+    occupy a whole CPU core and does not return on a signal.
 
     Args:
         executor: The executor.
         is_done: Called before each step; a true value ends the loop.
-        seconds: Maximum duration, in seconds.
+        seconds: Maximum duration of the loop, in seconds.
         step_s: Maximum duration of a step, in seconds.
         on_step: Called after each step.
 
     Returns:
-        Whether it is done. False means that the time is over.
+        True if `is_done` ended the loop, False if `seconds` have passed.
     """
     until = time.monotonic() + seconds
     while not is_done():
-        # Monotonic, because the clock of the system may be set meanwhile.
+        # The monotonic clock is used because the system clock may be set during the loop.
         left = until - time.monotonic()
         if left <= 0:
             return False
@@ -93,5 +99,5 @@ def spin_until(
 
 
 def domain_text() -> str:
-    """Return the DDS domain of this process in words."""
+    """Return a text such as "DDS domain 0" with the domain of this process, for messages."""
     return f"DDS domain {os.environ.get(VARIABLE) or 0}"

@@ -1,6 +1,6 @@
-"""Subscribes to a skin: its `info` and its newest `stress`.
+"""Subscribes to the topics `info` and `stress` of a skin and keeps the newest values.
 
-For nodes that show the skin, or compute something from its newest rows at a lower rate.
+It serves nodes that display the skin, or compute something from its newest stress at a low rate.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from .qos import LATCHED, NEWEST
 
 @dataclass
 class FollowedSkin:
-    """A skin as its topics show it.
+    """The state of a skin as received on its topics.
 
     Attributes:
-        info: The newest SkinInfo.
-        poses: Poses of its cubes.
-        newest: Newest row of each cube.
-        messages: Number of messages of `stress` so far.
-        stamp_ns: Stamp of the newest of them, in ns.
+        info: The newest SkinInfo message (names, poses and calibrations of the cubes).
+        poses: Poses of the cubes in the parent frame of the skin.
+        newest: The newest stress of each cube.
+        messages: Number of messages of `stress` received so far.
+        stamp_ns: Stamp of the newest message of `stress`, in ns since the Unix epoch; 0: none came.
     """
 
     info: Any
@@ -45,14 +45,20 @@ class FollowedSkin:
 
 
 class SkinSubscriber:
-    """Follows the skin whose topics a node sees.
+    """Receives `info` and `stress` of the skin in the namespace of a node.
 
     Attributes:
-        skin: The skin, or None until its `info` has come.
+        skin: The state of the skin; None until its first `info` message.
     """
 
     def __init__(self, node: Node, on_skin: Callable[[FollowedSkin], None]) -> None:
-        """Subscribe; `on_skin` is called when there is a skin, and when there is another one."""
+        """Subscribe to both topics.
+
+        Args:
+            node: The node that subscribes.
+            on_skin: Called at the first `info` message, and whenever names or poses of the cubes
+                have changed.
+        """
         self.skin: FollowedSkin | None = None
         self._node = node
         self._on_skin = on_skin
@@ -80,11 +86,12 @@ class SkinSubscriber:
             self._node.destroy_subscription(subscription)
 
     def now(self) -> float:
-        """Return the time of the node's clock in s, which `LatestStress` takes."""
+        """Return the time of the node's clock, in s. `LatestStress` uses it as arrival time."""
         return 1e-9 * float(self._node.get_clock().now().nanoseconds)
 
     def _receive_info(self, info: SkinInfo) -> None:
-        # A tare changes only rest frequencies: the picture of the skin stays.
+        # After a tare only the rest frequencies of the new `info` differ, so that `on_skin` need
+        # not be called.
         if self.skin is not None and geometry(self.skin.info) == geometry(info):
             self.skin.info = info
             return
@@ -97,7 +104,7 @@ class SkinSubscriber:
         self.skin = skin
 
     def _receive_stress(self, data: bytes) -> None:
-        # Without the poses and the number of cubes, rows mean nothing.
+        # Before the first `info` the number of cubes is unknown, so rows cannot be stored.
         if self.skin is None:
             return
         try:
@@ -111,38 +118,47 @@ class SkinSubscriber:
 
 
 class SkinSubscriberNode(CubeNode):
-    """A node that publishes one topic, named as the node, computed from a skin's newest rows.
+    """Base class of nodes that compute one topic from the newest stress of a skin.
 
-    It publishes at most `rate` messages a second, and only while somebody listens.
+    The topic has the name of the node. It is published at most `rate` times per second (parameter),
+    and only while it has subscribers.
     """
 
     def __init__(
         self, name: str, parameters: Sequence[Parameter], message_type: type, depth: int
     ) -> None:
-        """Make a node whose topic has a queue of `depth` messages."""
+        """Make the node.
+
+        Args:
+            name: Name of the node and of its topic.
+            parameters: Parameters of the node, among them `rate`.
+            message_type: Type of the messages.
+            depth: Depth of the queue of the topic, in messages.
+        """
         super().__init__(name, parameters)
         self._message_type = message_type
         self._depth = depth
 
     def prepare(self, skin: FollowedSkin) -> None:
-        """Prepare for a skin: there is one, or another one."""
+        """Prepare for messages about a skin. Called for the first skin and when it has changed."""
 
     def compute_message(self, skin: FollowedSkin, health: Index) -> Any:
-        """Return what to publish now: a message, or its bytes, or None for nothing.
+        """Return the message to publish now, or its serialised bytes; None: none is published.
 
         Args:
-            skin: The skin.
-            health: Health of each cube, (cubes,), as `LatestStress.health` gives it.
+            skin: The state of the skin.
+            health: Health of each cube, (cubes,): fine, doubtful, faulty or stale, as
+                `LatestStress.health` returns it.
         """
 
     def has_listeners(self, publisher: Any) -> bool:
-        """Return whether somebody listens to what `compute_message` gives."""
+        """Return whether the topic has a subscriber. Without one, nothing is computed."""
         return bool(publisher.get_subscription_count())
 
     def configure(self) -> None:
         subscriber = SkinSubscriber(self, self.prepare)
         self.call_at_cleanup(subscriber.close)
-        # A node publishes one topic, which has its name.
+        # The topic has the name of the node.
         publisher = self.own(
             self.create_lifecycle_publisher(self._message_type, self.get_name(), self._depth)
         )
@@ -151,7 +167,8 @@ class SkinSubscriberNode(CubeNode):
             skin = subscriber.skin
             if skin is None or not self.is_active or not self.has_listeners(publisher):
                 return
-            # A cube that has become silent is shown as stale, so the time counts and not only rows.
+            # The health is computed at each publication, because a cube becomes stale by time
+            # alone, without new rows.
             health = skin.newest.health(subscriber.now(), STALE_S)
             message = self.compute_message(skin, health)
             if message is not None:

@@ -1,1 +1,1 @@
-"""What nodes report on /diagnostics."""
+"""Makes the statuses that the nodes publish on /diagnostics."""

@@ -1,4 +1,4 @@
-"""Diagnostics of the driver: of all rows, and of each link."""
+"""Diagnostics of the driver: one status about all rows of frequencies, and one per link."""
 
 from __future__ import annotations
 
@@ -15,18 +15,23 @@ LEVELS = {
     LinkState.SILENT: DiagnosticStatus.STALE,
     LinkState.CLOSED: DiagnosticStatus.WARN,
 }
-"""State of a link -> level of its status."""
+"""State of a link (connection to a hub) -> level of its status on /diagnostics."""
 
 
 class LinkDiagnostics:
-    """Makes the driver's statuses, once a second."""
+    """Makes the diagnostic statuses of the driver. It is used once a second."""
 
     def __init__(self, skin_name: str) -> None:
         self._skin_name = skin_name
         self._counts_before = RowCounts()
 
     def statuses(self, links: LiveLinks, with_links: bool) -> list[DiagnosticStatus]:
-        """Return the status of all rows, and of each link if `with_links`."""
+        """Return the diagnostic statuses of the driver.
+
+        Args:
+            links: The links, which count rows and report their states.
+            with_links: Whether the list contains a status for each link, after the one about rows.
+        """
         counts = links.row_counts()
         statuses = [_rows_status(self._skin_name, counts, self._counts_before)]
         self._counts_before = counts
@@ -40,12 +45,18 @@ def _rows_status(
     counts: RowCounts,
     before: RowCounts,
 ) -> DiagnosticStatus:
-    """Return the status of all rows, with what happened since the counts `before`."""
+    """Return the status about all rows.
+
+    Args:
+        skin_name: Name of the skin.
+        counts: Numbers of rows since the start.
+        before: The same numbers at the previous call, one second earlier.
+    """
     level, text = DiagnosticStatus.OK, ""
     if counts.unaccounted:
         level = DiagnosticStatus.ERROR
         text = f"{counts.unaccounted} rows are lost in the driver: please report it"
-    # Only new losses, so that the level falls again.
+    # Only losses since the previous status count, so that the level returns to OK afterwards.
     elif counts.lost > before.lost:
         level = DiagnosticStatus.ERROR
         text = f"{counts.lost - before.lost} rows lost by an error: {counts.lost_reason}"
@@ -62,10 +73,10 @@ def _rows_status(
 
 
 def _link_status(report: LinkReport) -> DiagnosticStatus:
-    """Return the status of one link. Its level is that of the worst state since the last report."""
+    """Return the status of one link, whose level is the worst one since the previous status."""
     levels = [LEVELS[state] for state in (report.state, *report.past_states)]
     if report.notes:
-        # A note, such as damaged frames, is worth a look although rows come.
+        # A note, for example about damaged frames, is a warning even while the link is open.
         levels.append(DiagnosticStatus.WARN)
     uid = "" if report.hub_uid is None else f"{report.hub_uid:#x}"
     text = "; ".join(report.notes) or report.state.value

@@ -1,4 +1,4 @@
-"""What the reconstruction reports: rows, lost messages, tare, and the health of cubes in words."""
+"""Diagnostics of the reconstruction: rows, lost messages, tares, and the health of the cubes."""
 
 from __future__ import annotations
 
@@ -18,41 +18,48 @@ from ..compat import SubscriptionEventCallbacks
 from .updater import make_status
 
 MAX_CUBE_STATUSES = 64
-"""Maximum number of statuses of cubes in one message.
+"""Maximum number of cubes that have a status in one message of /diagnostics.
 
-On a skin whose hubs are all gone, a status for each of 1000 cubes helps nobody.
+If all hubs of a skin with 1000 cubes are disconnected, a status for each cube would be useless.
 """
 
 MISSING = "missing: no row yet, see its link"
+"""Status text of a cube that has not sent any row since the node was configured."""
 
 STALE = "stale: no rows any more, see its link"
+"""Status text of a cube that has sent rows before, but none since the previous status."""
 
 MIN_UPDATES_TO_LOG = 5
-"""Number of updates, one a second, before the log names a cube that has sent nothing yet.
-
-Hubs may start after the node.
-"""
+"""Number of updates of the diagnostics (one per second) during which cubes without any row are not
+logged, because hubs may start later than the node."""
 
 MAX_KNOWN_PUBLISHERS = 8
-"""Maximum number of publishers of a topic that are told apart by their message numbers."""
+"""Maximum number of publishers of one topic whose last message numbers are remembered, so that
+messages of different publishers are not taken for gaps."""
 
 LogChanges = list[tuple[str, bool]]
-"""Lines for the log, and whether each is bad news."""
+"""Lines for the log, each with whether it reports a problem (True) or the end of one (False)."""
 
 
 class TareState(Protocol):
-    """What diagnostics need of tare: uids by cube, and its age in words."""
+    """The part of the class `Taring` that diagnostics use.
+
+    Attributes:
+        uids: Index of a cube in the skin -> its uid.
+    """
 
     uids: dict[int, int]
 
-    def age(self) -> dict[str, str]: ...
+    def age(self) -> dict[str, str]:
+        """Return the number of tared cubes and the age of the oldest tare, as texts."""
 
 
 class ReconstructionDiagnostics:
-    """Makes the statuses of the reconstruction, once a second.
+    """Makes the diagnostic statuses of the reconstruction. It is used once a second.
 
     Attributes:
-        refused_messages: Number of messages that were damaged or contradicted themselves.
+        refused_messages: Number of messages of `frequencies` that were refused, because they were
+            damaged or inconsistent.
     """
 
     def __init__(
@@ -66,22 +73,25 @@ class ReconstructionDiagnostics:
         self._was_inactive = False
 
     def count(self, rows: StressRows) -> None:
-        """Count rows that were published."""
+        """Count the rows of one published message, and the invalid ones among them."""
         self._rows += len(rows)
         self._invalid_rows += int(np.count_nonzero(rows.status & INVALID))
 
     def statuses(self, is_active: bool) -> tuple[list[DiagnosticStatus], LogChanges]:
-        """Return the statuses, and what changed for the log.
+        """Return the statuses for /diagnostics, and lines for the log about changes.
 
-        The first status is about all rows. The others are about cubes that are not fine, or were
-        not at the last update. An inactive node processes no rows, which is no fault of the cubes,
-        so that it reports none.
+        The first status is about all rows. The others are about cubes that have a fault now or had
+        one at the previous call. While the node is inactive there are no statuses of cubes, because
+        an inactive node processes no rows and all cubes would seem to be silent.
+
+        Args:
+            is_active: Whether the node is active now.
         """
         cubes: list[DiagnosticStatus] = []
         changes: LogChanges = []
         if is_active and not self._was_inactive:
             cubes, changes = self._cubes.statuses(self._tare.uids)
-        else:  # The node was not active for all of the time since the last update.
+        else:  # The node was inactive for at least a part of the time since the previous call.
             self._cubes.discard()
         self._was_inactive = not is_active
 
@@ -116,22 +126,23 @@ class ReconstructionDiagnostics:
 
 
 class CubeHealth:
-    """Turns what `Health` has found since the last update into words."""
+    """Makes statuses of cubes from the conditions that `Health` has found in the last second."""
 
     def __init__(self, skin: Skin, reconstructor: Reconstructor) -> None:
         self._skin, self._pipeline = skin, reconstructor.pipeline
         self._health = reconstructor.health
         self._has_come = np.zeros(len(skin.cubes), bool)
-        # Cube -> its words, of those that were not fine: at the last update, and in the log.
+        # Index of a cube with a fault -> text of its status, in the previous statuses and in the
+        # log. The log may lag behind, because cubes are not logged just after the start.
         self._reported: dict[int, str] = {}
         self._logged: dict[int, str] = {}
         self._updates = 0
 
     def statuses(self, uids: Mapping[int, int]) -> tuple[list[DiagnosticStatus], LogChanges]:
-        """Return statuses of cubes that are not fine or were not at the last update, and changes.
+        """Return the statuses of cubes with a fault now or at the previous call, and log lines.
 
         Args:
-            uids: Index of a cube in the skin -> its uid, where the skin file does not give it.
+            uids: Index of a cube in the skin -> its uid, for cubes whose uid the skin file lacks.
         """
         bits, strained, rows = self._health.collect()
         self._updates += 1
@@ -170,11 +181,14 @@ class CubeHealth:
         return statuses, changes
 
     def discard(self) -> None:
-        """Forget what `Health` has found since the last update."""
+        """Discard the conditions that `Health` has found since the previous call."""
         self._health.collect()
 
     def summary(self) -> dict[str, int]:
-        """Return how many pads and cubes are in each condition now, without conditions of none."""
+        """Return the number of pads in each condition and of cubes with a high residual now.
+
+        Numbers that are 0 are left out. The keys are those of the diagnostics.
+        """
         counts = {
             f"pads {word}": int(np.count_nonzero(self._health.state & bit))
             for bit, word in WORDS.items()
@@ -185,7 +199,14 @@ class CubeHealth:
     def _describe_cubes(
         self, cubes: AnyArray, bits: AnyArray, strained: Mask, rows: AnyArray
     ) -> dict[int, str]:
-        """Return the words of these cubes, from conditions and numbers of rows of all cubes."""
+        """Return the text of the status of each of these cubes.
+
+        Args:
+            cubes: Indices of the cubes.
+            bits: Condition bits of each pad of all cubes, (all cubes, pads).
+            strained: Whether the residual of a cube was high, (all cubes,).
+            rows: Number of rows of each cube since the previous call, (all cubes,).
+        """
         suspects = self._find_suspects(strained)
         words = {}
         for cube in cubes.tolist():
@@ -203,7 +224,15 @@ class CubeHealth:
         return words
 
     def _find_suspects(self, strained: Mask) -> dict[int, list[str]]:
-        """Return, for each strained cube, the pads that alone would explain the residual."""
+        """Return the names of pads that may cause the high residuals of cubes.
+
+        Args:
+            strained: Whether the residual of a cube was high, (all cubes,).
+
+        Returns:
+            Index of a cube with a high residual -> its pads any one of which, if it alone were
+            faulty, would explain the residual.
+        """
         cubes = np.flatnonzero(strained)
         if not len(cubes):
             return {}
@@ -222,20 +251,22 @@ class CubeHealth:
 
 
 class LostMessages:
-    """Counts the messages of a topic that were sent and did not come.
+    """Counts the messages of a topic that were published but have not arrived.
 
-    It counts over one subscription after the other. DDS numbers the messages of each publisher. A
-    number that is left out is a message that is gone for good: the network lost it, or it was
-    dropped because this process was away longer than its queue holds, which DDS itself tells
-    nobody. Where rclpy does not give the numbers, and where several publishers send in turn, only
-    what DDS reports as lost is counted.
+    DDS numbers the messages of each publisher consecutively, so that a gap in the numbers shows a
+    lost message. Either the network has lost it, or it was dropped because this process did not
+    read its queue in time; DDS does not report the latter. If rclpy does not provide the numbers,
+    or several publishers send alternately, only the losses that DDS reports are counted. The count
+    continues when the node makes a new subscription.
     """
 
     def __init__(self) -> None:
-        # Lost in earlier subscriptions, by gaps of this one, and as DDS reports for this one.
+        # Number of lost messages: in earlier subscriptions; by gaps in this one; as DDS reports
+        # for this one.
         self._earlier = self._left_out = self._reported = 0
         self._newest: int | None = None
-        # The gap just before the newest number; it counts when its publisher goes on.
+        # Number of messages missing just before the newest one. It is counted only when the next
+        # message continues the numbers, as otherwise the newest came from another publisher.
         self._gap = 0
         self._other_publishers: deque[int] = deque(maxlen=MAX_KNOWN_PUBLISHERS)
         self._has_several_publishers = False
@@ -246,21 +277,30 @@ class LostMessages:
         return self._earlier + max(self._left_out, self._reported)
 
     def new_subscription(self) -> SubscriptionEventCallbacks:
-        """Begin to count for a new subscription, and return the events to make it with."""
+        """Begin to count for a new subscription.
+
+        Returns:
+            The argument `event_callbacks` of `create_subscription`.
+        """
         self._earlier, self._left_out, self._reported = self.count, 0, 0
         self._newest, self._gap, self._has_several_publishers = None, 0, False
         self._other_publishers.clear()
         return SubscriptionEventCallbacks(message_lost=self._on_message_lost)
 
     def note_arrival(self, number: int | None) -> None:
-        """Take note of a message that came, and of its number; None: it is not known."""
+        """Record the arrival of a message.
+
+        Args:
+            number: Number that DDS gave the message; None: rclpy does not provide it.
+        """
         newest, self._newest = self._newest, number
         if number is None or newest is None:
             return
         is_next = number == newest + 1
         continues_other = not is_next and number - 1 in self._other_publishers
         if continues_other or number <= newest:
-            # From another publisher: one of several, or a new one, which begins at 1.
+            # The message came from another publisher: one of several that send alternately, or a
+            # new one, whose numbers begin at 1.
             self._has_several_publishers |= continues_other
             self._other_publishers.append(newest)
             self._gap = 0
@@ -273,9 +313,9 @@ class LostMessages:
 
 
 def log_changes(logger: Any, changes: LogChanges) -> None:
-    """Log each line; bad news are warnings."""
+    """Write lines to the log: problems as warnings, and the end of problems as information."""
     for line, is_bad in changes:
-        # Two calls, because rclpy ties the level to the line of code that logs.
+        # rclpy requires that a line of code always logs with the same level, so there are two.
         if is_bad:
             logger.warning(line)
         else:
@@ -283,12 +323,16 @@ def log_changes(logger: Any, changes: LogChanges) -> None:
 
 
 def _condition_words(bits: int) -> str:
-    """Return the conditions of a pad in words."""
+    """Return the conditions of a pad, given as bits, as text."""
     return " and ".join(word for bit, word in WORDS.items() if bits & bit)
 
 
 def _residual_cause(suspects: list[str] | None) -> str:
-    """Return what may be the cause of a residual, in words."""
+    """Return a text with the possible cause of a high residual of a cube.
+
+    Args:
+        suspects: Names of the pads any one of which may be faulty; None or empty: none is known.
+    """
     if suspects:
         return f"pad {' or '.join(suspects)} may be bad"
     return "a pad is bad, or the load is outside the modes of this layout"

@@ -1,4 +1,7 @@
-"""Diagnostics at 1 Hz, by diagnostic_updater if it is installed, otherwise by a substitute."""
+"""Publishes diagnostics of a node at 1 Hz.
+
+The package diagnostic_updater of ROS is used if it is installed, otherwise a replacement.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,7 @@ try:
 except ModuleNotFoundError:
 
     class Updater:  # type: ignore[no-redef]
-        """The part of diagnostic_updater's class that is used here."""
+        """Replacement of diagnostic_updater's class, with the methods that are used here."""
 
         def __init__(self, node: Node, period: float = 1.0) -> None:
             self.node, self.node_name = node, node.get_name()
@@ -28,7 +31,7 @@ except ModuleNotFoundError:
             """Publish the statuses. Called by the timer."""
 
         def publish(self, statuses: list[DiagnosticStatus]) -> None:
-            """Publish these statuses under the name of the node."""
+            """Publish statuses, with the name of the node in front of their names."""
             message = DiagnosticArray(status=statuses)
             message.header.stamp = self.node.get_clock().now().to_msg()
             for status in statuses:
@@ -37,7 +40,7 @@ except ModuleNotFoundError:
 
 
 class Diagnostics(Updater):  # type: ignore[misc]
-    """Publishes statuses of a node once a second, for as long as the node lives."""
+    """Publishes the diagnostic statuses of a node once a second, until the node is destroyed."""
 
     def __init__(
         self,
@@ -49,15 +52,15 @@ class Diagnostics(Updater):  # type: ignore[misc]
 
         Args:
             node: The node.
-            statuses: Returns what to publish; nothing is published where it returns none.
-            count_errors: Returns how many callbacks of the node have failed so far, which the
-                first status also says.
+            statuses: Returns the statuses to publish. If the list is empty, nothing is published.
+            count_errors: Returns the number of calls of the node's callbacks that have raised an
+                exception so far. It is added to the first status.
         """
         super().__init__(node)
         self._statuses, self._count_errors = statuses, count_errors
         self._errors_before = 0
-        # With the namespace, because a skin may run in several. Left to itself, the updater uses
-        # the bare name or doubles the slash.
+        # The name contains the namespace, because several skins may run in different namespaces.
+        # By itself diagnostic_updater uses the name without namespace, or writes two slashes.
         self.node_name = node.get_fully_qualified_name()
 
     def update(self) -> None:
@@ -84,7 +87,15 @@ def make_status(
     text: str,
     values: Mapping[str, Any],
 ) -> DiagnosticStatus:
-    """Return the status of one part of a node."""
+    """Return the diagnostic status of one part of a node.
+
+    Args:
+        name: Name of the part, such as "link hub0".
+        hardware_id: Identifies the device, as a uid in hexadecimal; empty: it is not known.
+        level: Level of the status, a constant of DiagnosticStatus.
+        text: Message of the status.
+        values: Key -> value, shown as text.
+    """
     pairs = [_make_pair(name, key, str(value)) for key, value in values.items()]
     return DiagnosticStatus(
         name=name, hardware_id=hardware_id, level=level, message=text, values=pairs
@@ -92,12 +103,14 @@ def make_status(
 
 
 _newest_pairs: dict[tuple[str, str], KeyValue] = {}
+"""(name of a status, key) -> the pair of key and value that was published last."""
 
 
 def _make_pair(name: str, key: str, value: str) -> KeyValue:
-    """Return a key with its value.
+    """Return a pair of key and value for the status with this name.
 
-    The last pair is used again if the value has not changed, because rclpy takes 2 µs to make one.
+    The previous pair is returned if the value has not changed, because rclpy takes 2 µs to make a
+    new one.
     """
     pair = _newest_pairs.get((name, key))
     if pair is None or pair.value != value:

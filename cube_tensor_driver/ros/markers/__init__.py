@@ -1,1 +1,4 @@
-"""Shapes for RViz and Foxglove, which the node `markers` publishes."""
+"""Draws the picture of a skin for RViz and Foxglove, which the node `markers` publishes.
+
+Lengths are often stated as multiples of the pitch, the distance of neighbouring cubes.
+"""

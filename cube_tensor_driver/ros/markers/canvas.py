@@ -1,4 +1,7 @@
-"""The picture of a skin as a serialised MarkerArray: cubes, arrows, crosses and contacts."""
+"""The picture of a skin as a serialised MarkerArray: cubes, arrows, crosses and contacts.
+
+The pitch is the distance of neighbouring cubes, d0 is half the side of a cube.
+"""
 
 from __future__ import annotations
 
@@ -33,50 +36,61 @@ from .serialised import (
 )
 
 PLATE_SIDE = 2.04
-"""Side of the plate that has the colour of a cube, in half sides of the cube.
+"""Side of the square plate that shows the colour of a cube, divided by half the side of the cube.
 
-The plate covers the upper face, so that the cube of the robot model is seen below it.
+The plate covers the upper face of the cube; the sides of the cube are drawn from the robot model.
 """
 
 PLATE_THICKNESS = 0.3
-"""Thickness of the plate, in half sides of the cube."""
+"""Thickness of the plate that shows the colour of a cube, divided by half the side of the cube."""
 
 PLATE_HEIGHT = 0.9
-"""Height of the plate's centre above the cube's centre, in half sides of the cube."""
+"""Distance of the centre of a coloured plate from the centre of its cube, along the z axis of the
+cube, divided by half the side of the cube."""
 
 LINE_WIDTH = 0.05
-"""Width of lines, in pitches."""
+"""Width of the lines of arrows and crosses, divided by the pitch (distance of neighbouring cubes).
+"""
 
 PULL_COLOUR: Colour = (0.9, 0.3, 0.2)
+"""Colour of principal stresses that are positive (tension)."""
+
 PUSH_COLOUR: Colour = (0.3, 0.5, 1.0)
+"""Colour of principal stresses that are negative (compression)."""
+
 CONTACT_COLOUR: Colour = (1.0, 0.45, 0.75)
+"""Colour of the rings and texts of contacts."""
 
 MAX_CONTACTS = 8
-"""Number of contacts that are drawn. A message has those with the largest forces first."""
+"""Maximum number of contacts that are drawn. A message lists those with the largest forces first.
+"""
 
 RING_CORNERS = 24
-"""Number of corners of the ring around a contact."""
+"""Number of corners of the polygon that is drawn as the ring around a contact."""
 
 RING_WIDTH = 0.06
-"""Width of the line of a ring, in pitches."""
+"""Width of the line of the ring around a contact, divided by the pitch (distance of neighbouring
+cubes)."""
 
 FORCE_TEXT_HEIGHT = 0.3
-"""Height of the text with the force of a contact, in pitches."""
+"""Height of the letters that show the force of a contact, divided by the pitch (distance of
+neighbouring cubes)."""
 
 MIN_TEXT_DISTANCE_M = 2e-3
-"""Minimum distance, in m, of the text with the force of a contact from its centre."""
+"""Minimum distance, in m, between the centre of a contact and the text that shows its force."""
 
 HIDDEN_OPACITY = 0.001
-"""Opacity of a text without a contact. RViz warns of a colour whose opacity is 0."""
+"""Opacity of a force text while its contact does not exist. It is not 0, because RViz logs a
+warning for a colour with opacity 0."""
 
 
 class Ranges(NamedTuple):
-    """Values that the top of the colours and the longest arrows stand for.
+    """Upper ends of the scales of a picture.
 
     Attributes:
-        colours: In SI units of the quantity that is shown.
-        traction: In Pa.
-        gradient: In Pa/m.
+        colours: Value at the upper end of the colour scale, in SI units of the quantity shown.
+        traction: Traction (force per area on the upper face) of the longest arrow, in Pa.
+        gradient: Gradient of stress of the longest arrow, in Pa/m.
     """
 
     colours: float = 0.0
@@ -85,7 +99,7 @@ class Ranges(NamedTuple):
 
 
 class Canvas:
-    """The picture of a skin. Each marker has its name as namespace.
+    """The picture of a skin. The namespace of each marker is its name, such as "faults".
 
     Attributes:
         legend: The legend beside the skin.
@@ -102,10 +116,11 @@ class Canvas:
         """Make the markers.
 
         Args:
-            frame_id: The parent frame of the skin.
-            poses: Poses of the cubes.
-            crosses: Whether principal stresses are drawn.
-            signed: Whether colours lie about zero.
+            frame_id: Frame id of the parent frame of the skin.
+            poses: Poses of the cubes in this frame.
+            crosses: Whether the principal stresses of each cube are drawn.
+            signed: Whether the quantity that colours show can be negative. The middle of the colour
+                scale is then 0.
         """
         self._poses = poses
         self._pitch = poses.pitch
@@ -123,27 +138,37 @@ class Canvas:
         plates = poses.position + heights * poses.rotation[:, :, 2]
         oriented = enumerate(zip(self._groups, rotations, strict=True))
         for group, (members, rotation) in oriented:
-            # The points of a marker are in the frame of its pose.
+            # Points of a marker are given in the frame of the marker's pose, so they are rotated
+            # from the parent frame into it.
             self._markers[f"cubes {group}"].points[:] = plates[members] @ rotation
-        # The opacity stays, only red, green and blue are drawn later.
+        # The opacity is set once; the draw methods write only red, green and blue.
         for marker in markers:
             self._markers[marker.ns].colours[:, 3] = 1.0
         self.legend = Legend(self._markers, place)
-        # Until there is a contact, its placeholder text must not be seen.
+        # Drawing no contacts hides the texts, which hold placeholders until there is a contact.
         self.draw_contacts(None)
 
     @property
     def data(self) -> bytearray:
-        """The serialised message."""
+        """The serialised MarkerArray message."""
         return self._markers.data
 
     def draw_cubes(self, colours: Array) -> None:
-        """Give each cube its colour, (cubes, 3)."""
+        """Set the colour of each cube.
+
+        Args:
+            colours: Red, green and blue of each cube, (cubes, 3), from 0 to 1.
+        """
         for group, members in enumerate(self._groups):
             self._markers[f"cubes {group}"].colours[:, :3] = colours[members]
 
     def draw_arrows(self, values: Array, ranges: Ranges) -> None:
-        """Draw traction and gradient of each cube, from its stress and gradients (cubes, 15)."""
+        """Draw the arrows of traction and gradient of each cube.
+
+        Args:
+            values: Stress and gradients of each cube, (cubes, 15), in Pa and Pa/m.
+            ranges: Traction and gradient of the longest arrows.
+        """
         normal = self._poses.rotation[:, :, 2]
         longest_traction = TRACTION_LENGTH * self._pitch
         longest_gradient = GRADIENT_LENGTH * self._pitch
@@ -164,7 +189,11 @@ class Canvas:
             self._markers[name].points[:] = lines.reshape(-1, 3)
 
     def draw_faults(self, health: Index) -> None:
-        """Draw crosses over cubes that are not fine, if the health has changed."""
+        """Draw crosses over cubes whose health is not fine, unless nothing has changed.
+
+        Args:
+            health: Health of each cube, (cubes,), as `LatestStress.health` returns it.
+        """
         is_unchanged = self._health is not None and np.array_equal(health, self._health)
         if is_unchanged:
             return
@@ -172,15 +201,16 @@ class Canvas:
         faults = self._markers["faults"]
         crosses = scene.fault_crosses(self._poses, health)
         faults.points[:] = crosses.reshape(-1, 3)
-        # Each of the four ends of a cross has the colour.
+        # A cross consists of two lines with four end points, and each of them has a colour.
         faults.colours[:, :3] = np.repeat(scene.MARK[health], 4, axis=0)
 
     def draw_crosses(self, values: Array, longest_pa: float) -> None:
-        """Draw principal stresses, if the picture has them.
+        """Draw the principal stresses of each cube as three lines, if the picture shows them.
 
         Args:
-            values: Stress and gradients of each cube, (cubes, 15).
-            longest_pa: Stress, in Pa, whose line is as long as the pitch.
+            values: Stress and gradients of each cube, (cubes, 15), in Pa and Pa/m.
+            longest_pa: Stress, in Pa, whose line is as long as the pitch (distance of neighbouring
+                cubes).
         """
         if "crosses" not in self._markers:
             return
@@ -192,7 +222,11 @@ class Canvas:
         crosses.colours[:, :3] = np.repeat(colours, 2, axis=0)
 
     def draw_contacts(self, contacts: SkinContacts | None) -> None:
-        """Draw a ring as large as each contact, and its forces; None: there is no contact."""
+        """Draw each contact as a ring, with its normal and shear force as text.
+
+        Args:
+            contacts: The newest message of contacts; None: all rings and texts are hidden.
+        """
         rings = np.zeros((MAX_CONTACTS, RING_CORNERS, 2, 3))
         count = 0 if contacts is None else len(contacts.position)
         for number in range(MAX_CONTACTS):
@@ -202,7 +236,7 @@ class Canvas:
                 continue
             position = _to_array(contacts.position[number])
             normal = _to_array(contacts.normal[number])
-            # The ring has the area of the contact, whatever its shape.
+            # A circle with the area of the contact is drawn, although contacts have other shapes.
             area = max(0.0, contacts.area[number])
             radius = float(np.sqrt(area / np.pi))
             rings[number] = _make_ring(position, normal, radius)
@@ -213,11 +247,16 @@ class Canvas:
         self._markers["contacts"].points[:] = rings.reshape(-1, 3)
 
     def _make_cubes(self, frame_id: str, rotations: Array) -> list[Marker]:
-        """Return a marker for each orientation, because all boxes of a CUBE_LIST are parallel."""
+        """Return one marker for each orientation, because all boxes of a CUBE_LIST are parallel.
+
+        Args:
+            frame_id: Frame id of the parent frame of the skin.
+            rotations: Rotation matrix of each group of cubes, (groups, 3, 3).
+        """
         markers = []
         for group, (w, x, y, z) in enumerate(quaternions(rotations).tolist()):
             members = self._groups[group]
-            # All boxes of a marker have one size, so the largest cube decides.
+            # All boxes of a marker have the same size; it is that of the largest cube.
             half_side = float(self._poses.half_side[members].max())
             side = PLATE_SIDE * half_side
             thickness = PLATE_THICKNESS * half_side
@@ -238,8 +277,14 @@ class Canvas:
         return markers
 
     def _make_lines(self, frame_id: str, crosses: bool) -> list[Marker]:
-        """Return the markers of arrows and of crosses over faults; principal ones if `crosses`."""
-        # Name, number of points of a cube, and colour; None: each point has its own.
+        """Return the markers of arrows and of the crosses over faulty cubes.
+
+        Args:
+            frame_id: Frame id of the parent frame of the skin.
+            crosses: Whether there is a marker for principal stresses, too.
+        """
+        # Each entry is the name, the number of points per cube, and the colour of a marker. None
+        # as colour means that each point has a colour of its own.
         kinds: list[tuple[str, int, Colour | None]] = [
             ("traction", 6, TRACTION_COLOUR),
             ("gradient", 6, GRADIENT_COLOUR),
@@ -258,11 +303,19 @@ class Canvas:
 
 
 def _group_by_orientation(rotation: Array) -> tuple[list[Index], Array]:
-    """Return the cubes of each orientation, and the orientations upside down, (G, 3, 3)."""
-    # Rounded, because equal orientations may differ in their last bits.
+    """Group cubes by their orientation.
+
+    Args:
+        rotation: Rotation matrix of each cube, (cubes, 3, 3).
+
+    Returns:
+        The indices of the cubes of each group, and the rotation matrix of each group, turned upside
+        down (see `UPSIDE_DOWN`), (groups, 3, 3).
+    """
+    # Matrices are rounded, because those of equal orientations may differ by rounding errors.
     flat = rotation.round(6).reshape(len(rotation), 9)
     unique, group = np.unique(flat, axis=0, return_inverse=True)
-    group = group.ravel()  # numpy 2.0 alone gives it a second axis
+    group = group.ravel()  # numpy 2.0, but no other version, returns shape (cubes, 1)
     members = [np.flatnonzero(group == number) for number in range(len(unique))]
     orientations = unique.reshape(-1, 3, 3)
     return members, orientations * UPSIDE_DOWN
@@ -273,7 +326,12 @@ def _to_array(vector: Point | Vector3) -> Array:
 
 
 def _make_contacts(frame_id: str, pitch: float) -> list[Marker]:
-    """Return rings and texts for the contacts of a skin with this pitch, in m."""
+    """Return the marker of all rings and the text markers for contacts.
+
+    Args:
+        frame_id: Frame id of the parent frame of the skin.
+        pitch: Distance of neighbouring cubes, in m.
+    """
     rings = make_marker(
         frame_id,
         "contacts",
@@ -297,13 +355,25 @@ def _make_contacts(frame_id: str, pitch: float) -> list[Marker]:
 
 
 def _force_text(normal_n: float, shear_n: float) -> str:
-    """Return forces in N as a text of constant length. A force that is not observed is NaN."""
+    """Return a text of constant length with two forces.
+
+    Args:
+        normal_n: Normal force of a contact, in N.
+        shear_n: Tangential force of a contact, in N; NaN if it is not observed.
+    """
     return f"{four_characters(normal_n)} N, shear {four_characters(shear_n)} N"
 
 
 def _make_ring(centre: Array, normal: Array, radius: float) -> Array:
-    """Return the lines of a ring, (RING_CORNERS, 2, 3), perpendicular to a unit normal (3,)."""
-    # The axis that is closest to perpendicular gives the most accurate cross product.
+    """Return the lines of a ring as pairs of end points, (RING_CORNERS, 2, 3), in m.
+
+    Args:
+        centre: Centre of the ring, (3,), in m.
+        normal: Unit vector perpendicular to the plane of the ring, (3,).
+        radius: Radius of the ring, in m.
+    """
+    # Of the three coordinate axes, the one closest to perpendicular to the normal gives the most
+    # accurate cross product.
     aside = np.eye(3)[np.abs(normal).argmin()]
     first = np.cross(normal, aside)
     first /= np.linalg.norm(first)

@@ -1,4 +1,4 @@
-"""The legend of the `markers` picture: a bar of colours with its numbers, and a scale of arrows."""
+"""The legend of the picture of a skin: a colour bar with numbers, and the scales of the arrows."""
 
 from __future__ import annotations
 
@@ -21,30 +21,35 @@ from .serialised import (
 )
 
 UPSIDE_DOWN = np.array([-1.0, 1.0, -1.0])
-"""Half a turn about y, as factors of the axes of a frame.
+"""Rotation by 180 degrees about the y axis, as factors of the x, y and z coordinates.
 
-It leaves a box as it is. RViz 2 draws the face -z of a box at 0.9 of its colour and the face +z at
-0.5, so boxes are drawn upside down.
+Boxes are drawn upside down, because RViz 2 shades them: the face towards -z has 0.9 of the
+brightness of the colour, the face towards +z only 0.5. The shape of a box does not change.
 """
 
 TRACTION_LENGTH = 1.2
-"""Length of the longest arrow of traction, in pitches."""
+"""Length of the longest arrow of traction (force per area on the upper face of a cube), divided by
+the pitch (distance of neighbouring cubes)."""
 
 GRADIENT_LENGTH = 0.8
-"""Length of the longest arrow of gradient, in pitches."""
+"""Length of the longest arrow of the gradient of stress, divided by the pitch (distance of
+neighbouring cubes)."""
 
 TRACTION_COLOUR: Colour = (1.0, 1.0, 1.0)
+"""Colour of the arrows of traction."""
+
 GRADIENT_COLOUR: Colour = (0.2, 0.6, 1.0)
+"""Colour of the arrows of the gradient."""
 
 
 class ArrowScale(NamedTuple):
-    """How one kind of arrow is drawn.
+    """Appearance of one kind of arrow in the picture and in the legend.
 
     Attributes:
-        name: What the arrows show.
-        unit: Unit of the number beside the arrow in the legend.
-        unit_si: That unit in SI.
-        length: Length of the longest arrow, in pitches.
+        name: Quantity that the arrows show.
+        unit: Name of the unit of the number beside the arrow in the legend.
+        unit_si: Value of that unit in SI units, such as 1000 for kPa.
+        length: Length of the longest arrow, divided by the pitch (distance of neighbouring cubes).
         colour: Colour of the arrows.
     """
 
@@ -71,52 +76,57 @@ SCALES = (
         GRADIENT_COLOUR,
     ),
 )
+"""Arrows in the legend, from top to bottom."""
 
 TITLE_BYTES = 128
-"""Length of the legend's title, in bytes: one line, with spaces on both sides to centre it.
+"""Length of the text of the legend's title, in bytes. The title is centred in it with spaces.
 
-RViz sets a second line 1 cm lower, whatever the size of the text. A dot stands at either end,
-because RViz 2 takes a space for more than a metre at first. If a text began with spaces, it would
-seem out of sight, and never be drawn.
+It is a single line, because RViz draws a second line 1 cm lower, whatever the size of the text. A
+dot stands at both ends: RViz 2 first computes spaces as wider than a metre, so that it would take a
+text that begins with spaces for invisible and never draw it.
 """
 
 PLAIN_LETTERS = str.maketrans("−σ∂", "-sd")
-"""Replacements of letters of two bytes. RViz 2 reads a text byte by byte, so one makes two gaps."""
+"""Translation of letters that are not ASCII. RViz 2 draws a text byte by byte, and such a letter,
+which has several bytes in UTF-8, would leave gaps."""
 
 BAR_BOXES = 32
-"""Number of boxes that make up the bar of colours."""
+"""Number of boxes of different colours that form the colour bar of the legend."""
 
 NUMBER_POSITIONS = (0.0, 0.5, 1.0)
-"""Positions of the numbers along the bar of colours, from 0 to 1."""
+"""Positions of the three numbers along the colour bar: 0 is its left end, 1 its right end."""
 
 TEXT_HEIGHT = 0.05
-"""Height of the texts of the legend, in widths of its bar of colours."""
+"""Height of the letters of the legend, divided by the width of the colour bar."""
 
 LINE_DISTANCE = 1.5
-"""Distance between two lines of text in the legend, in heights of the text."""
+"""Distance between two lines of text of the legend, divided by the height of the letters."""
 
 NUMBERS_LINE = 0.7
-"""Place of the numbers of the legend, in lines of text below its bar of colours."""
+"""Distance of the numbers of the legend below the colour bar, divided by the distance of two lines
+of text."""
 
 TITLE_LINE = 2.0
-"""Place of the title of the legend, in lines of text below its bar of colours."""
+"""Distance of the title of the legend below the colour bar, divided by the distance of two lines of
+text."""
 
 FIRST_SCALE_LINE = 3.5
-"""Place of the first arrow of the legend, in lines of text below its bar of colours."""
+"""Distance of the first arrow of the legend below the colour bar, divided by the distance of two
+lines of text."""
 
 SCALE_LINES = 1.2
-"""Distance between two arrows of the legend, in lines of text."""
+"""Distance between the two arrows of the legend, divided by the distance of two lines of text."""
 
 
 class LegendPlace(NamedTuple):
-    """Where the legend is in the parent frame: beside the skin, towards -y.
+    """Position and size of the legend in the parent frame: beside the skin in the direction -y.
 
     Attributes:
-        pitch: Pitch of the cubes, in m.
-        width: Width of the bar, in m.
-        centre_x: x of the centre of the bar, in m.
-        top_y: y of its upper edge, in m.
-        z: z of the whole, in m.
+        pitch: Distance of neighbouring cubes, in m.
+        width: Width of the colour bar along x, in m.
+        centre_x: x coordinate of the centre of the colour bar, in m.
+        top_y: y coordinate of the upper edge of the colour bar, in m.
+        z: z coordinate of the legend, in m.
     """
 
     pitch: float
@@ -127,10 +137,10 @@ class LegendPlace(NamedTuple):
 
     @classmethod
     def beside(cls, poses: CubePoses) -> LegendPlace:
-        """Return a place beside the cubes with these poses."""
+        """Return the position and size of the legend of a skin whose cubes have these poses."""
         low, high = poses.position.min(axis=0), poses.position.max(axis=0)
         pitch = poses.pitch
-        # A legend as narrow as a single cube could not be read.
+        # The width has a minimum, so that the legend of a single cube is legible.
         width = max(high[0] - low[0], 4 * pitch)
         centre_x = float(low[0] + high[0]) / 2
         return cls(
@@ -142,11 +152,11 @@ class LegendPlace(NamedTuple):
         )
 
     def point(self, across: float, line: float) -> Array:
-        """Return a point (3,).
+        """Return a point of the legend in the parent frame of the skin, (3,), in m.
 
         Args:
-            across: Position along the bar, from 0 to 1.
-            line: Number of lines of text below the bar.
+            across: Position along the colour bar, from 0 at its left end to 1 at its right end.
+            line: Distance below the colour bar, divided by the distance of two lines of text.
         """
         x = self.centre_x + (across - 0.5) * self.width
         below = LINE_DISTANCE * TEXT_HEIGHT * self.width * line
@@ -154,7 +164,7 @@ class LegendPlace(NamedTuple):
 
 
 class Legend:
-    """Draws into the serialised markers that `legend_markers` made."""
+    """Draws the legend by writing into the serialised markers that `legend_markers` has made."""
 
     def __init__(self, markers: SerialisedMarkers, place: LegendPlace) -> None:
         self._markers = markers
@@ -176,29 +186,34 @@ class Legend:
         top: float,
         health: Index,
     ) -> None:
-        """Draw what colours mean and how the cubes are.
+        """Draw the colour bar with its numbers, and the title with the health of the cubes.
 
         Args:
             quantity: The quantity that colours show.
-            top: Top of their range, in SI units.
-            health: Health of each cube, (cubes,).
+            top: Value at the upper end of the colour scale, in SI units.
+            health: Health of each cube, (cubes,), as `LatestStress.health` returns it.
         """
         low = -top if quantity.signed else 0.0
         values = np.linspace(low, top, BAR_BOXES)
         self._markers["legend bar"].colours[:, :3] = scene.colours(quantity, values, top)
         for number, position in enumerate(NUMBER_POSITIONS):
             value = (low + position * (top - low)) / quantity.size
-            # Always one character where the quantity has signs, so that the text keeps its length.
+            # A number of a signed quantity always has a sign, so that the text keeps its length.
             sign = "-" if value < 0 else "+" if quantity.signed else ""
             text = sign + four_characters(abs(value))
             self._markers.write_text(f"legend number {number}", text)
 
         title = _title(quantity, top, health)
-        width = TITLE_BYTES - 2  # without the dots at both ends
+        width = TITLE_BYTES - 2  # There is a dot at both ends.
         self._markers.write_text("legend", f".{title[:width].center(width)}.")
 
     def draw_scale(self, traction_pa: float, gradient_pa_per_m: float) -> None:
-        """Draw what the longest arrows stand for."""
+        """Write the values of the longest arrows.
+
+        Args:
+            traction_pa: Traction (force per area on the upper face) of the longest arrow, in Pa.
+            gradient_pa_per_m: Gradient of stress of the longest arrow, in Pa/m.
+        """
         for scale, value in zip(
             SCALES,
             (traction_pa, gradient_pa_per_m),
@@ -212,10 +227,17 @@ def legend_markers(
     place: LegendPlace,
     signed: bool,
 ) -> list[Marker]:
-    """Return the markers of a legend; the numbers of the bar have signs if `signed`."""
+    """Return the markers of a legend, with placeholders for texts and colours.
+
+    Args:
+        frame_id: Frame id of the parent frame of the skin.
+        place: Position and size of the legend.
+        signed: Whether the quantity that colours show can be negative, so that its numbers have
+            signs.
+    """
     height = TEXT_HEIGHT * place.width
     bar = make_marker(frame_id, "legend bar", Marker.CUBE_LIST)
-    # Half a turn about y, see `UPSIDE_DOWN`.
+    # This quaternion is the rotation `UPSIDE_DOWN`, by 180 degrees about the y axis.
     bar.pose.orientation.y, bar.pose.orientation.w = 1.0, 0.0
     bar.scale = Vector3(
         x=place.width / BAR_BOXES,
@@ -251,7 +273,8 @@ def legend_markers(
             height,
             placeholder,
         )
-        # A letter is about half as wide as high; the text begins beside the longest arrow.
+        # The text begins to the right of the longest arrow. Its position is its centre, and its
+        # width is estimated from letters that are half as wide as high.
         begin = (TRACTION_LENGTH + 0.3) * place.pitch / place.width
         across = begin + 0.25 * len(placeholder) * TEXT_HEIGHT
         point = place.point(across, FIRST_SCALE_LINE + SCALE_LINES * number)
@@ -262,11 +285,11 @@ def legend_markers(
 
 
 def four_characters(value: float) -> str:
-    """Return a number from 0 up in four characters, so that a text keeps its length.
+    """Return a number that is not negative in exactly four characters.
 
-    Examples are 0.25, 18.7 and "250.". NaN and numbers that are too large become "----".
+    Examples are 0.25, 18.7 and "250.". NaN and numbers that are too large give "----".
     """
-    # NaN compares false. From 9999.5 on a number would be rounded to five digits.
+    # The comparison is false for NaN, too. Numbers from 9999.5 up would be rounded to five digits.
     if not value < 9999.5:
         return "----"
     texts = [f"{value:.{digits}f}" for digits in (2, 1, 0)]
@@ -274,7 +297,13 @@ def four_characters(value: float) -> str:
 
 
 def _title(quantity: scene.Quantity, top: float, health: Index) -> str:
-    """Return what colours mean up to the top of their range, in SI units, and how the cubes are."""
+    """Return the title: quantity and range of the colours, and number of cubes in each health.
+
+    Args:
+        quantity: The quantity that colours show.
+        top: Value at the upper end of the colour scale, in SI units.
+        health: Health of each cube, (cubes,).
+    """
     high = top / quantity.size
     low = -high if quantity.signed else 0
     label = quantity.label.translate(PLAIN_LETTERS)
@@ -288,7 +317,12 @@ def _title(quantity: scene.Quantity, top: float, health: Index) -> str:
 
 
 def _scale_text(scale: ArrowScale, value: float) -> str:
-    """Return what the longest arrow stands for, whose SI value is given, in a constant length."""
+    """Return a text of constant length with the value of the longest arrow.
+
+    Args:
+        scale: The kind of arrow.
+        value: Value of the longest arrow, in SI units.
+    """
     return f"{scale.name} {four_characters(value / scale.unit_si)} {scale.unit}"
 
 

@@ -1,11 +1,13 @@
-"""A serialised MarkerArray whose points, colours and texts are written in place.
+"""A serialised MarkerArray in which points, colours and texts are replaced in the bytes.
 
-The points and colours of a marker are thousands of Python objects to rclpy. So the array is made of
-markers with placeholders and serialised once, and each picture is numpy writing into those bytes.
+In rclpy each point and each colour of a marker is a Python object, so that serialising a picture of
+thousands of points would be slow. Here a MarkerArray with placeholders is serialised once, and each
+new picture is written by numpy into the bytes of the serialised message.
 
-A message is serialised as CDR: four bytes of encapsulation, then all fields in order, each aligned
-to its size; the length of a text or sequence stands before it in 4 bytes. Source: OMG Common Object
-Request Broker Architecture 3.3, part 2, section 9.3 (CDR transfer syntax).
+A message is serialised in the format CDR: four bytes of encapsulation, then all fields in order,
+each aligned to a multiple of its size. Before a text or a sequence stands its length, in 4 bytes.
+Source: OMG Common Object Request Broker Architecture 3.3, part 2, section 9.3 (CDR transfer
+syntax).
 """
 
 from __future__ import annotations
@@ -24,16 +26,15 @@ from ...core.arrays import AnyArray, Array, Single
 from ...core.errors import MessageError
 
 LIFETIME_S = 2
-"""Time, in seconds, after which viewers remove the picture if the node sends no other one.
-
-So no old load is shown as if it were there.
-"""
+"""Time, in seconds, after which viewers remove a picture if the node `markers` has sent no newer
+one. So an old load is not shown as the present one after the node has ended."""
 
 ENCAPSULATION_BYTES = 4
-"""Number of bytes before the first field of a message."""
+"""Number of bytes of the encapsulation, which precedes the first field of a serialised message."""
 
 MAX_PADDING_BYTES = 3
-"""Number of bytes that the middleware may add to a message, to fill up the last four."""
+"""Maximum number of bytes that the middleware appends to a serialised message, to make its size a
+multiple of four."""
 
 ITEM_BYTES = {
     "boolean": 1,
@@ -44,12 +45,13 @@ ITEM_BYTES = {
     "float": 4,
     "double": 8,
 }
-"""Plain type of a field of a Marker -> its size, in bytes."""
+"""Primitive type of a field of a Marker -> its size in a serialised message, in bytes."""
 
 Colour = tuple[float, float, float]
-"""Red, green and blue, from 0 to 1."""
+"""Red, green and blue, each from 0 to 1."""
 
 WHITE: Colour = (0.95, 0.95, 0.95)
+"""Colour of texts, and of markers whose points have colours of their own."""
 
 
 def make_marker(
@@ -58,7 +60,14 @@ def make_marker(
     shape: int,
     colour: Colour = WHITE,
 ) -> Marker:
-    """Return a marker without points. Its namespace is its name."""
+    """Return a marker without points.
+
+    Args:
+        frame_id: Frame id of the frame in which the pose of the marker is given.
+        name: Name of the marker, which becomes its namespace.
+        shape: Type of the marker, a constant such as Marker.LINE_LIST.
+        colour: Colour of the whole marker.
+    """
     marker = Marker(
         ns=name,
         type=shape,
@@ -84,37 +93,43 @@ def make_text(
     height: float,
     text: str,
 ) -> Marker:
-    """Return a text that faces the viewer, centred on its position.
+    """Return a marker that shows a text, which always faces the viewer.
 
     Args:
-        frame_id: The frame of its position.
-        name: Its namespace.
+        frame_id: Frame id of the frame in which the position of the text is given.
+        name: Name of the marker, which becomes its namespace.
         height: Height of the letters, in m.
-        text: The text. Later texts have the same length.
+        text: The text. Texts that replace it must have the same length.
     """
     marker = make_marker(frame_id, name, Marker.TEXT_VIEW_FACING)
     marker.scale.z = height
-    # RViz 2 draws a space half as wide as this; if it is 0, over a metre wide.
+    # RViz 2 draws a space half as wide as scale.x, and more than a metre wide if scale.x is 0.
     marker.scale.x = 0.5 * height
     marker.text = text
     return marker
 
 
 def allocate(marker: Marker, n_points: int, with_colours: bool) -> None:
-    """Give a marker placeholders for its points, each with a colour if `with_colours`."""
+    """Add placeholders for points to a marker.
+
+    Args:
+        marker: The marker, which is changed.
+        n_points: Number of points.
+        with_colours: Whether each point has a colour of its own.
+    """
     marker.points = [Point()] * n_points
     marker.colors = [ColorRGBA()] * (n_points if with_colours else 0)
 
 
 class MarkerArrays(NamedTuple):
-    """Views on the bytes of a marker.
+    """Numpy views of a marker in the bytes of a serialised message; writing changes the message.
 
     Attributes:
         points: Points in the frame of the marker's pose, (n, 3), in m.
-        colours: Colours of the points, (n, 4), or (0, 4) where points have none.
-        text: Text in ASCII.
+        colours: Red, green, blue and opacity of each point, (n, 4); (0, 4) if points have none.
+        text: Text of the marker as ASCII codes, (characters,).
         position: Position of the whole marker, (3,), in m.
-        colour: Colour of the whole marker, (4,).
+        colour: Red, green, blue and opacity of the whole marker, (4,).
     """
 
     points: Array
@@ -125,17 +140,22 @@ class MarkerArrays(NamedTuple):
 
 
 class SerialisedMarkers:
-    """A serialised MarkerArray. Its arrays are found by the markers' namespaces.
+    """A serialised MarkerArray. Indexing with the namespace of a marker returns its arrays.
 
     Attributes:
-        data: The message.
+        data: The serialised message.
     """
 
     def __init__(self, markers: Sequence[Marker]) -> None:
-        """Serialise markers, whose numbers of points and colours and lengths of texts are final.
+        """Serialise markers.
+
+        Args:
+            markers: The markers. Their numbers of points and colours and the lengths of their texts
+                cannot change afterwards.
 
         Raises:
-            MessageError: The installed visualization_msgs has other fields than expected.
+            MessageError: The serialised message has another size than computed, because the
+                installed version of visualization_msgs has other fields.
         """
         self.data = bytearray(serialize_message(MarkerArray(markers=list(markers))))
         self._arrays: dict[str, MarkerArrays] = {}
@@ -147,7 +167,8 @@ class SerialisedMarkers:
                 points=self._view("<f8", start["points"], (len(marker.points), 3)),
                 colours=self._view("<f4", start["colors"], (len(marker.colors), 4)),
                 text=self._view("u1", start["text"], (len(marker.text),)),
-                # The position is the first field of the pose, and aligned only itself.
+                # The position is the first field of the pose. Only numbers are aligned, not the
+                # messages that contain them, so the alignment of the first number is added.
                 position=self._view("<f8", _align(start["pose"], 8), (3,)),
                 colour=self._view("<f4", _align(start["color"], 4), (4,)),
             )
@@ -166,7 +187,12 @@ class SerialisedMarkers:
         return namespace in self._arrays
 
     def write_text(self, namespace: str, text: str) -> None:
-        """Write a text in ASCII that is as long as the one before."""
+        """Replace the text of a marker.
+
+        Args:
+            namespace: Namespace of the marker.
+            text: The new text in ASCII, which must be as long as the previous one.
+        """
         self._arrays[namespace].text[:] = np.frombuffer(text.encode(), np.uint8)
 
     def _view(
@@ -185,23 +211,35 @@ class SerialisedMarkers:
 
 
 class _CdrWalk:
-    """Goes through serialised values in order.
+    """Computes the byte offsets of the fields of a serialised message, one after the other.
+
+    Offsets are measured from the end of the encapsulation.
 
     Attributes:
-        end: Where the last value ended, in bytes after the encapsulation.
+        end: Byte offset at which the last value ended.
     """
 
     def __init__(self) -> None:
         self.end = 0
 
     def skip(self, type_name: str, value: Any) -> int:
-        """Go over a value, and return where its content begins."""
+        """Advance over a value of any type.
+
+        Args:
+            type_name: Type of the value, as ROS names it.
+            value: The value; its lengths of texts and sequences determine its size.
+
+        Returns:
+            Byte offset of the number, of the first character of the text or of the first item of
+            the sequence. For a message it is the end of the previous value, which may be followed
+            by padding.
+        """
         sequence = re.fullmatch(r"sequence<(.*)>", type_name)
         if sequence:
             return self._skip_sequence(sequence[1], value)
         if type_name == "string":
             start = self.skip("uint32", len(value)) + ITEM_BYTES["uint32"]
-            self.end = start + len(value.encode()) + 1  # with a closing zero
+            self.end = start + len(value.encode()) + 1  # A text ends with a zero byte.
             return start
         if type_name in ITEM_BYTES:
             size = ITEM_BYTES[type_name]
@@ -213,7 +251,11 @@ class _CdrWalk:
         return start
 
     def skip_message(self, message: Any) -> dict[str, int]:
-        """Go over a message, and return where the content of each field begins."""
+        """Advance over all fields of a message.
+
+        Returns:
+            Name of a field -> byte offset at which its content begins, as `skip` returns it.
+        """
         types = message.get_fields_and_field_types()
         return {name: self.skip(types[name], getattr(message, name)) for name in types}
 
@@ -224,13 +266,14 @@ class _CdrWalk:
         if item_type in ITEM_BYTES:
             start = self.skip(item_type, items[0])
         else:
-            # The padding before the first field belongs to no item.
+            # The first field may follow padding, which is not a part of the item.
             start = min(self.skip_message(items[0]).values())
-        # All items are alike, and their size is a multiple of their alignment.
+        # All items have the same size, and there is no padding between them, because the size is a
+        # multiple of the alignment.
         self.end = start + len(items) * (self.end - start)
         return start
 
 
 def _align(start: int, size: int) -> int:
-    """Return the first multiple of a size from `start` on."""
+    """Return the smallest multiple of `size` that is not smaller than `start`, both in bytes."""
     return -(-start // size) * size

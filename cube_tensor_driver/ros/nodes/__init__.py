@@ -1,12 +1,13 @@
-"""The nodes, one per file.
+"""The ROS nodes, one per file.
 
-Importing this package sets the number of threads of numpy's matrix products, which numpy reads when
-it is loaded. Nodes are started as modules of this package, so this comes first.
+Importing this package limits numpy's matrix products to one thread, through an environment variable
+that numpy reads when it is imported. Nodes are started as modules of this package, so that Python
+executes this file before any import of numpy.
 """
 
 import os
 
-# Products of 4096 rows are the first that OpenBLAS divides among threads, which then wait in a
-# loop: a reconstruction of 4108 cubes at 100 Hz took 111 instead of 13 % of a core. A number that
-# the user has set stays.
+# OpenBLAS (numpy's matrix library) divides products of 4096 and more rows among threads, which wait
+# for work in a busy loop: the reconstruction of 4108 cubes at 100 Hz took 111 % of a CPU core
+# instead of 13 %. A number of threads that the user has set is kept.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -1,6 +1,6 @@
-"""Driver and reconstruction in one process: the rows of the driver do not travel over DDS.
+"""Runs driver and reconstruction in one process, which saves sending frequencies over DDS.
 
-`frequencies` is published only while somebody subscribes to it.
+The topic `frequencies` is published only while it has subscribers.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from .reconstruction import Reconstruction
 
 
 def make_nodes() -> list[CubeNode]:
-    """Make both nodes; the driver calls the reconstruction with its rows."""
+    """Make both nodes. The driver passes its frequencies to the reconstruction by a call."""
     reconstruction = Reconstruction(subscribes=False)
     return [reconstruction, Driver(reconstruction.on_rows)]
 

@@ -1,4 +1,4 @@
-"""The node `contacts`: from `stress`, where something presses on the skin and how hard."""
+"""The node `contacts`: computes position, size and force of contacts on the skin from `stress`."""
 
 from __future__ import annotations
 
@@ -26,11 +26,12 @@ from ..skin_subscriber import FollowedSkin, SkinSubscriberNode
 
 
 class Contacts(SkinSubscriberNode):
-    """Publishes `contacts` for the newest `stress`, at most `rate` times a second.
+    """Publishes `contacts` for the newest `stress`, at most `rate` times per second (parameter).
 
-    The arrays of a message are empty where nothing presses. The method `inverse` also publishes the
-    surface's `traction`. The method is set up in another thread, so that the node answers
-    meanwhile; nothing is published before.
+    Without contacts the arrays of a message are empty. With the method `inverse` the node also
+    publishes `traction`, the force per area on the surface of the skin. The `ContactFinder` is set
+    up in another thread, because that may take long on a large skin and the node must answer
+    requests meanwhile. Nothing is published before it is ready.
     """
 
     def __init__(self) -> None:
@@ -47,7 +48,7 @@ class Contacts(SkinSubscriberNode):
         return self._has_traction_listeners() or super().has_listeners(publisher)
 
     def prepare(self, skin: FollowedSkin) -> None:
-        # Each setting is a parameter of the same name.
+        # Each field of ContactSettings has a parameter of the same name.
         names = [field.name for field in fields(ContactSettings)]
         settings = ContactSettings(**{name: self.value(name) for name in names})
         calibrations = cube_calibrations(skin.info)
@@ -59,13 +60,13 @@ class Contacts(SkinSubscriberNode):
 
     def compute_message(self, skin: FollowedSkin, health: Index) -> SkinContacts | None:
         finder = self._take_finder()
-        # The tracker follows contacts in time, so the same scan must not go in twice.
+        # The finder tracks contacts over time, so it must not get the same message twice.
         if finder is None or skin.messages == self._processed_messages:
             return None
         self._processed_messages = skin.messages
         values, frame_id = skin.newest.usable_values(health), skin.info.header.frame_id
         contacts = finder.update(values, skin.newest.left_out)
-        # Only listeners are worth the time that the cloud takes.
+        # Computing the point cloud takes time, so it is done only while somebody subscribes.
         if self._traction is not None and self._has_traction_listeners():
             cloud = finder.cloud(values)
             if cloud is not None:
@@ -84,7 +85,10 @@ class Contacts(SkinSubscriberNode):
         )
 
     def _take_finder(self) -> ContactFinder | None:
-        """Return the finder, or None while it is set up or if it could not be, which is logged."""
+        """Return the contact finder; None while it is being set up, or if the set-up has failed.
+
+        A failure is logged once.
+        """
         if self._future_finder is not None and self._future_finder.done():
             future, self._future_finder = self._future_finder, None
             try:

@@ -1,4 +1,4 @@
-"""The driver node: live links with a publisher at their end."""
+"""The node `driver`: reads the hubs of a skin and publishes the frequencies of the pads."""
 
 from __future__ import annotations
 
@@ -29,21 +29,26 @@ from ..node import (
 from ..qos import LATCHED, scans_per_message
 
 COUNT_PERIOD_S = 0.2
-"""Time, in seconds, between two counts of subscribers where rclpy does not report their number."""
+"""Time, in seconds, between two counts of the subscribers of `frequencies`.
+
+It matters only if rclpy (as in ROS 2 Humble) does not report changes of their number itself.
+"""
 
 
 class Driver(CubeNode):
     """Publishes `frequencies`, `driver/info` and diagnostics.
 
-    The reader's thread publishes the frequencies, the main thread spins the node.
+    The thread that reads the links (the reader's thread) publishes the frequencies. The main thread
+    spins the node.
     """
 
     def __init__(self, on_rows: Callable[[FrequencyRows], None] | None = None) -> None:
         """Make the node.
 
         Args:
-            on_rows: Called in the reader's thread with the rows of each message, which are valid
-                until it returns. Messages are then sent only while somebody subscribes to them.
+            on_rows: Called in the reader's thread with the rows of each message. Their arrays are
+                overwritten after it has returned. If it is given, `frequencies` is published only
+                while the topic has subscribers; with None it is published always.
         """
         super().__init__("driver", DRIVER)
         self._on_rows = on_rows
@@ -72,7 +77,8 @@ class Driver(CubeNode):
             cube_addresses(skin),
             self._publish,
             rate=rate_hz,
-            # Several scans in a message save time per message where latency does not matter.
+            # Gathering several scans (samples of all cubes) in a message saves CPU time, but adds
+            # latency, so it is up to the user.
             scans_per_call=scans_per_message(self.value("publish_period"), rate_hz),
             make_rows=self._frequencies.make_rows,
             clock_ns=self._node_clock.now_ns,
@@ -94,7 +100,7 @@ class Driver(CubeNode):
             self._links.close()
 
     def on_parameter_change(self, name: str) -> None:
-        """Ask the hubs for the new rate at once; queues keep the depth that they were made with."""
+        """Ask the hubs for the new sampling rate. The queues of the topics keep their depth."""
         if self._links is not None:
             self._links.set_rate(self._rate())
 
@@ -102,7 +108,7 @@ class Driver(CubeNode):
         self._links = None
 
     def _rate(self) -> float | None:
-        """Return the samples per second to ask of the hubs; None leaves it to them."""
+        """Return the sampling rate, in Hz, to ask of the hubs; None: the hubs choose it."""
         return float(self.value("rate")) or self._skin.rate
 
     def _publish(self, rows: FrequencyRows) -> None:
@@ -111,8 +117,8 @@ class Driver(CubeNode):
             self._on_rows(rows)
 
     def _count_errors(self) -> int:
-        """Return the number of errors of callbacks, in the main thread and in the reader's."""
-        # Errors there do not pass through `callback_errors`, which serves the main thread.
+        """Return the number of exceptions in callbacks, in the main and the reader's thread."""
+        # `callback_errors` counts only the main thread; the links count the reader's thread.
         in_reader = 0 if self._links is None else self._links.callback_errors
         return self.callback_errors.count + in_reader
 
@@ -130,11 +136,12 @@ class Driver(CubeNode):
         )
 
     def _statuses(self) -> list[DiagnosticStatus]:
-        """Return the status of all rows, and of each link while the node is active."""
+        """Return the diagnostics: one status for all rows, and one per link while active."""
         if self._links is None:
             return []
         self._node_clock.update()
-        # Hubs report uids some time after the start; the reconstruction restores tares by them.
+        # Hubs report the uids of cubes some time after the start. The reconstruction needs them to
+        # find the stored tares, so `driver/info` is published again.
         if self._links.cube_uids != self._published_uids:
             self._published_uids = self._links.cube_uids
             self._publish_info()
@@ -142,9 +149,9 @@ class Driver(CubeNode):
 
 
 class FrequenciesPublisher:
-    """Publishes `frequencies`: rows are written into the bytes of a message, and those are sent.
+    """Publishes `frequencies` without copies: rows are written into the serialised message.
 
-    One thread makes and publishes the rows.
+    `make_rows` and `publish` must be called from the same thread.
     """
 
     def __init__(
@@ -154,15 +161,23 @@ class FrequenciesPublisher:
         profile: QoSProfile,
         always: bool,
     ) -> None:
-        """Announce the topic; `always` publishes it whether or not anybody subscribes."""
+        """Make the publisher.
+
+        Args:
+            node: The node, which is being configured.
+            frame_id: Frame id in the header of the messages.
+            profile: Quality of service of the topic.
+            always: Whether messages are published even while the topic has no subscribers.
+        """
         self._always = always
         self._has_subscribers = False
         self._frame_id = frame_id.encode() + b"\0"
         self._buffer = lru_cache(maxsize=MAX_BUFFERS)(self._make_buffer)
-        # The message that holds the rows which the reader is filling.
+        # The message into which the reader writes rows now; None before the first `make_rows`.
         self._next: MessageBuffer[FrequencyRows] | None = None
 
-        # DDS tells how many subscribe; asking at each message would cost more.
+        # rclpy reports changes of the number of subscribers, which costs less than asking for the
+        # number at each message.
         events = on_matched(self._note_subscribers)
         self._publisher = node.own(
             node.create_lifecycle_publisher(
@@ -173,12 +188,20 @@ class FrequenciesPublisher:
             node.own(node.create_timer(COUNT_PERIOD_S, self._count_subscribers))
 
     def make_rows(self, n_rows: int, n_pads: int) -> FrequencyRows:
-        """Return rows to fill, in the memory of the next message, valid until the next call."""
+        """Return rows to be filled by the caller; their memory is that of the next message.
+
+        Args:
+            n_rows: Number of rows.
+            n_pads: Number of frequencies per row.
+
+        Returns:
+            The rows, which are valid until the next call of this method.
+        """
         self._next = self._buffer(n_rows, n_pads)
         return self._next.rows
 
     def publish(self) -> None:
-        """Publish the rows that `make_rows` returned last."""
+        """Publish the message with the rows that `make_rows` has returned last."""
         if self._next is not None and (self._always or self._has_subscribers):
             self._publisher.publish(self._next.data())
 

@@ -1,4 +1,4 @@
-"""The node `markers`: from `stress`, a MarkerArray with a few markers, at a rate for eyes."""
+"""The node `markers`: draws the newest `stress` as a MarkerArray for RViz and Foxglove."""
 
 from __future__ import annotations
 
@@ -14,14 +14,16 @@ from ..node import run
 from ..skin_subscriber import FollowedSkin, SkinSubscriberNode
 
 MAX_CONTACTS_AGE_NS = 1_000_000_000
-"""Time, in ns, by which contacts may be older than the stress and still be drawn."""
+"""Maximum age of a message of `contacts`, in ns, relative to the newest message of `stress`. Older
+contacts are not drawn."""
 
 
 class Markers(SkinSubscriberNode):
     """Publishes `markers`, the picture of a skin for RViz and Foxglove.
 
-    It shows cubes in colours, arrows of traction and gradient, a legend, crosses over cubes that
-    are not fine, and the contacts while the node `contacts` runs.
+    It shows the cubes in the colours of a quantity, arrows for traction (force per area on the
+    upper face) and for the gradient, a legend, crosses over cubes whose health is not fine, and the
+    contacts while the node `contacts` runs.
     """
 
     def __init__(self) -> None:
@@ -66,12 +68,13 @@ class Markers(SkinSubscriberNode):
         return bytes(canvas.data)
 
     def _newest_contacts(self, skin: FollowedSkin) -> SkinContacts | None:
-        """Return the contacts, or None if there is no node `contacts` or it has fallen behind."""
+        """Return the newest contacts; None: none came, or they are older than
+        `MAX_CONTACTS_AGE_NS`."""
         contacts = self._contacts
         if contacts is None:
             return None
         age_ns = skin.stamp_ns - to_ns(contacts.header.stamp)
-        # A node `contacts` that has ended leaves its last message.
+        # After the node `contacts` has ended, its last message must not be drawn for ever.
         return contacts if age_ns <= MAX_CONTACTS_AGE_NS else None
 
     def _on_contacts(self, message: SkinContacts) -> None:
@@ -83,11 +86,17 @@ class Markers(SkinSubscriberNode):
         residual: Array,
         shown: Array,
     ) -> Ranges:
-        """Return ranges that follow the values, from the last ones on."""
+        """Return the ranges of colours and arrows, which adapt to the values step by step.
+
+        Args:
+            values: Stress and gradients of each cube, (cubes, 15), in Pa and Pa/m.
+            residual: Residual of each cube, (cubes,).
+            shown: The quantity that the colours show, (cubes,), in SI units.
+        """
         shear, gradient = scene.QUANTITIES["shear"], scene.QUANTITIES["gradient"]
         last, fixed = self._ranges, float(self.value("range"))
-        # The components that act on the upper face of a cube.
-        traction = values[:, 2:5]  # zz, yz, zx
+        # Columns 2 to 4 are the stress components zz, yz and zx, which act on the upper face.
+        traction = values[:, 2:5]
         return Ranges(
             colours=fixed or scene.automatic(self._quantity, shown, last.colours),
             traction=scene.automatic(shear, traction, last.traction),

@@ -1,4 +1,4 @@
-"""The reconstruction node: raw frequencies in, stress tensors and gradients out."""
+"""The node `reconstruction`: computes stress tensors and gradients from the pads' frequencies."""
 
 from __future__ import annotations
 
@@ -32,23 +32,35 @@ if TYPE_CHECKING:
     from ...bags.reprocess.recorded_reconstruction import RecordedReconstruction
 
 MAX_SCANS = 1000
-"""Maximum number of rows of one cube in a message, unless publish_period needs more.
+"""Maximum number of rows (samples) of one cube in a message that is accepted, unless the parameter
+publish_period requires more.
 
-One row for each of 1280 cubes takes up to 0.3 ms, and the node does nothing else meanwhile.
+The limit keeps a single message from blocking the node for long: one row for each of 1280 cubes
+takes up to 0.3 ms.
 """
 
 BAG_SUFFIXES = (".mcap", ".db3")
-"""Suffixes of the files of bags. A folder is a bag, too."""
+"""Suffixes by which the parameter `config` is recognised as the file of a bag (recording). A folder
+is also taken for a bag."""
 
 
 class Reconstruction(CubeNode):
-    """Publishes `stress`, `info`, diagnostics, and the stress and wrench of single cubes."""
+    """Publishes `stress`, `info`, diagnostics, and the stress and wrench of single cubes.
+
+    It gets frequencies from the topic `frequencies`, or from a driver in the same process.
+    """
 
     def __init__(self, subscribes: bool = True) -> None:
-        """Make the node; it does not subscribe where a driver in this process calls `on_rows`."""
+        """Make the node.
+
+        Args:
+            subscribes: Whether the node subscribes to `frequencies`. False is for a process in
+                which a driver calls `on_rows`.
+        """
         super().__init__("reconstruction", RECONSTRUCTION)
         self._subscribes = subscribes
-        # In one process with the driver, its thread calls `on_rows`; services run in the main one.
+        # A driver in this process calls `on_rows` in the reader's thread, and services run in the
+        # main thread. Both use the reconstructor.
         self._lock = threading.Lock()
         self._lost = LostMessages()
         self._updater = Diagnostics(self, self._statuses, lambda: self.callback_errors.count)
@@ -58,7 +70,8 @@ class Reconstruction(CubeNode):
         skin = self._skin = self._recorded.skin if self._recorded else read_skin(self.config())
         self._reconstructor = Reconstructor(skin)
         self._reconstructor.drift_time = float(self.value("drift_time"))
-        # One scan more than asked for, as drivers may gather it; twice, because rates vary.
+        # The driver may put one scan more into a message than the publish period holds. The factor
+        # 2 is for hubs that send faster than the rate in the skin file.
         scans = scans_per_message(self.value("publish_period"), skin.rate)
         self._max_scans = max(MAX_SCANS, 2 * (scans + 1))
 
@@ -107,7 +120,7 @@ class Reconstruction(CubeNode):
         self._reconstructor.drift_time = float(self.value("drift_time"))
 
     def on_rows(self, rows: FrequencyRows) -> None:
-        """Process rows of a driver in the same process, as it would put them into one message."""
+        """Process the rows that a driver in the same process would send as one message."""
         if self.is_active:
             frame_id = self._skin.parent_frame.encode() + b"\0"
             self._process(rows, int(rows.stamp_ns.min()), frame_id)
@@ -127,7 +140,13 @@ class Reconstruction(CubeNode):
         stamp_ns: int,
         frame_id: bytes,
     ) -> None:
-        """Publish the stress of the rows of one message, with its stamp and frame."""
+        """Compute and publish the stress for the frequencies of one message.
+
+        Args:
+            rows: Rows of frequencies.
+            stamp_ns: Stamp of the message, in ns since the Unix epoch.
+            frame_id: Frame id of the message, encoded and with a closing zero byte.
+        """
         if not self.is_active:
             return
         try:
@@ -135,7 +154,7 @@ class Reconstruction(CubeNode):
             with self._lock:
                 recorded = self._recorded
                 health = recorded.health_at(rows, self._reconstructor) if recorded else None
-                # A tare between two steps of this would mix old and new.
+                # The lock keeps a tare from changing the rest frequencies during the computation.
                 stress = self._reconstructor.process(rows, health)
                 if self._reconstructor.rest_changes != self._published_rest_changes:
                     self._publish_info()
@@ -150,8 +169,8 @@ class Reconstruction(CubeNode):
         log_refused_message(self, "frequencies", error)
 
     def _check_scans(self, rows: FrequencyRows) -> None:
-        """Raise MessageError if a message has too many rows of one cube."""
-        # Almost all messages end here: so few rows cannot be too many of one cube.
+        """Raise MessageError if a message has more than the allowed number of rows of one cube."""
+        # A message with few rows in total, as almost all are, need not be counted by cube.
         if len(rows) <= self._max_scans:
             return
         counts = np.bincount(rows.cube)
@@ -162,8 +181,8 @@ class Reconstruction(CubeNode):
             )
 
     def _publish_info(self) -> None:
-        # One ns after the last row without these rest frequencies: a bag says from which row on
-        # they hold.
+        # The stamp states from which row on the rest frequencies are valid, which reprocessing of a
+        # bag needs: 1 ns after the last row that was computed without them.
         newest_ns = self._reconstructor.health.newest_ns
         since_ns = newest_ns + 1 if newest_ns else self.get_clock().now().nanoseconds
         self._published_rest_changes = self._reconstructor.rest_changes
@@ -180,21 +199,24 @@ class Reconstruction(CubeNode):
             return []
         with self._lock:
             statuses, changes = self._diagnostics.statuses(self.is_active)
-        # Outside of the lock, for which the thread of a driver in this process may wait.
+        # Logging is done after the lock is released, because the thread of a driver in this process
+        # may wait for the lock.
         log_changes(self.get_logger(), changes)
         return statuses
 
     def _open_recording(self) -> RecordedReconstruction | None:
-        """Return what a bag says about its reconstruction, or None if `config` is a skin file.
+        """Return the skin, tares and drift recorded in the bag that the parameter `config` names.
+
+        None means that `config` names a skin file.
 
         Raises:
-            BagError: The path is no bag, or the library that reads bags is missing.
+            BagError: The bag cannot be read, or the library that reads bags is not installed.
         """
         path = self.config()
         if not path.is_dir() and path.suffix not in BAG_SUFFIXES:
             return None
-        # Imported here because no other node or parameter needs the library for bags, which has no
-        # rosdep key.
+        # The import is here and not at the top, because the library for bags has no rosdep key and
+        # may be missing, and only this case needs it.
         try:
             from ...bags.reprocess.recorded_reconstruction import RecordedReconstruction
         except ModuleNotFoundError as error:

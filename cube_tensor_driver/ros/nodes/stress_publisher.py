@@ -1,4 +1,8 @@
-"""Publishes stress rows: all on `stress`, forces, and single cubes on topics of their own."""
+"""Publishes stress rows (the stress of one cube at one instant each) on several topics.
+
+All rows go to `stress`, forces of all cubes to `forces`, and the rows of single cubes to
+`cubes/<name>/stress` and `cubes/<name>/wrench`.
+"""
 
 from __future__ import annotations
 
@@ -25,27 +29,32 @@ from ..messages import tensor_message, to_time, wrench_message
 from ..node import MAX_BUFFERS, CubeNode
 
 LISTENERS_PERIOD_S = 0.5
-"""Time, in seconds, between two looks for listeners of single cubes' topics."""
+"""Time, in seconds, between two searches for subscribers of the topics of single cubes
+(`cubes/<name>/stress` and `cubes/<name>/wrench`)."""
 
 MAX_ANNOUNCED_CUBES = 64
-"""Skins with up to this many cubes announce all topics of single cubes.
+"""Maximum number of cubes of a skin for which the publishers of the topics of all single cubes are
+made at the start.
 
-In larger ones a topic is announced once somebody asks for it, because DDS tells every process of
-the domain about every topic.
+On a larger skin such a publisher is made only when somebody subscribes to its topic, because DDS
+sends the description of every publisher to every process in the domain.
 """
 
 MAX_COVARIANCES = 4096
-"""Maximum number of covariances that are cached, one for each cube and set of left-out pads."""
+"""Maximum number of cached covariance matrices. There is one for each cube and each set of pads
+that are left out because they are faulty."""
 
 CUBE_TOPIC_DEPTH = 10
-"""Depth of the queues of single cubes' topics, in messages."""
+"""Depth of the queues of the topics of single cubes (`cubes/<name>/stress` and
+`cubes/<name>/wrench`), in messages."""
 
 FORCE_FIELDS = ("x", "y", "z", "fx", "fy", "fz")
-"""Fields of a point of `forces`, float32: position in m and force in N in the parent frame."""
+"""Names of the float32 fields of a point in the point cloud `forces`: position of the cube, in m,
+and force on it, in N, both in the parent frame of the skin."""
 
 
 class StressPublisher:
-    """Publishes the rows of one reconstruction until its node cleans up."""
+    """Publishes the stress rows of a reconstruction node, until the node is cleaned up."""
 
     def __init__(
         self,
@@ -57,14 +66,15 @@ class StressPublisher:
         side: float | None,
         with_forces: bool,
     ) -> None:
-        """Announce the topics.
+        """Make the publishers.
 
         Args:
             node: The node, which is being configured.
             skin: The skin.
-            reconstructor: Gives the covariances.
+            reconstructor: Computes the covariances of stress and gradients.
             profile: Quality of service of `stress` and `forces`.
-            side: Side of the face that wrenches and forces refer to, in m; None: each cube's own.
+            side: Side, in m, of the square face over which stress is integrated to wrenches and
+                forces; None: the side of the cube itself.
             with_forces: Whether `forces` is published, too.
         """
         self._buffer = lru_cache(maxsize=MAX_BUFFERS)(stress_codec.buffer)
@@ -88,7 +98,13 @@ class StressPublisher:
         stamp_ns: int,
         frame_id: bytes,
     ) -> None:
-        """Send rows as one message with this stamp and frame, and cubes that have listeners."""
+        """Publish rows as one message, and on the topics of single cubes that have subscribers.
+
+        Args:
+            stress: The rows.
+            stamp_ns: Stamp of the message, in ns since the Unix epoch.
+            frame_id: Frame id of the message, encoded and with a closing zero byte.
+        """
         message = self._buffer(frame_id, len(stress))
         message.fill(stress)
         self._publisher.publish(message.data(stamp_ns))
@@ -98,9 +114,10 @@ class StressPublisher:
 
 
 class ForceCloud:
-    """Publishes `forces` while somebody listens: one force per cube, in the order of the skin.
+    """Publishes `forces`, a point cloud with one force per cube in the order of the skin file.
 
-    It is a point cloud, which other tactile stacks take.
+    It is published only while it has subscribers. Software for other tactile sensors reads forces
+    in this form.
     """
 
     def __init__(
@@ -113,7 +130,8 @@ class ForceCloud:
         self._forces = Forces(skin, side)
         self._n_cubes = len(skin.cubes)
         self._publisher = node.own(node.create_lifecycle_publisher(PointCloud2, "forces", profile))
-        # One message is filled again and again: its fields are many Python objects.
+        # The message is made once and its data replaced, because its fields are many Python objects
+        # that never change.
         item = np.dtype("<f4").itemsize
         step = item * len(FORCE_FIELDS)
         self._message = PointCloud2(
@@ -131,14 +149,20 @@ class ForceCloud:
         ]
 
     def publish(self, rows: StressRows, stamp_ns: int) -> None:
-        """Send the last row of each cube; NaN for cubes without one."""
+        """Publish the force of the last row of each cube. Cubes without a row have NaN.
+
+        Args:
+            rows: Rows of stress.
+            stamp_ns: Stamp of the message, in ns since the Unix epoch.
+        """
         if not self._publisher.get_subscription_count():
             return
-        # Frequencies of another skin may name cubes that this one does not have.
+        # If the driver of another skin publishes in the same namespace by mistake, rows may have
+        # indices of cubes that this skin does not have.
         known = rows.select(rows.cube < self._n_cubes)
         force = self._forces.of_skin(known)
         cloud = np.hstack([self._forces.position, force]).astype("<f4")
-        # An array of this type is what rclpy takes without looking at each byte.
+        # rclpy checks each byte of other types, but takes an `array.array` of type "B" as it is.
         data = array.array("B")
         data.frombytes(cloud.tobytes())
         self._message.data = data
@@ -148,9 +172,9 @@ class ForceCloud:
 
 
 class CubeTopics:
-    """The topics of single cubes, `cubes/<name>/stress` and `cubes/<name>/wrench`.
+    """Publishes the topics of single cubes, `cubes/<name>/stress` and `cubes/<name>/wrench`.
 
-    They are sent only while somebody listens.
+    A topic is published only while it has subscribers.
     """
 
     def __init__(
@@ -160,10 +184,11 @@ class CubeTopics:
         own_sides = [2 * cube.calibration.half_side for cube in skin.cubes]
         self._sides = np.array([side or own_side for own_side in own_sides])
         self._covariances: dict[tuple[int, int], Array] = {}
-        # Index of a cube -> its publisher.
+        # Index of a cube -> the publisher of its stress or its wrench.
         self._tensors: dict[int, Any] = {}
         self._wrenches: dict[int, Any] = {}
-        # Topic that is not announced yet -> its type, where its publisher goes, its cube.
+        # Topic without a publisher yet -> type of its messages, the dictionary in which its
+        # publisher is to be stored, and the index of its cube.
         self._unannounced: dict[str, tuple[type, dict[int, Any], int]] = {}
         for number, cube in enumerate(skin.cubes):
             for message_type, publishers, what in (
@@ -178,7 +203,7 @@ class CubeTopics:
         self._listened_wrenches: list[int] = []
 
     def find_listeners(self) -> None:
-        """Find out which topics anybody listens to. Called from time to time."""
+        """Find out which topics of single cubes have subscribers. A timer calls this regularly."""
         if self._unannounced:
             known_topics = {name for name, _ in self._node.get_topic_names_and_types()}
             self._announce(known_topics & self._unannounced.keys())
@@ -186,8 +211,12 @@ class CubeTopics:
         self._listened_wrenches = _find_listened(self._wrenches)
 
     def publish(self, rows: StressRows) -> None:
-        """Send the rows of cubes that somebody listens to; wrenches of valid rows only."""
-        # The timer may replace these lists meanwhile.
+        """Publish rows on the topics of their cubes that have subscribers.
+
+        A wrench is published only for valid rows.
+        """
+        # In a process with the driver this runs in the reader's thread, while `find_listeners` may
+        # replace the lists in the main thread.
         tensors, wrenches = self._listened_tensors, self._listened_wrenches
         if wrenches:
             self._publish_wrenches(rows, wrenches)
@@ -205,7 +234,7 @@ class CubeTopics:
             self._tensors[cube].publish(message)
 
     def _publish_wrenches(self, rows: StressRows, listened: list[int]) -> None:
-        # The wrench of an invalid row would be 0, which tools take for a measurement.
+        # The wrench of an invalid row would be 0, which looks like the measurement of no load.
         is_chosen = np.isin(rows.cube, listened) & (rows.status & INVALID == 0)
         chosen = np.flatnonzero(is_chosen)
         cubes = rows.cube[chosen].tolist()
@@ -238,7 +267,8 @@ class CubeTopics:
     def _covariance(self, cube: int, left_out: int) -> Array:
         key = cube, left_out
         if key not in self._covariances:
-            # Pads that come and go on a large skin would fill the memory otherwise.
+            # Every set of left-out pads is a new key, so without a limit the cache of a large skin
+            # with pads that fail intermittently would grow for ever.
             if len(self._covariances) >= MAX_COVARIANCES:
                 self._covariances.clear()
             self._covariances[key] = self._reconstructor.covariance(cube, left_out)
@@ -246,7 +276,7 @@ class CubeTopics:
 
 
 def _find_listened(publishers: dict[int, Any]) -> list[int]:
-    """Return the cubes whose publishers have a subscriber."""
+    """Return the indices of the cubes whose publisher has at least one subscriber."""
     return [
         number for number, publisher in publishers.items() if publisher.get_subscription_count()
     ]

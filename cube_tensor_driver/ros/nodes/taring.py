@@ -1,6 +1,7 @@
-"""Tare as services: ~/tare and ~/clear_tare.
+"""The services ~/tare and ~/clear_tare of the reconstruction node.
 
-Tares are kept on disk by uid, and restored when the driver reports the uids of the cubes.
+A tare measures the rest frequencies (frequencies without load) of a cube anew. It is stored in a
+file named by the uid of the cube, and restored when the driver reports that uid.
 """
 
 from __future__ import annotations
@@ -25,22 +26,30 @@ from ...srv import Tare
 from ..node import CubeNode
 
 MAX_DATA_AGE_S = 1.0
-"""Maximum age, in seconds, of data that show the present load."""
+"""Maximum age, in seconds, of the newest row at a request for a tare. With older data the request
+is refused, because the load may have changed since then."""
 
 
 def tare_folder(parameter: str) -> Path:
-    """Return the folder of parameter tare_folder; without it, one below ROS_HOME or ~/.ros."""
+    """Return the folder of the tare files.
+
+    Args:
+        parameter: Value of the parameter tare_folder. If it is empty, the folder is
+            cube_tensor_driver/tare in the folder of the variable ROS_HOME, or in ~/.ros.
+    """
     if parameter:
         return Path(parameter).expanduser()
     return Path(os.environ.get("ROS_HOME") or Path.home() / ".ros") / "cube_tensor_driver" / "tare"
 
 
 class Taring:
-    """The services of one reconstruction, and the files behind them.
+    """Offers the services for tares in a reconstruction node, and stores tares in files.
 
     Attributes:
-        uids: Index of a cube in the skin -> its uid, for cubes whose uid is known.
-        created: Index of a cube in the skin -> when its tare was taken, for cubes that have one.
+        uids: Index of a cube in the skin -> its uid (unique number), for cubes whose uid is known
+            from the skin file or from the hub.
+        created: Index of a cube in the skin -> time at which its tare was measured, for cubes that
+            have a tare.
     """
 
     def __init__(
@@ -57,20 +66,22 @@ class Taring:
         Args:
             node: The node, which is being configured.
             skin: The skin.
-            reconstructor: Uses the rest frequencies.
-            folder: Where tares are kept; None: nowhere.
-            lock: Held while the reconstructor is used.
-            on_change: Called, with the lock, when rest frequencies or uids have changed.
+            reconstructor: Measures the rest frequencies and computes the stress from them.
+            folder: Folder of the tare files; None: tares are neither stored nor restored.
+            lock: Held by this class while it uses the reconstructor.
+            on_change: Called, while the lock is held, when rest frequencies or uids have changed.
         """
         self._node, self._reconstructor = node, reconstructor
         self._skin, self._folder = skin, folder
         self._lock, self._on_change = lock, on_change
         self.uids: dict[int, int] = {}
         self.created: dict[int, datetime] = {}
-        # Cube whose uid is unknown -> when it was tared, or None if its tare was cleared.
+        # Index of a cube whose uid is unknown yet -> time of its tare, or None if its tare was
+        # cleared. Its file is written or removed when the uid becomes known.
         self._pending: dict[int, datetime | None] = {}
 
-        # No lock and no call of on_change: nobody uses the rest frequencies yet.
+        # Neither the lock nor on_change is needed: the reconstructor is not used before the node
+        # is configured.
         restored = self._learn_uids({n: cube.uid for n, cube in enumerate(skin.cubes) if cube.uid})
         if restored is not None:
             reconstructor.rest_frequency = restored
@@ -78,11 +89,12 @@ class Taring:
         node.own(node.create_service(Trigger, "~/clear_tare", self._on_clear))
 
     def on_info(self, message: SkinInfo) -> None:
-        """Take over from the driver's info the uids that the skin file does not name."""
-        # The driver of another skin may be in the same namespace by mistake.
+        """Take over the uids of cubes from a message of `driver/info`, and restore their tares."""
+        # By mistake the driver of another skin may publish in the same namespace.
         if message.name != self._skin.name or len(message.cubes) != len(self._skin.cubes):
             return
-        # Reading files takes time, so the lock is taken only afterwards.
+        # Reading files takes time, in which the lock would block the processing of rows. So it is
+        # acquired only afterwards.
         uids_before = dict(self.uids)
         reported = {n: cube.uid for n, cube in enumerate(message.cubes) if cube.uid}
         restored = self._learn_uids(reported)
@@ -93,7 +105,10 @@ class Taring:
                 self._on_change()
 
     def age(self) -> dict[str, str]:
-        """Return how many cubes are tared and since when, for diagnostics."""
+        """Return the number of tared cubes and the age of the oldest tare, in s, as texts.
+
+        The keys are those of the diagnostics.
+        """
         if not self.created:
             return {"cubes tared": "0"}
         oldest = datetime.now(timezone.utc) - min(self.created.values())
@@ -103,21 +118,27 @@ class Taring:
         }
 
     def _learn_uids(self, uids: Mapping[int, int]) -> Array | None:
-        """Take over uids, and return the rest frequencies if that changes them.
+        """Take over uids, and restore the tares of cubes whose uid is new.
 
-        A cube whose tare is kept gets that tare. A cube that was exchanged gets the rest
-        frequencies of its calibration.
+        A cube gets the stored tare of its uid. If the cube was exchanged and no tare is stored for
+        the new one, it gets the rest frequencies of its calibration.
+
+        Args:
+            uids: Index of a cube in the skin -> its uid.
+
+        Returns:
+            The rest frequencies of all cubes, (cubes, pads), in Hz; None if none has changed.
         """
         rest = self._reconstructor.rest_frequency
         before = rest.copy()
         for number, uid in uids.items():
             if self.uids.get(number) == uid:
                 continue
-            # Another uid than before means that somebody has exchanged the cube.
+            # The cube had another uid before, so it was exchanged, and its tare is not valid.
             if number in self.uids:
                 self._forget_tare(number, rest)
             self.uids[number] = uid
-            # What was asked for in this run is newer than the file of an earlier one.
+            # A request in this run of the node is newer than the file of an earlier run.
             if number in self._pending:
                 self._keep_pending(number, rest)
             else:
@@ -125,7 +146,15 @@ class Taring:
         return None if np.array_equal(before, rest, equal_nan=True) else rest
 
     def _restore_tare(self, number: int, uid: int, rest: Array) -> None:
-        """Read the tare of one cube into its row of the rest frequencies."""
+        """Read the tare file of one cube, if there is one, into the rest frequencies.
+
+        A file that cannot be used gives a warning in the log.
+
+        Args:
+            number: Index of the cube in the skin.
+            uid: Uid of the cube.
+            rest: Rest frequencies of all cubes, (cubes, pads), in Hz, which are changed.
+        """
         if self._folder is None:
             return
         cube = self._skin.cubes[number]
@@ -142,13 +171,19 @@ class Taring:
             log.info(f"cube {cube.name}: tare of {stored.created} restored")
 
     def _forget_tare(self, number: int, rest: Array) -> None:
-        """Give a cube that was exchanged the rest frequencies of its calibration."""
+        """Write the rest frequencies of the calibration of cube `number` into `rest`, in Hz.
+
+        It is called for a cube that was exchanged.
+        """
         calibration = self._skin.cubes[number].calibration
         rest[number, : calibration.layout.n_pads] = calibration.rest_frequency
         self.created.pop(number, None)
 
     def _keep_pending(self, number: int, rest: Array) -> None:
-        """Keep what was decided about a cube before its uid was known."""
+        """Write or remove the tare file of a cube, as was requested before its uid was known.
+
+        A failure gives a warning in the log.
+        """
         created = self._pending.pop(number)
         try:
             self._update_file(number, rest, created)
@@ -162,7 +197,12 @@ class Taring:
         rest: Array,
         created: datetime | None,
     ) -> None:
-        """Write the tare of a cube whose uid is known, or remove it if `created` is None.
+        """Write or remove the tare file of a cube whose uid is known.
+
+        Args:
+            number: Index of the cube in the skin.
+            rest: Rest frequencies of all cubes, (cubes, pads), in Hz.
+            created: Time of the tare; None: the tare was cleared, and its file is removed.
 
         Raises:
             ConfigError: The file cannot be written or removed.
@@ -193,17 +233,22 @@ class Taring:
         return response
 
     def _tare(self, names: list[str], duration_s: float) -> str:
-        """Tare cubes and keep their tares, and return what the answer says.
+        """Tare cubes, store their tares, and return the text for the response.
 
         Args:
-            names: Names of the cubes; none: all cubes.
-            duration_s: Time to average, in seconds; 0: as the parameter says.
+            names: Names of the cubes; an empty list: all cubes.
+            duration_s: Time, in seconds, over which frequencies are averaged; 0: the value of the
+                parameter tare_duration.
+
+        Raises:
+            TareError: No data arrive, a name is unknown, or the reconstructor refuses the tare.
         """
         cubes = self._find_cubes(names)
         now_ns = self._node.get_clock().now().nanoseconds
         duration_s = duration_s or float(self._node.value("tare_duration"))
         with self._lock:
-            # Data of before the links were lost would be tared without a complaint.
+            # The reconstructor keeps the newest data after the links were lost. A tare of such old
+            # data would succeed with wrong values.
             age_ns = now_ns - self._reconstructor.health.newest_ns
             if age_ns > 1e9 * MAX_DATA_AGE_S:
                 raise TareError("no data now: see the diagnostics of the links")
@@ -211,7 +256,7 @@ class Taring:
             rest = self._reconstructor.tare(cubes, duration_s)
             self._on_change()
         moved = np.abs(rest / before - 1)[cubes]
-        moved_ppm = 1e6 * np.nanmax(moved)  # NaN stands for pads that a cube does not have
+        moved_ppm = 1e6 * np.nanmax(moved)  # NaN fills the columns of pads that a cube lacks
         kept = self._keep_tares(cubes, rest)
         return f"{len(cubes)} cubes, rest frequencies moved by up to {moved_ppm:.0f} ppm{kept}"
 
@@ -237,7 +282,12 @@ class Taring:
         rest: Array,
         created: datetime | None,
     ) -> None:
-        """Keep the tare of a cube, or remove it, now or once its uid is known.
+        """Write or remove the tare file of a cube now, or as soon as its uid is known.
+
+        Args:
+            number: Index of the cube in the skin.
+            rest: Rest frequencies of all cubes, (cubes, pads), in Hz.
+            created: Time of the tare; None: the tare was cleared.
 
         Raises:
             ConfigError: The file cannot be written or removed.
@@ -248,7 +298,11 @@ class Taring:
             self._pending[number] = created
 
     def _find_cubes(self, names: list[str]) -> list[int]:
-        """Return the indices of cubes by name, or of all cubes if none is named."""
+        """Return the indices of the cubes with these names; an empty list stands for all cubes.
+
+        Raises:
+            TareError: The skin has no cube of one of the names.
+        """
         index = {name: number for number, name in enumerate(self._skin.names)}
         unknown = [name for name in names if name not in index]
         if unknown:
@@ -259,12 +313,18 @@ class Taring:
         return [index[name] for name in names] if names else list(index.values())
 
     def _keep_tares(self, cubes: list[int], rest: Array) -> str:
-        """Keep the tares of cubes, and return what the answer should say about it."""
+        """Store the tares of cubes, and return a text for the response that states the result.
+
+        Args:
+            cubes: Indices of the cubes in the skin.
+            rest: Rest frequencies of all cubes, (cubes, pads), in Hz.
+        """
         created = datetime.now(timezone.utc)
         self.created.update(dict.fromkeys(cubes, created))
         if self._folder is None:
             return "; not kept"
-        # Cubes without a uid come first: an error of the disk does not concern them.
+        # The first error of the disk ends the loop. Cubes without a uid come first, because their
+        # tares are only noted and no file is written yet.
         for number in sorted(cubes, key=lambda number: number in self.uids):
             try:
                 self._decide(number, rest, created)
