@@ -1,1 +1,1 @@
-"""What commands do in the ROS graph: record, replay, echo, list topics, call services."""
+"""Functions of the commands that need ROS: record, replay, echo, list topics, call services."""

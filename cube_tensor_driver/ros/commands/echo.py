@@ -1,4 +1,4 @@
-"""One topic for a command: found, subscribed to, and its messages as plain values."""
+"""Finds one topic, subscribes to it, and returns its messages as plain values (`./cube echo`)."""
 
 from __future__ import annotations
 
@@ -22,13 +22,16 @@ from ..session import domain_text, node_session, spin_until
 from .services import discover
 
 QUEUE_DEPTH = 100
-"""Number of messages that wait to be printed. The oldest are dropped if printing is too slow."""
+"""Maximum number of messages that wait to be printed. If printing is slower than the topic, the
+oldest are dropped."""
 
 MAX_INFO_S = 3.0
-"""Maximum time, in seconds, to wait for the names of cubes after their topic was found."""
+"""Maximum time, in seconds, to wait for the names of the cubes (the topic `info`) after a topic of
+stress was found. Without names, the cubes are printed by their indices."""
 
 MAX_MESSAGE_S = 5.0
-"""Maximum time, in seconds, to wait for the first message, where one is wanted."""
+"""Maximum time, in seconds, to wait for a message if a single one was asked for (`once`). Without a
+message in this time the command fails."""
 
 
 @dataclass(frozen=True)
@@ -36,11 +39,13 @@ class StressReading:
     """The stress of one cube at one instant.
 
     Attributes:
-        stamp_ns: Time at which the pads were read.
+        stamp_ns: Time at which the pads were read, in ns since the Unix epoch.
         cube: Name of the cube.
-        values: One per name of `COMPONENTS`, in Pa and Pa/m; NaN where it is not observed.
-        residual: Residual relative to the expected noise.
-        status: Bits of `core/status.py`.
+        values: 6 stress components, in Pa, and 9 gradients, in Pa/m, in the order of
+            `core.modes.COMPONENTS`; NaN for those that are not observed.
+        residual: Disagreement between the signals of the pads, sqrt(chi-square / degrees of
+            freedom): about 1 for noise alone, larger for a faulty pad or an unusual load.
+        status: Status bits, see `core/status.py`.
     """
 
     stamp_ns: int
@@ -54,18 +59,19 @@ Item = StressReading | dict[str, Any]
 
 
 def listen(topic: str, once: bool) -> Iterator[list[Item]]:
-    """Yield the content of each message of a topic, until a signal asks to end.
+    """Yield the content of each message of a topic, until a signal asks the process to end.
 
     Args:
-        topic: The topic.
+        topic: Name of the topic.
         once: Whether to end after the first message.
 
     Yields:
-        For topics of stress one `StressReading` per row, for others one dict of plain values.
+        For each message a list: one `StressReading` per row for topics of stress, a single dict of
+        plain values for other topics.
 
     Raises:
-        CubeError: Nobody publishes the topic, its messages are not installed here, or with `once`
-            no message comes within `MAX_MESSAGE_S`.
+        CubeError: No node publishes the topic, the type of its messages is not installed, or with
+            `once` no message came within `MAX_MESSAGE_S`.
     """
     stop = stop_event()
     with node_session("echo") as (node, executor):
@@ -77,7 +83,7 @@ def listen(topic: str, once: bool) -> Iterator[list[Item]]:
                 f"nobody publishes {name} in {domain_text()}; ./cube topics lists what there is"
             )
         spin_until(executor, lambda: stop.is_set() or listener.has_names, MAX_INFO_S)
-        # Somebody who watches a topic may wait for its first message as long as he likes.
+        # Without `once`, the user watches the topic and ends the command himself (Ctrl-C).
         wait_s = MAX_MESSAGE_S if once else float("inf")
         while spin_until(executor, lambda: stop.is_set() or listener.waiting, wait_s):
             if stop.is_set():
@@ -92,7 +98,11 @@ def listen(topic: str, once: bool) -> Iterator[list[Item]]:
 
 
 def resolve_topics(node: Node, topics: tuple[str, ...] | list[str]) -> list[str]:
-    """Return the full names of topics. ConfigError: ROS does not allow such a name."""
+    """Return the full names of topics, with the namespace and remaps of a node.
+
+    Raises:
+        ConfigError: ROS does not allow one of the names.
+    """
     names = []
     for topic in topics:
         try:
@@ -105,7 +115,7 @@ def resolve_topics(node: Node, topics: tuple[str, ...] | list[str]) -> list[str]
 
 
 def to_plain(value: Any) -> Any:
-    """Return a message as dicts, lists, numbers and texts."""
+    """Convert a message, or the value of a field, to dicts, lists, numbers and texts."""
     if hasattr(value, "get_fields_and_field_types"):
         names = value.get_fields_and_field_types()
         return {name: to_plain(getattr(value, name)) for name in names}
@@ -119,10 +129,10 @@ def to_plain(value: Any) -> Any:
 
 
 class _Listener:
-    """Subscribes to one topic, and to the `info` beside it for the names of cubes.
+    """Subscribes to one topic, and for `stress` also to `info`, which has the names of the cubes.
 
     Attributes:
-        waiting: Messages that nobody has taken yet.
+        waiting: Received messages that `take` has not returned yet, the oldest first.
     """
 
     def __init__(self, node: Node, topic: str) -> None:
@@ -134,26 +144,32 @@ class _Listener:
         cubes, _, what = topic.rpartition("/")
         self._cube = cubes.rpartition("/")[2]
         if what == "stress" and cubes.rpartition("/")[0].endswith("/cubes"):
-            # A large skin announces the topic of a cube only once somebody asks for it.
+            # On a large skin the publisher of a single cube's topic is made only when somebody
+            # subscribes, so the subscription comes before the search for the publisher.
             profile = offered_profile([], QUEUE_DEPTH)
             self._early_subscription = self._add(StressTensorStamped, self._on_message, profile)
 
     @property
     def has_names(self) -> bool:
-        """Whether the names of cubes are known, or not needed."""
+        """Whether the names of the cubes are known, or are not needed for this topic."""
         return self._names is not None or not self._needs_names
 
     def subscribe(self) -> bool:
-        """Subscribe once the topic has a publisher, and return whether it has.
+        """Subscribe if the topic has a publisher by now.
+
+        Returns:
+            Whether there is a publisher. If not, the method should be called again later.
 
         Raises:
-            CubeError: The topic has several types, or its messages are not installed here.
+            CubeError: Publishers of the topic have different types, or the type of its messages is
+                not installed.
         """
         offers = self._node.get_publishers_info_by_topic(self._topic)
         if not offers:
             return False
         kinds = sorted({offer.topic_type for offer in offers})
-        # A subscription has one type, and the others would be dropped silently.
+        # A subscription has one type, and messages of publishers with another type would be
+        # missing without an error.
         if len(kinds) > 1:
             raise CubeError(
                 f"{self._topic} has publishers of {' and '.join(kinds)}; end those of the wrong one"
@@ -166,7 +182,7 @@ class _Listener:
 
         profile = offered_profile(offers, QUEUE_DEPTH)
         if kind is SkinStress:
-            # Rows number the cubes; their names are in the info.
+            # Rows contain the index of a cube in the skin; its name is in the topic `info`.
             self._needs_names = True
             info = f"{self._topic.rpartition('/')[0]}/info"
             self._node.create_subscription(

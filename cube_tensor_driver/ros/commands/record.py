@@ -1,6 +1,6 @@
-"""Records topics into a bag, in the bytes in which messages arrive.
+"""Records topics into a bag (file of messages). Messages are stored as the bytes that arrive.
 
-The main thread receives messages, a separate thread writes them.
+The main thread receives the messages, and a separate thread writes them to the disk.
 """
 
 from __future__ import annotations
@@ -28,41 +28,45 @@ from ..session import domain_text, node_session, spin_until
 from .echo import resolve_topics
 
 QUEUE_DEPTH = 2000
-"""Depth of the queues of recorded topics, in messages."""
+"""Depth of the queue of each recorded topic, in messages."""
 
 WRITE_PERIOD_S = 0.05
-"""Time, in seconds, between two looks of the writing thread for messages.
+"""Time, in seconds, for which the writing thread sleeps before it writes the messages that have
+arrived meanwhile.
 
-It is long, so that the thread does not contend for the interpreter.
+With a shorter time the thread would compete with the receiving thread for Python's global
+interpreter lock more often.
 """
 
 FLUSH_PERIOD_S = 0.25
-"""Time, in seconds, between two hand-overs of written data to the system.
+"""Time, in seconds, after which written data are passed to the operating system (flushed).
 
-A kill -9 costs at most twice this time.
+If the process is killed (SIGKILL), at most the messages of twice this time are lost.
 """
 
 MAX_WAITING_BYTES = 256 << 20
-"""Maximum size of messages that wait for the disk. Those beyond it are dropped and counted."""
+"""Maximum size, in bytes, of all messages that wait to be written. Messages that exceed it are
+dropped and counted."""
 
 FIND_PERIOD_S = 0.2
-"""Time, in seconds, between two looks for new topics."""
+"""Time, in seconds, between two searches for publishers of the topics to record."""
 
 SHOW_PERIOD_S = 1.0
-"""Time, in seconds, between two calls of `show`."""
+"""Time, in seconds, between two calls of the function `show`, which reports the progress."""
 
 
 class Recorder:
-    """Records topics of a node's graph into a bag from now until `close`.
+    """Records topics into a bag, from its construction until `close`.
 
-    Call `find_topics` from time to time: it subscribes to topics that have appeared.
+    The caller calls `find_topics` regularly, which subscribes to topics that are published by now.
 
     Attributes:
-        received: Number of messages that came.
-        dropped: Number of messages that were not recorded, because the disk is too slow.
-        counts: Topic -> number of its messages.
-        refused: Topic -> why it is not recorded.
-        error: Error that ended the writing thread; None: there is none.
+        received: Number of messages that have arrived.
+        dropped: Number of messages that were not recorded, because the disk is too slow or writing
+            has failed.
+        counts: Topic that is recorded -> number of its messages that have arrived.
+        refused: Topic -> reason why it is not recorded.
+        error: Error that ended the writing thread; None: no error has occurred.
     """
 
     def __init__(
@@ -71,7 +75,13 @@ class Recorder:
         topics: Sequence[str],
         bag: BagWriter,
     ) -> None:
-        """Begin to record topics, which are full names."""
+        """Start the writing thread.
+
+        Args:
+            node: The node that subscribes.
+            topics: Full names of the topics.
+            bag: The bag, which is empty.
+        """
         self.received = self.dropped = 0
         self.counts: dict[str, int] = {}
         self.refused: dict[str, str] = {}
@@ -80,7 +90,8 @@ class Recorder:
         self._wanted = list(topics)
         self._subscriptions: list[Any] = []
         self._waiting: deque[tuple[str, int, bytes]] = deque()
-        # Each of these two counts is changed by one thread only, so they need no lock.
+        # The receiving thread changes only the first of these counts and the writing thread only
+        # the second, so they need no lock.
         self._received_bytes = self._written_bytes = 0
         self._lock = threading.Lock()
         self._closing = threading.Event()
@@ -89,12 +100,12 @@ class Recorder:
 
     @property
     def missing(self) -> list[str]:
-        """Topics that nobody offers yet."""
+        """Topics without a publisher so far."""
         known = self.counts.keys() | self.refused.keys()
         return [topic for topic in self._wanted if topic not in known]
 
     def find_topics(self) -> None:
-        """Subscribe to the wanted topics that have a publisher by now. Main thread only."""
+        """Subscribe to the topics that have a publisher by now. Call it in the main thread only."""
         for topic in self.missing:
             offers = self._node.get_publishers_info_by_topic(topic)
             if offers:
@@ -104,7 +115,11 @@ class Recorder:
                     self.refused[topic] = str(error)
 
     def close(self) -> None:
-        """Write what waits and complete the bag. BagError: why it could not be."""
+        """Write the messages that wait, and close the bag.
+
+        Raises:
+            BagError: Writing has failed, now or earlier.
+        """
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
         self._subscriptions.clear()
@@ -129,7 +144,7 @@ class Recorder:
         def receive(data: bytes) -> None:
             self.received += 1
             self.counts[topic] += 1
-            # The deque is safe for two threads, but does not count bytes.
+            # Two threads may use a deque without a lock, but its size in bytes must be counted.
             waiting_bytes = self._received_bytes - self._written_bytes
             if waiting_bytes + len(data) > MAX_WAITING_BYTES or self.error is not None:
                 self.dropped += 1
@@ -180,22 +195,22 @@ def record(
     duration: float | None,
     show: Callable[[Recorder, float], None],
 ) -> Recorder:
-    """Record topics into a new bag, until a signal or the end of the duration.
+    """Record topics into a new bag, until a signal asks the process to end or the duration is over.
 
     Args:
         folder: Folder of the bag, which must not exist.
-        topics: The topics.
-        storage: mcap or sqlite3.
-        max_bytes: Maximum size of one file of the bag; 0: no limit.
-        max_seconds: Maximum duration of one file of the bag; 0: no limit.
-        duration: Time in s from the first message on; None: until a signal. Without any message
-            recording ends after the same time.
-        show: Called once a second with the recorder and the seconds since the start.
+        topics: Names of the topics.
+        storage: Format of the files of the bag: mcap or sqlite3.
+        max_bytes: Maximum size of one file of the bag, in bytes; 0: no limit.
+        max_seconds: Maximum duration of one file of the bag, in seconds; 0: no limit.
+        duration: Time, in s, from the first message on, after which recording ends; None: it ends
+            only at a signal. If no message arrives, it ends after this time from the start.
+        show: Called once a second with the recorder and the time since the start, in s.
 
     Raises:
-        BagError: The bag cannot be written; what was written before is made readable. Or nothing
-            came: then there is no bag.
-        ConfigError: ROS does not allow the name of a topic, or does not start.
+        BagError: Writing the bag has failed; the messages written before are readable. Or no
+            message arrived, and the bag was removed.
+        ConfigError: ROS does not allow the name of a topic, or rclpy does not start.
     """
     stop = stop_event()
     with node_session("recorder") as (node, executor):
@@ -222,7 +237,20 @@ def fill(
     duration: float | None,
     show: Callable[[Recorder, float], None],
 ) -> Recorder:
-    """Record the topics `names` until `stop` is set, and close the bag; the rest as in `record`."""
+    """Record topics into a bag, and close the bag, as `record` does.
+
+    Args:
+        bag: The bag, which is empty.
+        node: The node that subscribes.
+        executor: The executor that contains the node.
+        names: Full names of the topics.
+        stop: Recording ends when this event is set.
+        duration: See `record`.
+        show: See `record`.
+
+    Raises:
+        BagError: See `record`.
+    """
     recorder = Recorder(node, names, bag)
     begin = find_at = show_at = time.monotonic()
     until = float("inf") if duration is None else begin + duration
@@ -232,7 +260,8 @@ def fill(
         nonlocal has_come, until
         now = time.monotonic()
         if not has_come and any(recorder.counts.values()):
-            # Finding the topics takes up to seconds on a busy machine, which the duration excludes.
+            # The duration counts from the first message on, because finding the topics may take
+            # seconds on a busy machine.
             has_come, until = True, until + now - begin
         return stop.is_set() or recorder.error is not None or now >= until
 
@@ -251,7 +280,7 @@ def fill(
     finally:
         _close(recorder, bag.folder)
     if not bag.messages:
-        # An empty bag is of no use, and its name would be taken the next time.
+        # An empty bag is removed, so that the next recording can use the same name.
         shutil.rmtree(bag.folder, ignore_errors=True)
         raise BagError(f"nothing recorded, no bag made: {_why_nothing(recorder)}")
     return recorder
@@ -267,12 +296,16 @@ def _why_nothing(recorder: Recorder) -> str:
 
 
 def _close(recorder: Recorder, folder: Path) -> None:
-    """Complete the bag, or repair it if that fails."""
+    """Close the bag in `folder`, and repair it if that fails.
+
+    Raises:
+        BagError: Writing has failed. The message states how many messages are readable.
+    """
     try:
         recorder.close()
     except BagError as error:
-        # Most likely the disk is full: without the last, incomplete chunk there is room for the
-        # summary.
+        # Most likely the disk is full. Removing the last, incomplete chunk of messages makes room
+        # for the summary at the end of the file.
         try:
             done = repair(folder, keep_rest=False)
         except BagError as worse:

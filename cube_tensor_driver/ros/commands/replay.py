@@ -1,7 +1,7 @@
-"""Publishes a bag on its topics again: the recorded bytes at the recorded intervals.
+"""Replays a bag: publishes the recorded messages on their topics at the recorded intervals.
 
-The player publishes in a thread of its own. The main thread spins a node with a topic that tells
-the player's state, and a service that pauses and jumps.
+The player publishes in a thread of its own. The main thread spins a node, which publishes the state
+of the player and offers a service to pause it and to jump to another position.
 """
 
 from __future__ import annotations
@@ -27,48 +27,56 @@ from ..qos import NEWEST, make_profile
 from ..session import node_session, spin_until
 
 QUEUE_DEPTH = 2000
-"""Depth of the queues of published topics, in messages."""
+"""Depth of the queue of each replayed topic, in messages."""
 
 CLOCK_PERIOD_S = 0.01
-"""Maximum time, in seconds, between two messages of /clock. One comes before every message, too."""
+"""Maximum time, in seconds, between two messages of /clock (simulated time). One is also published
+before every replayed message."""
 
 SETTLE_S = 1.0
-"""Time, in seconds, without a new subscriber after which the first message is published.
+"""Time, in seconds, without a new subscriber after which the replay begins.
 
-Each topic is discovered separately: a subscriber to `info` need not have found `frequencies` yet.
+A node discovers each topic separately, so a node that has subscribed to `info` may not have found
+`frequencies` yet and would miss the first messages.
 """
 
 MAX_WAIT_S = 3.0
-"""Time, in seconds, after which the replay begins even if nobody subscribes to frequencies."""
+"""Time, in seconds, without a new subscriber after which the replay begins even if `frequencies`
+has no subscribers."""
 
 LOOK_PERIOD_S = 0.1
-"""Time, in seconds, between two looks for subscribers."""
+"""Time, in seconds, between two counts of subscribers before the replay begins."""
 
 SHOWN_NS = 100_000_000
-"""Length of bag, in ns, that is published after a jump while the player is paused.
+"""Duration of the recording, in ns, that is published after a jump while the player is paused.
 
-It is enough for a row of every link.
+In this time every link has sent at least one row, so that viewers show the new position.
 """
 
 STATE_PERIOD_S = 0.1
-"""Time, in seconds, between two messages of the player's state."""
+"""Time, in seconds, between two messages on `~/state`, the state of the player."""
 
 RECONSTRUCTED_TYPES = (
     STRESS,
     f"{PACKAGE}/msg/StressTensorStamped",
     "geometry_msgs/msg/WrenchStamped",
 )
-"""Types that a reconstruction publishes. Their topics are left out unless stress is asked for."""
+"""Types of messages that a reconstruction publishes.
+
+Their topics are not replayed by default, because a running reconstruction publishes them anew.
+"""
 
 
 class Player:
-    """Publishes a bag. `run` is called once, from one thread; the other methods from any.
+    """Publishes the messages of a bag.
+
+    `run` must be called only once; the other methods may be called from any thread meanwhile.
 
     Attributes:
-        position: Position of the last message, in s after the begin of the bag.
-        length: Length of the bag, in s.
-        published: Number of messages published.
-        stop: Set when `run` shall end.
+        position: Time of the message published last, in s from the begin of the bag.
+        length: Duration of the bag, in s.
+        published: Number of messages published so far.
+        stop: Event that ends `run`; `end` sets it.
     """
 
     def __init__(
@@ -80,17 +88,18 @@ class Player:
         stress: bool,
         clock: bool,
     ) -> None:
-        """Announce the topics of the bag.
+        """Make the publishers for the topics of the bag.
 
         Args:
             node: The node that publishes.
             bag: The bag.
-            rate: Speed, in times the recorded one.
-            stress: Whether to publish what a reconstruction made, too.
-            clock: Whether to publish /clock.
+            rate: Speed of the replay, divided by the speed of the recording.
+            stress: Whether to publish the recorded topics of a reconstruction (stress and wrenches)
+                as well.
+            clock: Whether to publish /clock (simulated time).
 
         Raises:
-            BagError: The bag cannot be read, or has nothing to publish.
+            BagError: A type of messages is not installed, or the bag has no topic to publish.
         """
         self.stop = threading.Event()
         self.published = 0
@@ -98,12 +107,12 @@ class Player:
         self._paused, self._steps = False, 0
         self._jump_ns: int | None = None
         self._shown_until_ns = 0
-        # Guards these states, and wakes `run` when one changes.
+        # This condition guards the four states above, and wakes `run` when one of them changes.
         self._wake = threading.Condition()
         self._node, self._bag, self._rate = node, bag, rate
         self._publishers: dict[str, Any] = {}
         self._latched: set[str] = set()
-        # A bag may hold several skins, each in its namespace.
+        # A bag may contain several skins in different namespaces; each has a topic `frequencies`.
         skins = [topic.removesuffix("frequencies") for topic in bag.topics(FREQUENCIES)]
         for connection in bag.connections:
             topic = connection.topic
@@ -123,22 +132,26 @@ class Player:
         return self._paused
 
     def pause(self, paused: bool) -> None:
-        """Pause, or go on."""
+        """Pause the replay, or continue it if `paused` is false."""
         with self._wake:
             self._paused, self._steps = paused, 0
             self._wake.notify()
 
     def step(self) -> None:
-        """While paused: publish the next message of frequencies, and what comes before it."""
+        """Publish all messages up to the next one of `frequencies`, while the replay is paused."""
         with self._wake:
             self._steps += 1
             self._wake.notify()
 
     def jump(self, position: float, paused: bool) -> None:
-        """Go on from a position, or pause there after `SHOWN_NS` of the bag.
+        """Continue the replay at another position.
+
+        Args:
+            position: The position, in s from the begin of the bag.
+            paused: Whether the replay pauses there, after `SHOWN_NS` of the recording.
 
         Raises:
-            BagError: The position is not in the bag.
+            BagError: The position is negative or after the end of the bag.
         """
         to_ns = max(self._bag.start_ns, min(self._to_ns(position), self._bag.end_ns - SHOWN_NS))
         with self._wake:
@@ -146,7 +159,7 @@ class Player:
             self._wake.notify()
 
     def end(self) -> None:
-        """Let `run` end soon."""
+        """Make `run` return after the message that it publishes now."""
         with self._wake:
             self.stop.set()
             self._wake.notify()
@@ -155,12 +168,13 @@ class Player:
         """Publish the bag to its end.
 
         Args:
-            start: Where to begin, in s after the begin of the bag.
-            loop: Whether to begin there again at the end.
-            hold: Whether to pause at the end and wait for `jump` or `end`.
+            start: Position at which the replay begins, in s from the begin of the bag.
+            loop: Whether the replay begins at `start` again after the end of the bag.
+            hold: Whether the replay pauses at the end of the bag and waits for `jump`, `pause` or
+                `end`, instead of returning.
 
         Raises:
-            BagError: The bag is damaged, or `start` is not in the bag.
+            BagError: The bag is damaged, or `start` is negative or after the end of the bag.
         """
         begin_ns: int | None = self._to_ns(start)
         self._await_subscribers()
@@ -179,7 +193,12 @@ class Player:
                     self._shown_until_ns = next_ns + SHOWN_NS
 
     def _announce(self, topic: str, connection: Any) -> None:
-        """Make the publisher of a topic, with the quality of service that was recorded."""
+        """Make the publisher of a topic, with the quality of service of the recorded publisher.
+
+        Args:
+            topic: Name of the topic.
+            connection: Description of the topic in the bag.
+        """
         profile = make_profile(
             QUEUE_DEPTH,
             is_latched=connection.is_latched,
@@ -191,9 +210,10 @@ class Player:
             self._latched.add(topic)
 
     def _await_subscribers(self) -> None:
-        """Wait until subscribers have found the publishers."""
+        """Wait until no new subscriber has come for `SETTLE_S`, or `MAX_WAIT_S` without one."""
         everything = [*self._publishers.values(), *([self._clock] if self._clock else [])]
-        # Without a reconstruction nobody subscribes to frequencies, which must not delay for long.
+        # A subscriber of each topic `frequencies` is awaited. It may never come, if no
+        # reconstruction runs; then the replay begins after MAX_WAIT_S.
         needed = [self._publishers[name] for name in self._publishers if _is_frequencies(name)]
         found, since, wait_s = 0, time.monotonic(), MAX_WAIT_S
         while time.monotonic() - since < wait_s and not self.stop.wait(LOOK_PERIOD_S):
@@ -204,7 +224,11 @@ class Player:
                 wait_s = SETTLE_S if all_heard else MAX_WAIT_S
 
     def _to_ns(self, position: float) -> int:
-        """Return the time of the bag at a position. BagError: it is not in the bag."""
+        """Convert a position, in s from the begin of the bag, to the time of recording, in ns.
+
+        Raises:
+            BagError: The position is negative or after the end of the bag.
+        """
         if not 0 <= position <= self.length:
             raise BagError(
                 f"{self._bag.path}: {position:g} s is not in the bag, which is "
@@ -213,30 +237,42 @@ class Player:
         return self._bag.start_ns + round(position * SECOND)
 
     def _publish_from(self, start_ns: int) -> None:
-        """Publish the bag from a time on, until its end or until a jump or the end is asked for."""
-        # What was latched before the start holds at the start.
+        """Publish messages until the end of the bag, a call of `jump`, or a call of `end`.
+
+        Args:
+            start_ns: Time of recording of the first message, in ns.
+        """
+        # Latched messages (such as `info`) from before the start are still valid at the start.
         for entry in self._bag.entries(self._latched, None, start_ns):
             self._publish(entry)
         self._set_time(start_ns)
         for entry in self._bag.entries(set(self._publishers), start_ns):
             if not self._wait_until_due(entry.time_ns):
                 return
-            # Nodes with simulated time must know the time of a message before it comes.
+            # The clock of nodes with simulated time must have reached the time of a message before
+            # the message arrives.
             self._publish_clock(entry.time_ns)
             self._publish(entry)
-            # Read by other threads: one assignment needs no lock.
+            # Other threads read the position. A single assignment needs no lock.
             self.position = (entry.time_ns - self._bag.start_ns) / SECOND
-            # One step is one scan: what belongs to it comes before.
+            # A step ends with a message of `frequencies`, which holds one scan.
             if self._steps and _is_frequencies(entry.topic):
                 with self._wake:
                     self._steps -= 1
 
     def _set_time(self, bag_ns: int) -> None:
-        """Let this time of the bag be now."""
+        """Define that the time of recording `bag_ns`, in ns, is replayed now."""
         self._anchor_ns, self._anchor_s = bag_ns, time.monotonic()
 
     def _wait_until_due(self, bag_ns: int) -> bool:
-        """Wait until a message is due, and return False if the player shall end or jump."""
+        """Wait until a message is due, with pauses and steps.
+
+        Args:
+            bag_ns: Time of recording of the message, in ns.
+
+        Returns:
+            Whether the message is to be published. False means that `end` or `jump` was called.
+        """
         with self._wake:
             while not self.stop.is_set() and self._jump_ns is None:
                 if self._paused:
@@ -266,9 +302,14 @@ class Player:
 
 
 def _is_reconstructed(connection: Any, skins: list[str]) -> bool:
-    """Return whether a reconstruction made a topic of a bag.
+    """Return whether a reconstruction published a topic of a bag.
 
-    Wrenches have a common type, so they count only below the `cubes` of a skin in the bag.
+    Other nodes publish messages of type WrenchStamped, too, so a topic of this type counts only if
+    it is the topic of a single cube.
+
+    Args:
+        connection: Description of the topic in the bag.
+        skins: Namespaces of the skins in the bag, each with a closing slash.
     """
     if connection.msgtype not in RECONSTRUCTED_TYPES:
         return False
@@ -281,7 +322,7 @@ def _is_frequencies(topic: str) -> bool:
 
 
 class ReplayControl:
-    """The topic `~/state` and the service `~/steer` of the node of a player."""
+    """Publishes the state of a player on `~/state`, and offers `~/steer` to control the player."""
 
     def __init__(self, node: Node, player: Player) -> None:
         self._player = player
@@ -325,20 +366,21 @@ def replay(
     hold: bool,
     each: Callable[[Player], None],
 ) -> None:
-    """Publish a bag until its end or a signal.
+    """Publish a bag until its end, or until a signal asks the process to end.
 
     Args:
         bag: The bag.
-        rate: Speed, in times the recorded one.
-        loop: Whether to begin again at the end.
-        start: Where to begin, in s after the begin of the bag.
-        clock: Whether to publish /clock.
-        stress: Whether to publish what a reconstruction made, too.
-        hold: Whether to wait at the end to be steered.
-        each: Called in the main thread after every step of spinning.
+        rate: Speed of the replay, divided by the speed of the recording.
+        loop: Whether the replay begins at `start` again after the end of the bag.
+        start: Position at which the replay begins, in s from the begin of the bag.
+        clock: Whether to publish /clock (simulated time).
+        stress: Whether to publish the recorded topics of a reconstruction (stress and wrenches) as
+            well.
+        hold: Whether the replay pauses at the end of the bag and waits for the service `~/steer`.
+        each: Called in the main thread with the player, after every step of the executor.
 
     Raises:
-        BagError: The bag cannot be read, or has nothing to publish.
+        BagError: The bag cannot be read, or has no topic to publish.
     """
     errors: list[BagError] = []
     with node_session("player") as (node, executor):

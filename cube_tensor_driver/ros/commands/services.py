@@ -1,4 +1,4 @@
-"""What commands ask of running nodes through services: their parameters, and a tare."""
+"""Calls services of running nodes for commands: reads and sets parameters, and requests tares."""
 
 from __future__ import annotations
 
@@ -22,22 +22,24 @@ from ...srv import Tare
 from ..session import domain_text, node_session, spin_until
 
 MAX_DISCOVERY_S = 5.0
-"""Maximum time, in seconds, for the discovery of nodes."""
+"""Maximum time, in seconds, for which topics and services of other nodes are searched."""
 
 SETTLE_S = 0.3
-"""Time, in seconds, to wait for further nodes after the last one was found.
+"""Time, in seconds, without a newly found topic or service, after which the search ends.
 
-It also lets a server meet our client: rmw_fastrtps drops the answer to a client that the server met
-less than 0.1 s before.
+It is also the time between finding a service and calling it: rmw_fastrtps drops the response to a
+client that the server has discovered less than 0.1 s before.
 """
 
 MAX_ANSWER_S = 10.0
-"""Maximum time, in seconds, for the answer of a service."""
+"""Maximum time, in seconds, to wait for the response of a service, with repeated requests."""
 
 REPEAT_S = 3.0
-"""Time, in seconds, after which a request without an answer is sent again."""
+"""Time, in seconds, after which a request without a response is sent again."""
 
 LIST_SERVICE = "/list_parameters"
+"""Last part of the name of a service that every node with parameters offers. Nodes are found by it.
+"""
 
 EXPECTED = {
     bool: "true or false",
@@ -45,17 +47,17 @@ EXPECTED = {
     float: "a number",
     str: "a text",
 }
-"""Type of a parameter -> what a user has to write for it."""
+"""Type of a parameter -> description of its values, for error messages."""
 
 
 @dataclass(frozen=True)
 class TareAnswer:
-    """The answer of one reconstruction to a request for a tare.
+    """The response of one reconstruction node to a request for a tare.
 
     Attributes:
-        node: Full name of the reconstruction.
-        success: Whether it has done what was asked.
-        message: What it has done, or why not.
+        node: Full name of the reconstruction node.
+        success: Whether the tare was measured, or cleared if that was requested.
+        message: Text of the node about the result, or about the reason of the failure.
     """
 
     node: str
@@ -64,14 +66,14 @@ class TareAnswer:
 
 
 def request_tare(cubes: Sequence[str], clear: bool) -> list[TareAnswer]:
-    """Ask every reconstruction in the DDS domain for a tare.
+    """Request a tare (new rest frequencies) from every reconstruction node in the DDS domain.
 
     Args:
-        cubes: Names of the cubes; none: all cubes.
-        clear: Whether to clear the tare of all cubes instead.
+        cubes: Names of the cubes; an empty sequence: all cubes.
+        clear: Whether to clear the tares of all cubes instead.
 
     Raises:
-        CubeError: No reconstruction runs, or one does not answer.
+        CubeError: No reconstruction runs, or one has not responded within `MAX_ANSWER_S`.
     """
     with node_session("tare_request") as (node, executor):
         services = find_services(node, executor, "cube_tensor_driver/srv/Tare")
@@ -81,7 +83,7 @@ def request_tare(cubes: Sequence[str], clear: bool) -> list[TareAnswer]:
             )
         answers = []
         for service in services:
-            # The service is that of a node: /reconstruction/tare.
+            # The name of the service begins with that of its node, as in /reconstruction/tare.
             name = service.rpartition("/")[0]
             if clear:
                 request = Trigger.Request()
@@ -106,13 +108,24 @@ def request_tare(cubes: Sequence[str], clear: bool) -> list[TareAnswer]:
 
 
 def list_nodes() -> list[str]:
-    """Return the full names of the nodes that have parameters. ConfigError: none runs."""
+    """Return the full names of all nodes in the DDS domain that have parameters.
+
+    Raises:
+        ConfigError: No such node was found within `MAX_DISCOVERY_S`.
+    """
     with node_session("parameters") as (node, executor):
         return _find_nodes(node, executor)
 
 
 def read_parameters(name: str, parameter: str | None) -> dict[str, Any]:
-    """Return parameters of a node and their values: one of them, or all.
+    """Return parameters of a node.
+
+    Args:
+        name: Name of the node.
+        parameter: Name of a parameter; None: all parameters.
+
+    Returns:
+        Name of each parameter -> its value.
 
     Raises:
         ConfigError: There is no such node or parameter.
@@ -132,10 +145,10 @@ def set_parameter(name: str, parameter: str, text: str) -> Any:
     Args:
         name: Name of the node.
         parameter: Name of the parameter.
-        text: The value, written as in YAML. A whole number will do for a real one.
+        text: The value in YAML. A parameter that is a real number may be given as an integer.
 
     Returns:
-        The value of the parameter from now on.
+        The value that the parameter has afterwards.
 
     Raises:
         ConfigError: There is no such node or parameter, or the node refuses the value.
@@ -151,7 +164,11 @@ class _NodeParameters:
     """The parameters of one node, reached through its services."""
 
     def __init__(self, node: Node, executor: Any, name: str) -> None:
-        """Find the node with this name. ConfigError: there is none."""
+        """Find the node with this name.
+
+        Raises:
+            ConfigError: No node of this name was found within `MAX_DISCOVERY_S`.
+        """
         self._node, self._executor = node, executor
         self._name = f"/{name.removeprefix('/')}"
         nodes = _find_nodes(node, executor, f"{self._name}{LIST_SERVICE}")
@@ -178,10 +195,18 @@ class _NodeParameters:
         return dict(zip(names, values, strict=True))
 
     def set(self, parameter: str, text: str) -> None:
-        """Set a parameter to a text. ConfigError: the node refuses it."""
+        """Set a parameter.
+
+        Args:
+            parameter: Name of the parameter.
+            text: The value in YAML.
+
+        Raises:
+            ConfigError: The value has the wrong type, or the node refuses it.
+        """
         value = get_parameter_value(text)
         kind = type(self.values([parameter])[parameter])
-        # A person writes 2 for 2.0, which rclpy would refuse.
+        # rclpy refuses an integer for a parameter of type double, but users write 2 for 2.0.
         if kind is float and value.type == ParameterType.PARAMETER_INTEGER:
             value = ParameterValue(
                 type=ParameterType.PARAMETER_DOUBLE, double_value=float(value.integer_value)
@@ -215,7 +240,16 @@ def _find_nodes(
     executor: Any,
     wanted_service: str = "",
 ) -> list[str]:
-    """Return the full names of nodes with parameters. ConfigError: there is none."""
+    """Return the full names of the nodes in the DDS domain that have parameters.
+
+    Args:
+        node: The node that searches, which is left out.
+        executor: The executor that contains `node`.
+        wanted_service: Full name of a service with which the search ends; empty: all are searched.
+
+    Raises:
+        ConfigError: No node was found within `MAX_DISCOVERY_S`.
+    """
     kind = "rcl_interfaces/srv/ListParameters"
     services = find_services(node, executor, kind, wanted_service)
     nodes = [service.removesuffix(LIST_SERVICE) for service in services]
@@ -230,13 +264,15 @@ def find_services(
     kind: str,
     wanted: str = "",
 ) -> list[str]:
-    """Return the full names of services of other nodes, sorted; there may be none.
+    """Return the full names of all services of one type, sorted; the list may be empty.
 
     Args:
-        node: Our node.
-        executor: The executor of our node.
+        node: The node that searches. Its own services are left out.
+        executor: The executor that contains `node`.
         kind: Type of the services, as in std_srvs/srv/Trigger.
-        wanted: A service to wait for. Without it, the search ends when no further service appears.
+        wanted: Full name of a service with which the search ends. If it is empty, the search ends
+            when no further service has appeared for `SETTLE_S`, at the latest after
+            `MAX_DISCOVERY_S`.
     """
     own = f"{node.get_fully_qualified_name()}/"
 
@@ -247,7 +283,7 @@ def find_services(
         )
 
     if wanted:
-        # One that is named may be found first: there is no need to wait for others.
+        # Only the named service is needed, so the search need not go on for others.
         discover(executor, lambda: wanted in find())
     else:
         discover_all(executor, find)
@@ -261,10 +297,20 @@ def call_service(
     name: str,
     request: Any,
 ) -> Any:
-    """Return the answer of a service. The request must do no harm if it comes twice.
+    """Call a service and return its response.
+
+    The request is sent again every `REPEAT_S`, so it must be one that may be executed twice.
+
+    Args:
+        node: The node that calls.
+        executor: The executor that contains `node`.
+        service_type: Type of the service.
+        name: Full name of the service.
+        request: The request.
 
     Raises:
-        CubeError: Nobody offers the service, or no answer comes.
+        CubeError: The service was not found within `MAX_DISCOVERY_S`, or no response has come
+            within `MAX_ANSWER_S`.
     """
     client = node.create_client(service_type, name)
     try:
@@ -273,7 +319,7 @@ def call_service(
         futures: list[Any] = []
         until = time.monotonic() + MAX_ANSWER_S
         while time.monotonic() < until:
-            # A request that the server has lost is never answered, so another one is sent.
+            # DDS may lose a request, and then no response comes; so the request is repeated.
             futures.append(client.call_async(request))
             spin_until(executor, lambda: any(future.done() for future in futures), REPEAT_S)
             for future in futures:
@@ -287,7 +333,15 @@ def call_service(
 
 
 def discover(executor: Any, find: Callable[[], object]) -> bool:
-    """Spin until `find` returns something and a moment longer, and return whether it has."""
+    """Spin until `find` returns a true value, and `SETTLE_S` longer.
+
+    Args:
+        executor: The executor to spin.
+        find: Returns what was found so far; called repeatedly.
+
+    Returns:
+        Whether anything was found within `MAX_DISCOVERY_S`.
+    """
     if not spin_until(executor, find, MAX_DISCOVERY_S):
         return False
     spin_until(executor, lambda: False, SETTLE_S)
@@ -295,15 +349,19 @@ def discover(executor: Any, find: Callable[[], object]) -> bool:
 
 
 def discover_all(executor: Any, find: Callable[[], object]) -> bool:
-    """Spin until `find` returns something and no more of it a moment later.
+    """Spin until the result of `find` is not empty and has not changed for `SETTLE_S`.
+
+    Args:
+        executor: The executor to spin.
+        find: Returns what was found so far; called repeatedly.
 
     Returns:
-        Whether it has found anything.
+        Whether anything was found within `MAX_DISCOVERY_S`.
     """
     until = time.monotonic() + MAX_DISCOVERY_S
     if not spin_until(executor, find, MAX_DISCOVERY_S):
         return False
-    # Nodes are discovered one after the other, so it is looked again until nothing is new.
+    # DDS discovers nodes one after the other, so the search goes on until nothing new is found.
     before = None
     while before != (now := find()) and time.monotonic() < until:
         before = now

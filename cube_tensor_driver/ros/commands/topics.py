@@ -1,4 +1,4 @@
-"""The topics that nodes publish, with the number of messages that come within a second."""
+"""Lists the topics that nodes publish, with the rate of their messages, for `./cube topics`."""
 
 from __future__ import annotations
 
@@ -17,30 +17,32 @@ from .echo import QUEUE_DEPTH
 from .services import SETTLE_S, discover_all
 
 COUNT_S = 1.0
-"""Time, in seconds, for which messages are counted."""
+"""Time, in seconds, for which the messages of each topic are counted."""
 
 MAX_TRIES = 3
-"""Maximum number of attempts to count messages.
-
-They are counted again if topics came or went meanwhile.
-"""
+"""Maximum number of times that the messages of all topics are counted. They are counted again if
+the number of topics has changed meanwhile."""
 
 HIDDEN_TOPICS = ("/rosout", "/parameter_events")
-"""Topics that every node has, ours too."""
+"""Topics that are not listed, because every ROS node has them, also the node that lists."""
 
 ANY_CUBE = "<name>"
+"""Text that replaces the name of the cube in a listed topic, as in cubes/<name>/stress."""
+
 _CUBE_TOPIC = re.compile(r"(?P<before>.*/cubes/)(?P<cube>[^/]+)(?P<after>/(stress|wrench))")
 
 
 @dataclass
 class ListedTopic:
-    """One topic, or one kind of topic of all cubes, of which the first cube's is listened to.
+    """A line of the list: one topic, or the topics of all cubes that differ only in the cube.
 
     Attributes:
-        name: Full name, in which `<name>` stands for each of `cubes`, if there are any.
-        kinds: Types of its messages.
-        cubes: Names of the cubes.
-        count: Number of messages within `COUNT_S`; None: its messages are not installed here.
+        name: Full name of the topic. For topics of cubes it contains `<name>` in place of the name
+            of the cube.
+        kinds: Types of the messages.
+        cubes: Names of the cubes that have the topic; empty for other topics.
+        count: Number of messages within `COUNT_S`, of the first cube for topics of cubes; None: the
+            type of the messages is not installed.
     """
 
     name: str
@@ -50,17 +52,21 @@ class ListedTopic:
 
     @property
     def rate(self) -> float | None:
-        """Messages per second."""
+        """Rate of the messages, in Hz; None: the type of the messages is not installed."""
         return None if self.count is None else self.count / COUNT_S
 
     @property
     def listened(self) -> str:
-        """The topic that is listened to."""
+        """Full name of the topic whose messages are counted: that of the first cube, if any."""
         return self.name.replace(ANY_CUBE, self.cubes[0]) if self.cubes else self.name
 
 
 def list_topics() -> list[ListedTopic]:
-    """Return the topics that somebody publishes, by name. CubeError: there is none."""
+    """Return the topics in the DDS domain that have a publisher, sorted by name.
+
+    Raises:
+        CubeError: No topic was found.
+    """
     with node_session("topic_list") as (node, executor):
         if not discover_all(executor, lambda: _find_topics(node)):
             raise CubeError(f"nobody publishes in {domain_text()}; start ./cube demo or a skin")
@@ -77,7 +83,7 @@ def _find_topics(node: Node) -> list[ListedTopic]:
     for name, kinds in sorted(node.get_topic_names_and_types()):
         if name in HIDDEN_TOPICS or not node.count_publishers(name):
             continue
-        # A skin of 1000 cubes would give 2000 lines.
+        # The topics of single cubes are listed together, as 1000 cubes would give 2000 lines.
         found = _CUBE_TOPIC.fullmatch(name)
         common = f"{found['before']}{ANY_CUBE}{found['after']}" if found else name
         topic = topics.setdefault(common, ListedTopic(common, kinds, []))
@@ -91,14 +97,15 @@ def _count_messages(
     executor: Any,
     topics: list[ListedTopic],
 ) -> None:
-    """Count the messages of these topics."""
+    """Count the messages of topics for `COUNT_S`, and store the number in each `ListedTopic`."""
     subscriptions = [_subscribe(node, topic) for topic in topics]
-    # Latched messages of before are no rate, and subscriptions take a moment to be matched.
+    # Counting begins after a pause: DDS needs time to connect the subscriptions, and latched
+    # messages, which were published earlier, arrive in this time and are not counted.
     spin_until(executor, lambda: False, SETTLE_S)
     before = {topic.name: topic.count or 0 for topic in topics}
     begin = time.monotonic()
     spin_until(executor, lambda: False, COUNT_S)
-    # A busy machine spins for longer than it was asked to.
+    # On a busy machine the time that has really passed is longer than COUNT_S.
     seconds = time.monotonic() - begin
     for topic in topics:
         if topic.count is not None:
@@ -108,7 +115,10 @@ def _count_messages(
 
 
 def _subscribe(node: Node, topic: ListedTopic) -> Any:
-    """Return a subscription that counts, or None if the messages are not installed."""
+    """Return a subscription that counts messages in `topic.count`.
+
+    None means that the type of the messages is not installed; the count is then None, too.
+    """
     try:
         kind = message_class(topic.listened, topic.kinds[0])
     except BagError:
