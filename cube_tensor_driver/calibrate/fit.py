@@ -101,8 +101,8 @@ class Fit:
             source: Origin of the values.
 
         Raises:
-            FitError: Coefficients are undetermined. Add the loads of `advice`, or give the
-                coefficients as `fixed`.
+            FitError: The loads do not determine all coefficients. `advice` names loads to add; the
+                alternative is to give the coefficients to `fit` as `fixed`.
         """
         if self.undetermined:
             raise FitError(

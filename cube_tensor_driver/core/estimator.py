@@ -49,7 +49,7 @@ SUSPECT_MARGIN = 2 * math.log(100)
 """Difference of two values of chi-square at which one explanation is 100 times as likely as the
 other.
 
-If leaving out another pad lowers chi-square by this much more, a pad is not suspected.
+A pad is not suspected to be broken if leaving out another pad lowers chi-square by this much more.
 """
 
 

@@ -85,7 +85,7 @@ def match_rows(known: SampleRows, wanted: SampleRows) -> Index:
 
 
 def _keys(rows: SampleRows) -> AnyArray:
-    """Return one integer per row (N,) that holds the numbers of the cube and of the sample."""
+    """Return one integer per row (N,) that combines its cube number and its sequence number."""
     cube = rows.cube.astype(np.int64) << _SEQUENCE_BITS
     keys: AnyArray = cube | rows.sequence.astype(np.int64)
     return keys

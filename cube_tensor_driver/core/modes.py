@@ -25,10 +25,11 @@ from .errors import SymmetryError
 from .layout import AXES
 
 STRESS = ("xx", "yy", "zz", "yz", "zx", "xy")
-"""Names of the six stress components, in Voigt order."""
+"""Names of the six components of stress, in Voigt order: normal stresses, then shear stresses."""
 
 GRADIENT = tuple(f"{a}{a}_{b}" for a in AXES for b in AXES)
-"""Names of the nine gradients of normal stresses: rows xx, yy, zz, columns d/dx, d/dy, d/dz."""
+"""Names of the nine gradients of normal stresses: xx, yy and zz, each with its derivatives along x,
+y and z, such as "zz_x"."""
 
 COMPONENTS = STRESS + GRADIENT
 """Names of the 15 published components: six stresses, then nine gradients of normal stresses."""
@@ -49,14 +50,18 @@ Float = TypeVar("Float", bound=np.floating[Any])
 
 
 def to_matrix(stress: NDArray[Float]) -> NDArray[Float]:
-    """Return symmetric matrices (..., 3, 3) of components (..., 6) in Voigt order."""
+    """Return stress tensors as symmetric matrices (..., 3, 3).
+
+    Args:
+        stress: Components xx, yy, zz, yz, zx, xy (..., 6).
+    """
     s = np.asarray(stress)
     matrix: NDArray[Float] = s[..., _COMPONENT_NUMBERS]
     return matrix
 
 
 def to_voigt(matrix: NDArray[Float]) -> NDArray[Float]:
-    """Return components (..., 6), in Voigt order, of symmetric matrices (..., 3, 3)."""
+    """Return the components xx, yy, zz, yz, zx, xy (..., 6) of stress tensors (..., 3, 3)."""
     m = np.asarray(matrix)
     components: NDArray[Float] = m[..., _ROWS, _COLUMNS]
     return components

@@ -45,7 +45,8 @@ def pad_stress(
         modulus: Modulus of the pad's foam, in Pa.
 
     Returns:
-        Stresses; NaN for frequencies that the pad law excludes.
+        Stresses; NaN for frequencies outside 0 < f < `highest_frequency`, which no thickness of
+        the foam explains.
     """
     f, f0 = np.asarray(frequency), np.asarray(rest_frequency)
     with np.errstate(all="ignore"):

@@ -167,7 +167,7 @@ class Pipeline:
         self.calibrations = tuple(calibrations)
         self.n_pads = max(c.layout.n_pads for c in self.calibrations)
 
-        # Cubes with equal calibrations form a group, whose matrices exist once.
+        # Cubes with equal calibrations form a group, which shares its matrices.
         by_id = {c.id: c for c in reversed(self.calibrations)}
         numbers = {key: number for number, key in enumerate(by_id)}
         self._groups = tuple(by_id.values())
@@ -391,9 +391,15 @@ class Pipeline:
         return np.where(is_missing, np.nan, stress)
 
     def suspects(self, rows: FrequencyRows, left_out: PadMasks | None = None) -> Mask:
-        """Find the pads (N, P) that explain a high residual if just this one pad is broken.
+        """Find the pads that explain a high residual if just this one pad is broken.
 
-        `Estimator.suspects` states the rule; `pad_stress` explains the arguments.
+        Args:
+            rows: N rows of frequencies.
+            left_out: Bit masks of the pads that are not used (N,). None stands for the pads that
+                the device reports as broken.
+
+        Returns:
+            Whether a pad is a suspect (N, P), by the rule of `Estimator.suspects`.
         """
         groups, unknown, stress, bad = self._apply_law_by_row(rows, left_out)
         result = np.zeros(stress.shape, dtype=bool)
@@ -407,6 +413,11 @@ class Pipeline:
         self, rows: FrequencyRows, left_out: PadMasks | None
     ) -> tuple[Index, Mask, Array, Times]:
         """Apply the pad law (frequency to stress of a pad) to N rows.
+
+        Args:
+            rows: N rows of frequencies.
+            left_out: Bit masks of the pads that are not used (N,). None stands for the pads that
+                the device reports as broken.
 
         Returns:
             Number of the calibration of each row (N,), whether the skin lacks the row's cube (N,),

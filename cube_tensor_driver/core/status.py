@@ -50,7 +50,7 @@ RANGE = 64
 """Condition of a pad: by the pad law, its frequency means a strain that the foam would not
 survive."""
 STUCK = 128
-"""Condition of a pad: its frequency does not change while the other pads of the cube move."""
+"""Condition of a pad: its frequency does not change while those of the cube's other pads do."""
 NOISY = 256
 """Condition of a pad: the noise of its frequency is much larger than its calibration states, and
 larger than that of the other pads of the cube."""

@@ -300,7 +300,9 @@ def coefficient_counts(layout: Layout) -> dict[str, int | None]:
 
 
 def largest_symmetry(layout: Layout) -> str:
-    """Return the name of the largest symmetry group under which a layout's response need not be
-    zero."""
+    """Return the name of the largest symmetry group that a layout has.
+
+    Groups under which all responses of the layout would be zero are skipped.
+    """
     counts = coefficient_counts(layout)
     return next(name for name, count in counts.items() if count)

@@ -19,14 +19,15 @@ CONTACT_THRESHOLD = 3e-4
 """Relative shift |f/f0 - 1| of a pad's frequency f from its rest frequency f0 above which the pad
 counts as loaded.
 
-It corresponds to about 0.1 kPa for foam with E = 0.3 MPa.
+It corresponds to a stress of about 0.1 kPa for foam with a modulus of 0.3 MPa.
 """
 
 RELEASE_S = 5.0
-"""Time, in seconds, for which a cube must stay unloaded before its drift is tracked again.
+"""Time, in seconds, for which a cube must stay unloaded before the drift of its rest frequencies
+(frequencies without load) is tracked again.
 
-After a contact the elastomer recovers for a few seconds, and tracking at once would learn that
-recovery as drift.
+After a contact the elastomer recovers for a few seconds. Earlier tracking would treat this recovery
+as drift.
 """
 
 WINDOWS_PER_UPDATE = 20

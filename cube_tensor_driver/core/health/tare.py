@@ -48,10 +48,10 @@ A larger difference shows that a load is on the cube, or that the calibration is
 
 JUMP_SPAN_RATIO = 10.0
 """Span (highest minus lowest frequency of a pad), as a multiple of the measured noise, above which
-the frequency has jumped.
+the frequency is assumed to have jumped, because white noise does not span so much.
 
-White noise does not span so much. A jump raises the measured noise as well, so a refused tare then
-reports the span and not the noise.
+A jump raises the measured noise as well. The error message of the refused tare then names the span
+as the reason, and not the noise.
 """
 
 MAX_GAP_S = 0.25
