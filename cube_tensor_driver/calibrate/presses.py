@@ -43,12 +43,12 @@ MIN_PRESS_CHANGE = 2e-4
 load. It holds if the noise of the pads would allow a smaller change."""
 
 STEADY_SHARE = 0.1
-"""Largest change of a pad's frequency between two successive averages with which a press is steady,
-as a fraction of the largest frequency change that the press caused."""
+"""A press is steady if no pad's frequency differs between two successive averages by more than this
+fraction of the largest frequency change that the press caused."""
 
 RELEASED_SHARE = 0.4
-"""Fraction of the smallest frequency change of a press; when the largest change of all pads falls
-below it, the press has ended.
+"""A press has ended when the largest frequency change of all pads is below this fraction of the
+smallest change that counts as a press.
 
 It is below 1, so that a press near the limit is not counted twice.
 """
@@ -75,19 +75,16 @@ All of them are tried, because people do not press at a measured distance.
 """
 
 MAX_SWAP_RATIO = 0.5
-"""Largest ratio of misfit² (unexplained fraction of the squared stresses on the pads) after and
-before two pads are swapped with which the swap is accepted."""
+"""Two pads are taken to be swapped only if this reduces misfit² (unexplained fraction of the
+squared stresses on the pads during presses) to at most this fraction of its value."""
 
 SIMILAR_RATIO = 1.5
-"""Largest ratio of an explanation's misfit to the lowest misfit of all with which the explanation
-counts as equally good.
-
-An explanation is a rotation of the cube and an order of its pads.
-"""
+"""An explanation of the presses (rotation of the cube, order of its pads) counts as equally good as
+the best one if its misfit is at most this multiple of the lowest misfit."""
 
 SIMILAR_MISFIT = 0.06
-"""Largest misfit with which an explanation (rotation of the cube, order of its pads) counts as
-equally good as the best one, even if that has a far lower misfit."""
+"""An explanation of the presses (rotation of the cube, order of its pads) with at most this misfit
+counts as equally good as the best one, even if that has a far lower misfit."""
 
 MAX_MISFIT = 0.5
 """Largest misfit (root of the unexplained fraction of the squared stresses on the pads) with which

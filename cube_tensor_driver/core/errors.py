@@ -10,7 +10,8 @@ class LayoutError(CubeError):
 
 
 class SymmetryError(CubeError):
-    """A symmetry is unknown, or the layout or the modes do not have it."""
+    """A symmetry group is unknown, or it does not map the pads of a layout onto each other, or the
+    modes (linear stress fields) onto combinations of each other."""
 
 
 class CalibrationError(CubeError):

@@ -168,7 +168,7 @@ class TemperatureModel:
         return factor
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the model in plain types, which `from_dict` reads."""
+        """Return the model as a table of numbers and lists, which `from_dict` reads."""
         return {"reference": self.reference, "coefficients": self.coefficients.tolist()}
 
     @classmethod

@@ -162,7 +162,7 @@ class Health:
     def refresh(self) -> None:
         """Compute the limits of the frequencies again, from the rest frequencies of the pipeline.
 
-        To be called after these have changed, by a tare or by the tracking of drift.
+        The caller must do this after a tare or the tracking of drift has changed them.
         """
         calibrations, n_pads = self._pipeline.calibrations, self._pipeline.n_pads
         beta = pad_table([c.beta for c in calibrations], n_pads, fill=1.0)
@@ -196,7 +196,8 @@ class Health:
             reports as broken, and the conditions that any pad of the row's cube has (N,).
 
         Raises:
-            LayoutError: The frequencies have the wrong shape, or the skin does not have a cube.
+            LayoutError: The frequencies have the wrong shape, or a row is of a cube that the skin
+                does not have.
         """
         if rows.frequency.shape != (len(rows), self._exists.shape[1]):
             raise self._misfit(rows.cube, rows.frequency.shape)

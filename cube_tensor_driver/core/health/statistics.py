@@ -182,7 +182,7 @@ class WindowStatistics:
         stamp_ns: Times,
         doubtful: Mask | None = None,
     ) -> None:
-        """Add B scans of the same N cubes.
+        """Add B scans, each with one row of the same N cubes.
 
         Sums are formed scan by scan, so their bits do not depend on the number of scans per call.
 
