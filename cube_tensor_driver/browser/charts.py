@@ -28,16 +28,17 @@ TIME_SCALE = uplot.Scale(
 )
 
 NUDGE_PERIOD = 3
-"""Number of drawings after which the range of the value axis changes by an invisible amount.
+"""Number of drawings of a chart after which the range of its value axis changes invisibly.
 
-The change makes the browser lay the chart out again, see the argument `nudge` of `Chart.draw`.
+The change makes the browser lay the chart out again. This is needed because a chart that was made
+before the browser knew its width has no time axis until a range changes.
 """
 
 MAX_LINES = 12
 """Maximum number of lines in one chart; readers cannot distinguish more."""
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#000000", "#e69f00", "#56b4e9", "#888888")
-"""Colours of the lines of a chart, in order.
+"""Colours of the lines of a chart; the first line has the first colour, and so on.
 
 They are those of Okabe and Ito, which colour-blind readers can distinguish, too.
 """
@@ -59,8 +60,10 @@ CHART_HEIGHT = 250
 """Height of a chart, in pixels."""
 
 NOISE_SHARE = 0.02
-"""Fraction of the largest absolute value in a chart; the axis ends at zero on a side where no value
-is larger than this, because such values are noise."""
+"""Fraction of the largest absolute value in a chart up to which values are considered as noise.
+
+If the values on one side of zero are all noise, the axis ends at zero on that side.
+"""
 
 GROUPS = {
     "normal stress": ("xx", "yy", "zz"),

@@ -150,10 +150,10 @@ class ReplayClient:
         self._wanted_s = time.monotonic()
 
     def update(self) -> bool:
-        """Send the jump that `jump_to` stored, once the jump before it was answered.
+        """Send the jump that `jump_to` stored, unless the answer to an earlier jump is missing.
 
-        If no replay is known, the jump waits up to `MAX_ANSWER_S` for one and is then dropped with
-        a note to the user: on a busy machine the messages of a replay arrive late.
+        If no replay is known, the jump is kept, because on a busy machine the messages of a replay
+        arrive late. After `MAX_ANSWER_S` it is dropped, and a note tells the user so.
 
         Returns:
             Whether a jump was sent in this call.

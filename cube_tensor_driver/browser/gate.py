@@ -105,12 +105,12 @@ def guarded_server(token: str = "") -> Iterator[None]:
 def _answer(
     connection: Any, request: Request, token: str, process_request: Callable[..., Any]
 ) -> Any:
-    """Refuse a request, or let viser answer it and add the cookie with the token.
+    """Refuse a request, or let viser answer it and add a cookie with the token to the answer.
 
     Args:
         connection: The connection, as the websockets library passes it.
         request: The HTTP request with which the connection begins.
-        token: The token; empty: none is needed.
+        token: Secret text that browsers must send; empty if none is needed.
         process_request: Function of viser that answers the request.
     """
     host = request.headers.get("Host", "")

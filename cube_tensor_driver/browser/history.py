@@ -31,7 +31,8 @@ class History:
         Args:
             now: Time of the picture, in s, on any clock that all calls share.
             values: Stress in Pa and gradients in Pa/m (cubes, 15); NaN where unknown.
-            residual: Residual (cubes,) relative to the expected noise.
+            residual: Misfit between pads and tensor relative to the noise (cubes,); about 1 for
+                noise alone.
         """
         slot = self._count % len(self._times)
         self._values[slot, :, :-1] = values

@@ -48,22 +48,28 @@ CUBE_EDGES = np.array(
 """Edges (12, 2, 3) of `CUBE`: the positions of both ends of each edge."""
 
 MIN_ARROW = 0.15
-"""Minimum length of an arrow that is drawn, relative to the unit length of all arrows."""
+"""Minimum length of an arrow that is drawn, relative to the unit length of arrows.
+
+The unit length is the pitch (distance of neighbouring cubes) or, on a large skin, a little more.
+"""
 
 HEAD_LENGTH = 0.2
-"""Length of the head of an arrow, relative to the unit length of all arrows."""
+"""Length of the head of an arrow, relative to the unit length of arrows (about the pitch, which is
+the distance of neighbouring cubes)."""
 
 SHAFT_RADIUS = 0.025
-"""Radius of the shaft of an arrow, relative to the unit length of all arrows."""
+"""Radius of the shaft of an arrow, relative to the unit length of arrows (about the pitch, which is
+the distance of neighbouring cubes)."""
 
 HEAD_RADIUS = 0.075
-"""Radius of the base of an arrow's head, relative to the unit length of all arrows."""
+"""Radius of the base of an arrow's head, relative to the unit length of arrows (about the pitch,
+which is the distance of neighbouring cubes)."""
 
 RING_POINTS = 49
 """Number of points that approximate the circle of a ring; the last is equal to the first."""
 
 COLOUR_STEPS = 32
-"""Number of colours of a `SquareLayer`.
+"""Number of colours in which a `SquareLayer` (coloured squares of a skin) is drawn.
 
 The squares of each colour are a mesh of their own, so more colours take the browser more time.
 """

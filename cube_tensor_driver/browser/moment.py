@@ -60,7 +60,7 @@ class Moment(NamedTuple):
 
     Attributes:
         values: (N, 15) stress in Pa and gradients in Pa/m; NaN where a cube has no usable tensor.
-        residual: (N,) residual relative to the expected noise.
+        residual: (N,) misfit between pads and tensor relative to the noise; 1 for noise alone.
         health: (N,) health of the cubes, as in core/latest_stress.py.
         status: (N,) status bits, as in core/status.py.
         field: Pressure and shear at the points of the surface.

@@ -49,8 +49,8 @@ MAX_NAMED_CUBES = 256
 MIN_ARROW_UNIT = SPAN / 16
 """Minimum of the unit length to which the sizes of arrows are relative, in units of the scene.
 
-The unit length is usually the pitch (distance of neighbouring cubes). In a skin of a thousand cubes
-the pitch is so small that the direction of arrows of this size could not be seen.
+The unit length is the pitch (distance of neighbouring cubes) if that is larger. On a skin of a
+thousand cubes the pitch is so small that the directions of such arrows could not be seen.
 """
 
 MIN_THICKNESS = SPAN / 1000
@@ -259,7 +259,7 @@ def round_down(length: float) -> float:
 
 
 class Cubes:
-    """The coloured cubes, and the coloured field of pressure or shear below and between them."""
+    """The coloured cubes, and below them the coloured field (values between the cubes)."""
 
     def __init__(
         self,
@@ -432,7 +432,7 @@ class Arrows:
 
         Args:
             values: (N, 15) stress in Pa and gradients in Pa/m.
-            residual: (N,) residual relative to the expected noise.
+            residual: (N,) misfit between pads and tensor relative to the noise.
             visible: Whether the arrows are shown.
         """
         style, unit = self._style, self._placement.arrow

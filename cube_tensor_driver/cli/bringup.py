@@ -45,10 +45,10 @@ PPM = 1e6
 """Number of ppm (parts per million) in 1."""
 
 UNKNOWN_MISFIT = 0.5
-"""Misfit that decides how presses are reported that do not determine the rotation of a cube.
+"""Limit of the misfit that selects the message if presses do not determine a cube's rotation.
 
-The misfit is 0 if a rotation explains the measurement completely and 1 if it explains nothing.
-Below this value the report is that several rotations fit, above it that none does.
+The misfit is 0 if the best rotation explains the measurement completely and 1 if it explains
+nothing. Below the limit the message is that several rotations fit, above it that none fits.
 """
 
 
@@ -246,7 +246,12 @@ def press_cubes(source: LinkSource, rest: PadsAtRest) -> dict[int, Explanation]:
     explanations: dict[int, Explanation] = {}
 
     def wait_for_press(allowed: set[int], where: str) -> SteadyPress:
-        """Ask for a press until one is beside an allowed cube."""
+        """Ask the user to press until a press loads an allowed cube, and return that press.
+
+        Args:
+            allowed: Indices of the cubes of which a press is accepted.
+            where: Description of the cube and its side, for the text that asks the user.
+        """
         while True:
             say(f"press the skin next to {where}, and hold")
             press = next(each for each in map(detector.update, means) if each is not None)

@@ -13,10 +13,10 @@ if TYPE_CHECKING:
     from ..lerobot.export import Exported
 
 UNUSUAL_DEPTH = 2
-"""Ratio of the largest to the usual number of samples in a frame above which a warning is printed.
+"""Ratio of the largest to the usual number of samples per frame above which a warning is printed.
 
-Every window of the data set (the samples that belong to one frame) is as long as the largest one,
-so a single unusual frame enlarges the whole data set.
+A frame is one time step of a LeRobot data set. All frames have room for as many samples as the
+largest one has, so a single unusual frame enlarges the whole data set.
 """
 
 TABLES = {

@@ -105,7 +105,9 @@ def run(options: argparse.Namespace) -> int:
 def read_inputs(
     options: argparse.Namespace, layout: Layout
 ) -> tuple[Loads, Calibration, Array, str]:
-    """Read the loads, and the calibration from which the fit takes beta, modulus and half side.
+    """Read the loads, and the base calibration, which provides what the fit does not determine.
+
+    This is the pad law (beta and foam modulus), the half side of the cube and the noise.
 
     Args:
         options: The options of the command.

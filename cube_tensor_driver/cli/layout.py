@@ -122,7 +122,7 @@ def noise_text(result: dict[str, Any], mode: str) -> str:
 
     Args:
         result: Result of `core.estimator.summarize_response`; unknown values are None.
-        mode: Name of the mode (linear stress field whose amplitude a cube measures).
+        mode: Name of the mode, which is a linear stress field whose amplitude a cube measures.
     """
     if mode in result["unobservable"]:
         return "not observed"

@@ -27,7 +27,7 @@ PITCH = 0.012
 """Distance of neighbouring cubes, in metres, in the grid that `./cube demo --cubes N` simulates."""
 
 DEFAULT_RATE = 100.0
-"""Number of samples per second if neither the option --rate nor the skin file states a rate."""
+"""Samples per second of each cube, if neither the option --rate nor the skin file states a rate."""
 
 CUBES_PER_HUB = 8
 """Number of cubes on each simulated hub of the grid that `./cube demo --cubes N` simulates."""
@@ -77,7 +77,7 @@ class DemoSettings:
 
 
 def run_demo(settings: DemoSettings) -> int:
-    """Simulate a skin, run driver and reconstruction on it, and show or measure the tensors.
+    """Simulate a skin, run the nodes driver and reconstruction, and show or measure their tensors.
 
     Returns:
         The exit code: 0, or `INTERRUPTED` if Ctrl-C ended a measurement before its duration.

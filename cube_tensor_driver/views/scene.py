@@ -43,8 +43,8 @@ The entry for `FINE` is not used, because a cube that is fine has no cross.
 """
 
 RANGE_DECAY = 0.98
-"""Ratio of the upper end of an automatic range to that in the picture before, while the values are
-smaller: the range shrinks by 2 % per picture."""
+"""Factor by which the upper end of an automatic range shrinks from one picture to the next, while
+all values are smaller than it."""
 
 CROSS_SIZE = 1.3
 """Half the width of the cross over a cube with a fault, relative to half the side of the cube."""
@@ -90,7 +90,7 @@ def _length(*names: str) -> Callable[[Array, Array], Array]:
     """Return a function that computes the magnitude (N,) of the vector of some components.
 
     Args:
-        names: Names of the components, of COMPONENTS.
+        names: Names of the components, as in COMPONENTS.
     """
     columns = [COMPONENTS.index(name) for name in names]
 

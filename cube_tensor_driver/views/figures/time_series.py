@@ -46,7 +46,7 @@ class TimeSeries:
         frequency: (N, P) frequencies of the pads, in Hz.
         rest: (P,) frequencies of the pads without load, in Hz.
         values: (N, 15) stress in Pa and gradient in Pa/m; NaN where it is not observed.
-        residual: (N,) residual relative to the expected noise.
+        residual: (N,) misfit between pads and tensor relative to the noise; 1 for noise alone.
         status: (N,) status bits, as in core/status.py.
     """
 
@@ -63,7 +63,7 @@ class TimeSeries:
 def cube_series(
     source: BagSource, name: str | None, start_s: float | None, end_s: float | None
 ) -> TimeSeries:
-    """Read the samples of one cube from a bag, and compute the stress from their frequencies.
+    """Read the frequencies of one cube from a bag, and compute the stress from them.
 
     Args:
         source: The bag.

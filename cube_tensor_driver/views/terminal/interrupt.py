@@ -22,7 +22,7 @@ Outside of C code, the main thread ends by KeyboardInterrupt within this time an
 """
 
 INTERRUPTED = 130
-"""Exit code after Ctrl-C: 128 plus the number of SIGINT, as shells count."""
+"""Exit code after Ctrl-C: by the convention of shells, 128 plus the number of the signal SIGINT."""
 
 _SHOW_CURSOR = b"\x1b[?25h"
 

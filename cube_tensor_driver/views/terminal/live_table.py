@@ -147,7 +147,10 @@ class LiveTable:
         return self.seen == len(self._count)
 
     def update(self, rows: StressRows) -> None:
-        """Take over the rows of a message; of several rows of a cube the last one is shown."""
+        """Store the rows of a stress message, which the next `refresh` shows.
+
+        Of several rows of one cube, the last one is shown.
+        """
         if not self._count.any():
             # The next `refresh` draws the first tensors without waiting for `DRAW_PERIOD_S`.
             self._drawn_s = 0.0

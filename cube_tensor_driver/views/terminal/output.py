@@ -11,8 +11,7 @@ from rich.table import Column, Table
 from rich.text import Text
 
 BAR_WIDTH = 20
-"""Width of a progress bar, in characters; the rest of the line shows the name of the present step.
-"""
+"""Width of a progress bar, in characters; the name of the step takes the rest of the line."""
 
 
 def say(text: str, style: str = "", *, stderr: bool = False) -> None:
@@ -33,7 +32,12 @@ def say(text: str, style: str = "", *, stderr: bool = False) -> None:
 
 
 def make_table(names: Iterable[str], numbers: Iterable[str]) -> Table:
-    """Make an empty table: columns for names, then right-justified columns for numbers."""
+    """Make a table without rows, with left-justified columns and then right-justified columns.
+
+    Args:
+        names: Headings of the left-justified columns, which are for names.
+        numbers: Headings of the right-justified columns, which are for numbers.
+    """
     table = Table(*names)
     for heading in numbers:
         table.add_column(heading, justify="right")
@@ -42,11 +46,11 @@ def make_table(names: Iterable[str], numbers: Iterable[str]) -> Table:
 
 @contextmanager
 def progress_bar() -> Iterator[Callable[[float, float, str], None]]:
-    """Show a progress bar of one line on stderr, where that is a terminal.
+    """Show a progress bar of one line on stderr inside a `with` block, if stderr is a terminal.
 
     Yields:
-        A function ``report(done, total, what)``: the work done, the whole work in the same unit,
-        and the name of the present step.
+        A function ``report(done, total, what)`` that updates the bar. Its arguments are the work
+        done, the whole work in the same unit, and the name of the present step.
     """
     console = Console(stderr=True)
     if not console.is_terminal:
