@@ -1,1 +1,1 @@
-"""What presses on the skin: the traction on its surface from all cubes, and contacts."""
+"""Traction on the surface of a skin and contacts on it, from the values of all cubes."""

@@ -1,4 +1,4 @@
-"""Contacts of a skin by one of two methods, behind one interface."""
+"""Common interface of the two methods that find the contacts of a skin: interpolation, inverse."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ class ContactSettings:
     Attributes:
         method: One of `CONTACT_METHODS`.
         depth: Distance from the centres of the cubes to the surface, in m.
-        least: Pressure at the depth of the cubes, in Pa, from which on something is a contact.
-        thickness: Thickness of the elastomer on rigid ground in m, for the method inverse; 0 for a
-            half space.
-        poisson: Poisson's ratio of the elastomer. Used by the method inverse.
-        influence: Name of the influence functions of the pads (influence_file.py), which then
-            determine depth, thickness and Poisson's ratio; empty: cubes are modelled as points.
-            Used by the method inverse.
+        least: Smallest pressure of a contact at the depth of the cubes, in Pa.
+        thickness: Thickness of the elastomer on rigid ground in m; 0 for a half space. Only the
+            method inverse uses it.
+        poisson: Poisson's ratio of the elastomer. Only the method inverse uses it.
+        influence: Name of the file with the influence functions of the pads (influence_file.py),
+            whose depth, thickness and Poisson's ratio replace those of these settings. Empty: cubes
+            are modelled as points. Only the method inverse uses it.
     """
 
     method: str = INTERPOLATION
@@ -50,7 +50,7 @@ class ContactSettings:
 
     @property
     def layer(self) -> Layer:
-        """Layer of these settings.
+        """Elastic layer with the thickness and Poisson's ratio of these settings.
 
         Raises:
             ElasticError: Thickness or Poisson's ratio is out of range.
@@ -61,8 +61,9 @@ class ContactSettings:
         """Check the settings.
 
         Raises:
-            ElasticError: There is no such layer, or it does not contain the depth.
-            ConfigError: The influence functions do not exist.
+            ElasticError: Thickness or Poisson's ratio is out of range, or the depth exceeds the
+                thickness.
+            ConfigError: There are no influence functions with this name.
         """
         self.layer.check_depth(self.depth)
         if self.influence:
@@ -76,19 +77,23 @@ class ContactFinder(Protocol):
         """Find the contacts in the newest values.
 
         Args:
-            values: Components (cubes, 15), NaN where unknown.
-            left_out: Bits (cubes,) of the pads that were left out of the values.
+            values: Components (cubes, 15) in Pa and Pa/m, NaN where unknown.
+            left_out: Bit masks (cubes,), in which bit k is set if pad k was not used for `values`.
 
         Returns:
             Contacts, strongest first.
         """
 
     def cloud(self, values: Array) -> Array | None:
-        """Return the surface after `update` with these values.
+        """Return the traction on the surface as a point cloud; call `update` with `values` before.
+
+        Args:
+            values: Components (cubes, 15) of the last `update`.
 
         Returns:
-            Position in the skin's parent frame in m, pressure, shear and standard deviation of the
-            pressure in Pa (M, 6); None if the method does not compute the surface.
+            One row (M, 6) for each point of the surface: position x, y, z in the skin's parent
+            frame in m; pressure, shear and standard deviation of the pressure in Pa. None if the
+            method does not compute the traction (interpolation).
         """
 
 
@@ -97,7 +102,7 @@ def contact_finder(
     poses: CubePoses,
     calibrations: Sequence[Calibration],
 ) -> ContactFinder:
-    """Create the finder of these settings; the method inverse takes seconds.
+    """Create the contact finder for one skin. With the method inverse, this takes seconds.
 
     Args:
         settings: Method and properties of the elastomer.
@@ -105,7 +110,8 @@ def contact_finder(
         calibrations: Calibration of each cube.
 
     Raises:
-        ElasticError: The settings and the cubes do not fit together.
+        ElasticError: A setting is out of range, no cube observes any component, or the influence
+            functions belong to other cubes.
         ConfigError: The influence functions cannot be read.
     """
     if settings.method == INTERPOLATION:
@@ -114,7 +120,7 @@ def contact_finder(
 
 
 class _InterpolationFinder:
-    """Contacts from the interpolated pressure."""
+    """Finds contacts in the pressure that is interpolated between the cubes (surface.py)."""
 
     def __init__(self, settings: ContactSettings, poses: CubePoses) -> None:
         self._surface = Surface(poses, settings.depth)
@@ -128,7 +134,7 @@ class _InterpolationFinder:
 
 
 class _InverseFinder:
-    """Contacts that are tracked by fits to the values of all cubes."""
+    """Finds contacts by fits to the values of all cubes and follows them from scan to scan."""
 
     def __init__(
         self,
@@ -141,7 +147,7 @@ class _InverseFinder:
         model = None
         if settings.influence:
             influence = read_influence(find_influence(settings.influence))
-            # The influence functions hold for one layer and depth only.
+            # Influence functions are computed for one layer and depth, which replace the settings.
             layer = influence.layer
             depth = influence.depth
             model = model_pads(influence, calibrations)
@@ -153,7 +159,7 @@ class _InverseFinder:
         self._tracker = ContactTracker(self._inverse, settings.least)
 
     def update(self, values: Array, left_out: PadMasks) -> list[TrackedContact]:
-        # Noise matrices are computed again only for cubes whose pads in use have changed.
+        # Noise matrices are computed again only for cubes of which other pads are used than before.
         changed = np.flatnonzero(left_out != self._left_out)
         if len(changed):
             by_pad = noise_by_pad(self._pipeline, changed, left_out[changed])

@@ -1,7 +1,8 @@
 """Inverse problem of a skin: the traction on its surface from the measured values of all cubes.
 
-The measured values depend linearly on the traction t (layer.py), y = H t + e. posterior.py computes
-the posterior of t, prediction.py replaces values that are missing.
+The measured values y depend linearly on the traction t (force per area on the surface) and have an
+error e: y = H t + e, with the response H of the elastic layer (layer.py). posterior.py computes the
+posterior of t, prediction.py replaces values that are missing.
 """
 
 from __future__ import annotations
@@ -28,11 +29,11 @@ from .unrolled_skin import unroll
 
 
 class TractionField(NamedTuple):
-    """Traction on the M points of a surface.
+    """Traction (force per area) at M points of the surface of a skin.
 
     Attributes:
-        traction: Traction (M, 3) in Pa on the skin along x, y, z, in the frame of the cube on whose
-            patch the point lies. Pressing is negative along z.
+        traction: Traction (M, 3) in Pa on the skin along x, y and z of the cube below the point.
+            The z component is negative where a body presses on the skin.
         depth_pressure: Pressure (M,) in Pa below each point, at the depth of the cubes.
     """
 
@@ -58,7 +59,7 @@ class FieldDeviation(NamedTuple):
 
 
 class SurfaceInverse:
-    """Computes the traction on the surface of a skin from its stress rows.
+    """Computes the traction on the surface of a skin from the values that its cubes measure.
 
     Attributes:
         poses: Poses of the cubes.
@@ -68,12 +69,15 @@ class SurfaceInverse:
             `side` on the patch of each cube.
         cube: Index (M,) of the cube on whose patch a point lies.
         spacing: Distance of neighbouring points, in m.
-        area: Area that a point stands for, in m^2.
-        kernels: Kernels of the layer.
+        area: Area of the square that each point represents in integrals, in m^2.
+        kernels: Covariances between components and traction in the elastic layer.
         columns: Indices (C,) in `COMPONENTS` of the components that some cube observes.
-        observed: Whether each cube observes them (cubes, C), with all of its pads.
-        by_pad: Noise matrices (cubes, C, P) with the pads in use, in Pa.
-        variant: Variant (cubes,) of each cube in the measurement model.
+        observed: Whether each cube observes each of these components (cubes, C) if it uses all of
+            its pads.
+        by_pad: Change (cubes, C, P) of each component, in Pa, for one standard deviation of the
+            noise of each pad, with the pads in use.
+        variant: Index (cubes,) of each cube's variant (calibration and pads in use) in the
+            measurement model.
     """
 
     def __init__(
@@ -86,7 +90,7 @@ class SurfaceInverse:
         side: int = 2,
         influence: Influence | None = None,
     ) -> None:
-        """Set up the matrices, which takes a second the first time.
+        """Set up the matrices. The first time takes about a second, later ones load from the cache.
 
         Args:
             skin: Skin as from `read_skin`.
@@ -94,11 +98,12 @@ class SurfaceInverse:
             thickness: Thickness of the elastomer on rigid ground, in m; infinite for a half space.
             poisson: Poisson's ratio of the elastomer.
             side: Number of points along a side of the patch of a cube.
-            influence: Influence functions of the pads, which determine depth, thickness and
-                Poisson's ratio; None: cubes are modelled as points.
+            influence: Influence functions (stress of each pad under a force of 1 N, by the force's
+                position), whose depth, thickness and Poisson's ratio replace those given here.
+                None: cubes are modelled as points.
 
         Raises:
-            ElasticError: There is no such layer, no cube observes anything, or the influence
+            ElasticError: The layer is impossible, no cube observes any component, or the influence
                 functions belong to other cubes.
         """
         by_pad = noise_of_all_pads(skin.calibrations)
@@ -128,7 +133,8 @@ class SurfaceInverse:
             layer: Elastic layer that contains the cubes.
             depth: Distance from the centres of the cubes to the surface, in m.
             side: Number of points along a side of the patch of a cube.
-            model: Measurement model of the cubes; by default they are points.
+            model: Measurement model of the cubes as from `model_pads`; None: they are modelled as
+                points.
         """
         inverse = cls.__new__(cls)
         inverse._set_up(poses, by_pad, layer, depth, side, model)
@@ -170,8 +176,8 @@ class SurfaceInverse:
         self.by_pad = by_pad[:, self.columns] * self._unit_factors[:, None]
         self._all_pads = self.by_pad.copy()
 
-        # A cube gets another variant of the measurement model when pads are left out. These are the
-        # variants with all pads.
+        # `_whole_variant` are the variants of the measurement model with all pads. A cube gets
+        # another variant when some of its pads are left out.
         self._whole_variant = np.zeros(n, np.intp) if model is None else model.variant
         self._variant_pads = None if model is None else model.pads
         self.variant = self._whole_variant.copy()
@@ -191,11 +197,14 @@ class SurfaceInverse:
         self._prediction = MissingValuePrediction(self._windows, self.observed, self._known)
 
     def scaled(self, values: Array) -> Array:
-        """Convert values (cubes, 15) to the observed components (cubes, C), all in Pa."""
+        """Select the observed components (cubes, C) of values (cubes, 15) and convert them to Pa.
+
+        Gradients, in Pa/m, are multiplied by half the side of a cube.
+        """
         return np.asarray(values)[:, self.columns] * self._unit_factors
 
     def unroll(self, centre: int, cubes: Index) -> tuple[Array, Array]:
-        """Lay cubes flat around one cube.
+        """Lay cubes of a bent skin flat around one cube, from which they keep their distance.
 
         Args:
             centre: Index of the cube that stays in place.
@@ -212,12 +221,13 @@ class SurfaceInverse:
         return place[0], angle[0]
 
     def leave_out(self, cubes: Index, by_pad: Array) -> None:
-        """Change the pads that cubes use.
+        """Change the pads that cubes use, for example because some pads are broken.
 
-        The contact tracker uses the components of such a cube as they are. The field does so only
-        if cubes are modelled as points, whose components do not depend on the pads. With influence
-        functions they do, and the matrices of the field are those of all pads; there, the values of
-        the cube count as missing.
+        The contact tracker uses the components of a cube with pads left out like those of other
+        cubes. `field` uses them only if cubes are modelled as points, because the response of
+        points does not depend on the pads. With influence functions, the response depends on the
+        pads in use, but the matrices of `field` are computed for all pads. Therefore, the values of
+        such a cube then count as missing in `field`.
 
         Args:
             cubes: Indices (n,) of the cubes.
@@ -242,35 +252,41 @@ class SurfaceInverse:
             values: Components (cubes, 15) as in `StressRows`, in Pa and Pa/m, NaN where unknown.
 
         Returns:
-            Traction on all points; 0 where no cube of a window has a value.
+            Traction at all points; 0 at points for which none of the `WINDOW_CUBES` nearest cubes
+            has a value.
         """
         return self.field_of_scaled(self.scaled(values))
 
     def field_of_scaled(self, scaled: Array) -> TractionField:
-        """Compute the same from values (cubes, C) as from `scaled`."""
-        # Row by row: the patches follow the order of `points`.
+        """Compute the field as `field`, from values (cubes, C) in Pa as returned by `scaled`."""
+        # The results are sorted by cube and then by point of its patch, as `points` are.
         result = self._windows.product(self._fill(scaled))
         rows = result.reshape(len(self.points), -1).astype(np.float64)
         return TractionField(rows[:, :3], rows[:, 3])
 
     def deviation(self, values: Array) -> FieldDeviation:
-        """Compute the standard deviations of `field`, which takes several times as long."""
+        """Compute the standard deviations of the result of `field`, with the same argument.
+
+        This takes several times as long as `field`.
+        """
         scaled = self.scaled(values)
         return self.residual_deviation(scaled, scaled)
 
     def residual_deviation(self, residual: Array, scaled: Array) -> FieldDeviation:
-        """Compute the standard deviations of the field of a residual.
+        """Compute the standard deviations of the field that is computed from a residual.
 
         Args:
-            residual: Part (cubes, C) of the scaled values that the contacts do not explain.
-            scaled: All scaled values (cubes, C); errors of the gains are proportional to them.
+            residual: Values (cubes, C) in Pa minus the response to the contacts (`ContactModel`).
+            scaled: Values (cubes, C) in Pa as from `scaled`. Errors of the pads' gains are
+                proportional to them.
         """
         y = self._fill(residual)
-        # Variance of each pad divided by that of its noise: 1 for the noise, and the gain error.
+        # Variance of each pad's error, divided by the variance of its noise: 1 for the noise itself
+        # plus the gain error.
         stresses = pad_stresses(self.by_pad, self._known, scaled)
         has_values = self._known.any(axis=1)[:, None]
         gain_variance = (GAIN_ERROR * stresses) ** 2
-        # A cube without values adds no noise.
+        # A cube without known values contributes no noise to the field.
         pad_variance = np.where(has_values, gain_variance + 1, 0).astype(np.float32)
 
         windows = self._windows
@@ -282,9 +298,17 @@ class SurfaceInverse:
         return FieldDeviation(*np.sqrt(variance).reshape(-1, 2).T)
 
     def _fill(self, scaled: Array) -> Single:
-        """Return values (cubes, C) in which predictions replace those that are missing."""
+        """Replace missing values by predictions from the neighbouring cubes.
+
+        Args:
+            scaled: Values (cubes, C) in Pa, NaN where missing.
+
+        Returns:
+            Values (cubes, C) in Pa without NaN.
+        """
         usable = ~self._has_other_pads[:, None]
-        # Predictions depend on what is known only, which rarely changes.
+        # The matrices of the prediction depend only on which values are known. This rarely changes
+        # from scan to scan, so they are kept.
         known = np.isfinite(scaled) & self.observed & usable
         if not np.array_equal(known, self._known):
             self._known = known

@@ -1,10 +1,11 @@
 """Prediction of missing values of a cube from its neighbours.
 
-Missing values D (R are the other values around their cube) do not change the matrices of a window.
-Predicting the missing values and then using all values gives the same estimate as leaving them
-out::
+A window (a cube and its nearest neighbours) has the gain matrix G from values to traction and the
+inverse covariance P of the values (posterior.py). Both are computed once, for complete values.
+Let D be the missing and R the other values of the window. Predicting the missing values and then
+using all values gives the same traction as leaving the missing values out::
 
-    y_D = -P_DD^-1 P_DR y_R,      the covariance of the estimate grows by G_D P_DD^-1 G_D'
+    y_D = -P_DD^-1 P_DR y_R,   the covariance of the traction grows by G_D P_DD^-1 G_D'
 
 Source: C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learning (2006), 5.4.2
 (leave-one-out predictions).
@@ -21,16 +22,18 @@ from .posterior import WindowPosteriors, select_pressure
 
 
 class _Prediction(NamedTuple):
-    """Prediction of the missing values of one cube.
+    """Matrices for the prediction of the D missing values of one cube.
 
     Attributes:
         cube: Index of the cube.
-        columns: Columns (D,) of its missing values.
-        near: Indices (inner,) of the cubes that predict them.
-        weights: Matrix (D, inner C) from the values of these cubes.
-        by_pad: Change (D, inner P) of the predictions by the noise of each pad.
-        rows: Windows (n,) that contain the cube.
-        gain: Gains (n, D, points x 2) of the missing values in these windows.
+        columns: Columns (D,) of the missing values among the observed components.
+        near: Indices (inner,) of the cubes from whose values they are predicted.
+        weights: Matrix (D, inner C) from the values of these cubes to the predictions.
+        by_pad: Change (D, inner P) of the predictions in Pa for one standard deviation of the noise
+            of each pad.
+        rows: Indices (n,) of the windows (named by their centre cube) that contain the cube.
+        gain: Entries (n, D, points x 2) of the matrices G of these windows: change of the pressures
+            on the surface and at the cubes' depth per Pa of each missing value.
     """
 
     cube: int
@@ -43,12 +46,13 @@ class _Prediction(NamedTuple):
 
 
 class MissingValuePrediction:
-    """Predictions of all missing values of a skin, each from the inner cubes of its cube's window.
+    """Predicts all missing values of a skin from the cubes nearest to the cube that lacks them.
 
-    The errors of the predictions of different cubes count as independent.
+    The errors of the predictions for different cubes are treated as independent.
 
     Attributes:
-        variance: Increase (cubes, points x 2) of the posterior variances, at the prior scale 1.
+        variance: Increase (cubes, points x 2) in Pa^2 of the posterior variances of the pressures
+            on the surface and at the cubes' depth, for the prior scale s = 1 (posterior.py).
     """
 
     def __init__(
@@ -61,8 +65,8 @@ class MissingValuePrediction:
 
         Args:
             windows: Matrices of all windows.
-            observed: Components (cubes, C) that the cubes normally observe.
-            known: Components (cubes, C) that are known now.
+            observed: Whether each cube normally observes each component (cubes, C).
+            known: Whether each component (cubes, C) is known now.
         """
         missing = observed & ~known
         n_pressures = windows.prior.shape[1]
@@ -77,21 +81,27 @@ class MissingValuePrediction:
         missing: Mask,
         cube: int,
     ) -> None:
-        """Prepare the prediction of the missing values of one cube."""
+        """Prepare the prediction of the missing values of one cube and add to `variance`.
+
+        Args:
+            windows: Matrices of all windows.
+            missing: Whether each component (cubes, C) is observed normally but not known now.
+            cube: Index of the cube.
+        """
         width = missing.shape[1]
         near = windows.near[cube, : windows.inner]
         precision = windows.precision[windows.kind[cube]].astype(float)
         is_missing = missing[near].ravel()
         own = np.flatnonzero(missing[cube])
 
-        # The cube is the first of its window: its values are the first of all missing ones.
+        # A window lists its centre cube first, so the first missing values are those of this cube.
         missing_block = precision[np.ix_(is_missing, is_missing)]
         selection = np.eye(is_missing.sum(), len(own))
         covariance = np.linalg.solve(missing_block, selection)
         weights = -covariance.T @ precision[is_missing]
         weights[:, is_missing] = 0.0
 
-        # All windows that contain the cube, and its place in each of them.
+        # All windows that contain the cube, and the cube's position in the list of each window.
         rows, place = np.nonzero(windows.near == cube)
         columns = place[:, None] * width + own
         kinds = windows.kind[rows][:, None]
@@ -115,10 +125,15 @@ class MissingValuePrediction:
         return filled
 
     def noise(self, pad_variance: Single) -> Array:
-        """Compute the variances (cubes, points x 2) that pad noise causes through the predictions.
+        """Compute the variances of the pressures that pad noise causes through the predictions.
 
         Args:
-            pad_variance: Variance (cubes, P) of each pad divided by that of its noise.
+            pad_variance: Variance (cubes, P) of the error of each pad, divided by the variance of
+                its noise.
+
+        Returns:
+            Variances (cubes, points x 2) in Pa^2 of the pressures on the surface and at the cubes'
+            depth.
         """
         total = np.zeros_like(self.variance)
         for one in self._predictions:

@@ -1,9 +1,11 @@
 """Force, position and moment of a fitted contact, with standard deviations.
 
-They are linear functionals L of the whole traction within reach of the contact: of the Hertz
-contact and of the residual field alike. Their variance is that of universal kriging. With k the
-covariance of the functional of the residual with the values y, and J and b the derivatives of y and
-of the functional by the parameters (f, c, ln a)::
+They are linear functionals L (integrals) of the whole traction near the contact: of the fitted
+Hertz contact and of the residual field, the traction that the contacts do not explain. Their
+variance is the variance of universal kriging. Let k_LL be the prior variance of the functional of
+the residual field, k its covariance with the values y, W the inverse covariance of the values
+(contact_fit.py), and J and b the derivatives of y and of the functional by the parameters (force f,
+centre c, logarithm of the radius ln a) of the contacts. Then::
 
     var = k_LL - k' W k + (b - J' W k)' (J' W J + prior)^-1 (b - J' W k)
 
@@ -23,15 +25,27 @@ from ..prior import AMPLITUDE
 from .contact_fit import ContactFit, Observations
 
 NEGLIGIBLE_RESIDUAL = 2.5e-4
-"""Residual scale divided by `AMPLITUDE` below which the residual adds less than a hundredth to any
-variance. Its contribution is then left out, which saves half of the time."""
+"""Residual scale (standard deviation of the pressure that the contacts do not explain), divided by
+`AMPLITUDE`, below which the residual field adds less than a hundredth to any variance of a contact.
+It is then left out of the estimate, which takes half the time."""
 
 _MIN_NORMAL_FORCE = 1e-12
-"""Smallest normal force in N that is divided by."""
+"""Smallest absolute value, in N, of a normal force in a denominator; it avoids a division by 0."""
 
 
 class ContactEstimate(NamedTuple):
-    """Estimate of one contact on the unrolled skin; units and meaning as in `TrackedContact`."""
+    """Estimate of one contact, in the plane of the flattened skin.
+
+    Attributes:
+        force: Force (3,) in N on the skin.
+        force_variance: Variance (3,) of the force in N^2.
+        place: Position (2,) of the contact in m.
+        place_variance: Variance (2,) of the position in m^2.
+        moment: Moment about the normal through this position, in N m.
+        moment_variance: Variance of the moment in N^2 m^2.
+        area: Area of the fitted Hertz contact in m^2.
+        area_uncertainty: Standard deviation of the area in m^2.
+    """
 
     force: Array
     force_variance: Array
@@ -48,13 +62,20 @@ def estimate_contact(
     fit: ContactFit,
     j: int,
 ) -> ContactEstimate:
-    """Estimate contact j of a fit, together with the residual field around it."""
+    """Compute force, position and moment of a contact from its fit and the residual field.
+
+    Args:
+        observations: Known values of the cubes, their noise and prior covariance.
+        fit: Fit of one or several contacts to these values.
+        j: Index of the contact in the fit.
+    """
     depth = observations.kernels.depth
     centre = fit.centres[j]
     size = float(fit.sizes[j])
     contact_force = fit.forces[j]
 
-    # The region around the contact ends halfway to the nearest other one.
+    # The residual field is integrated over a disc around the contact, which ends halfway to the
+    # nearest other contact.
     distances = np.linalg.norm(
         np.delete(fit.centres, j, axis=0) - centre,
         axis=1,
@@ -67,7 +88,7 @@ def estimate_contact(
         covariance = observations.cross(centre + offset)
         cross = fit.residual_scale**2 * covariance * weight[:, None, None]
 
-    # Force and first moment; the position is where the moment of the pressure vanishes.
+    # The position is the point about which the first moment of the pressure vanishes.
     total = cross.sum(axis=0)  # (3, D)
     force = contact_force + total @ fit.weighted_residual
     normal_force = force[2] if abs(force[2]) > _MIN_NORMAL_FORCE else -_MIN_NORMAL_FORCE
@@ -75,13 +96,14 @@ def estimate_contact(
     shift = first_moment @ fit.weighted_residual / normal_force
     lever = (first_moment - np.outer(shift, total[2])) / normal_force
 
-    # Moment about the normal through this position.
+    # Moment about the normal through this position, from the shear traction.
     arm = offset - shift
     twist = arm[:, 0] @ cross[:, 1] - arm[:, 1] @ cross[:, 0]
     contact_moment = shift[1] * contact_force[0] - shift[0] * contact_force[1]
     moment = contact_moment + twist @ fit.weighted_residual
 
-    # Derivatives b (6, parameters) of force, position and moment.
+    # Derivatives b (6, parameters) of force (3), position (2) and moment by the parameters of all
+    # contacts: force, centre, ln a.
     functionals = np.concatenate([total, lever, twist[None]])  # (6, D)
     first = 6 * j
     slopes = np.zeros((6, fit.jacobian.shape[1]))
@@ -119,15 +141,19 @@ def _functional_variance(
     radius: float,
     normal_force: float,
 ) -> Array:
-    """Return the prior variances k_LL (6,) of force, position and moment of the residual field.
+    """Return the prior variances k_LL (6,) of force (3), position (2) and moment.
+
+    They are the variances that the residual field (traction that the contacts do not explain) on a
+    disc causes before any value is measured.
 
     Args:
         residual_scale: Standard deviation of the pressure of the residual field, in Pa.
-        depth: Depth of the cubes in m.
+        depth: Distance from the centres of the cubes to the surface, in m.
         radius: Radius of the disc over which the residual field is integrated, in m.
         normal_force: Normal force of the contact in N.
     """
-    # Variance per area of an integral of the pressure over an area wider than the prior's lengths.
+    # Variance of the integral of the pressure over an area, per m^2 of this area. It holds for
+    # areas wider than the correlation lengths of the prior.
     lengths = np.array(PRIOR_LENGTHS) * depth
     density = residual_scale**2 * np.mean(2 * np.pi * lengths**2)
 
@@ -149,7 +175,14 @@ def _functional_variance(
 
 
 def _disc_quadrature(radius: float) -> tuple[Array, Array]:
-    """Return points (Q, 2) on a disc and their areas (Q,): Gauss points in r^2 times angles."""
+    """Return quadrature points on a disc: Gauss points in r^2, equally spaced in the angle.
+
+    Args:
+        radius: Radius of the disc in m.
+
+    Returns:
+        Positions (Q, 2) from the centre in m, and weights (Q,) in m^2 whose sum is the area.
+    """
     nodes, weights = np.polynomial.legendre.leggauss(5)
     r = radius * np.sqrt((nodes + 1) / 2)
     n_angles = 10

@@ -1,19 +1,25 @@
 """Fit of Hertz contacts to the values of some cubes, beside a Gaussian process for the residual.
 
-With given centres c and radii a, the model is linear in the forces f of the contacts. Centres and
-ln a are found by Gauss-Newton steps, weighted with the covariance of the residual::
+The values y are the sum of the response to the contacts j, the response to the residual field (the
+traction that the contacts do not explain) and an error e. With given centres c and radii a, the
+model is linear in the forces f of the contacts. Centres and ln a are found by Gauss-Newton steps,
+weighted with the inverse covariance W of residual, shapes and error::
 
     y = sum_j (R(c_j, a_j) + sum_k s_jk D_k(c_j, a_j)) f_j + H residual + e
     W = (alpha^2 K + S + N)^-1
 
-R is the response of the cubes to a contact, K the prior of kernels.py, N the noise of pad_noise.py.
-alpha, the residual scale, is the standard deviation of the pressure of the residual field. The
-shape functions D move pressure within a contact without changing its force and position: they make
-it longer along x or along a diagonal, and emptier or fuller at its rim. The shapes s have the prior
-covariance that `SHAPE_DEVIATIONS` gives, which makes the covariance S of the values. alpha is
-chosen for the greatest evidence, the likelihood with forces, centres and radii integrated over
-their priors. If the true contacts are like none of these, alpha grows, and so do all standard
-deviations.
+R is the response of the cubes to a contact, H their response to a traction, K the prior covariance
+of the values (prior.py) and N the covariance of their noise (pad_noise.py). alpha, the residual
+scale, is the standard deviation of the pressure of the residual field.
+
+A shape is a deviation of a contact from a circular Hertz contact. The shape functions D move
+pressure within a contact without changing its force and position: two make it longer along x or
+along a diagonal, the third moves pressure between centre and rim. Their coefficients s have the
+prior standard deviations `SHAPE_DEVIATIONS`, which cause the covariance S of the values.
+
+alpha is chosen for the greatest evidence, the likelihood with forces, centres and radii integrated
+over their priors. If the model does not fit the true contacts, alpha grows, and with alpha all
+standard deviations.
 
 Source: K. L. Johnson, Contact Mechanics (1985), 4.2 (Hertz); D. J. C. MacKay, Bayesian
 interpolation, Neural Computation 4 (1992) 415 (evidence).
@@ -36,30 +42,33 @@ from ..pad_noise import GAIN_ERROR, pad_stresses
 from ..prior import AMPLITUDE
 
 USUAL_SIZE = 0.8
-"""Prior mean of the radius of a contact, divided by the depth."""
+"""Prior mean (of the logarithm) and start value of the radius of a contact, divided by the depth of
+the cubes' centres below the surface."""
 
 SIZE_DEVIATION = 1.0
-"""Prior standard deviation of the natural logarithm of the radius."""
+"""Prior standard deviation of the natural logarithm of the radius of a contact."""
 
 FORCE_DEVIATION = 1e3
-"""Prior standard deviation of each component of a force in N. It is so large that it has no
-influence; zero force is possible."""
+"""Prior standard deviation of each component of the force of a contact, in N; the prior mean is 0.
+It is so large that it does not influence the fitted force."""
 
 ROUGH_GAIN_ERROR = 0.1
-"""Standard deviation of every pad divided by the rms of its cube's pads, for a contact far from its
-solution. There, the linear problem is wrong by more than the gain errors, also for pads with little
-stress."""
+"""Standard deviation of the error of every pad (sensing element), divided by the rms stress of the
+pads of its cube, while a contact is far from its solution. Linearisation errors are then larger
+than the pads' gain errors, also for pads with little stress."""
 
 SHAPE_DEVIATIONS = np.array([0.7, 0.7, 1.0])
-"""Prior standard deviations of the three shapes of a contact: two lengths and the flatness. Two
-balls that touch each other have a length of 1.1, a rigid flat punch has a flatness of 1."""
+"""Prior standard deviations of the coefficients of the three shapes (deviations from a circular
+Hertz contact): elongation along x, elongation along a diagonal, flatness. For comparison, two balls
+side by side have an elongation of 1.1, a rigid flat punch has a flatness of 1."""
 
 SHAPE_SHIFT = 0.5
-"""Shift, divided by the radius, of the contacts whose difference is a length shape."""
+"""Shift, divided by the contact's radius, of the contacts from which an elongation shape is made:
+contacts shifted along an axis minus contacts shifted across it."""
 
 SHAPE_WIDENING = 0.2
-"""Change of the logarithm of the radius between the contacts whose difference is the flatness
-shape."""
+"""Change of the natural logarithm of the radius of the contacts from which the flatness shape is
+made: the contact minus a mixture of a narrower and a wider one."""
 
 STEPS_NEW = 16
 """Number of Gauss-Newton steps for a contact that has just begun."""
@@ -68,28 +77,30 @@ STEPS_TRACKED = 3
 """Number of Gauss-Newton steps for a contact that was fitted in the previous scan."""
 
 STEPS_EVALUATE = 0
-"""Number of Gauss-Newton steps, none, to compute only the evidence of given centres and radii."""
+"""Number of Gauss-Newton steps, zero, of a fit that only computes the evidence (probability of the
+values) of given centres and radii."""
 
 MAX_SHIFT_PITCHES = 1.5
-"""Largest distance, in cube pitches and along each axis, that one fit may move a contact.
+"""Largest distance along each axis that one fit may move a contact from its start, divided by the
+pitch (distance of neighbouring cubes).
 
-A start on the wrong side of a cube is up to one pitch away from the solution. If the limit stops a
-fit just before the solution, its linearised evidence still looks good and the wrong position is
-accepted.
+A start on the wrong side of a cube is up to one pitch away from the solution. A smaller limit could
+stop a fit just before the solution. Its linearised evidence would still look good, so that the
+wrong position would be accepted.
 """
 
 FINE_STEPS = 6
-"""Number of the last Gauss-Newton steps of a new contact, in which pads have their own gain errors
-instead of the larger `ROUGH_GAIN_ERROR`."""
+"""Number of the last Gauss-Newton steps in the fit of a new contact that use the usual gain errors
+of the pads (`GAIN_ERROR`) instead of the larger `ROUGH_GAIN_ERROR`."""
 
 SETTLED_STEP = 0.02
-"""Size of a Gauss-Newton step below which a contact has converged: the distance divided by the
-depth, and the change of the logarithm of the radius. One more step follows; the error that then
-remains is of second order."""
+"""Threshold of the Gauss-Newton steps below which a contact has converged. It limits both the
+distance divided by the depth of the cubes, and the change of the logarithm of the radius. One more
+step follows, so that only an error of second order remains."""
 
 _MAX_STEP_DEPTHS = 0.5
-"""Largest distance that one Gauss-Newton step moves a contact along each axis, divided by the
-depth."""
+"""Largest distance that one Gauss-Newton step moves a contact along each axis, divided by the depth
+of the cubes' centres below the surface."""
 
 _MAX_STEP_LOG_SIZE = 0.5
 """Largest change of the natural logarithm of a radius in one Gauss-Newton step."""
@@ -99,17 +110,21 @@ _SCALE_FACTORS = {
     STEPS_TRACKED: np.array([0.5, 1.0, 2.0]),
     STEPS_EVALUATE: np.array([1.0]),
 }
-"""Factors of the residual scale whose evidence is compared."""
+"""Factors by which a fit multiplies the residual scale (standard deviation of the pressure that the
+contacts do not explain). The scale with the greatest evidence is kept. The key is the number of
+Gauss-Newton steps."""
 
 _MIN_SCALE = 1e-4 * AMPLITUDE
-"""Smallest residual scale in Pa; the largest one is `AMPLITUDE`."""
+"""Smallest residual scale (standard deviation of the pressure that the contacts do not explain), in
+Pa; the largest one is `AMPLITUDE`."""
 
 _DIFFERENCE_STEP = 1 / 50
-"""Step of the numerical derivatives with respect to the centre of a contact, divided by the
-depth."""
+"""Step of the numerical derivatives with respect to the centre of a contact, divided by the depth
+of the cubes' centres below the surface."""
 
 _N_PARAMETERS = 6
-"""Number of parameters of a contact: f_x, f_y, f_z, c_x, c_y, ln a."""
+"""Number of fitted parameters of a contact: force f_x, f_y, f_z, centre c_x, c_y and the logarithm
+ln a of the radius."""
 
 _STENCIL = np.array(
     [[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]],
@@ -119,21 +134,21 @@ _DIAGONALS = np.array([[1, 1], [-1, -1], [1, -1], [-1, 1]]) / np.sqrt(2)
 _SHAPE_STENCIL = np.concatenate([_STENCIL[1:], _DIAGONALS])
 
 _Factor = tuple[Array, bool]
-"""Cholesky factor as from `cho_factor`."""
+"""Cholesky factor as `scipy.linalg.cho_factor` returns it: matrix, and whether it is lower."""
 
 
 class Observations:
-    """Known values of some cubes on the unrolled skin, with their noise and prior.
+    """Known values of some cubes, with their noise and prior covariance, on the flattened skin.
 
     Attributes:
         y: Known values (D,) in Pa.
         size: Number D of known values.
-        noise: Noise covariance N (D, D).
-        prior: Prior covariance K (D, D) for a pressure of unit variance.
+        noise: Covariance N (D, D) of the noise and gain errors of the pads, in Pa^2.
+        prior: Prior covariance K (D, D) for a surface pressure of variance 1 Pa^2.
         sees_all: Whether every cube observes all components and nothing is missing.
         place: Positions (n, 2) of the cubes in m.
         pitch: Typical distance of neighbouring cubes, in m.
-        kernels: Kernels of the layer.
+        kernels: Covariances between components and traction, and responses, in the elastic layer.
     """
 
     def __init__(
@@ -145,15 +160,16 @@ class Observations:
         place: Array,
         angle: Array,
     ) -> None:
-        """Collect what is known.
+        """Select the known values of some cubes.
 
         Args:
-            inverse: Inverse of the skin.
-            values: Scaled values (n, C) of the cubes, NaN where unknown.
-            prior: Prior covariance (n C, n C) of the cubes.
+            inverse: Poses, noise and kernels of the skin.
+            values: Values (n, C) of the cubes in Pa as from `SurfaceInverse.scaled`, NaN where
+                unknown.
+            prior: Prior covariance (n C, n C) of the cubes' values as from `covariance_matrix`.
             cubes: Indices (n,) of the cubes.
-            place: Positions (n, 2) in m as from `SurfaceInverse.unroll`.
-            angle: Rotations (n,) in rad, likewise.
+            place: Positions (n, 2) of the cubes in m as from `SurfaceInverse.unroll`.
+            angle: Rotations (n,) of the cubes in rad as from `SurfaceInverse.unroll`.
         """
         self.kernels = inverse.kernels
         self.pitch = inverse.pitch
@@ -180,15 +196,16 @@ class Observations:
 
     @cached_property
     def rough_noise(self) -> Array:
-        """Noise covariance (D, D) with `ROUGH_GAIN_ERROR` instead of the gain errors."""
+        """Noise covariance (D, D) in Pa^2 with `ROUGH_GAIN_ERROR` instead of `GAIN_ERROR`."""
         mean_square = self._squared_stresses.mean(axis=1, keepdims=True)
         return self._noise_covariance(ROUGH_GAIN_ERROR**2 * mean_square)
 
     def _noise_covariance(self, gain_variance: Array) -> Array:
-        """Return the noise covariance (D, D).
+        """Return the covariance (D, D) in Pa^2 that noise and gain errors of the pads cause.
 
         Args:
-            gain_variance: Variance (n, P, 1) of each pad by its gain, divided by that of its noise.
+            gain_variance: Variance (n, P, 1) that the gain error of each pad causes, divided by the
+                variance of the pad's noise.
         """
         transposed = self._by_pad.swapaxes(1, 2)
         own = self._by_pad @ ((1 + gain_variance) * transposed)
@@ -201,25 +218,50 @@ class Observations:
         return np.asarray(all_components[known])
 
     def responses(self, centres: Array, size: float) -> Array:
-        """Compute the values (K, D, 3) under contacts with 1 N at K centres (K, 2) in m."""
+        """Compute the values under single contacts with a force of 1 N.
+
+        Args:
+            centres: Centres (K, 2) of K contacts on the flattened skin, in m.
+            size: Radius of each contact in m.
+
+        Returns:
+            Values (K, D, 3) in Pa/N, for a force along x, y and z.
+        """
         responses = self.kernels.response(*self._cubes_from(centres), size)
         return self._select_known(responses, len(centres))
 
     def cross(self, points: Array) -> Array:
-        """Compute the prior covariance (points, 3, D) of the traction at points with the values."""
+        """Compute the prior covariance of the traction at some points with the known values.
+
+        Args:
+            points: Positions (K, 2) on the flattened skin, in m.
+
+        Returns:
+            Covariance (K, 3, D) for a surface pressure of variance 1 Pa^2.
+        """
         cross = self.kernels.cross(*self._cubes_from(points))
         known = self._select_known(cross, len(points))
         return np.asarray(known.swapaxes(1, 2))
 
     def _cubes_from(self, points: Array) -> tuple[Array, Array, Index]:
-        """Return position (K n, 2), rotation and variant (K n,) of n cubes from K points (K, 2)."""
+        """Return arguments for `Kernels`: all pairs of the points (K, 2) with the n cubes.
+
+        Returns:
+            Positions (K n, 2) of the cubes from the points in m, rotations (K n,) of the cubes in
+            rad, and their variants (K n,) in the measurement model.
+        """
         count = len(points)
         offset = self.place - points[:, None]
         angle = np.tile(self._angle, count)
         return offset.reshape(-1, 2), angle, np.tile(self._variant, count)
 
     def _select_known(self, components: Array, count: int) -> Array:
-        """Select the known values (K, D, 3) of all components (K n, 15, 3) of n cubes."""
+        """Select the known values (K, D, 3) from all components (K n, 15, 3) of n cubes.
+
+        Args:
+            components: Components of the cubes for K points.
+            count: Number K of points.
+        """
         observed = components[:, self._columns].reshape(count, -1, 3)
         return np.asarray(observed[:, self._known])
 
@@ -231,14 +273,17 @@ class ContactFit(NamedTuple):
         centres: Centres (J, 2) in m.
         sizes: Radii (J,) in m.
         forces: Forces (J, 3) in N.
-        residual_scale: Standard deviation alpha of the pressure of the residual field, in Pa.
-        factor: Cholesky factor of W^-1 = alpha^2 K + S + N.
-        weighted_residual: W r (D,) with the residual r.
-        jacobian: Derivatives J (D, 6 contacts) of the values by all parameters.
-        shapes: Values (D, 3 contacts) that one standard deviation of each shape causes.
-        normal_matrix: J' W J + prior precision (6 contacts, 6 contacts).
-        score: -2 ln of the evidence (Laplace approximation). It compares fits of the same values,
-            also with different numbers of contacts; smaller is better.
+        residual_scale: Standard deviation alpha, in Pa, of the pressure that the contacts do not
+            explain (residual field).
+        factor: Cholesky factor (D, D) of W^-1 = alpha^2 K + S + N (file head).
+        weighted_residual: W r (D,) with the residual r, the values minus the contacts' response.
+        jacobian: Derivatives J (D, 6 J) of the values by the parameters of all contacts: force,
+            centre and ln a of the first contact, then those of the others.
+        shapes: Change (D, 3 J) of the values for one standard deviation of each shape (deviation
+            from a circular Hertz contact).
+        normal_matrix: Matrix (6 J, 6 J) of the normal equations, J' W J + prior precision.
+        score: -2 ln of the evidence (Laplace approximation), by which fits of the same values are
+            compared, also with different numbers of contacts. Smaller is better.
     """
 
     centres: Array
@@ -255,8 +300,9 @@ class ContactFit(NamedTuple):
     def covariance(self, j: int) -> Array:
         """Return the covariance (9, 9) of the parameters x of contact j and of its shapes s.
 
-        The order is force, centre, ln a, and the shapes divided by `SHAPE_DEVIATIONS`. The shapes
-        are a part of the noise in W; so with their values M and Q = M' W J::
+        The order is force, centre, ln a, and the coefficients of the shapes divided by
+        `SHAPE_DEVIATIONS`. The fit treats the shapes as a part of the noise in W. So with the
+        changes M of the values by the shapes (`shapes`) and Q = M' W J::
 
             cov(x) = (J' W J + prior)^-1,   cov(s, x) = -Q cov(x),
             cov(s) = 1 - M' W M + Q cov(x) Q'
@@ -284,18 +330,21 @@ def fit_contacts(
     residual_scale: float,
     steps: int,
 ) -> ContactFit:
-    """Fit contacts by Gauss-Newton steps.
+    """Fit J contacts by Gauss-Newton steps.
 
-    New contacts use the rough noise until they settle or only `FINE_STEPS` are left. A step of ln a
-    that takes back more than half of the previous one is halved: radius and flatness look alike,
-    and the shape covariance S is that of the previous radius, so fits of flat punches oscillate.
+    The fit of a new contact uses the larger noise with `ROUGH_GAIN_ERROR` until it has converged or
+    only `FINE_STEPS` steps are left. A step of ln a that takes back more than half of the previous
+    step is halved, because fits of flat punches oscillate: a larger radius and a larger flatness
+    have almost the same effect, and the covariance S of the shapes is computed with the radius of
+    the previous step.
 
     Args:
-        observations: Values of the cubes.
-        centres: Centres (J, 2) at the start, in m.
+        observations: Known values of the cubes, their noise and prior covariance.
+        centres: Centres (J, 2) at the start on the flattened skin, in m.
         sizes: Radii (J,) at the start, in m.
-        residual_scale: Residual scale alpha at the start, in Pa.
-        steps: `STEPS_NEW`, `STEPS_TRACKED` or `STEPS_EVALUATE`.
+        residual_scale: Start value of alpha, the standard deviation of the pressure that the
+            contacts do not explain, in Pa.
+        steps: Number of steps: `STEPS_NEW`, `STEPS_TRACKED` or `STEPS_EVALUATE`.
     """
     depth = observations.kernels.depth
     count = len(centres)
@@ -304,7 +353,7 @@ def fit_contacts(
     max_shift = MAX_SHIFT_PITCHES * observations.pitch
     log_sizes = np.log(sizes)
     usual_log_size = np.log(USUAL_SIZE * depth)
-    # `Kernels` interpolates up to the second and third last tabulated radius.
+    # `Kernels` interpolates responses between the second and the third last radius of its table.
     min_log_size = np.log(DISC_SIZES[1] * depth)
     max_log_size = np.log(DISC_SIZES[-3] * depth)
 
@@ -322,7 +371,8 @@ def fit_contacts(
             for centre, log_size in zip(centres, log_sizes, strict=True)
         ]
 
-        # Covariance with the shapes of the previous forces, then the forces by linear regression.
+        # The effect of the shapes is proportional to the forces. It is computed with the forces of
+        # the previous step, then the new forces follow by linear regression.
         pairs = zip(responses, forces, strict=True)
         shape_parts = [one.shapes @ force for one, force in pairs]
         shapes = np.concatenate(shape_parts).T  # (D, 3 contacts)
@@ -334,7 +384,8 @@ def fit_contacts(
 
         jacobian = _join_derivatives(responses, forces)
         residual = observations.y - response @ forces.ravel()
-        # Every second step, because each scale to compare needs its own Cholesky factor.
+        # The residual scale is optimised only in every second step, because every candidate needs
+        # a Cholesky factor of its own.
         if is_last or (steps == STEPS_NEW and not is_rough and step % 2 == 0):
             previous_scale = residual_scale
             candidates = residual_scale * _SCALE_FACTORS[steps]
@@ -349,7 +400,8 @@ def fit_contacts(
 
         weighted = cho_solve(factor, jacobian)
         normal_matrix = jacobian.T @ weighted + np.diag(precision)
-        # Without it, rounding could make the matrix of a vanishing contact singular.
+        # This tiny increase of the diagonal keeps the matrix invertible despite rounding errors if
+        # the force of a contact is almost 0.
         normal_matrix[np.diag_indices(len(normal_matrix))] *= 1 + 1e-9
         if is_last:
             break
@@ -364,7 +416,7 @@ def fit_contacts(
         largest_shift = np.abs(shift).max() / depth
         largest_growth = np.abs(growth).max()
 
-        # A step that takes back more than half of the previous one
+        # A step of ln a oscillates if it takes back more than half of the previous step.
         oscillates = growth * previous_growth < -(previous_growth**2) / 2
         growth[oscillates] /= 2
         previous_growth = growth.copy()
@@ -396,7 +448,15 @@ def fit_contacts(
 
 
 def _prior_precision(count: int, pitch: float) -> Array:
-    """Return the prior precisions (6 contacts,) of the parameters of all contacts."""
+    """Return the prior precisions (1 / variance) of the parameters of all contacts.
+
+    Args:
+        count: Number J of contacts.
+        pitch: Prior standard deviation of the centres in m: the distance of neighbouring cubes.
+
+    Returns:
+        Precisions (6 J,) in the order force, centre, ln a of each contact.
+    """
     force = [FORCE_DEVIATION**-2] * 3
     centre = [pitch**-2] * 2
     return np.tile(
@@ -414,8 +474,18 @@ def _regress(
     response: Array,
     y: Array,
 ) -> Array:
-    """Return the forces (3 contacts,) that explain the values y best, weighted with W."""
-    # R' W R f = R' W y. Contacts on the same place make it singular, so lstsq.
+    """Compute the forces of J contacts by weighted linear regression.
+
+    Args:
+        factor: Cholesky factor (D, D) of the covariance W^-1 of the values.
+        response: Values (D, 3 J) in Pa per N of each force component.
+        y: Measured values (D,) in Pa.
+
+    Returns:
+        Forces (3 J,) in N that explain the values best.
+    """
+    # Normal equations R' W R f = R' W y. Least squares instead of `solve`, because two contacts at
+    # the same position make the matrix singular.
     weighted = cho_solve(factor, response)
     return np.asarray(
         np.linalg.lstsq(
@@ -427,12 +497,14 @@ def _regress(
 
 
 class ContactResponse(NamedTuple):
-    """Values D under a contact with 1 N, and how they change with its centre, radius and shape.
+    """Response of D values to a contact, and its derivatives by centre, radius and shapes.
 
     Attributes:
-        response: Values (D, 3) per N along x, y and z.
-        slopes: Derivatives (3, D, 3) of them by c_x, c_y and ln a.
-        shapes: Changes (3, D, 3) by one standard deviation of each shape.
+        response: Values (D, 3) in Pa per N of force along x, y and z.
+        slopes: Derivatives (3, D, 3) of the response by the centre c_x, c_y in m and by ln a, the
+            natural logarithm of the radius.
+        shapes: Changes (3, D, 3) of the response for one standard deviation of each shape
+            (deviation from a circular Hertz contact).
     """
 
     response: Array
@@ -450,8 +522,9 @@ class ContactResponse(NamedTuple):
         """Compute response and derivatives by central differences.
 
         Args:
-            respond: Function that returns the values (K, D, 3) for K centres (K, 2) and a radius.
-            depth: Distance from the cubes to the surface, in m.
+            respond: Function that returns the values (K, D, 3) in Pa/N for K centres (K, 2) in m
+                and one radius in m.
+            depth: Distance from the centres of the cubes to the surface, in m.
             centre: Centre (2,) of the contact in m.
             size: Radius of the contact in m.
         """
@@ -467,11 +540,11 @@ class ContactResponse(NamedTuple):
         by_log_size = (wider - narrower) / (2 * SHAPE_WIDENING)
         slopes = np.concatenate([by_centre, by_log_size[None]])
 
-        # Length: contacts displaced along an axis, minus contacts displaced across it.
+        # Elongation shapes: contacts shifted along an axis, minus contacts shifted across it.
         both_sides = moved[5:].reshape(4, 2, *response.shape)
         axes = both_sides.sum(axis=1) / 4
-        # Flatness: the contact minus a mixture of a narrower and a wider one. The share of the
-        # wider one keeps the second moment of the pressure.
+        # Flatness shape: the contact minus a mixture of a narrower and a wider contact. The share
+        # of the wider contact is chosen so that the second moment of the pressure stays the same.
         shrink = np.exp(-2 * SHAPE_WIDENING)
         grow = np.exp(2 * SHAPE_WIDENING)
         share = (1 - shrink) / (grow - shrink)
@@ -490,21 +563,29 @@ class ContactResponse(NamedTuple):
         )
 
     def by_parameters(self, force: Array) -> Array:
-        """Compute the derivatives with respect to all parameters of a contact.
+        """Compute the derivatives of the values with respect to all parameters of a contact.
 
         Args:
             force: Force (3,) of the contact in N.
 
         Returns:
-            Derivatives (D, 9) by force, centre, logarithm of the radius, and the shapes.
+            Derivatives (D, 9) by force, centre, logarithm of the radius, and the coefficients of
+            the shapes divided by `SHAPE_DEVIATIONS`.
         """
         moved = np.concatenate([self.slopes, self.shapes]) @ force
         return np.concatenate([self.response, moved.T], axis=1)
 
 
 def _join_derivatives(responses: list[ContactResponse], forces: Array) -> Array:
-    """Return the Jacobian (D, 6 contacts)."""
-    # Columns per contact: f_x, f_y, f_z, c_x, c_y, ln a
+    """Compute the Jacobian of D values by the parameters of J contacts.
+
+    Args:
+        responses: Response to each contact and its derivatives.
+        forces: Forces (J, 3) in N.
+
+    Returns:
+        Jacobian (D, 6 J). The columns of a contact are f_x, f_y, f_z, c_x, c_y and ln a.
+    """
     blocks = []
     for one, force in zip(responses, forces, strict=True):
         blocks += [one.response, (one.slopes @ force).T]
@@ -516,12 +597,17 @@ def _factorise(
     noise: Array,
     residual_scale: float,
 ) -> _Factor:
-    """Return the Cholesky factor of alpha^2 K + noise.
+    """Return the Cholesky factor of alpha^2 K + noise, with the residual scale alpha in Pa.
 
-    scipy instead of numpy: several products use one factor. For 240 values, that takes 0.3 ms
-    instead of 2.4 ms with numpy's solver.
+    SciPy's factor can be used for several products, which NumPy's solver cannot. For 240 values,
+    this takes 0.3 ms instead of 2.4 ms.
+
+    Args:
+        observations: Values with their prior covariance K (D, D).
+        noise: Covariance (D, D) of noise and shapes, in Pa^2.
+        residual_scale: Standard deviation alpha of the pressure that the contacts do not explain.
     """
-    # The transpose is the same matrix, in the memory order of LAPACK.
+    # The matrix is symmetric; its transpose has the memory order of LAPACK, which avoids a copy.
     matrix = (residual_scale**2 * observations.prior + noise).T
     factor: _Factor = cho_factor(
         matrix,
@@ -540,19 +626,21 @@ def _best_scale(
     precision: Array,
     candidates: Array,
 ) -> tuple[float, float, _Factor]:
-    """Find the residual scale with the greatest evidence.
+    """Find the residual scale with the greatest evidence (smallest score).
 
-    With unit priors of the parameters (columns J precision^-1/2), the score is::
+    If each parameter is divided by its prior standard deviation (columns of J times
+    precision^-1/2), the score -2 ln(evidence) is, up to a constant::
 
         r' W r - r' W J (J' W J + 1)^-1 J' W r + ln det W^-1 + ln det (J' W J + 1)
 
     Args:
-        observations: Values of the cubes.
-        noise: Covariance S + N (D, D).
-        jacobian: Derivatives J (D, parameters).
-        residual: Residual r (D,) of the contacts.
-        precision: Prior precisions (parameters,).
-        candidates: Residual scales to compare, in Pa.
+        observations: Known values of the cubes and their prior covariance.
+        noise: Covariance S + N (D, D) of shapes and noise, in Pa^2.
+        jacobian: Derivatives J (D, parameters) of the values by the parameters.
+        residual: Values minus the response to the contacts, r (D,) in Pa.
+        precision: Prior precisions (1 / variance) of the parameters (parameters,).
+        candidates: Residual scales (standard deviations of the pressure that the contacts do not
+            explain) to compare, in Pa.
 
     Returns:
         The best scale, its score, and the Cholesky factor of W^-1.

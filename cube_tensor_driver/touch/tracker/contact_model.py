@@ -1,4 +1,7 @@
-"""Hertz contacts on a skin, the response of the cubes to them and their traction on the surface."""
+"""Hertz contacts on a skin: the response of the cubes to them and their traction on the surface.
+
+The pressure of a Hertz contact of radius a falls from its centre to its rim as sqrt(1 - r^2/a^2).
+"""
 
 from __future__ import annotations
 
@@ -15,15 +18,16 @@ from ..surface import square_points
 from .contact_fit import ContactResponse
 
 SUBPOINTS = 8
-"""Number of positions along each side of the square that a point of the surface stands for. The
-traction of a contact is averaged over them, because it may be narrower than the square."""
+"""Number of positions along each side of the square that a point of the surface represents. The
+traction of a contact is averaged over them, because a contact may be narrower than the square."""
 
 _PRESSURE_REACH_DEPTHS = 6.0
-"""Distance, in depths, beyond which the pressure of a contact counts as zero."""
+"""Distance from the centre of a contact beyond which its pressure at the depth of the cubes counts
+as zero, divided by this depth (of the cubes' centres below the surface)."""
 
 _MIN_FACING = 0.5
-"""Smallest cosine between the normals of two cubes of which one responds to contacts on the
-other."""
+"""Smallest cosine of the angle between the outward normals of two cubes at which one of them
+responds to a contact above the other. On a bent skin, cubes that face away do not respond."""
 
 
 @dataclass
@@ -33,18 +37,20 @@ class HertzContact:
     Attributes:
         id: Number that stays the same as long as the contact is tracked.
         home: Index of the home cube.
-        place: Position (2,) of the centre in the frame of the home, in m.
+        place: Position (2,) of the centre in the x-y plane of the home cube, in m.
         size: Radius in m.
-        force: Force (3,) in N on the skin.
-        residual_scale: Standard deviation of the pressure of the residual field around it, in Pa.
-        place_ambiguity: Variance of the position in m^2 because fits from other starts ended
-            elsewhere; infinite before the first fit, 0 if they all agree.
-        force_ambiguity: Variance (3,) of the force in N^2 for the same reason.
+        force: Force (3,) in N on the skin, in the frame of the home cube.
+        residual_scale: Standard deviation, in Pa, of the pressure that the contacts do not explain
+            (residual field) around this contact.
+        place_ambiguity: Variance of the position in m^2 over fits from several starts; infinite
+            before the first fit, 0 if all fits ended at the same position.
+        force_ambiguity: Variance (3,) of the force in N^2 over these fits.
         covariance: Covariance (9, 9) of force, position, ln(size) and shapes as from
-            `ContactFit.covariance`, plus these ambiguities.
-        split_tested_at: Residual scale in Pa at the last test whether the contact is two; 0: none.
-        was_split: Whether it came from a split (contact_split.py) and is told apart from its
-            neighbour by the likelihood alone.
+            `ContactFit.covariance`, plus the two ambiguities.
+        split_tested_at: Residual scale in Pa at the last test whether the contact is in fact two
+            contacts; 0 if it was not tested.
+        was_split: Whether the contact is one of two into which a contact was split
+            (contact_split.py). The pressure between such contacts need not have a valley.
     """
 
     id: int
@@ -64,7 +70,7 @@ class ContactModel:
     """Computes the response of all cubes to Hertz contacts, and the traction on the surface.
 
     Attributes:
-        inverse: Inverse of the skin.
+        inverse: Poses, surface points and kernels of the skin.
     """
 
     def __init__(self, inverse: SurfaceInverse) -> None:
@@ -81,11 +87,11 @@ class ContactModel:
         return np.asarray(poses.position[contact.home] + offset)
 
     def response(self, contacts: list[HertzContact]) -> Array:
-        """Compute the response (cubes, C) of all cubes to contacts, in Pa."""
+        """Compute the components (cubes, C) in Pa that all cubes measure under some contacts."""
         inverse = self.inverse
         total = np.zeros(inverse.observed.shape)
         for contact in contacts:
-            # The skin is unrolled around the home, in whose frame the position is given.
+            # The skin is laid flat around the home cube, in whose frame the contact is described.
             cubes, place, angle = self._cubes_around(contact.home)
             offset = place - contact.place
             variant = inverse.variant[cubes]
@@ -94,7 +100,7 @@ class ContactModel:
         return total
 
     def depth_pressure(self, contacts: list[HertzContact]) -> Array:
-        """Compute the pressure (M,) of contacts below all points at the cubes' depth, in Pa."""
+        """Compute the pressure (M,) in Pa of contacts, at the cubes' depth below all M points."""
         pressure = np.zeros(len(self.inverse.points))
         for contact in contacts:
             points, offset, _ = self._points_around(contact)
@@ -112,13 +118,14 @@ class ContactModel:
         """Add the traction of contacts to the residual field.
 
         Args:
-            residual: Field that the contacts do not explain.
-            depth_pressure: Total pressure (M,) at the cubes' depth, contacts included.
+            residual: Traction field that the contacts do not explain.
+            depth_pressure: Total pressure (M,) at the cubes' depth in Pa, contacts included.
             contacts: Contacts to add.
 
         Returns:
-            Total field. The traction of a contact is the mean over the square of each point, so
-            that the sum over all points is the force, however small the contact is.
+            Total field. The traction of a contact is averaged over the square that each point
+            represents, so that the sum over all points times the area of a square is the force,
+            however small the contact is.
         """
         traction = residual.traction.copy()
         for contact in contacts:
@@ -130,10 +137,11 @@ class ContactModel:
         return TractionField(traction, depth_pressure)
 
     def pressure_variance(self, contacts: list[HertzContact]) -> Array:
-        """Compute the variances (M, 2) of the pressure that the covariances of contacts cause.
+        """Compute the variances of the pressure that the covariances of the contacts cause.
 
         Returns:
-            Variances in Pa^2 of the pressure on the surface, and of that at the cubes' depth.
+            Variances (M, 2) in Pa^2 of the pressure on the surface, and of the pressure at the
+            cubes' depth.
         """
         total = np.zeros((len(self.inverse.points), 2))
         for contact in contacts:
@@ -141,10 +149,10 @@ class ContactModel:
         return total
 
     def _add_pressure_variance(self, total: Array, contact: HertzContact) -> None:
-        """Add the variances of one contact to `total` (M, 2)."""
+        """Add the pressure variances of one contact to `total` (M, 2): on the surface, at depth."""
         inverse = self.inverse
         points, offset, rotation = self._points_around(contact)
-        # The shapes of a contact do not extend beyond twice its radius.
+        # A contact with its deviations from a circle (shapes) ends within twice its radius.
         reach = 2 * contact.size + inverse.spacing
         touched = np.linalg.norm(offset, axis=1) < reach
         subpoints = offset[touched][:, None] + self._subpoints
@@ -173,7 +181,8 @@ class ContactModel:
             ),
             (1, points, pressure_at_depth),
         )
-        # var(p) = slopes cov slopes'
+        # Error propagation: var(p) = S C S' with the derivatives S of the pressure p by the
+        # parameters of the contact and the parameters' covariance C.
         for column, chosen, respond in parts:
             response = ContactResponse.linearise(
                 respond,
@@ -189,8 +198,9 @@ class ContactModel:
         """Find the points near a contact.
 
         Returns:
-            Indices (n,) of the points, their positions (n, 2) from the centre in the frame of the
-            contact's home, and the rotations (n, 3, 3) from that frame to the points'.
+            Indices (n,) of the points, their positions (n, 2) from the contact's centre in the
+            frame of its home cube in m, and the rotations (n, 3, 3) from the frame of the home cube
+            to the frame of each point's cube.
         """
         inverse = self.inverse
         centre = self.centre(contact)
@@ -207,18 +217,21 @@ class ContactModel:
         return points, local[:, :2], to_point
 
     def _cubes_around(self, home: int) -> tuple[Index, Array, Array]:
-        """Find the cubes that respond to contacts of a home.
+        """Find the cubes that measure a contact whose nearest cube (home) is given.
+
+        Args:
+            home: Index of the home cube.
 
         Returns:
-            Indices (n,) of the cubes, their positions (n, 2) and rotations (n,) on the skin
-            unrolled around the home.
+            Indices (n,) of the cubes, and their positions (n, 2) in m and rotations (n,) in rad on
+            the skin laid flat around the home cube.
         """
         inverse = self.inverse
         poses = inverse.poses
         reach = REACH_DEPTHS * inverse.depth
         near = self._cubes.query_ball_point(poses.position[home], reach)
         cubes = np.array(sorted(near), np.intp)
-        # On a bent skin, cubes on the other side do not respond.
+        # On a bent skin, cubes that face away from the home cube do not measure its contacts.
         facing = poses.rotation[cubes, :, 2] @ poses.rotation[home, :, 2]
         cubes = cubes[facing > _MIN_FACING]
         return cubes, *inverse.unroll(home, cubes)
@@ -230,5 +243,5 @@ class ContactModel:
         return np.asarray(found, dtype=np.intp).reshape(-1)
 
     def nearest_points(self, positions: Array) -> Index:
-        """Return the index (n,) of the surface point nearest to each position (n, 3)."""
+        """Return the index (n,) of the surface point nearest to each position (n, 3) in m."""
         return np.asarray(self._points.query(positions)[1], dtype=np.intp)

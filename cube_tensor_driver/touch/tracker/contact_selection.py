@@ -1,6 +1,6 @@
-"""Number of contacts: detection of new ones, merging of pairs, pruning of vanished ones.
+"""Number of contacts: detection of new ones, merging of pairs, removal of those that have ended.
 
-All pressures here are those at the depth of the cubes.
+All pressures in this file are pressures in the plane of the cubes' centres, not on the surface.
 """
 
 from __future__ import annotations
@@ -13,36 +13,42 @@ from ...core.arrays import Array
 from .contact_model import ContactModel, HertzContact
 
 DETECTION_FRACTION = 0.2
-"""Fraction of the largest pressure that the residual must exceed for a new contact."""
+"""Pressure that the present contacts do not explain, divided by the largest total pressure on the
+skin, above which a new contact is detected. An absolute threshold applies in addition."""
 
 PRUNING_FRACTION = 0.1
-"""Fraction of the peak pressure of the strongest contact below which a contact ends. It is smaller
-than `DETECTION_FRACTION`, so that a contact near the limit does not flicker."""
+"""Peak pressure of a contact, divided by the peak pressure of the strongest contact, below which
+the contact is removed. It is smaller than `DETECTION_FRACTION`, so that a contact near the
+threshold is not removed and detected again in turn."""
 
 MIN_DISTANCE_PITCHES = 1.0
-"""Smallest distance, in cube pitches, of a new contact from all others."""
+"""Smallest distance of a new contact from every other one, divided by the pitch (distance of
+neighbouring cubes)."""
 
 MERGE_DISTANCE_PITCHES = 0.7
-"""Distance, in cube pitches, below which two contacts become one. It is smaller than
-`MIN_DISTANCE_PITCHES`, so that a contact near the limit does not flicker."""
+"""Distance of two contacts, divided by the pitch (distance of neighbouring cubes), below which the
+younger one is removed. It is smaller than `MIN_DISTANCE_PITCHES`, so that a contact near the
+threshold is not removed and detected again in turn."""
 
 DETECTION_VALLEY = 0.8
-"""Lowest pressure between a new contact and another one, divided by the smaller of their pressures,
-below which they are two."""
+"""Threshold of the valley ratio (lowest pressure on the line between two positions, divided by the
+lower pressure at its ends) for a new contact. A new contact is accepted only if its valley ratio to
+every other contact is smaller."""
 
 MERGE_VALLEY = 0.92
-"""Lowest pressure between two existing contacts, divided by the smaller of their pressures, above
-which they become one."""
+"""Threshold of the valley ratio (lowest pressure on the line between two positions, divided by the
+lower pressure at its ends) above which two contacts are merged into one."""
 
 SPLIT_OVERLAP = 0.6
-"""Distance of two contacts that a split of one contact made (contact_split.py), divided by the sum
-of their radii, below which they become one again."""
+"""Distance of two contacts, divided by the sum of their radii, below which they are merged if both
+were made by splitting a contact (contact_split.py)."""
 
 _VALLEY_SAMPLES = 9
-"""Number of positions along the line on which a valley is searched."""
+"""Number of positions on the line between two contacts at which the pressure is compared, the ends
+included."""
 
 _MIN_PRESSURE = 1e-9
-"""Smallest pressure in Pa that is divided by."""
+"""Smallest pressure in Pa in a denominator; it avoids a division by 0."""
 
 
 def detect_contact(
@@ -53,19 +59,20 @@ def detect_contact(
     tried: list[Array],
     min_pressure: float,
 ) -> int | None:
-    """Find the point at which the next contact begins.
+    """Find the point of the surface at which a new contact is started.
 
     Args:
         model: Model of the skin.
-        contacts: Contacts so far.
-        residual: Pressure (M,) that the contacts do not explain, in Pa.
+        contacts: Present contacts.
+        residual: Pressure (M,) that the present contacts do not explain, in Pa.
         pressure: Total pressure (M,) in Pa.
-        tried: Positions (3,) at which a contact was tried already, in m.
-        min_pressure: Pressure from which on something is a contact, in Pa.
+        tried: Positions (3,) in m at which a contact was already started in this scan.
+        min_pressure: Smallest pressure of a new contact in Pa.
 
     Returns:
-        The index of the point with the highest residual that is separated from all contacts by
-        distance and by a valley of the pressure; None if there is none.
+        Index of the point with the highest residual among those whose residual is above the
+        thresholds and that are separated from all contacts, both by `MIN_DISTANCE_PITCHES` and by a
+        valley of the pressure. None if there is no such point.
     """
     threshold = max(
         min_pressure,
@@ -78,7 +85,8 @@ def detect_contact(
         distance = np.linalg.norm(points - centre, axis=1)
         is_candidate &= distance > MIN_DISTANCE_PITCHES * model.inverse.pitch
 
-    # The highest residual may be the flank of a known contact: then the next one is tried.
+    # The highest residual may lie on the flank of a present contact, without a valley in between.
+    # Then the point with the next lower residual is tested.
     highest_first = np.argsort(-np.where(is_candidate, residual, -np.inf))
     for candidate in highest_first[: is_candidate.sum()].tolist():
         position = points[candidate]
@@ -93,9 +101,18 @@ def find_pair_to_merge(
     contacts: list[HertzContact],
     pressure: Array,
 ) -> tuple[HertzContact, HertzContact] | None:
-    """Return two contacts without a valley of the pressure (M,) between them, the older one first.
+    """Find two contacts that are really one, because the pressure between them has no valley.
 
-    Two contacts from a split need no valley, but must not overlap much.
+    Two contacts that were made by splitting one contact need no valley. They count as one if they
+    overlap too much (`SPLIT_OVERLAP`).
+
+    Args:
+        model: Model of the skin.
+        contacts: Contacts, the oldest first.
+        pressure: Total pressure (M,) at all points in Pa.
+
+    Returns:
+        The first such pair, the older contact first; None if there is no such pair.
     """
     for older, younger in itertools.combinations(contacts, 2):
         first = model.centre(older)
@@ -115,12 +132,15 @@ def prune_contacts(
     contacts: list[HertzContact],
     min_pressure: float,
 ) -> list[HertzContact]:
-    """Remove contacts that pull, are weak or lie close to an older one.
+    """Remove contacts that pull at the skin, are weak, or lie close to an older one.
 
     Args:
         model: Model of the skin.
         contacts: Contacts to check.
-        min_pressure: Pressure from which on something is a contact, in Pa.
+        min_pressure: Smallest pressure of a new contact in Pa; a contact is weak below half of it.
+
+    Returns:
+        The other contacts, the oldest first.
     """
     origin = np.zeros((1, 2))
     kernels = model.inverse.kernels
@@ -129,14 +149,16 @@ def prune_contacts(
         for contact in contacts
     }
     strongest = max(peaks.values(), default=0.0)
-    # Half of the pressure at which a contact begins, so that it does not flicker.
+    # A contact ends at half of the pressure at which it begins, so that a contact near the
+    # threshold is not removed and detected again in turn.
     threshold = max(min_pressure / 2, PRUNING_FRACTION * strongest)
 
-    # In the order of their ids: an older contact is kept, a younger one beside it ends.
+    # Ids increase with time, so older contacts come first: they stay, younger ones beside them end.
     kept: list[HertzContact] = []
     for contact in sorted(contacts, key=lambda one: one.id):
         centre = model.centre(contact)
-        # Contacts from a split may be close to each other; `find_pair_to_merge` checks these.
+        # Contacts that were made by a split may be close to each other; `find_pair_to_merge`
+        # decides about them.
         others = [one for one in kept if not (contact.was_split and one.was_split)]
         offsets = [centre - model.centre(one) for one in others]
         distances = [float(np.linalg.norm(offset)) for offset in offsets]
@@ -156,13 +178,13 @@ def valley_ratio(
 
     Args:
         model: Model of the skin.
-        first: Position (3,) in m.
-        second: Position (3,) in m.
-        pressure: Pressure (M,) on all points.
+        first: Position (3,) of one end of a line, in m.
+        second: Position (3,) of its other end, in m.
+        pressure: Pressure (M,) at all points of the surface, in Pa.
 
     Returns:
-        Lowest pressure along the line between them, divided by the lower one of the pressures at
-        its ends; 1 if the pressure does not fall at all.
+        Lowest pressure along the line, divided by the lower one of the pressures at its ends; 1 if
+        the pressure does not fall at all.
     """
     fractions = np.linspace(0, 1, _VALLEY_SAMPLES)[:, None]
     path = first + fractions * (second - first)

@@ -1,8 +1,9 @@
 """Test whether one fitted contact is really two contacts beside each other.
 
-Two balls that touch look like one ball with a large residual, or like one long contact. A fit of
-one contact does not converge to two. So pairs are tried as starts: a second contact beside the
-fitted one in eight directions, and two halves of it in four. The most likely starts are fitted.
+Two balls side by side have almost the same response as one ball with a large residual, or as one
+elongated contact. A fit with one contact cannot turn into two. So pairs of contacts are tried as
+starts: a second contact beside the fitted one in eight directions, and two halves of the fitted one
+in four directions. The most likely starts are fitted.
 """
 
 from __future__ import annotations
@@ -20,21 +21,25 @@ from .contact_fit import (
 )
 
 FITTED_PAIRS = 3
-"""Number of pairs that are fitted: those with the greatest evidence at their start."""
+"""Number of pairs of contacts, out of all starts that are tried, for which a fit is computed: those
+with the greatest evidence before the fit."""
 
 MIN_PAIR_DISTANCE = 0.8
-"""Smallest distance of two contacts divided by the sum of their radii: two bodies cannot press on
-the same place."""
+"""Smallest distance of the centres of two contacts, divided by the sum of their radii, at which a
+contact is split into them. Two bodies cannot press on the same part of the surface."""
 
 MAX_PAIR_DISTANCE = 1.5
-"""Largest distance of two contacts divided by the sum of their radii: between contacts farther
-apart, the pressure has a valley (contact_selection.py)."""
+"""Largest distance of the centres of two contacts, divided by the sum of their radii, at which a
+contact is split into them. Between contacts farther apart, the pressure has a valley, and
+contact_selection.py finds the second one."""
 
 MIN_FORCE_RATIO = 0.1
-"""Smallest ratio of the smaller to the larger normal force: the rim of a punch is no contact."""
+"""Smallest ratio of the smaller to the larger normal force of two contacts into which a contact is
+split. With a smaller ratio, the second contact would describe the rim of a punch."""
 
 _ANGLES = 2 * np.pi * np.arange(8) / 8
 _DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
+"""Unit vectors (8, 2) in the plane of the surface, from a fitted contact to a second one."""
 
 
 def split_contact(
@@ -44,25 +49,28 @@ def split_contact(
     start_scale: float,
     max_scale: float,
 ) -> ContactFit | None:
-    """Fit two contacts in place of contact j.
+    """Fit two contacts in place of contact j, and decide whether they replace it.
+
+    The residual scale is the standard deviation of the pressure that the contacts do not explain.
 
     Args:
-        observations: Values of the cubes.
-        one: Fit with one contact.
+        observations: Known values of the cubes, their noise and prior covariance.
+        one: Fit in which contact j is a single contact.
         j: Index of this contact.
         start_scale: Residual scale with which the fits begin, in Pa.
-        max_scale: Largest residual scale of an acceptable fit of two, in Pa.
+        max_scale: Largest residual scale of an acceptable fit with two contacts, in Pa.
 
     Returns:
-        Fit whose last contact is the new one. None if two contacts are less likely than one, do not
-        both press, do not lie beside each other or leave too large a residual.
+        Fit with one more contact, which is the last one. None if the two contacts are less likely
+        than one, do not both press on the skin, do not lie side by side, or leave a residual scale
+        above `max_scale`.
     """
     size = max(one.sizes[j], USUAL_SIZE * observations.kernels.depth)
     starts = [
         _evaluate_pair(observations, one, j, pair, start_scale)
         for pair in _list_pairs(one.centres[j], size)
     ]
-    # A smaller score is more likely.
+    # The score is -2 ln of the evidence: the start with the smallest score is the most likely.
     likeliest = sorted(starts, key=lambda start: start.score)[:FITTED_PAIRS]
     fits = [
         fit_contacts(observations, start.centres, start.sizes, start_scale, STEPS_NEW)
@@ -74,7 +82,8 @@ def split_contact(
     distances = np.linalg.norm(offsets, axis=1)
     ratios = distances / (two.sizes[:-1] + two.sizes[-1])
     is_beside = ratios.min() > MIN_PAIR_DISTANCE and ratios[j] < MAX_PAIR_DISTANCE
-    # Both must press: a fit can explain a residual by a contact that pulls.
+    # Both contacts must press on the skin, because a fit can also explain a residual by a contact
+    # that pulls at it.
     smaller, larger = np.sort(-two.forces[[j, -1], 2])
     both_press = smaller > MIN_FORCE_RATIO * larger
     is_better = two.score < one.score and two.residual_scale < max_scale
@@ -82,8 +91,16 @@ def split_contact(
 
 
 def _list_pairs(centre: Array, size: float) -> list[tuple[Array, Array, float]]:
-    """Return centres (2,) of two contacts and their radius: one beside the other, or two halves."""
-    # Touching circles of equal size, and two circles with half the radius inside the fitted one.
+    """List the pairs of contacts that are tried in place of one contact.
+
+    Args:
+        centre: Centre (2,) of the fitted contact in m.
+        size: Radius of the fitted contact in m.
+
+    Returns:
+        Centres (2,) of the two contacts and their common radius, in m. First the fitted contact
+        with an equal one that touches it, then two circles with half the radius inside it.
+    """
     beside = [
         (
             centre,
@@ -111,7 +128,15 @@ def _evaluate_pair(
     pair: tuple[Array, Array, float],
     start_scale: float,
 ) -> ContactFit:
-    """Compute the evidence of a pair in place of contact j, without moving it."""
+    """Compute the evidence of a pair of contacts in place of contact j, without moving them.
+
+    Args:
+        observations: Known values of the cubes, their noise and prior covariance.
+        one: Fit in which contact j is a single contact.
+        j: Index of this contact.
+        pair: Both centres (2,) and the common radius, in m.
+        start_scale: Standard deviation of the pressure that the contacts do not explain, in Pa.
+    """
     first, second, size = pair
     centres = np.vstack([one.centres, second])
     sizes = np.append(one.sizes, size)

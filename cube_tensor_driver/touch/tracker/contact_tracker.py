@@ -1,10 +1,11 @@
-"""Contact tracker: contacts from the values of all cubes, followed from scan to scan.
+"""Contact tracker: finds contacts from the values of all cubes, follows them from scan to scan.
 
-A contact is narrow, which a prior that is the same everywhere does not know. So the traction is the
-sum of Hertz contacts and of a Gaussian process for the residual. contact_model.py computes the
-effect of the contacts, contact_fit.py fits them, contact_estimate.py computes force and position
-with standard deviations, contact_selection.py decides how many contacts there are, and
-contact_split.py whether one of them is really two.
+A Gaussian prior that is the same everywhere on the surface cannot describe that contacts are
+narrow. Therefore, the traction is modelled as the sum of Hertz contacts and of a residual field, a
+Gaussian process for what the contacts do not explain. contact_model.py computes the response to the
+contacts, contact_fit.py fits them, contact_estimate.py computes force and position with standard
+deviations, contact_selection.py decides how many contacts there are, and contact_split.py tests
+whether one contact is really two.
 """
 
 from __future__ import annotations
@@ -32,39 +33,44 @@ from .contact_selection import detect_contact, find_pair_to_merge, prune_contact
 from .contact_split import split_contact
 
 CUBES_PER_CONTACT = 16
-"""Number of cubes nearest to a contact from whose values it is computed."""
+"""Number of cubes from whose values a contact is fitted: those nearest to it."""
 
 MAX_CONTACTS = 10
-"""Largest number of contacts that are tracked at the same time."""
+"""Largest number of contacts tracked at the same time on one skin."""
 
 MAX_CONTACTS_PER_FIT = 4
-"""Largest number of contacts in one fit, whose time grows with the cube of this number."""
+"""Largest number n of contacts that are fitted jointly; the time of a fit grows with n^3."""
 
 JOINT_FIT_PITCHES = 4.0
-"""Distance, in cube pitches, below which contacts share cubes and are fitted together."""
+"""Distance of two contacts, divided by the pitch (distance of neighbouring cubes), below which they
+are fitted jointly, because many of their nearest cubes are the same."""
 
 LARGE_RESIDUAL = 0.02
-"""Residual scale (standard deviation of the residual pressure) divided by `AMPLITUDE` above which a
-fit may be wrong, so that other starts are tried."""
+"""Residual scale (standard deviation of the pressure that the contacts do not explain), divided by
+`AMPLITUDE`, above which a fit counts as possibly wrong and is repeated from other starts."""
 
 WIDE_SIZE = 2.5
-"""Radius divided by the depth with which a fit that leaves a large residual starts once more, since
-the true contact may be wide."""
+"""Radius, divided by the depth of the cubes' centres, with which the fit of a contact is repeated
+if it leaves a large residual. The true contact may be wide, and the usual start radius is small."""
 
 POSITION_TOLERANCE_PITCHES = 0.005
-"""Standard deviation of the positions that different starts lead to, in cube pitches, above which
-the position is ambiguous and the starts are tried again in the next scan."""
+"""Standard deviation of the positions at which fits from different starts end, divided by the pitch
+(distance of neighbouring cubes). Above it, the position of the contact counts as ambiguous, and the
+other starts are tried again in the next scan."""
 
 RESTART_CUBES = 4
-"""Number of nearest cubes around which a new contact with a large residual is searched."""
+"""Number of cubes around which fits of a new contact are started if its first fit leaves a large
+residual: those nearest to the result of this fit."""
 
 START_SCALE = 0.05 * AMPLITUDE
-"""Residual scale in Pa with which the fit of a new contact begins."""
+"""Start value, in Pa, of the residual scale (standard deviation of the pressure that the contacts
+do not explain) in the fit of a new contact."""
 
 _MIN_VALUES_PER_CONTACT = 6
 """Smallest number of known values per contact for a fit: a contact has six parameters."""
 
 _CORNERS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
+"""Signs (4, 2) of x and y for the four mirror images of a position about the axes of a cube."""
 
 
 class TrackedContact(NamedTuple):
@@ -76,13 +82,13 @@ class TrackedContact(NamedTuple):
             surface.
         normal: Unit normal (3,) out of the skin.
         force: Force (3,) in N on the skin.
-        normal_force: Normal force in N; pressing is positive.
-        shear_force: Tangential force in N.
-        moment: Moment about the normal through the position, in N m.
+        normal_force: Normal force in N, positive for a body that presses on the skin.
+        shear_force: Length of the tangential force in N.
+        moment: Moment of the traction about the normal through `position`, in N m.
         area: Area of the Hertz contact that fits best, in m^2.
         position_uncertainty: Standard deviation of the position along each axis, in m.
         force_uncertainty: Standard deviation of the normal force, in N.
-        shear_uncertainty: Standard deviation of the tangential force, in N.
+        shear_uncertainty: Standard deviation of `shear_force`, in N.
         moment_uncertainty: Standard deviation of the moment, in N m.
         area_uncertainty: Standard deviation of the area, in m^2.
     """
@@ -103,19 +109,19 @@ class TrackedContact(NamedTuple):
 
 
 class ContactTracker:
-    """Follows the contacts of a skin from scan to scan.
+    """Follows the contacts of a skin from scan to scan (a scan is one set of values of all cubes).
 
     Attributes:
-        field: Traction on the surface in the newest scan, contacts included; 0 before the first.
+        field: Traction on the surface in the newest scan, contacts included; 0 before the first
+            scan.
     """
 
     def __init__(self, inverse: SurfaceInverse, min_pressure: float) -> None:
-        """Begin without contacts.
+        """Create a tracker without contacts.
 
         Args:
-            inverse: Inverse of the skin.
-            min_pressure: Pressure at the depth of the cubes from which on something is a contact,
-                in Pa.
+            inverse: Computes the traction on the surface of this skin.
+            min_pressure: Smallest pressure of a new contact at the depth of the cubes, in Pa.
         """
         self._inverse = inverse
         self._min_pressure = min_pressure
@@ -132,9 +138,9 @@ class ContactTracker:
         )
 
     def update(self, values: Array) -> list[TrackedContact]:
-        """Fit the contacts to the newest values.
+        """Fit the contacts to the newest values, and find, merge and remove contacts.
 
-        The time is bounded by `MAX_CONTACTS` and by the number of steps of each fit.
+        The computing time is bounded by `MAX_CONTACTS` and by the number of steps of each fit.
 
         Args:
             values: Components (cubes, 15), NaN where unknown.
@@ -158,7 +164,7 @@ class ContactTracker:
 
             pair = find_pair_to_merge(model, self._contacts, pressure)
             if pair is not None:
-                # The older one keeps its id and is fitted to the values of both.
+                # The older contact keeps its id and replaces both contacts in a new fit.
                 older, younger = pair
                 self._contacts.remove(younger)
                 self._fit(y, [older], STEPS_NEW)
@@ -175,7 +181,8 @@ class ContactTracker:
             if point is None or len(self._contacts) >= MAX_CONTACTS:
                 break
             tried.append(self._inverse.points[point])
-            # The neighbours are fitted again: so far, they had to explain the new contact, too.
+            # The neighbours are fitted again, because so far they were fitted to values to which
+            # the new contact contributes.
             contact = self._start_contact(point)
             neighbours = self._neighbours(contact, self._contacts)
             self._contacts.append(contact)
@@ -187,10 +194,12 @@ class ContactTracker:
         return sorted(results, key=lambda contact: -contact.normal_force)
 
     def deviation(self, values: Array) -> FieldDeviation:
-        """Compute the standard deviations of `field` by the residual and by the contacts.
+        """Compute the standard deviations of `field`.
+
+        The variances of the residual field and of the contacts' parameters are added.
 
         Args:
-            values: The components (cubes, 15) of the last `update`.
+            values: Components (cubes, 15) of the last `update`.
         """
         scaled = self._inverse.scaled(values)
         residual = self._inverse.residual_deviation(self._residual, scaled)
@@ -199,7 +208,7 @@ class ContactTracker:
         return FieldDeviation(*np.sqrt(variance).T)
 
     def _start_contact(self, point: int) -> HertzContact:
-        """Create a contact without force at a point of the surface."""
+        """Create a contact without force at the surface point with index `point`."""
         inverse = self._inverse
         home = int(inverse.cube[point])
         offset = inverse.points[point] - inverse.poses.position[home]
@@ -214,12 +223,12 @@ class ContactTracker:
         )
 
     def _take_id(self) -> int:
-        """Return an id that no contact had before."""
+        """Return an id that no contact of this tracker had before."""
         self._next_id += 1
         return self._next_id - 1
 
     def _neighbours(self, contact: HertzContact, others: list[HertzContact]) -> list[HertzContact]:
-        """Return the other contacts that share cubes with this one, nearest first."""
+        """Return the contacts of `others` closer than `JOINT_FIT_PITCHES`, nearest first."""
         centre = self._model.centre(contact)
         centres = [self._model.centre(one) for one in others]
         distances = [float(np.linalg.norm(one - centre)) for one in centres]
@@ -232,18 +241,18 @@ class ContactTracker:
         contacts: list[HertzContact],
         steps: int,
     ) -> None:
-        """Fit contacts, those that share cubes together; other contacts stay as they are.
+        """Fit some contacts in groups of neighbours; the tracker's other contacts do not change.
 
         Args:
-            y: Scaled values (cubes, C).
-            contacts: Contacts to fit.
-            steps: As in `fit_contacts`.
+            y: Values (cubes, C) in Pa as from `SurfaceInverse.scaled`.
+            contacts: Contacts to fit, which are changed.
+            steps: Number of Gauss-Newton steps, as in `fit_contacts`.
         """
         remaining = list(contacts)
         while remaining:
             first = remaining.pop(0)
             group = [first, *self._neighbours(first, remaining)[: MAX_CONTACTS_PER_FIT - 1]]
-            # By identity: two contacts with equal values are still two.
+            # Contacts are compared by identity, because two contacts may have equal attributes.
             members = {id(one) for one in group}
             remaining = [one for one in remaining if id(one) not in members]
             others = [one for one in self._contacts if id(one) not in members]
@@ -255,7 +264,13 @@ class ContactTracker:
         contacts: list[HertzContact],
         steps: int,
     ) -> None:
-        """Fit contacts together, to values (cubes, C) without the response to all others."""
+        """Fit contacts jointly and store the results.
+
+        Args:
+            y: Values (cubes, C) in Pa minus the response to all contacts that are not fitted here.
+            contacts: Contacts to fit, which are changed.
+            steps: Number of Gauss-Newton steps, as in `fit_contacts`.
+        """
         inverse = self._inverse
         home = contacts[0].home
         near = [self._model.nearest_cubes(contact, CUBES_PER_CONTACT) for contact in contacts]
@@ -265,10 +280,12 @@ class ContactTracker:
         observations = Observations(inverse, y[cubes], prior, cubes, place, angle)
         if observations.size < _MIN_VALUES_PER_CONTACT * len(contacts):
             for contact in contacts:
-                contact.force = np.zeros(3)  # nothing is known: `prune_contacts` removes it
+                # Too few values are known for a fit. `prune_contacts` removes contacts without
+                # force.
+                contact.force = np.zeros(3)
             return
 
-        # Centres on the skin unrolled around the home of the first contact.
+        # Centres of the contacts on the skin laid flat around the home cube of the first contact.
         homes = np.array([contact.home for contact in contacts])
         origins, angles = inverse.unroll(home, homes)
         rotations = _plane_rotations(angles)
@@ -291,7 +308,7 @@ class ContactTracker:
         for j, contact in enumerate(contacts):
             self._store_fit(contact, fit, j, cubes, place, angle)
             estimate = estimate_contact(observations, fit, j)
-            # Positions are known in the plane: each axis has half of the variance.
+            # `place_ambiguity` is the sum of the variances along x and y; each gets half of it.
             estimate = estimate._replace(
                 place_variance=estimate.place_variance + contact.place_ambiguity / 2,
                 force_variance=estimate.force_variance + contact.force_ambiguity,
@@ -310,19 +327,23 @@ class ContactTracker:
     ) -> ContactFit:
         """Restart the fit of one contact from other positions and radii, keep the most likely fit.
 
-        Gauss-Newton can end in a local optimum. A wide contact looks like a narrow one with a large
-        residual. Beside a cube that does not observe all components, mirrored positions have almost
-        the same response. Both are tried for contacts that are new or whose position was ambiguous.
-        If cubes are far apart, the field may point at the wrong cube. Therefore, a new contact with
-        a large residual is searched around other cubes, too.
+        Gauss-Newton can end in a local optimum: a wide contact looks like a narrow one with a large
+        residual, and beside a cube that does not observe all components, mirrored positions have
+        almost the same response. So a fit with a large residual is restarted with a wide radius,
+        and a contact that is new or was ambiguous is restarted at the mirrored positions. If cubes
+        are far apart, the largest pressure may be found above the wrong cube. Therefore, a new
+        contact with a large residual is restarted around other cubes, too.
 
         Args:
-            observations: Values of the cubes.
+            observations: Known values of the cubes, their noise and prior covariance.
             fit: Fit from the usual start.
-            contact: Contact, whose ambiguities are updated.
+            contact: Contact; its `place_ambiguity` and `force_ambiguity` are changed.
             j: Index of the contact in the fit.
-            origin: Position (2,) of the contact's home on the unrolled skin.
-            rotation: Rotation (2, 2) from the frame of the home to the unrolled skin.
+            origin: Position (2,) in m of the contact's home (nearest cube) on the flattened skin.
+            rotation: Rotation (2, 2) from the frame of the home to the flattened skin.
+
+        Returns:
+            The fit with the smallest score.
         """
         fits = [fit]
 
@@ -333,7 +354,8 @@ class ContactTracker:
             sizes[j] = size
             fits.append(fit_contacts(observations, centres, sizes, START_SCALE, STEPS_NEW))
 
-        # A contact that is known to leave a large residual is not tried again in every scan.
+        # A fit from another start takes long. It is not repeated in every scan for a contact whose
+        # residual was large before, unless its position is ambiguous.
         limit = LARGE_RESIDUAL * AMPLITUDE
         depth = self._inverse.depth
         was_ambiguous = contact.place_ambiguity > 0
@@ -341,7 +363,8 @@ class ContactTracker:
             start_at(fit.centres[j], WIDE_SIZE * depth)
 
         if was_ambiguous and not observations.sees_all:
-            # Mirror images of the position about the axes of the cube, and about those of others.
+            # Starts at the mirror images of the position about the axes of the contact's cube, and,
+            # for a new contact with a large residual, of other cubes.
             best = min(fits, key=lambda one: one.score)
             offset = np.abs(rotation.T @ (best.centres[j] - origin))
             offset = np.maximum(offset, self._inverse.pitch / 4)
@@ -353,9 +376,9 @@ class ContactTracker:
                 for corner in _CORNERS:
                     start_at(home + rotation @ (corner * offset), USUAL_SIZE * depth)
 
-        # Variance over all fits, weighted with their evidence.
+        # Variance of position and force over all fits, weighted with their evidence.
         best = min(fits, key=lambda one: one.score)
-        # The score is -2 ln of the evidence.
+        # The score is -2 ln of the evidence, so this is the evidence relative to the best fit.
         weight = np.exp([(best.score - one.score) / 2 for one in fits])
         weight /= weight.sum()
         shifts = [one.centres[j] - best.centres[j] for one in fits]
@@ -374,9 +397,18 @@ class ContactTracker:
         fit: ContactFit,
         contacts: list[HertzContact],
     ) -> ContactFit:
-        """Split contacts that are two each, also in `contacts`.
+        """Test contacts with a large residual and split those that are really two contacts.
 
-        A contact is tested again only after its residual has doubled, because a test takes long.
+        A test takes long. So a contact is tested again only when its residual has become twice as
+        large as at the last test.
+
+        Args:
+            observations: Known values of the cubes, their noise and prior covariance.
+            fit: Joint fit of the contacts.
+            contacts: Contacts of the fit; new contacts are appended.
+
+        Returns:
+            Fit of all contacts, new ones included.
         """
         limit = LARGE_RESIDUAL * AMPLITUDE
         for j, contact in enumerate(list(contacts)):
@@ -406,15 +438,15 @@ class ContactTracker:
         place: Array,
         angle: Array,
     ) -> None:
-        """Write a fit into a contact, in the frame of the cube that is nearest now.
+        """Store the result of a fit in a contact, in the frame of the cube that is now nearest.
 
         Args:
             contact: Contact to change.
-            fit: Fit.
+            fit: Result of the fit.
             j: Index of the contact in the fit.
-            cubes: Indices (n,) of the cubes of the fit.
-            place: Positions (n, 2) of the cubes on the unrolled skin, in m.
-            angle: Rotations (n,) of the cubes, in rad.
+            cubes: Indices (n,) of the cubes whose values were fitted.
+            place: Positions (n, 2) of these cubes on the flattened skin, in m.
+            angle: Rotations (n,) of these cubes about z, in rad.
         """
         nearest, to_home = _nearest_home(fit.centres[j], place, angle)
         in_plane = to_home[:2, :2]
@@ -424,7 +456,8 @@ class ContactTracker:
         contact.force = to_home @ fit.forces[j]
         contact.residual_scale = fit.residual_scale
 
-        # The two length shapes rotate by twice the angle, as an ellipse looks the same after 180°.
+        # The coefficients of the two elongation shapes (x, diagonal) rotate by twice the angle,
+        # because an ellipse is the same after a rotation by 180°.
         double = (to_home @ to_home)[:2, :2]
         rotation = block_diag(to_home, in_plane, 1.0, double, 1.0)
         place_ambiguities = [contact.place_ambiguity / 2] * 2
@@ -445,7 +478,15 @@ class ContactTracker:
         place: Array,
         angle: Array,
     ) -> TrackedContact:
-        """Convert an estimate to the skin's parent frame; arguments as in `_store_fit`."""
+        """Convert an estimate from the flattened skin to the skin's parent frame.
+
+        Args:
+            number: Id of the contact.
+            estimate: Force and position of the contact, with variances, on the flattened skin.
+            cubes: Indices (n,) of the cubes whose values were fitted.
+            place: Positions (n, 2) of these cubes on the flattened skin, in m.
+            angle: Rotations (n,) of these cubes about z, in rad.
+        """
         inverse = self._inverse
         nearest, to_home = _nearest_home(estimate.place, place, angle)
         home = int(cubes[nearest])
@@ -455,7 +496,7 @@ class ContactTracker:
         position = inverse.poses.position[home] + rotation @ offset
         force = to_home @ estimate.force
         shear = float(np.hypot(force[0], force[1]))
-        # Variance of the length of the shear force: that along its direction.
+        # The variance of the length of the shear force is the variance along its direction.
         direction = estimate.force[:2] / max(shear, 1e-300)
         shear_variance = direction**2 @ estimate.force_variance[:2]
         return TrackedContact(
@@ -480,9 +521,19 @@ class ContactTracker:
         place: Array,
         angle: Array,
     ) -> Array:
-        """Return the prior covariance (n C, n C) of cubes; the most recent ones are kept."""
+        """Return the prior covariance of the values of some cubes, from memory if possible.
+
+        Args:
+            cubes: Indices (n,) of the cubes.
+            place: Positions (n, 2) of the cubes on the flattened skin, in m.
+            angle: Rotations (n,) of the cubes about z, in rad.
+
+        Returns:
+            Covariance (n C, n C) for a surface pressure of variance 1 Pa^2.
+        """
         inverse = self._inverse
-        # Contacts rarely move to other cubes, and a covariance takes longer than a fit.
+        # The last covariances are kept, because computing one takes longer than a fit and a contact
+        # rarely moves to other cubes.
         variant = inverse.variant[cubes]
         key = (*cubes.tolist(), *variant.tolist())
         if key not in self._priors:
@@ -495,7 +546,7 @@ class ContactTracker:
 
 
 def _plane_rotations(angle: Array) -> Array:
-    """Return the rotation matrices (J, 2, 2) of angles (J,) in rad."""
+    """Return the matrices (J, 2, 2) of rotations in the plane by J angles (J,) in rad."""
     cosine = np.cos(angle)
     sine = np.sin(angle)
     first_row = np.stack([cosine, -sine], axis=-1)
@@ -508,10 +559,16 @@ def _nearest_home(
     place: Array,
     angle: Array,
 ) -> tuple[int, Array]:
-    """Find the cube nearest to a position on the unrolled skin.
+    """Find the cube nearest to a position on the flattened skin.
+
+    Args:
+        centre: Position (2,) in m.
+        place: Positions (n, 2) of the cubes in m.
+        angle: Rotations (n,) of the cubes about z, in rad.
 
     Returns:
-        Index of the cube, and the rotation (3, 3) from the unrolled skin into its frame.
+        Index of the cube in `place`, and the rotation (3, 3) from the axes of the flattened skin to
+        the frame of this cube.
     """
     distance = np.linalg.norm(place - centre, axis=1)
     nearest = int(np.argmin(distance))
