@@ -26,6 +26,7 @@ TIME_SCALE = uplot.Scale(
     auto=False,
     range=(-HISTORY_S, 0.0),
 )
+"""Time axis of the plots: seconds relative to the newest value, without automatic range."""
 
 NUDGE_PERIOD = 3
 """Number of drawings of a chart after which the range of its value axis changes invisibly.

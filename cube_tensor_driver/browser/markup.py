@@ -38,9 +38,13 @@ It is odd, so that one colour is that of the middle of the range.
 """
 
 BOX_STYLE = "padding:0 0.8em 0.4em;font-size:0.85em"
+"""CSS style of every text on the page: its margins and the size of its letters."""
 BAR_STYLE = "height:0.9em;border-radius:3px;background:linear-gradient(to right,{})"
+"""CSS style of the bar of colours in the legend; {} stands for a list of colours."""
 TICKS_STYLE = "display:flex;justify-content:space-between"
+"""CSS style of the numbers below the bar of colours in the legend."""
 VALUE_STYLE = "text-align:right;font-family:monospace"
+"""CSS style of the cells with numbers in a table."""
 
 PHONE_STYLE = (
     "<style>@media (max-width: 36em) {"
@@ -135,7 +139,7 @@ def surface_pressure(pressure: float, sigma: float) -> str:
 
 
 def clock(seconds: float) -> str:
-    """Return a duration as "12.3 s" or "3 min 12.3 s"."""
+    """Return a duration in seconds as text, such as "12.3 s" or "3 min 12.3 s"."""
     minutes, rest = divmod(round(seconds, 1), 60)
     return f"{minutes:.0f} min {rest:.1f} s" if minutes else f"{rest:.1f} s"
 

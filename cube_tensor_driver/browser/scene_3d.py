@@ -29,6 +29,7 @@ from .meshes import CUBE, CUBE_EDGES, NO_MESH, Mesh, SquareLayer, arrows, hit, r
 from .moment import Moment
 
 Colour = tuple[int, int, int]
+"""A colour as red, green and blue from 0 to 255."""
 
 SPAN = 2.0
 """Length of the longest side of every skin, in units of the 3-D scene.
@@ -68,9 +69,12 @@ DIRECT_LIGHT = 1.7
 DARK: Colour = (40, 44, 52)
 BLUE: Colour = (25, 105, 210)
 EDGE_COLOUR: Colour = (110, 114, 122)
+"""Colour of the edges of the cubes."""
 
 TENSION_COLOUR: Colour = (210, 40, 40)
+"""Colour of the lines of positive principal stresses (tension)."""
 COMPRESSION_COLOUR: Colour = (40, 80, 220)
+"""Colour of the lines of negative principal stresses (compression)."""
 
 FAULT_COLOURS = {DOUBTFUL: (230, 130, 0), FAULTY: (215, 25, 25), STALE: DARK}
 """Health of a cube -> colour of the cross that is drawn over it, as red, green, blue from 0 to 255.
@@ -86,6 +90,7 @@ crosses are outside of the cubes and can be seen.
 """
 
 NO_SHADOWS: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
+"""Arguments of viser for an object that neither casts nor receives shadows."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +127,7 @@ class Placement:
         return cls(scaled, centre, unit, pitch, max(pitch, MIN_ARROW_UNIT))
 
     def point(self, position: Array) -> Array:
-        """Transform positions (..., 3) in metres of the parent frame into the scene."""
+        """Transform positions (..., 3) from the parent frame, in metres, to units of the scene."""
         return (position - self.centre) * self.unit
 
 
@@ -154,7 +159,7 @@ class Scene3D:
         """
         placement = Placement.of(poses)
         self.shown = Shown()
-        # The cube in the middle is chosen at first.
+        # Until the user chooses a cube, the one nearest to the centre of the skin is chosen.
         distance = np.linalg.norm(placement.poses.position, axis=1)
         self.selected = int(distance.argmin())
         self._unit = placement.unit
@@ -496,7 +501,11 @@ class FaultCrosses:
             self._meshes[state] = _add_mesh(api, f"faults/{state}", colour)
 
     def draw(self, health: AnyArray) -> None:
-        """Draw the crosses again if the health (N,) of any cube has changed."""
+        """Draw the crosses again if the health of any cube has changed.
+
+        Args:
+            health: (N,) health of the cubes, as in core/latest_stress.py.
+        """
         # The comparison saves work and data: health seldom changes, and each change of a mesh sends
         # the whole mesh to the browser.
         if self._drawn is not None and np.array_equal(health, self._drawn):

@@ -70,7 +70,7 @@ def show_bag(path: Path) -> None:
     console = Console(highlight=False)
     with Bag(path) as bag:
         duration_s = 0.0
-        # The start and end time of a bag without messages are undefined.
+        # A bag without messages has no start and end time.
         if any(connection.msgcount for connection in bag.connections):
             duration_s = (bag.end_ns - bag.start_ns) * 1e-9
             # The start is printed in ms, because its nanoseconds are of no interest to a reader.
@@ -139,7 +139,7 @@ def show_skin(bag: Bag, topic: str, console: Console) -> None:
 
     table = make_table(("cube", "uid"), ("samples", "Hz", "lost", "gaps", "longest gap / ms"))
     for cube in cube_summaries(bag, topic, info):
-        # A cube with fewer than two samples has no rate and no gaps.
+        # Rate, losses and gaps are unknown for a cube with fewer than two samples.
         cells = ["", "", "", ""]
         if cube.rate is not None and cube.longest_gap is not None:
             gap_ms = f"{1e3 * cube.longest_gap:.1f}"

@@ -21,6 +21,7 @@ from .parser import Parser, check_outputs, columns, nearest, sentence
 from .table import COMMANDS, GROUPS, PACKAGES
 
 PROGRAM = "./cube"
+"""Name of the program in help texts and error messages."""
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C: by the convention of shells, 128 plus the number of the signal SIGINT."""
@@ -110,10 +111,13 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def command_parser(name: str) -> Parser:
-    """Return the parser of a command.
+    """Return the parser of the options of a command.
+
+    Args:
+        name: Name of the command.
 
     Raises:
-        SystemExit: There is no such command.
+        SystemExit: There is no such command, or it is not part of this installation.
     """
     # The script ./cube of a checkout handles --distro before it starts Python. If the option
     # arrives here, the package was started without that script.

@@ -325,7 +325,8 @@ def total_force(contacts: list[Contact]) -> tuple[Array, Array]:
     """
     if not contacts:
         return np.zeros(3), np.full(3, np.nan)
-    # The centre of pressure is weighted by the normal force.
+    # The common centre of pressure is the mean of the contacts' positions, weighted by their normal
+    # forces.
     weight = np.array([contact.normal_force for contact in contacts])
     positions = np.array([contact.position for contact in contacts])
     force = np.sum([contact.force for contact in contacts], axis=0)

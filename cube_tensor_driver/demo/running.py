@@ -58,7 +58,7 @@ class Observer:
         self.node.create_subscription(kind, topic, receive, quality, raw=True)
 
     def log_error(self, text: str) -> None:
-        """Write an error to the log of the node."""
+        """Write an error message to the log of the ROS node."""
         logger: Any = self.node.get_logger()  # type: ignore[no-untyped-call]
         logger.error(text)
 

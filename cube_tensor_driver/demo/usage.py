@@ -10,6 +10,7 @@ import psutil
 from ..processes.children import Children
 
 BYTES_PER_MB = 2**20
+"""Number of bytes in one MiB, the unit of the reported memory."""
 
 
 class Usage:

@@ -19,6 +19,7 @@ from ..simulation.cubes import hub_cubes
 from ..simulation.sample_log import SampleTable
 
 NS_TO_MS = 1e-6
+"""Number of milliseconds in a nanosecond."""
 
 
 class Arrivals:
@@ -85,7 +86,8 @@ class Arrivals:
         """
         if not self._parts:
             return tuple(np.empty((4, 0), np.int64))
-        # The joined parts are stored, so that the next call does not join them again.
+        # The parts of all messages are replaced by the joined one, so that the next call does not
+        # have to join them again.
         self._parts = [tuple(np.concatenate(column) for column in zip(*self._parts, strict=True))]
         return self._parts[0]
 

@@ -28,7 +28,8 @@ MAX_TWO_COLUMN_PADS = 12
 def draw_layout(layout: Layout) -> Figure:
     """Draw a cube with its pads: visible pads are filled, hidden ones are a dashed outline."""
     figure = Figure(figsize=(5, 4.6))
-    # The drawing order is set by hand: matplotlib would sort by the centres of the parts.
+    # Each part is given its drawing order (zorder), because matplotlib would sort the parts by the
+    # distance of their centres, which hides the wrong ones.
     axes: Any = figure.add_subplot(projection="3d", computed_zorder=False)
     _draw_edges(axes)
     for name, centre, normal in zip(layout.pads, layout.positions, layout.normals, strict=True):

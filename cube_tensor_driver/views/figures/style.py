@@ -141,7 +141,7 @@ def check_picture(path: Path) -> None:
     Raises:
         ConfigError: matplotlib does not know the format.
     """
-    # The list depends on the installed version of matplotlib.
+    # Which formats matplotlib can write depends on its version.
     formats = FigureCanvasAgg.get_supported_filetypes()
     if path.suffix and path.suffix[1:].lower() not in formats:
         raise ConfigError(

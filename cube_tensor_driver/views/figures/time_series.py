@@ -18,6 +18,7 @@ from ...core.status import INVALID, RESIDUAL
 from .style import MARKERS, print_style, symbol
 
 DASHES = ("-", "--", "-.", ":")
+"""Line styles of matplotlib, in the order in which the lines of a panel use them."""
 
 MIN_GAP_STEPS = 3.0
 """Minimum time between two samples, relative to the median of this time, that counts as a gap.

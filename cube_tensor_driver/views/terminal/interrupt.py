@@ -25,6 +25,7 @@ INTERRUPTED = 130
 """Exit code after Ctrl-C: by the convention of shells, 128 plus the number of the signal SIGINT."""
 
 _SHOW_CURSOR = b"\x1b[?25h"
+"""Escape sequence that makes a terminal show its cursor again."""
 
 
 @contextmanager

@@ -256,7 +256,7 @@ class LiveTable:
         return table
 
     def _component(self, name: str) -> Array:
-        """Return a component of all cubes (N,), in Pa or Pa/m."""
+        """Return the values (N,) of one component of all cubes, in Pa or Pa/m."""
         return self._values[:, COMPONENTS.index(name)]
 
     def _state(self, number: int) -> Text:

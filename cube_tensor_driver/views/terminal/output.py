@@ -19,7 +19,8 @@ def say(text: str, style: str = "", *, stderr: bool = False) -> None:
 
     Args:
         text: The line.
-        style: Colour or weight, as rich names it; it is dropped where the output is no terminal.
+        style: Colour or weight of the text in the notation of rich, such as "red" or "bold". It is
+            ignored if the output is not a terminal.
         stderr: Whether the line goes to stderr instead of stdout.
     """
     console = Console(stderr=stderr, highlight=False)
