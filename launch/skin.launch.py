@@ -27,6 +27,7 @@ from cube_tensor_driver.ros.launching import (
 )
 
 PACKAGE = "cube_tensor_driver"
+"""ROS package that contains the executables of the nodes and of the simulator."""
 
 RESPAWN_DELAY_S = 2.0
 """Time, in seconds, between the unexpected end of a node and its new start (`respawn:=true`)."""
@@ -76,6 +77,7 @@ ARGUMENTS = (
         "rviz", "Show the skin in RViz. This also starts markers and robot_state_publisher."
     ),
 )
+"""Arguments of this launch file, which `ros2 launch --show-args` lists."""
 
 
 def generate_launch_description() -> LaunchDescription:

@@ -55,7 +55,7 @@ _SHEAR: JsonSchema = {
     "description": "a force [x, y, z] in N, or a list of at least two",
 }
 _TIMES = integer(1, MAX_TAPS, f"an integer from 1 to {MAX_TAPS}")
-_PATH = list_of(TRIPLE, "places [x, y, z]", 2)
+_PATH = list_of(TRIPLE, "positions [x, y, z]", 2)
 
 
 def _action_schema(optional: JsonSchema, **required: JsonSchema) -> JsonSchema:

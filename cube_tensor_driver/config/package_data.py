@@ -8,6 +8,7 @@ from pathlib import Path
 from ..core.errors import ConfigError
 
 _NAME = "cube_tensor_driver"
+"""Name of the ROS package, and of its folder below share/."""
 
 
 def package_data() -> Path:

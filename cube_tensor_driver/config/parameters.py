@@ -49,12 +49,16 @@ AUTOSTART = Parameter(
     "With true the node configures and activates itself when it starts. With false it waits for "
     "lifecycle transitions.",
 )
+"""Parameter of every node."""
+
 RELIABILITY = Parameter(
     "qos_reliability",
     "reliable",
     "Reliability (quality of service) of the topics `frequencies`, `stress` and `forces`.",
     choices="reliable, best_effort",
 )
+"""Parameter of the nodes `driver` and `reconstruction`."""
+
 DRIVER = (
     AUTOSTART,
     Parameter("config", "", "Path of the skin file (YAML). It is required."),
@@ -89,6 +93,8 @@ DRIVER = (
     ),
     RELIABILITY,
 )
+"""Parameters of the node `driver`, which reads the hubs."""
+
 RECONSTRUCTION = (
     AUTOSTART,
     Parameter(
@@ -141,6 +147,8 @@ RECONSTRUCTION = (
         live=True,
     ),
 )
+"""Parameters of the node `reconstruction`, which computes stress from frequencies."""
+
 SKIN_SUBSCRIBER = (
     AUTOSTART,
     Parameter(
@@ -150,6 +158,8 @@ SKIN_SUBSCRIBER = (
         span=(0.1, 100.0),
     ),
 )
+"""Parameters that the nodes `markers` and `contacts` have in common."""
+
 MARKERS = (
     *SKIN_SUBSCRIBER,
     Parameter(
@@ -171,6 +181,8 @@ MARKERS = (
         "With true the principal stresses of each cube are drawn as three crossing lines.",
     ),
 )
+"""Parameters of the node `markers`, which draws the skin for RViz and Foxglove."""
+
 CONTACTS = (
     *SKIN_SUBSCRIBER,
     Parameter(
@@ -217,3 +229,4 @@ CONTACTS = (
         problem=influence_problem,
     ),
 )
+"""Parameters of the node `contacts`, which computes positions and forces of contacts."""

@@ -8,10 +8,10 @@ from __future__ import annotations
 from urllib.parse import urlsplit
 
 TCP = "socket://"
-"""Prefix of a TCP address, the same as in pyserial."""
+"""Prefix of a port that is a TCP address (socket://host:port), the same as in pyserial."""
 
 ALLOWED = "a device path, a pattern such as /dev/ttyACM*, or socket://host:port"
-"""Description of a valid port, for error messages."""
+"""Description of the texts that are allowed as the port of a link, for error messages."""
 
 
 def tcp_address(url: str) -> tuple[str, int] | None:

@@ -22,19 +22,23 @@ JsonSchema = dict[str, Any]
 MAX_SHOWN_CHARACTERS = 60
 """Maximum number of characters of a wrong value that an error message quotes."""
 
-# Names of skins and cubes become parts of topics and frame ids. ROS allows 247 characters for a
-# topic including its namespace, so 64 per name leave room.
 NAME: JsonSchema = {
     "type": "string",
     "pattern": r"^[A-Za-z][A-Za-z0-9_]{0,63}\Z",
     "description": "a name of at most 64 letters, digits and _, a letter first",
 }
+"""Schema of the name of a skin, a link, a cube or an indenter.
+
+Names become parts of topics and frame ids. ROS allows 247 characters for a topic including its
+namespace, so 64 per name leave room.
+"""
 
 TEXT: JsonSchema = {
     "type": "string",
     "minLength": 1,
     "description": "a text that is not empty",
 }
+"""Schema of any text that is not empty."""
 
 TRIPLE: JsonSchema = {
     "type": "array",
@@ -43,6 +47,7 @@ TRIPLE: JsonSchema = {
     "maxItems": 3,
     "description": "three finite numbers",
 }
+"""Schema of a list of three numbers, such as a position [x, y, z]."""
 
 _NUMBER_WORDS = {1: "one", 2: "two"}
 

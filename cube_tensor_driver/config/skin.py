@@ -338,7 +338,8 @@ class _CubeReader:
                 ": found neither uid nor both link and index, which say where the cube is; "
                 "add one of them"
             )
-        # After a cube was exchanged, its uid and the index in the file would mean different cubes.
+        # If the cube at this index was exchanged for another one, the uid and the index in the file
+        # would identify different cubes.
         if uid is not None and index is not None:
             yield ": found both uid and index; keep one, they might contradict each other"
         if item["layout"] != calibration.layout.name:

@@ -23,6 +23,7 @@ SCHEMA_VERSION = 1
 """Version of the format of tare files. Files with another version are refused."""
 
 _HEADER = "Rest frequencies in Hz that ~/tare measured; ~/clear_tare removes it."
+"""Comment in the first line of a tare file, for people who open it."""
 
 
 class StoredTare(NamedTuple):

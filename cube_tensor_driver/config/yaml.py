@@ -39,6 +39,7 @@ They do not derive from yaml.YAMLError.
 """
 
 _Dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+"""PyYAML's class that writes plain values, implemented in C where that is installed."""
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]

@@ -70,7 +70,8 @@ class Children:
         which order the children end.
         """
         program = [process.program] if process.program else [sys.executable, "-m", process.module]
-        # If a demo was killed and its driver went on, the ports would stay in use.
+        # `end_with_parent` ends the command when this process is killed. Otherwise a driver would
+        # go on and keep its ports open.
         command = [*end_with_parent(), *program, *process.arguments]
         if process.node:
             command += ["--ros-args", *ros_arguments(process.parameters)]

@@ -12,9 +12,10 @@ SIGHUP when the terminal is closed."""
 
 
 def on_stop_signal(stop: Callable[[], None]) -> None:
-    """Have `stop` called at each signal of `STOP_SIGNALS`, instead of ending the process at once.
+    """Register `stop` as handler of the signals that ask this process to end (`STOP_SIGNALS`).
 
-    Must be called in the main thread, as Python requires for handlers of signals.
+    The process then does not end by itself at such a signal. This function must be called in the
+    main thread, as Python requires for handlers of signals.
     """
     for number in STOP_SIGNALS:
         # A command started with nohup ignores SIGHUP; a handler here would undo that.
@@ -23,7 +24,7 @@ def on_stop_signal(stop: Callable[[], None]) -> None:
 
 
 def stop_event() -> threading.Event:
-    """Return an event that is set when a signal of `STOP_SIGNALS` comes."""
+    """Return an event that is set when the process gets SIGINT, SIGTERM or SIGHUP."""
     event = threading.Event()
     on_stop_signal(event.set)
     return event

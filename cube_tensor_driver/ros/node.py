@@ -66,6 +66,7 @@ run at every scan or every second one for nothing.
 """
 
 Entity = TypeVar("Entity", Publisher, Subscription, Timer, Service)
+"""Type of an rclpy object that a node makes and destroys."""
 
 
 class CubeNode(LifecycleNode):

@@ -14,20 +14,24 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from ..core.errors import ConfigError
 
 MAX_PAUSE_S = 2.0
-"""Longest pause, in seconds, of a subscriber after which no message of a batch topic is lost.
+"""Longest pause, in seconds, of a subscriber after which it has lost no message of a batch topic (a
+topic whose messages hold all cubes, such as `stress`).
 
 The depth of a queue is this time multiplied by the rate of messages, unless `MAX_QUEUE_BYTES`
 limits it.
 """
 
 MAX_QUEUE_BYTES = 64_000_000
-"""Maximum size of the queue of a batch topic, in bytes. It keeps the processes below 200 MB.
+"""Maximum size, in bytes, of the queue of a batch topic (a topic whose messages hold all cubes).
+
+It keeps the memory of each process below 200 MB.
 
 On the largest skins a queue of this size holds less than `MAX_PAUSE_S` of messages.
 """
 
 MIN_BATCH_DEPTH = 10
-"""Minimum depth of the queue of a batch topic, in messages."""
+"""Minimum depth of the queue of a batch topic (a topic whose messages hold all cubes), in messages.
+"""
 
 ROW_BYTES = 78
 """Size of the row of one cube in a message of `stress`, in bytes.
@@ -39,17 +43,20 @@ DEFAULT_RATE_HZ = 1000.0
 """Rate, in Hz, that is assumed for samples or messages if the rate is not known."""
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-"""Profile of `info` topics. A node that subscribes after the last message still gets it."""
+"""Profile (quality of service) of the topics `info` and `driver/info`, which describe the skin. A
+node that subscribes after the last message still gets that message."""
 
 NEWEST = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""Profile of subscribers that need only the newest messages, such as viewers.
+"""Profile (quality of service) of subscribers that need only the newest messages, such as viewers.
 
 With best effort, a slow subscriber does not make the publisher wait.
 """
 
 SERVICES = QoSProfile(depth=1000)
-"""Profile of services. It is deeper than the default of ROS, 10 requests, beyond which DDS silently
-drops the oldest. The parameter services of rclpy have a depth of 1000, too.
+"""Profile (quality of service) of services.
+
+Its queue is longer than the default of ROS, 10 requests, beyond which DDS silently drops the oldest
+one. The parameter services of rclpy have a depth of 1000, too.
 """
 
 _RELIABILITIES = {

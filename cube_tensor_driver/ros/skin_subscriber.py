@@ -81,7 +81,7 @@ class SkinSubscriber:
         ]
 
     def close(self) -> None:
-        """End the subscriptions."""
+        """End the subscriptions to `info` and `stress`."""
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
 

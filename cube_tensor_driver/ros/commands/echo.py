@@ -56,6 +56,7 @@ class StressReading:
 
 
 Item = StressReading | dict[str, Any]
+"""Content of a message: the stress of a cube, or the fields of any other message by name."""
 
 
 def listen(topic: str, once: bool) -> Iterator[list[Item]]:
@@ -197,7 +198,10 @@ class _Listener:
         return True
 
     def take(self) -> list[Item]:
-        """Return the content of the oldest waiting message."""
+        """Remove the oldest message from `waiting`, and return its content.
+
+        The list has one `StressReading` per row of a message of stress, or a single dict.
+        """
         message = self.waiting.popleft()
         if isinstance(message, StressRows):
             return list(self._read_rows(message))

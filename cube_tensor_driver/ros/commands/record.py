@@ -100,7 +100,7 @@ class Recorder:
 
     @property
     def missing(self) -> list[str]:
-        """Topics without a publisher so far."""
+        """Topics that are to be recorded but have had no publisher so far."""
         known = self.counts.keys() | self.refused.keys()
         return [topic for topic in self._wanted if topic not in known]
 

@@ -68,7 +68,7 @@ Their topics are not replayed by default, because a running reconstruction publi
 
 
 class Player:
-    """Publishes the messages of a bag.
+    """Publishes the messages of a bag (recording) at the intervals at which they were recorded.
 
     `run` must be called only once; the other methods may be called from any thread meanwhile.
 
@@ -76,7 +76,7 @@ class Player:
         position: Time of the message published last, in s from the begin of the bag.
         length: Duration of the bag, in s.
         published: Number of messages published so far.
-        stop: Event that ends `run`; `end` sets it.
+        stop: Event that ends the method `run`; the method `end` sets it.
     """
 
     def __init__(

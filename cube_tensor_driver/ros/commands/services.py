@@ -161,7 +161,7 @@ def set_parameter(name: str, parameter: str, text: str) -> Any:
 
 
 class _NodeParameters:
-    """The parameters of one node, reached through its services."""
+    """Reads and sets the parameters of another node through the services of that node."""
 
     def __init__(self, node: Node, executor: Any, name: str) -> None:
         """Find the node with this name.
@@ -181,7 +181,7 @@ class _NodeParameters:
         return sorted(answer.result.names)
 
     def check_name(self, parameter: str) -> None:
-        """Raise ConfigError if the node has no such parameter."""
+        """Raise ConfigError if the node has no parameter of this name."""
         names = self.names()
         if parameter not in names:
             raise ConfigError(

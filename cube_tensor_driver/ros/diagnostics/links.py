@@ -19,7 +19,7 @@ LEVELS = {
 
 
 class LinkDiagnostics:
-    """Makes the diagnostic statuses of the driver. It is used once a second."""
+    """Makes the statuses of the node `driver` for /diagnostics. It is used once a second."""
 
     def __init__(self, skin_name: str) -> None:
         self._skin_name = skin_name
@@ -73,7 +73,10 @@ def _rows_status(
 
 
 def _link_status(report: LinkReport) -> DiagnosticStatus:
-    """Return the status of one link, whose level is the worst one since the previous status."""
+    """Return the status of one link.
+
+    Its level is that of the worst state that the link has had since the previous status.
+    """
     levels = [LEVELS[state] for state in (report.state, *report.past_states)]
     if report.notes:
         # A note, for example about damaged frames, is a warning even while the link is open.

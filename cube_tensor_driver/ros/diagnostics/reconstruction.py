@@ -51,7 +51,10 @@ class TareState(Protocol):
     uids: dict[int, int]
 
     def age(self) -> dict[str, str]:
-        """Return the number of tared cubes and the age of the oldest tare, as texts."""
+        """Return the number of tared cubes and the age of the oldest tare, in s, as texts.
+
+        The keys are those of the status on /diagnostics.
+        """
 
 
 class ReconstructionDiagnostics:
@@ -185,9 +188,10 @@ class CubeHealth:
         self._health.collect()
 
     def summary(self) -> dict[str, int]:
-        """Return the number of pads in each condition and of cubes with a high residual now.
+        """Return the number of pads in each faulty condition (open, short, noisy and so on) now.
 
-        Numbers that are 0 are left out. The keys are those of the diagnostics.
+        The number of cubes with a high residual is added. Numbers that are 0 are left out. The keys
+        are those of the status on /diagnostics.
         """
         counts = {
             f"pads {word}": int(np.count_nonzero(self._health.state & bit))
@@ -273,7 +277,7 @@ class LostMessages:
 
     @property
     def count(self) -> int:
-        """Number of lost messages so far."""
+        """Number of messages lost so far, in all subscriptions since the node was made."""
         return self._earlier + max(self._left_out, self._reported)
 
     def new_subscription(self) -> SubscriptionEventCallbacks:
@@ -323,7 +327,11 @@ def log_changes(logger: Any, changes: LogChanges) -> None:
 
 
 def _condition_words(bits: int) -> str:
-    """Return the conditions of a pad, given as bits, as text."""
+    """Return the faulty conditions of a pad as text, such as "open and noisy".
+
+    Args:
+        bits: Bits of the conditions, see `core/status.py`.
+    """
     return " and ".join(word for bit, word in WORDS.items() if bits & bit)
 
 

@@ -28,7 +28,7 @@ except ModuleNotFoundError:
             self.timer = node.create_timer(period, self.update)
 
         def update(self) -> None:
-            """Publish the statuses. Called by the timer."""
+            """Publish the statuses of the node; subclasses override it. The timer calls it."""
 
         def publish(self, statuses: list[DiagnosticStatus]) -> None:
             """Publish statuses, with the name of the node in front of their names."""
@@ -64,7 +64,7 @@ class Diagnostics(Updater):  # type: ignore[misc]
         self.node_name = node.get_fully_qualified_name()
 
     def update(self) -> None:
-        """Publish the statuses. Called by the timer."""
+        """Publish the statuses of the node. A timer of the base class calls this once a second."""
         statuses = self._statuses()
         if statuses:
             self._add_errors(statuses[0])

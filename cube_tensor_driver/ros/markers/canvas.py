@@ -1,6 +1,6 @@
 """The picture of a skin as a serialised MarkerArray: cubes, arrows, crosses and contacts.
 
-The pitch is the distance of neighbouring cubes, d0 is half the side of a cube.
+The pitch, in multiples of which many lengths are stated, is the distance of neighbouring cubes.
 """
 
 from __future__ import annotations

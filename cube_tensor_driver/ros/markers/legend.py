@@ -76,7 +76,7 @@ SCALES = (
         GRADIENT_COLOUR,
     ),
 )
-"""Arrows in the legend, from top to bottom."""
+"""The two kinds of arrows in the picture, in the order of the legend from top to bottom."""
 
 TITLE_BYTES = 128
 """Length of the text of the legend's title, in bytes. The title is centred in it with spaces.
@@ -204,7 +204,7 @@ class Legend:
             self._markers.write_text(f"legend number {number}", text)
 
         title = _title(quantity, top, health)
-        width = TITLE_BYTES - 2  # There is a dot at both ends.
+        width = TITLE_BYTES - 2  # The text has a dot at each end.
         self._markers.write_text("legend", f".{title[:width].center(width)}.")
 
     def draw_scale(self, traction_pa: float, gradient_pa_per_m: float) -> None:

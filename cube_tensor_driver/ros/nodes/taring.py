@@ -26,8 +26,8 @@ from ...srv import Tare
 from ..node import CubeNode
 
 MAX_DATA_AGE_S = 1.0
-"""Maximum age, in seconds, of the newest row at a request for a tare. With older data the request
-is refused, because the load may have changed since then."""
+"""Maximum age, in seconds, of the newest measurement when a tare is requested. With older data the
+request is refused, because the load on the skin may have changed since then."""
 
 
 def tare_folder(parameter: str) -> Path:
