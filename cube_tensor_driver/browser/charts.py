@@ -163,7 +163,8 @@ class Charts:
         A cube observes a component if it has been finite in `history`.
         """
         observed = dict(zip(History.COLUMNS, history.observed, strict=True))
-        # Before the first tensors arrive, it is unknown which components the cubes observe.
+        # Until the first tensors arrive, it is unknown which components the cubes observe, and all
+        # groups stay in the lists.
         if not any(observed[name] for name in COMPONENTS):
             return
         groups = [

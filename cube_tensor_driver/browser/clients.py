@@ -174,7 +174,8 @@ class ReplayClient:
         self._wanted_position = None
         self._jump = self._client.call_async(request)
         self._jump_asked_s = now_s
-        # The slider would jump back to the old position until the next state of the replay arrives.
+        # Without this assignment, the slider would jump back to the old position until the next
+        # state of the replay arrives.
         self.state.position = position
         return True
 

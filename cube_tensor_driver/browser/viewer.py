@@ -126,7 +126,7 @@ class Viewer:
         next_picture_s = next_numbers_s = time.monotonic()
         waiting_note_s = next_picture_s + WAITING_NOTE_S
         while not stop.is_set():
-            # `spin_once` returns earlier if a message arrives.
+            # `spin_once` waits until the next picture is due, or returns earlier after a message.
             wait_s = min(next_picture_s - time.monotonic(), PICTURE_PERIOD_S)
             self._executor.spin_once(timeout_sec=max(0.0, wait_s))
             while not self._actions.empty():

@@ -127,7 +127,7 @@ def check_file(path: Path) -> int:
     from ..device.links.line_load import line_doubts
     from ..views.terminal.output import working
 
-    # A skin of thousands of cubes takes seconds to check.
+    # `working` shows that the command is busy, because a skin of thousands of cubes takes seconds.
     with working(f"checking {path}"):
         skin, mistakes = check_skin(path)
         # Doubtful poses, and lines that are too slow for the sample rate, can be found only in a

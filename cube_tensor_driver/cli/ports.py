@@ -35,7 +35,7 @@ def run(options: argparse.Namespace) -> int:
                 f"{name}: hub 0x{hello.hub_uid:x}, {hello.n_cubes} cubes of {hello.n_pads} pads, "
                 f"{rate(hello.period_us)}, firmware 0x{hello.firmware:x}"
             )
-        # The port could not be opened: a driver uses it, or this user has no permission.
+        # The port could not be opened, because a driver uses it or this user has no permission.
         elif port.problem:
             print(port.problem)
         else:
