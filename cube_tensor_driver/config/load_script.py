@@ -290,7 +290,7 @@ def _find_action_mistakes(action: Action, friction: float, period: float | None)
 
 def _max_shear_ratio(action: Action) -> float:
     """Return the maximum ratio of tangential to normal force during the action."""
-    # Without shear nothing can slip, also where the force is 0.
+    # Without a tangential force the indenter cannot slip, even where the normal force is 0.
     if not action.shear.any():
         return 0.0
     if len(action.shear) == 1:

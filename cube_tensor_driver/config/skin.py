@@ -256,7 +256,7 @@ def check_skin_data(data: Any, folder: Path) -> tuple[Skin | None, list[str]]:
 
     if mistakes:
         return None, mistakes
-    # A rate that is written as 100 is an integer in YAML.
+    # The rate is converted because YAML gives an integer if it is written as 100.
     rate = None if data.get("rate") is None else float(data["rate"])
     return Skin(data["name"], data["parent_frame"], rate, links, cubes), []
 

@@ -128,7 +128,7 @@ class Player:
 
     @property
     def paused(self) -> bool:
-        """Whether the player is paused."""
+        """Whether the replay is paused, by `pause`, by `jump` or at the end of the bag."""
         return self._paused
 
     def pause(self, paused: bool) -> None:

@@ -11,7 +11,10 @@ from .reconstruction import Reconstruction
 
 
 def make_nodes() -> list[CubeNode]:
-    """Make both nodes. The driver passes its frequencies to the reconstruction by a call."""
+    """Make the nodes `driver` and `reconstruction`.
+
+    The driver passes its frequencies to the reconstruction by a function call.
+    """
     reconstruction = Reconstruction(subscribes=False)
     return [reconstruction, Driver(reconstruction.on_rows)]
 

@@ -53,7 +53,7 @@ class Driver(CubeNode):
         super().__init__("driver", DRIVER)
         self._on_rows = on_rows
         self._node_clock = NodeClock(self)
-        # None while the node is not configured.
+        # The links to the hubs; None while the node is not configured.
         self._links: LiveLinks | None = None
         self._diagnostics = Diagnostics(self, self._statuses, self._count_errors)
 
