@@ -1,4 +1,6 @@
-"""Elasticity of the elastomer around the cubes: contacts on a half space or a bonded layer.
+"""Elasticity of the elastomer around the cubes: a half space, or a layer bonded to rigid ground.
 
-Kernels from loads on the surface to the stress at the cubes, and influence functions of pads.
+The modules compute the stress at the cubes under loads on the surface, and covariances of this
+stress under random loads. influence.py holds the response of single pads, which finite elements
+computed.
 """

@@ -1,8 +1,8 @@
 """Cache of arrays that take seconds to compute, in the user's cache folder.
 
-The name of a file contains a hash of everything its arrays depend on, the source code included. A
-damaged file, or one of another version of the code, is computed again. If the folder cannot be
-written, the arrays are computed at every start.
+The name of a file contains a hash of everything its arrays depend on, the source code included. So
+arrays are computed again if an input or the code has changed, or if their file is damaged. If the
+folder cannot be written, they are computed at every start.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ MAX_CACHE_BYTES = 1 << 30
 removed."""
 
 _READ_ERRORS = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
-"""Errors that numpy raises for a missing or damaged file."""
+"""Errors that NumPy and zipfile raise for a missing or damaged file."""
 
 _CODE = (
     "mechanics/layer.py",
@@ -41,6 +41,7 @@ _CODE = (
 """Source files, relative to the package, whose change makes all cached arrays invalid."""
 
 Arrays = dict[str, AnyArray]
+"""Arrays by name, as in one .npz file."""
 
 
 def cache_folder() -> Path:
@@ -58,9 +59,9 @@ def load_or_compute(
     """Load arrays from the cache, or compute and store them.
 
     Args:
-        kind: Name of the kind of arrays; the file name begins with it.
-        inputs: Numbers and arrays that determine the result.
-        compute: Function that computes the arrays.
+        kind: Name of what is computed; the name of the file begins with it.
+        inputs: Numbers and arrays on which the result depends.
+        compute: Function that computes the arrays; it is called only if they are not in the cache.
 
     Returns:
         The arrays by name, the same whether they were loaded or computed.
@@ -72,7 +73,7 @@ def load_or_compute(
         return arrays
 
     arrays = compute()
-    with suppress(OSError):  # without a writable folder, nothing is stored
+    with suppress(OSError):  # if the folder cannot be written, nothing is stored
         _store(path, arrays)
     return arrays
 
@@ -87,7 +88,7 @@ def _hash_inputs(inputs: Iterable[Any]) -> str:
 
     for value in inputs:
         array = np.ascontiguousarray(value)
-        # Without type and shape, arrays of equal bytes would get the same hash.
+        # Type and shape are included, because different arrays may consist of equal bytes.
         digest.update(f"{array.dtype.str} {array.shape} ".encode())
         digest.update(array.tobytes())
     return digest.hexdigest()[:32]
@@ -96,17 +97,24 @@ def _hash_inputs(inputs: Iterable[Any]) -> str:
 def _load(path: Path) -> Arrays | None:
     """Load a file, or return None if it is missing or damaged."""
     try:
-        # The checksums of the zip format detect damage.
+        # NumPy checks the checksums of the zip file and raises an error for a damaged one.
         with np.load(path, allow_pickle=False) as file:
             arrays = dict(file)
-        os.utime(path)  # `_make_room` goes by the time of the last use
+        # The file's time becomes the time of its last use, by which `_make_room` sorts.
+        os.utime(path)
     except _READ_ERRORS:
         return None
     return arrays
 
 
 def _store(path: Path, arrays: Arrays) -> None:
-    """Write a file completely or not at all, even if several processes write it at once."""
+    """Store arrays in a file, which appears complete, even if several processes store it at once.
+
+    Arrays of more than `MAX_CACHE_BYTES` are not stored.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
     size = sum(array.nbytes for array in arrays.values())
     if size > MAX_CACHE_BYTES:
         return
@@ -124,7 +132,11 @@ def _store(path: Path, arrays: Arrays) -> None:
 
 
 def _make_room(newest: Path) -> None:
-    """Remove the least recently used files until all fit into `MAX_CACHE_BYTES`."""
+    """Remove the least recently used files until all files together fit into `MAX_CACHE_BYTES`.
+
+    Args:
+        newest: File that was just written, which is kept.
+    """
     others = [path for path in newest.parent.glob("*.npz") if path != newest]
     others.sort(key=lambda path: path.stat().st_mtime, reverse=True)
 

@@ -1,14 +1,13 @@
 """Circular components: combinations of stress and gradient that only change phase under rotation.
 
 A rotation of the frame about z by an angle multiplies a circular component c of order m (0 to 3) by
-exp(-i m angle). The field of a rotationally symmetric contact therefore depends on the direction
-phi = atan2(y, x) from the contact to the cube only through a phase. With the force (F_r, F_t, F_z)
-along this direction, across it and along z::
+exp(-i m angle). Example: the shear stresses zx and yz form the component zx + i yz of order 1.
 
-    c = exp(i m phi) (R(r) F_r + Z(r) F_z + i T(r) F_t),     R, Z, T real functions of the distance
-    r
+The stress under a rotationally symmetric contact therefore depends on the direction phi = atan2(y,
+x) from the contact to the cube only through a phase. Let F_r, F_t and F_z be the force along this
+direction, across it and along z, and R, Z and T real functions of the distance r. Then::
 
-Example: the in-plane shear (zx, yz) is the component zx + i yz of order 1.
+    c = exp(i m phi) (R(r) F_r + Z(r) F_z + i T(r) F_t)
 """
 
 from __future__ import annotations
@@ -25,16 +24,23 @@ Orders = NDArray[np.int64]
 
 
 def _define_components() -> tuple[Complex, Orders]:
-    """Define the circular components.
+    """Define the 14 circular components as combinations of the stresses and their gradients.
 
     Returns:
         Matrix (14, 24) of the components as combinations of `FIELD`, and their orders (14,).
     """
-    # Unit vectors by name, from which the combinations are composed
+    # Unit vector (24,) of each quantity, by its name in `FIELD`
     unit = dict(zip(FIELD, np.eye(len(FIELD)), strict=True))
 
     def combine_stresses(suffix: str) -> list[tuple[int, Complex]]:
-        """Return order and component for the six stresses, or for their derivative by `suffix`."""
+        """Return the components of the six stresses, or of their derivatives along one axis.
+
+        Args:
+            suffix: "" for the stresses, "_x", "_y" or "_z" for the derivatives.
+
+        Returns:
+            Order m and row (24,) of the matrix for each component.
+        """
         s = {name: unit[name + suffix].astype(complex) for name in STRESS}
         return [
             (0, (s["xx"] + s["yy"]) / 2),
@@ -50,7 +56,8 @@ def _define_components() -> tuple[Complex, Orders]:
     by_y = combine_stresses("_y")
     for (order, along_x), (_, along_y) in zip(by_x, by_y, strict=True):
         components.append((order + 1, along_x + 1j * along_y))
-        if order > 0:  # at order 0 it would be the complex conjugate of the one above
+        # At order 0, the second combination would be the complex conjugate of the first one.
+        if order > 0:
             components.append((order - 1, along_x - 1j * along_y))
 
     orders = np.array([order for order, _ in components])
@@ -58,14 +65,16 @@ def _define_components() -> tuple[Complex, Orders]:
 
 
 CIRCULAR_FROM_FIELD, ORDERS = _define_components()
-"""Matrix (14, 24) from `FIELD` to the circular components, and their orders (14,)."""
+"""Matrix (14, 24) from the stresses and gradients `FIELD` to the circular components, and the order
+m (14,) of each component: rotating the frame by an angle multiplies it by exp(-i m angle)."""
 
 FIELD_FROM_CIRCULAR = np.linalg.pinv(
     np.concatenate([CIRCULAR_FROM_FIELD.real, CIRCULAR_FROM_FIELD.imag])
 ).T
-"""Matrix (28, 24) from the real and imaginary parts of the circular components back to `FIELD`.
+"""Matrix (28, 24) from the real and then the imaginary parts of the circular components back to the
+stresses and gradients `FIELD`.
 
-It is multiplied from the right: ``parts @ FIELD_FROM_CIRCULAR``.
+Row vectors are multiplied from the left: ``parts @ FIELD_FROM_CIRCULAR``.
 """
 
 
@@ -79,9 +88,9 @@ def sum_rotated(
         rotation: Angle (N, L) of each frame about z as the complex number exp(i angle).
 
     Returns:
-        Stress (N, 6) and gradient (N, 6, 3), each the sum over the L fields in the cube's frame.
+        Stress (N, 6) and gradient (N, 6, 3) in the frame of each cube, summed over the L fields.
     """
-    # Multiplying is much faster than the exponential of m times the angle.
+    # exp(i m angle) is computed as a power of exp(i angle), which is much faster than np.exp.
     powers = np.stack(
         [
             np.ones_like(rotation),

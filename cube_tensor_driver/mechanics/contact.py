@@ -1,10 +1,12 @@
 """Stress and stress gradient in a half space under contact loads on its surface.
 
-The skin is the half space z <= 0: z points out of the skin, its surface is z = 0 and a cube sits at
-z = -depth. A force acts *on* the skin, so that pressing has a negative z component.
+The skin is the half space z <= 0: z points out of the skin, its surface is z = 0 and a cube is at z
+= -depth. A force acts *on* the skin, so that a force that presses has a negative z component.
 
-With d = point - source, R = |d|, Z = -d_z and the harmonic potential chi = Z ln(R + Z) - R, the
-solutions of Boussinesq (normal force) and Cerruti (tangential force) are one expression::
+A force F acts at a source on the surface. With d = point - source, R = |d|, Z = -d_z and the
+harmonic potential chi = Z ln(R + Z) - R, the solutions of Boussinesq (normal force) and Cerruti
+(tangential force) for the stress sigma at the point are one expression; nu is Poisson's ratio, and
+an index of chi and g is a derivative::
 
     sigma_ij = -3 / (2 pi) d_i d_j (F . d) / R^5  +  (1 - 2 nu) / (2 pi) C_ij
     C_xx = g_yy,  C_yy = g_xx,  C_xy = -g_xy,  C_zi = 0,   g = F_x chi_x + F_y chi_y - F_z chi_Z
@@ -13,8 +15,8 @@ An incompressible body has only the first term. The second term is a plane stres
 Airy function g: it is in equilibrium by itself and leaves every plane z = const free of traction.
 
 Source: K. L. Johnson, Contact Mechanics (1985), 3.2 (normal) and 3.6 (tangential); A. E. H. Love,
-Phil. Trans. R. Soc. A 228 (1929) 377. They print the components. The form with g was derived here;
-the tests compare it with the printed components.
+Phil. Trans. R. Soc. A 228 (1929) 377. These sources give the components one by one. The form with g
+was derived for this project; the tests compare it with the components of the sources.
 """
 
 from __future__ import annotations
@@ -28,20 +30,22 @@ from ..core.arrays import Array
 from ..core.errors import ElasticError
 
 _HERTZ_ORDER_PER_RADIUS = 5.5
-"""Quadrature order that a Hertz contact needs, per radius divided by depth; measured."""
+"""Quadrature order (number of rings of point forces) that represents a Hertz contact accurately,
+divided by radius / depth of the contact. The value was found by numerical tests."""
 
 _MIN_HERTZ_ORDER = 6
-"""Quadrature order of Hertz contacts that are small compared with the depth."""
+"""Smallest quadrature order (number of rings of point forces) of a Hertz contact. It suffices for
+radii that are small compared with the depth."""
 
 _STRESS_AXES = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
-"""Axes of the stress components xx, yy, zz, yz, zx, xy."""
+"""Indices of both axes (0: x, 1: y, 2: z) of the stress components xx, yy, zz, yz, zx, xy."""
 
 _AIRY_COMPONENTS = ((0, 1, 1, 1.0), (1, 0, 0, 1.0), (5, 0, 1, -1.0))
 """Stress components that are second derivatives of the Airy function g, as index of the component,
 the two axes of the derivative, and its sign: xx = g_yy, yy = g_xx, xy = -g_xy."""
 
 _THIRD_DERIVATIVES = ((0, 0, 0), (0, 0, 1), (0, 1, 1), (1, 1, 1))
-"""Axes of all different third derivatives in a plane: xxx, xxy, xyy, yyy."""
+"""Axes (0: x, 1: y) of the four different third derivatives in a plane: xxx, xxy, xyy, yyy."""
 
 
 def field(
@@ -52,8 +56,8 @@ def field(
 ) -> tuple[Array, Array]:
     """Compute stress and its gradient at points under point forces on the surface.
 
-    Leading axes, such as time, broadcast. About 500 bytes of memory are used per pair of point and
-    force.
+    Leading axes of the arguments, such as time, follow NumPy's broadcasting rules. About 500 bytes
+    of memory are used per pair of a point and a force.
 
     Args:
         points: Positions (..., N, 3) in m, z <= 0.
@@ -74,7 +78,7 @@ def field(
     forces = np.asarray(forces, dtype=np.float64)
     _check(points, sources, forces, poisson)
 
-    # One row per point, one column per force.
+    # d has one row per point and one column per force.
     d = points[..., :, None, :] - sources[..., None, :, :]
     forces = forces[..., None, :, :]
     distance = np.sqrt(np.einsum("...i,...i->...", d, d))
@@ -84,7 +88,8 @@ def field(
         )
 
     stress, gradient = _radial(d, forces, distance)
-    if poisson != 0.5:  # an incompressible body has only the first term
+    # The second term of the solution vanishes for an incompressible body.
+    if poisson != 0.5:
         airy_stress, airy_gradient = _airy(d, forces, distance)
         scale = (1.0 - 2.0 * poisson) / (2.0 * np.pi)
         stress += scale * airy_stress
@@ -100,14 +105,14 @@ def disc(
 ) -> tuple[Array, Array]:
     """Return point forces that represent a uniform traction on a disc.
 
-    The point forces are Gauss points in r^2 at equally spaced angles. At points deeper than their
-    spacing, the error decreases exponentially with `order`.
+    The point forces lie on rings, at Gauss points in r^2 and at equally spaced angles. The error of
+    the stress at depths larger than their spacing decreases exponentially with `order`.
 
     Args:
         radius: Radius of the disc in m.
         force: Total force (3,) in N.
         centre: Centre (2,) of the disc in m.
-        order: Number of rings.
+        order: Number of rings of point forces.
 
     Returns:
         Sources (L, 3) in m and forces (L, 3) in N, with L = 4 order^2.
@@ -127,21 +132,27 @@ def hertz(
 ) -> tuple[Array, Array]:
     """Return point forces that represent the traction below a sphere that presses or slides.
 
-    The traction is 3 F / (2 pi a^2) sqrt(1 - r^2 / a^2), Johnson 4.2 (normal) and 7.1 (sliding).
-    Arguments, result and errors are those of `disc`. The default order is accurate from a depth of
-    half the radius on; `hertz_order` returns the order for any depth.
+    The traction at the distance r from the centre is 3 F / (2 pi a^2) sqrt(1 - r^2 / a^2), with the
+    force F and the radius a (Johnson, Contact Mechanics, 4.2 for pressing and 7.1 for sliding).
+    Arguments, result and errors are those of `disc`. The default order is accurate at depths of at
+    least half the radius; `hertz_order` returns the order for any depth.
     """
     nodes, weights = _gauss_points(order)
-    # With t = sqrt(1 - r^2), p r dr = t^2 dt is smooth at the rim, where p itself is not.
+    # The Gauss points are placed in t = sqrt(1 - r^2) instead of r. The integrand p r dr = t^2 dt
+    # is then smooth at the rim, where the pressure p as a function of r has a vertical slope.
     radii = np.sqrt(1.0 - nodes**2)
     return _place_rings(radius, radii, 3.0 * weights * nodes**2, force, centre)
 
 
 def hertz_order(radius: float, depth: float) -> int:
-    """Return the order with which `hertz` is accurate from a depth on; both arguments are in m.
+    """Return the order with which the point forces of `hertz` are accurate at a depth.
 
-    Stress and gradient are then within 1e-3 of their largest value at that depth, for radii of up
-    to four depths. The error decreases exponentially with order * depth / radius.
+    The errors of stress and gradient at this depth are then at most 1e-3 of their largest values,
+    for radii of up to four depths. They decrease exponentially with order * depth / radius.
+
+    Args:
+        radius: Radius of the contact in m.
+        depth: Smallest depth below the surface at which the stress is computed, in m.
 
     Raises:
         ElasticError: An argument is not positive.
@@ -164,8 +175,8 @@ def rectangle(
 
     Args:
         sides: Side lengths (2,) along x and y, in m.
-        force: As in `disc`.
-        centre: As in `disc`.
+        force: Total force (3,) in N.
+        centre: Centre (2,) of the rectangle in m.
         order: Number of Gauss points along each side.
 
     Returns:
@@ -230,10 +241,19 @@ def _radial(
     forces: Array,
     distance: Array,
 ) -> tuple[Array, Array]:
-    """Return the first term of the module head and its gradient, summed over the forces.
+    """Compute the stress in an incompressible half space and its gradient, summed over the forces.
 
-    With w = -3 / (2 pi) (F . d) / R^5, sigma_ij = w d_i d_j and its derivative along k is
-    d_i d_j dw/dk + w (delta_ik d_j + delta_jk d_i).
+    This is the first term of the solution at the head of this file. With w = -3 / (2 pi) (F . d) /
+    R^5, sigma_ij = w d_i d_j, and its derivative along k is d_i d_j dw/dk + w (delta_ik d_j +
+    delta_jk d_i).
+
+    Args:
+        d: Positions (..., N, L, 3) of N points from L forces, in m.
+        forces: Forces (..., 1, L, 3) in N.
+        distance: Lengths (..., N, L) of `d`, in m.
+
+    Returns:
+        Stress (..., N, 6) in Pa and gradient (..., N, 6, 3) in Pa/m.
     """
     constant = -3.0 / (2.0 * np.pi)
     pairs = [d[..., i] * d[..., j] for i, j in _STRESS_AXES]
@@ -257,11 +277,20 @@ def _airy(
     forces: Array,
     distance: Array,
 ) -> tuple[Array, Array]:
-    """Return the field C_ij of the module head and its gradient, summed over the forces.
+    """Compute the field C_ij at the head of this file and its gradient, summed over the forces.
 
-    In a plane Z = const, a function h of r has the second derivatives delta_ij h1 + d_i d_j h2 with
-    h1 = h'/r, h2 = h1'/r and so on. The names below are those of chi (chi2, chi3, chi4), of
-    chi_Z = ln(R + Z) (log1, log2, log3) and of chi_ZZ = 1/R (inv1, inv2).
+    It is the part of the stress that depends on Poisson's ratio. In a plane Z = const, a function h
+    of the distance r has the second derivatives delta_ij h1 + d_i d_j h2 with h1 = h'/r, h2 =
+    h1'/r; h3 = h2'/r follows in the same way. These functions have the names chi1 to chi4 for h =
+    chi, log1 to log3 for h = chi_Z = ln(R + Z), and inv1 and inv2 for h = chi_ZZ = 1/R.
+
+    Args:
+        d: Positions (..., N, L, 3) of N points from L forces, in m.
+        forces: Forces (..., 1, L, 3) in N.
+        distance: Lengths (..., N, L) of `d`, in m.
+
+    Returns:
+        Field C (..., N, 6) and its gradient (..., N, 6, 3), without the factor of Poisson's ratio.
     """
     x, y, z = np.moveaxis(d, -1, 0)
     fx, fy, fz = np.moveaxis(np.broadcast_to(forces, d.shape), -1, 0)
@@ -292,15 +321,15 @@ def _airy(
         n1: Array,
         n2: Array,
     ) -> Array:
-        """Return g_ij of the module head, or its derivative by Z.
+        """Return the second derivative g_ij of the Airy function g, or the derivative of g_ij by Z.
 
         Args:
-            i: First axis, 0 or 1.
-            j: Second axis.
-            t2: h2 of the potential of the tangential force, chi or chi_Z.
-            t3: h3 of it.
-            n1: h1 of the potential of the normal force, chi_Z or chi_ZZ.
-            n2: h2 of it.
+            i: First axis of the derivative, 0 (x) or 1 (y).
+            j: Second axis of the derivative.
+            t2: Function h2 of the potential of the tangential force: chi, or chi_Z for d/dZ.
+            t3: Function h3 of this potential.
+            n1: Function h1 of the potential of the normal force: chi_Z, or chi_ZZ for d/dZ.
+            n2: Function h2 of this potential.
         """
         mixed = force[i] * position[j] + force[j] * position[i]
         by_distance = f_dot_d * t3 - fz * n2
@@ -314,7 +343,10 @@ def _airy(
         j: int,
         k: int,
     ) -> Array:
-        """Return g_ijk; every pair of the three indices contributes alike."""
+        """Return the third derivative g_ijk of the Airy function g along axes i, j and k (0, 1).
+
+        The loop runs over the three ways to separate one of the indices from the other two.
+        """
         value = h3 * position[i] * position[j] * position[k]
         for a, b, c in ((i, j, k), (j, i, k), (k, i, j)):
             value = value + chi3 * force[a] * position[b] * position[c]
@@ -325,7 +357,8 @@ def _airy(
 
     third_derivatives = {axes: third(*axes) for axes in _THIRD_DERIVATIVES}
 
-    # C_xx = g_yy, C_yy = g_xx, C_xy = -g_xy; d/dz = -d/dZ
+    # C_xx = g_yy, C_yy = g_xx, C_xy = -g_xy. The depth Z is -d_z, so a derivative by z is the
+    # negative of the derivative by Z.
     n_components = len(_STRESS_AXES)
     stress = np.zeros((*distance.shape[:-1], n_components))
     gradient = np.zeros(
@@ -350,7 +383,7 @@ def _gauss_points(order: int) -> tuple[Array, Array]:
     """Return Gauss-Legendre nodes (order,) and weights (order,) on the interval from 0 to 1."""
     if order < 1:
         raise ElasticError(f"quadrature order is {order}; it must be at least 1")
-    # numpy's nodes are those of the interval from -1 to 1.
+    # NumPy's nodes and weights are for the interval from -1 to 1.
     nodes, weights = np.polynomial.legendre.leggauss(order)
     return (nodes + 1.0) / 2.0, weights / 2.0
 
@@ -362,18 +395,21 @@ def _place_rings(
     force: ArrayLike,
     centre: ArrayLike,
 ) -> tuple[Array, Array]:
-    """Return point forces on n concentric rings.
+    """Return point forces on n concentric rings, with 4 n equally spaced forces on each.
 
     Args:
         radius: Radius of the contact in m.
-        rings: Radii (n,) of the rings, divided by that of the contact.
+        rings: Radii (n,) of the rings, divided by the radius of the contact.
         fractions: Fraction (n,) of the force on each ring.
         force: Total force (3,) in N.
         centre: Centre (2,) of the contact in m.
+
+    Returns:
+        Sources (4 n^2, 3) in m and forces (4 n^2, 3) in N.
     """
     if not radius > 0.0:
         raise ElasticError(f"patch radius is {radius} m; it must be positive")
-    # As many angles as resolve the outermost ring as finely as the radii.
+    # With this number of angles, neighbours on the outermost ring are about as close as rings.
     n = 4 * len(rings)
     angle = 2.0 * np.pi * (np.arange(n) + 0.5) / n
     x = radius * np.outer(rings, np.cos(angle))
@@ -402,6 +438,9 @@ def _place_forces(
         fractions: Fraction (L,) of the force at each position.
         force: Total force (3,) in N.
         centre: Centre (2,) in m.
+
+    Returns:
+        Sources (L, 3) in m, with z = 0, and forces (L, 3) in N.
     """
     cx, cy = np.asarray(centre, dtype=np.float64)[:2]
     z = np.zeros_like(x)

@@ -5,13 +5,15 @@ circular components (circular.py) of unit loads, and both compute a field in thr
 interpolate the tables, weight the unit loads with the loads, rotate the sum into the frame of the
 cube.
 
-A round contact needs R, T and Z over the distance r and the radius of the contact.
+For round contacts, the functions R, T and Z of circular.py are tabulated over the distance r and
+the radius of the contact.
 
-A polygon is, as seen from the point of the surface above a cube (the origin O), the sum of the
-triangles between O and its edges; they count negative if O lies outside of the edge. A triangle is
-the difference of two right triangles. One leg of both is the perpendicular of length d from O to
-the line of the edge, in the direction beta; the other leg has the length t along the line. With the
-position q from O, the traction is (v_x, v_y, v_z) + w z x q. A right triangle then has::
+Let the origin O be the point of the surface above a cube. A polygon is the sum of the triangles
+between O and its edges; triangles of edges with O on their outer side are subtracted. Each triangle
+is the difference of two right triangles. One leg of both is the perpendicular of length d from O to
+the line of the edge, in the direction beta; the other leg has the length t along this line. At the
+position q from O, the traction is (v_x, v_y, v_z) + w z x q, where w is the gradient of a traction
+that turns about O. The circular components of a right triangle then are::
 
     c = exp(i m beta) (A v + B conj(v) + Z v_z + W w),     v = (v_x + i v_y) exp(-i beta)
 
@@ -38,35 +40,40 @@ from .layer import Layer
 from .spectra import layer_spectra, tabulate_bessel
 
 CONTACT_SIZES = np.geomspace(0.1, 5.0, 23)
-"""Radii of the tabulated round contacts, divided by the depth. Other radii are rounded to the
-nearest of these, by at most 10 %."""
+"""Radii of the tabulated round contacts, divided by the depth of the cubes. Other radii are rounded
+to the nearest one; within the range, this changes them by at most 10 %."""
 
 GRID_STEP = 1 / 16
-"""Step of the polygon tables in asinh(d) and in asinh(t / sqrt(1 + d**2)), with d and t divided by
-the depth. The asinh makes the grid fine near the cube and coarse far away."""
+"""Step of the grid of the polygon tables, in asinh(d) and in asinh(t / sqrt(1 + d**2)). d is the
+distance of an edge's line from the cube and t the length along it, divided by the depth. The
+function asinh makes the grid fine near the cube and coarse far away."""
 
 MAX_LEG_RATIO = 50.0
-"""Largest tabulated t / sqrt(1 + d**2), with d and t divided by the depth. Longer legs are cut
-there: beyond it hardly any stress reaches the cube."""
+"""Largest tabulated t / sqrt(1 + d**2), where d is the distance of an edge's line from the cube and
+t the length along it, divided by the depth. Longer edges are cut off there, because traction
+farther away hardly causes any stress at the cube."""
 
 _LAST_DISTANCE = REACH_DEPTHS * POINTS_PER_DEPTH
 """Index of the largest tabulated distance between a round contact and a cube."""
 
 _GRID_ROWS = int(np.ceil(np.arcsinh(REACH_DEPTHS) / GRID_STEP)) + 2
-"""Number of rows of the polygon tables: values of the distance d of an edge from the cube."""
+"""Number of rows of the polygon tables, one for each value of the distance d of an edge's line from
+the cube."""
 
 _CENTRE_COLUMN = int(np.ceil(np.arcsinh(MAX_LEG_RATIO) / GRID_STEP))
-"""Column of the polygon tables for t = 0, where t is the length along an edge."""
+"""Index of the column of the polygon tables for t = 0, where t is the length along an edge from the
+point that is nearest to the cube."""
 
 _GRID_COLUMNS = 2 * _CENTRE_COLUMN + 1
-"""Number of columns of the polygon tables: values of the length t along an edge, of either sign."""
+"""Number of columns of the polygon tables, one for each value of the length t along an edge; t is
+negative on one side of the point that is nearest to the cube."""
 
 _ORIGIN_TOLERANCE = 1e-12
-"""Length of an edge, divided by the depth, below which it counts as a point."""
+"""Length of an edge, divided by the depth of the cubes, below which the edge counts as a point."""
 
 
 class _ContactTables:
-    """Look-up and summation that both kinds of tables share.
+    """Look-up and summation, which both kinds of tables have in common.
 
     Args:
         layer: Elastic layer that contains the cubes.
@@ -77,7 +84,7 @@ class _ContactTables:
     """
 
     _kind: str
-    """Kind of the tables, with which the name of the cached file begins."""
+    """Name of the kind of tables; the name of their file in the cache begins with it."""
 
     def __init__(self, layer: Layer, depth: float) -> None:
         layer.check_depth(depth)
@@ -85,12 +92,17 @@ class _ContactTables:
         self.depth = depth
         inputs = [layer.thickness, layer.poisson, depth]
         table = load_or_compute(self._kind, inputs, self._compute)["table"]
-        # One row of real numbers per grid point: a product of real matrices interpolates.
+        # Complex numbers are stored as pairs of real ones, one row per grid point, so that a
+        # product of real matrices interpolates.
         n_loads = table.shape[-2]
         self._rows = table.reshape(-1, n_loads * len(ORDERS)).view(np.float32)
 
     def _compute(self) -> Arrays:
-        """Return table (grid points ..., unit loads, 14), complex circular components."""
+        """Compute the table (grid points ..., unit loads, 14) of complex circular components.
+
+        Returns:
+            Dictionary with the single key `table`.
+        """
         raise NotImplementedError
 
     def _sum_loads(
@@ -181,7 +193,7 @@ class DiscTables(_ContactTables):
             axis=-1,
         )
 
-        # Linear interpolation between two distances
+        # Linear interpolation between the two nearest tabulated distances
         index = distance / self.depth * POINTS_PER_DEPTH
         is_near = index < _LAST_DISTANCE
         below = np.minimum(index, _LAST_DISTANCE - 1).astype(np.intp)
@@ -219,10 +231,10 @@ class PolygonTables(_ContactTables):
     _kind = "polygon_tables"
 
     def _compute(self) -> Arrays:
-        """Tabulate the components of right triangles.
+        """Tabulate the circular components of right triangles.
 
         Returns:
-            A, B, Z and W of the module head (rows of d, columns of t, 4, 14).
+            Functions A, B, Z and W of the file head (rows of d, columns of t, 4, 14).
         """
         over_distance = self._integrate_distance()
 
@@ -235,7 +247,8 @@ class PolygonTables(_ContactTables):
         r_safe = np.where(is_origin, 1.0, r)
         direction = np.where(is_origin, 1.0, (d + 1j * t) / r_safe)  # exp(i alpha)
 
-        # The integral over alpha becomes one over eta: alpha = atan(t / d), t = t(eta).
+        # The integral over the angle alpha = atan(t / d) is computed as an integral over the grid
+        # variable eta, with t = sqrt(1 + d^2) sinh(eta).
         t_slope = np.hypot(1.0, d) * np.cosh(eta)
         alpha_slope = d * t_slope / r_safe**2
         exponents = np.stack(
@@ -254,13 +267,18 @@ class PolygonTables(_ContactTables):
 
         load_sign = np.array([-1.0, -1.0, 1.0, -1j])[:, None]
         sign = (-1.0) ** ORDERS * load_sign
-        # Lengths were divided by the depth: A, B and Z are areas, W is a volume.
+        # Lengths were divided by the depth, so A, B and Z are multiplied by its square (areas) and
+        # W by its cube.
         dimension = np.array([2.0, 2.0, 2.0, 3.0])[:, None]
         unit = self.depth**dimension
         return {"table": (table * sign * unit).astype(np.complex64)}
 
     def _integrate_distance(self) -> CubicSpline:
-        """Return the inner integrals over r of A, B, Z and W, as functions (..., 4, 14) of r."""
+        """Return the inner integrals over r in the functions A, B, Z and W of the file head.
+
+        Returns:
+            Spline of the integrals (..., 4, 14) from 0 to r, over r divided by the depth.
+        """
         spectra = layer_spectra(self.layer, self.depth)
         r = np.arange(_LAST_DISTANCE + 2) / POINTS_PER_DEPTH
         bessel = tabulate_bessel(spectra.k, r * self.depth)
@@ -293,8 +311,8 @@ class PolygonTables(_ContactTables):
             end: End (N, L, 2) of each edge, likewise.
             traction: Traction (N, L, 3) in Pa on the skin that the edge's polygon has at the
                 origin, the point of the surface above the cube.
-            twist: Gradient (N, L) in Pa/m of a tangential traction that turns about the origin: at
-                the position q from it, the traction is larger by twist z x q.
+            twist: Gradient (N, L) in Pa/m of a tangential traction that turns about the origin. At
+                the position q from the origin, it adds twist z x q to the traction.
 
         Returns:
             Stress (N, 6) in Pa and gradient (N, 6, 3) in Pa/m, as `contact.field`.
@@ -305,7 +323,7 @@ class PolygonTables(_ContactTables):
         edge = second - first
         edge /= np.maximum(np.abs(edge), _ORIGIN_TOLERANCE)
 
-        # In axes along and across the edge, both ends have the coordinates t - i d.
+        # In axes along and across the edge, both ends of the edge have the coordinates t - i d.
         ends = np.stack([first, second], axis=-1)
         local = ends * edge.conj()[..., None]
         signed_distance = -local[..., 0].imag
@@ -314,7 +332,8 @@ class PolygonTables(_ContactTables):
         d = np.abs(signed_distance)
         t = local.real * side[..., None]
 
-        # Triangles that begin beyond the reach of the tables depend on their angle only.
+        # For an edge beyond the last tabulated distance, the integral over the triangle depends
+        # only on the angle under which the edge appears from the cube.
         shrink = np.minimum(1.0, REACH_DEPTHS / np.maximum(d, REACH_DEPTHS))
         weights, rows = _triangle_neighbours(d * shrink, t * shrink[..., None])
 
@@ -339,15 +358,15 @@ def _to_complex(vectors: Array) -> Complex:
 
 
 def _triangle_neighbours(d: Array, t: Array) -> tuple[Single, Index]:
-    """Return weights and table rows (..., 8) that give the triangle between two legs t.
+    """Return the weights and table rows (..., 8) of the triangle between a cube and an edge.
 
     Args:
         d: Distance (...) of the edge's line, divided by the depth.
         t: Start and end (..., 2) of the edge along this line, divided by the depth.
 
     Returns:
-        Weights of bilinear interpolation at four grid points for the start, which are negative, and
-        at four for the end; rows of these grid points.
+        Weights of bilinear interpolation and rows in the table: four grid points for the start of
+        the edge, whose weights are negative, then four for its end.
     """
     ratio = t / np.hypot(1.0, d)[..., None]
     column = np.arcsinh(ratio) / GRID_STEP + _CENTRE_COLUMN

@@ -1,4 +1,4 @@
-"""Influence functions: response of each pad of a cube in a layer to forces on the surface."""
+"""Influence functions: stress of each pad of a cube under a unit force, by the force's position."""
 
 from __future__ import annotations
 
@@ -14,19 +14,21 @@ from .layer import Layer
 
 @dataclass(frozen=True, eq=False)
 class Influence:
-    """Influence functions of the pads of a cube, on a grid of positions on the surface.
+    """Influence functions of the pads (sensing elements) of a cube in an elastic layer.
 
-    They come from finite elements in space (three components of the force) or in a plane (two).
+    They are tabulated on a grid of positions of the force on the surface. Finite elements computed
+    them, either in space (dim = 3 components of the force) or in a plane (dim = 2).
 
     Attributes:
-        layout: Layout of the P pads.
+        layout: Positions, normals and size of the P pads on the cube.
         side: Side length of the cube, in m.
         layer: Layer on rigid ground that contains the cube.
         depth: Distance from the centre of the cube to the surface, in m.
         place: Positions (n, dim - 1) of the forces in m, from the point of the surface above the
             centre of the cube: a sorted rectangular grid of x and, in space, y.
-        pads: Mean normal stress (P, n, dim) of each pad under a unit force along x, (y,) z at each
-            position: in Pa per N in space, in Pa per N/m in a plane. Tension is positive.
+        pads: Mean normal stress (P, n, dim) of each pad under a unit force along x, y (only in
+            space) and z at each position: in Pa per N in space, in Pa per N/m in a plane. Tension
+            is positive.
     """
 
     layout: Layout
@@ -43,9 +45,9 @@ class Influence:
             place: Positions (m, dim - 1) of forces, in m.
 
         Returns:
-            Pad stresses (P, m, dim); 0 outside of the grid.
+            Stress (P, m, dim) of each pad per unit force; 0 for positions outside of the grid.
         """
-        # The positions are all combinations of the coordinates, sorted by x, then by y.
+        # The grid contains all combinations of its x and y coordinates, sorted by x, then by y.
         axes = [np.unique(column) for column in self.place.T]
         nodes = np.moveaxis(self.pads, 1, 0)
         grid = nodes.reshape(*map(len, axes), *nodes.shape[1:])
@@ -56,7 +58,7 @@ class Influence:
 
     @property
     def reach(self) -> float:
-        """Distance from the centre, in m, up to which the grid covers all directions."""
+        """Radius in m of the largest circle around the cube's centre that lies within the grid."""
         smallest = -self.place.min(axis=0).max()
         largest = self.place.max(axis=0).min()
         return float(min(smallest, largest))

@@ -1,4 +1,4 @@
-"""Files of influence functions: numpy arrays in a zip file (.npz)."""
+"""Files (.npz) of influence functions: stress of each pad of a cube under a unit force."""
 
 from __future__ import annotations
 
@@ -17,17 +17,18 @@ from .influence import Influence
 from .layer import Layer
 
 SCHEMA = 1
-"""Version of the file format."""
+"""Version of the format of influence files; a file with another version is refused."""
 
 MAX_FILE_BYTES = 64 << 20
-"""Maximum size of a file, and of its content after decompression, in bytes."""
+"""Maximum size in bytes of a file of influence functions, also after decompression. The limit
+protects against damaged or malicious files."""
 
 MAX_INTEGER = 30_000
-"""Integer to which the largest stress is scaled. Values are stored as 16-bit integers; the rounding
-error is a tenth of the error of the finite elements."""
+"""Integer that stands for the largest stress in a file. Stresses are stored as 16-bit integers; the
+rounding error is a tenth of the error of the finite elements."""
 
 _READ_ERRORS = (OSError, ValueError, KeyError, EOFError, MemoryError, zipfile.BadZipFile)
-"""Errors that numpy raises for a damaged file."""
+"""Errors that NumPy and zipfile raise for a damaged file."""
 
 
 def write_influence(
@@ -35,7 +36,7 @@ def write_influence(
     influence: Influence,
     made_by: str,
 ) -> None:
-    """Write influence functions, completely or not at all.
+    """Write influence functions to a file. If writing fails, an existing file stays unchanged.
 
     Args:
         path: File to write.
@@ -45,7 +46,8 @@ def write_influence(
     Raises:
         ConfigError: The file cannot be written.
     """
-    # 16-bit integers instead of floats: the file is part of the package.
+    # Stresses are stored as 16-bit integers instead of floats, because such a file is part of the
+    # package and should be small.
     step = np.abs(influence.pads).max() / MAX_INTEGER
     layout = influence.layout
     with atomic_write(path) as partial, partial.open("wb") as file:
@@ -68,7 +70,7 @@ def write_influence(
 
 
 def read_influence(path: Path) -> Influence:
-    """Read and check influence functions of a cube in space.
+    """Read and check influence functions that were computed in space (three force components).
 
     Raises:
         ConfigError: The file is missing, damaged or inconsistent.
@@ -92,7 +94,7 @@ def read_influence(path: Path) -> Influence:
 
 def _load_arrays(data: bytes) -> Arrays:
     """Decompress the arrays of a file after checking their size."""
-    # A small archive may decompress to any size.
+    # A small zip file may decompress to any size, so the sizes are checked before.
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         size = sum(member.file_size for member in archive.infolist())
     if size > MAX_FILE_BYTES:
@@ -122,7 +124,7 @@ def _parse(arrays: Arrays) -> Influence:
 
 
 def _check(influence: Influence) -> None:
-    """Raise ElasticError or ConfigError if the quantities contradict each other."""
+    """Raise ElasticError or ConfigError if the quantities of a file contradict each other."""
     influence.layer.check_depth(influence.depth)
     if not 0 < influence.side < 2 * influence.depth:
         raise ConfigError(

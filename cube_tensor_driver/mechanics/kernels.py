@@ -1,9 +1,10 @@
 """Response of cubes at one depth to traction on the surface, and covariances of random traction.
 
-A layer is the same everywhere and in all directions. Quantities that depend on two positions are
-therefore tabulated along one line: the offset p = r (cos phi, sin phi) only multiplies circular
-components by a phase. With the spectra c(k) of spectra.py and a prior of the traction with the
-spectrum S(k)::
+A layer is the same everywhere and in all directions. Quantities that depend on the offset p = r
+(cos phi, sin phi) of two positions are therefore tabulated over the distance r only: the direction
+phi multiplies circular components (circular.py) by a phase. The tables are integrals over the
+wave vector k. With the spectra c(k) of the circular components (spectra.py) and a random traction
+with the spectrum S(k) as prior::
 
     response(p) = int c exp(i k.p) B_a,     B_a = 3 (sin ka - ka cos ka) / (ka)^3
     cross(p)    = int c S exp(i k.p),       covariance(p) = int c S c* exp(i k.p)      [d2k / 4 pi2]
@@ -32,19 +33,22 @@ from .layer import FIELD, Layer
 from .spectra import BesselTable, Spectra, layer_spectra, tabulate_bessel
 
 PRIOR_LENGTHS = (0.2, 0.8)
-"""Correlation lengths of the prior, divided by the depth. They are close to the pair that explained
-contacts of 2 to 20 mm best, in a half space at a depth of 5 mm."""
+"""Correlation lengths of the random traction that serves as prior, divided by the depth of the
+cubes. They are close to the pair of lengths with the smallest errors for contacts of 2 to 20 mm in
+a half space at a depth of 5 mm."""
 
 SHEAR_RATIO = 0.5
-"""Prior standard deviation of the shear divided by that of the pressure."""
+"""Prior standard deviation of the shear traction along x and along y, divided by the prior standard
+deviation of the pressure."""
 
 DISC_SIZES = np.geomspace(0.1, 5.0, 44)
-"""Tabulated radii of discs, divided by the depth. Between them, `Kernels.response` interpolates
-with an error of at most a hundredth of the largest value, at the wide end."""
+"""Radii of the tabulated round contacts (discs), divided by the depth of the cubes. The error of
+the interpolation between them in `Kernels.response` is at most a hundredth of the largest value; it
+is largest for wide discs."""
 
 POINTS_PER_DEPTH = 32
-"""Number of tabulated distances per depth. Cubic interpolation between them has an error of 1e-4 of
-the peak."""
+"""Number of tabulated distances between load and cube per length of one depth of the cubes. The
+error of the cubic interpolation between them is 1e-4 of the largest value."""
 
 REACH_DEPTHS = 20
 """Largest tabulated distance from a load to a cube, divided by the depth of the cube. Responses and
@@ -54,21 +58,23 @@ _OBSERVED = np.array([FIELD.index(name) for name in COMPONENTS])
 _IS_GRADIENT = np.arange(len(COMPONENTS)) >= len(STRESS)
 _FIELD_ZZ = FIELD.index("zz")
 _CIRCULAR_ZZ = int(np.argmax(CIRCULAR_FROM_FIELD[:, _FIELD_ZZ].real))
+"""Index of the circular component that is the stress zz alone."""
 
 
 class MeasurementModel(NamedTuple):
-    """Linear model of what the cubes of a skin measure under traction on the surface.
+    """Linear model of the values that the cubes of a skin measure under traction on the surface.
 
-    All cubes respond to the same n circular components. Cubes of one calibration, and with the same
-    pads in use, form a variant: they compute their measured components in the same way.
+    The values follow from n circular components (circular.py), which are the same for all cubes. A
+    variant is a set of cubes with the same calibration and the same pads in use: their values
+    follow from the circular components by the same matrix.
 
     Attributes:
-        spectra: Spectra of the circular components.
+        spectra: Spectra of the circular components over the wavenumber.
         components: Matrix (variants, 2 n, 15) from the real and imaginary parts of the circular
             components to the measured `COMPONENTS` in the frame of the cube, in Pa and Pa/m.
-        variant: Variant (cubes,) of each cube.
-        pads: Matrix (variants, 2 n, P) to the stresses of the pads divided by their noise; None if
-            cubes are modelled as points.
+        variant: Index (cubes,) of the variant of each cube.
+        pads: Matrix (variants, 2 n, P) from the same parts to the stress of each pad, divided by
+            the standard deviation of the pad's noise; None if cubes are modelled as points.
     """
 
     spectra: Spectra
@@ -82,7 +88,7 @@ def model_points(
     depth: float,
     cubes: int,
 ) -> MeasurementModel:
-    """Model cubes as points, which measure the stress and its gradient at their centres.
+    """Return the measurement model of points: cubes measure stress and gradient at their centres.
 
     Args:
         layer: Elastic layer that contains the cubes.
@@ -98,24 +104,28 @@ def model_points(
 
 
 class Kernels:
-    """Tabulated responses and covariances of cubes at one depth in a layer.
+    """Tabulated responses of cubes to loads on the surface, and covariances under random loads.
 
-    Positions (N, 2) are in m. Measured components are `COMPONENTS` with the gradients multiplied by
-    `scale`, so that all are in Pa. They are in the frame of a cube that is rotated about z by
-    `angle` (N,) in rad and belongs to the variant `variant` (N,) of the measurement model.
-    Tractions and forces are along x, y and z.
+    All cubes are at one depth in a layer. In the methods, positions (N, 2) are in m. Measured
+    components are `COMPONENTS` with the gradients multiplied by `scale`, so that all are in Pa.
+    They are in the frame of a cube that is rotated about z by `angle` (N,) in rad and has the index
+    `variant` (N,) in the measurement model. Tractions and forces are along x, y and z. Covariances
+    are for a prior of the pressure with the variance 1 Pa^2.
 
-    The first set-up takes a few seconds; cache.py keeps the tables.
+    The first set-up for a layer takes a few seconds; later ones load the tables from the cache.
 
     Attributes:
         layer: Elastic layer.
         depth: Distance from the centres of the cubes to the surface, in m.
         scale: Length in m that gradients are multiplied by.
         step: Distance in m between two tabulated positions.
-        variance: Prior variance (3,) of the traction along x, y and z, relative to the pressure.
-        pressure_variance: Prior variance of the pressure at the depth of the cubes.
-        component_matrices: `MeasurementModel.components` with scaled gradients.
-        inputs: Arrays and numbers that determine the tables.
+        variance: Prior variance (3,) of the traction along x, y and z, divided by the prior
+            variance of the pressure on the surface.
+        pressure_variance: Prior variance of the pressure at the depth of the cubes, divided by the
+            prior variance of the pressure on the surface.
+        component_matrices: Matrices `MeasurementModel.components` with gradients multiplied by
+            `scale`.
+        inputs: Arrays and numbers on which the tables depend, as keys for the cache.
     """
 
     def __init__(
@@ -128,10 +138,10 @@ class Kernels:
         """Compute the tables or load them from the cache.
 
         Args:
-            layer: Elastic layer.
+            layer: Elastic layer that contains the cubes.
             depth: Distance from the centres of the cubes to the surface, in m.
-            scale: Length in m that gradients are multiplied by.
-            model: Measurement model of the cubes; by default they are points.
+            scale: Length in m by which gradients are multiplied.
+            model: Measurement model of the cubes; None: they measure stress and gradient at points.
 
         Raises:
             ElasticError: The layer does not contain this depth.
@@ -159,7 +169,7 @@ class Kernels:
         ]
         self.inputs = [*table_inputs, self.component_matrices]
 
-        # Cubic interpolation needs one more distance on the left, and two on the right.
+        # Cubic interpolation needs one tabulated distance more at the beginning, two at the end.
         self._last = REACH_DEPTHS * POINTS_PER_DEPTH
         distance = np.arange(-1.0, self._last + 3) * self.step
         bessel = tabulate_bessel(spectra.k, distance)
@@ -182,15 +192,16 @@ class Kernels:
         return np.where(_IS_GRADIENT, self.scale, 1.0)
 
     def add_variant(self, components: Array) -> int:
-        """Add a variant of the measurement model, unless it exists already.
+        """Add a variant of the measurement model, unless an equal one exists already.
 
         Args:
-            components: Matrix (2 n, 15) as in `MeasurementModel`, for cubes without some pads.
+            components: Matrix (2 n, 15) as in `MeasurementModel`, for cubes of which only some pads
+                are used.
 
         Returns:
-            The number of the variant.
+            Index of the variant in `component_matrices`.
         """
-        # Variants are few: cubes that lost the same pad share one.
+        # Cubes without the same pad share a variant, so that there are few variants to compare.
         matrix = components * self._unit_factors
         is_equal = self.component_matrices == matrix
         equal = np.flatnonzero(is_equal.all(axis=(1, 2)))
@@ -224,13 +235,20 @@ class Kernels:
         points: Spectra,
         bessel: BesselTable,
     ) -> Arrays:
-        """Return the tables that depend on the prior.
+        """Compute the tables that depend on the prior (random traction on the surface).
+
+        Args:
+            spectra: Spectra of the n circular components that the cubes measure.
+            points: Spectra of the circular components of the stress at a point.
+            bessel: Bessel functions at the tabulated distances.
 
         Returns:
-            cross: R, Z and T (distances, 3, n) of the covariance with the traction at a point.
-            real: Covariance (distances, n, n) of real parts.
-            imaginary: Covariance (distances, n, n) of imaginary parts.
-            pressure: Covariance (distances, n) of real parts with the pressure below a point.
+            cross: Functions R, Z and T of circular.py (distances, 3, n) for the covariance of the
+                circular components with the traction at a point of the surface.
+            real: Covariance (distances, n, n) of the real parts of two cubes' components.
+            imaginary: Covariance (distances, n, n) of their imaginary parts.
+            pressure: Covariance (distances, n) of the real parts with the pressure at the cubes'
+                depth below a point of the surface.
             own: Variance of this pressure.
         """
         prior = _prior_spectrum(spectra.k * self.depth) * self.depth**2
@@ -257,13 +275,16 @@ class Kernels:
         variant: Index,
         size: float,
     ) -> Array:
-        """Compute the measured components (N, 15, 3) under a disc with a force of 1 N.
+        """Compute the measured components under a Hertz contact with a force of 1 N.
 
         Args:
-            place: Positions (N, 2) of the cubes from the centre of the disc.
-            angle: Rotations (N,) of the cubes.
-            variant: Variants (N,) of the cubes.
-            size: Radius of the disc in m.
+            place: Positions (N, 2) of the cubes from the centre of the contact, in m.
+            angle: Rotations (N,) of the cubes about z, in rad.
+            variant: Index (N,) of each cube's variant in the measurement model.
+            size: Radius of the contact in m.
+
+        Returns:
+            Components (N, 15, 3) in Pa/N, for a force along x, y and z.
         """
         table = self._interpolate_size(self._response, size, place)
         return self._measure(
@@ -272,14 +293,15 @@ class Kernels:
         )
 
     def field(self, place: Array, size: float) -> Array:
-        """Compute the stress field under a disc with a force of 1 N.
+        """Compute stress and gradient under a Hertz contact with a force of 1 N.
 
         Args:
-            place: Positions (N, 2) from the centre of the disc.
-            size: Radius of the disc in m.
+            place: Positions (N, 2) from the centre of the contact, in m.
+            size: Radius of the contact in m.
 
         Returns:
-            `FIELD` (N, 24, 3) at the depth of the cubes, in Pa and Pa/m.
+            Quantities `FIELD` (N, 24, 3) at the depth of the cubes, in Pa and Pa/m per N, for a
+            force along x, y and z.
         """
         table = self._interpolate_size(self._field, size, place)
         circular = self._rotate_loads(table, place, np.zeros(len(place)), ORDERS)
@@ -291,15 +313,15 @@ class Kernels:
         size: float,
         force: Array,
     ) -> Array:
-        """Compute the pressure at the depth of the cubes under a disc.
+        """Compute the pressure at the depth of the cubes under a Hertz contact.
 
         Args:
-            place: Positions (N, 2) from the centre of the disc.
-            size: Radius of the disc in m.
-            force: Force (3,) on the disc in N.
+            place: Positions (N, 2) from the centre of the contact, in m.
+            size: Radius of the contact in m.
+            force: Force (3,) on the skin in N.
 
         Returns:
-            Pressure (N,) in Pa.
+            Pressure -σzz (N,) in Pa.
         """
         return -self.field(place, size)[:, _FIELD_ZZ] @ force
 
@@ -309,12 +331,15 @@ class Kernels:
         angle: Array,
         variant: Index,
     ) -> Array:
-        """Compute the covariance (N, 15, 3) of cubes with the traction at one point.
+        """Compute the prior covariance of the measured components with the traction at one point.
 
         Args:
-            place: Positions (N, 2) of the cubes from the point.
-            angle: Rotations (N,) of the cubes.
-            variant: Variants (N,) of the cubes.
+            place: Positions (N, 2) of the cubes from the point, in m.
+            angle: Rotations (N,) of the cubes about z, in rad.
+            variant: Index (N,) of each cube's variant in the measurement model.
+
+        Returns:
+            Covariance (N, 15, 3) for a pressure of variance 1 Pa^2.
         """
         circular = self._rotate_loads(self._cross, place, angle, self._order)
         return self._measure(circular, variant)
@@ -327,14 +352,17 @@ class Kernels:
         other_angle: Array,
         other_variant: Index,
     ) -> Array:
-        """Compute the covariance (N, 15, 15) of N pairs of cubes.
+        """Compute the prior covariance between the measured components of N pairs of cubes.
 
         Args:
-            place: Positions (N, 2) of the first cubes from the other ones.
-            angle: Rotations (N,) of the first cubes.
-            variant: Variants (N,) of the first cubes.
-            other_angle: Rotations (N,) of the other cubes.
-            other_variant: Variants (N,) of the other cubes.
+            place: Position (N, 2) of the first cube of each pair from the other one, in m.
+            angle: Rotations (N,) of the first cubes about z, in rad.
+            variant: Index (N,) of each first cube's variant in the measurement model.
+            other_angle: Rotations (N,) of the other cubes, in rad.
+            other_variant: Index (N,) of each other cube's variant.
+
+        Returns:
+            Covariance (N, 15, 15) for a pressure of variance 1 Pa^2.
         """
         distance, direction = _polar(place)
         first = self._matrices_towards(direction - angle, variant)
@@ -362,9 +390,12 @@ class Kernels:
         angle: Array,
         variant: Index,
     ) -> Array:
-        """Compute the covariance (N, 15) of cubes with the pressure at their depth below one point.
+        """Compute the prior covariance of measured components with the pressure below one point.
 
-        Arguments as in `cross`.
+        The pressure is taken at the depth of the cubes. Arguments as in `cross`.
+
+        Returns:
+            Covariance (N, 15) for a surface pressure of variance 1 Pa^2.
         """
         distance, direction = _polar(place)
         covariance = self._interpolate(self._pressure, distance)
@@ -379,16 +410,17 @@ class Kernels:
         angle: Array,
         order: Orders,
     ) -> Array:
-        """Return circular components in rotated frames under loads along x, y and z.
+        """Return circular components in rotated frames under unit loads along x, y and z.
 
         Args:
-            table: Functions R, Z and T of circular.py (distances, 3, n).
-            place: Positions (N, 2) from the load.
-            angle: Rotations (N,) of the frames.
-            order: Orders (n,) of the components.
+            table: Functions R, Z and T of circular.py (distances, 3, n) over the distance from the
+                load.
+            place: Positions (N, 2) from the load, in m.
+            angle: Rotations (N,) of the frames about z, in rad.
+            order: Orders (n,) of the circular components.
 
         Returns:
-            Real and imaginary parts (N, 3, 2 n).
+            Real parts and then imaginary parts (N, 3, 2 n), for loads along x, y and z.
         """
         distance, direction = _polar(place)
         parts = self._interpolate(table, distance)
@@ -407,21 +439,25 @@ class Kernels:
         return np.concatenate([rotated.real, rotated.imag], axis=2)
 
     def _measure(self, circular: Array, variant: Index) -> Array:
-        """Return measured components (N, 15, 3) of circular components (N, 3, 2 n)."""
+        """Convert circular components (N, 3, 2 n) of N cubes to measured components (N, 15, 3)."""
         matrices = self.component_matrices
         # One product for all rows is faster than one for each row.
         matrix = matrices[0] if len(matrices) == 1 else matrices[variant]
         return np.asarray((circular @ matrix).swapaxes(1, 2))
 
     def _matrices_towards(self, angle: Array, variant: Index) -> tuple[Array, Array]:
-        """Return matrices from circular components in frames along the line between two cubes.
+        """Return the matrices from circular components to measured components of N cubes.
+
+        The circular components are in a frame whose x axis points along the line between two cubes,
+        the measured components in the frame of the cube.
 
         Args:
-            angle: Direction (N,) of the line in the frame of the cube.
-            variant: Variants (N,) of the cubes.
+            angle: Direction (N,) of the line in the frame of the cube, in rad.
+            variant: Index (N,) of each cube's variant in the measurement model.
 
         Returns:
-            Matrices (N, 15, n) of the real parts and of the imaginary parts.
+            Matrix (N, 15, n) for the real parts of the circular components, and for their
+            imaginary parts.
         """
         phases = _phases(angle, self._order)[:, None]
         real, imaginary = np.split(
@@ -429,7 +465,8 @@ class Kernels:
             2,
             axis=2,
         )
-        # Rotating the frame multiplies a component by a phase, which acts on its coefficients.
+        # A rotation of the frame multiplies a circular component by a phase. Here, the phase is
+        # applied to the coefficients of the component.
         matrices = (real - 1j * imaginary)[variant] * phases
         return matrices.real, -matrices.imag
 
@@ -439,20 +476,22 @@ class Kernels:
         size: float,
         place: Array,
     ) -> Array:
-        """Interpolate a table between the radii of discs.
+        """Interpolate a table of round contacts between the tabulated radii.
 
         Args:
             discs: Functions R, Z and T of circular.py (radii, distances, 3, n).
-            size: Radius of the disc in m.
-            place: Positions (N, 2) at which the table will be used.
+            size: Radius of the contact in m.
+            place: Positions (N, 2) from the centre of the contact, in m, for which the result will
+                be used.
 
         Returns:
-            R, Z and T (distances, 3, n), up to the farthest position.
+            Functions R, Z and T (distances, 3, n) at the tabulated distances up to the farthest of
+            these positions.
         """
         farthest = np.hypot(*place.T).max(initial=0.0) / self.step
         n_distances = int(min(farthest, self._last)) + 4
 
-        # The radii are a geometric series: interpolation in the logarithm.
+        # The tabulated radii are a geometric series, so their logarithms are equally spaced.
         log_step = np.log(DISC_SIZES[1] / DISC_SIZES[0])
         index = np.log(size / self.depth / DISC_SIZES[0]) / log_step
         first, weights = _cubic_weights(np.clip(index, 1.0, len(DISC_SIZES) - 2.001))
@@ -460,12 +499,20 @@ class Kernels:
         return np.asarray(np.tensordot(weights, neighbours, axes=1))
 
     def _interpolate(self, table: Array, distance: Array) -> Array:
-        """Interpolate a table (distances, ...) at distances (N,) in m; 0 beyond the last one."""
+        """Interpolate a table over the distance.
+
+        Args:
+            table: Values (distances, ...) at the tabulated distances.
+            distance: Distances (N,) in m.
+
+        Returns:
+            Values (N, ...); 0 beyond `REACH_DEPTHS`.
+        """
         index = distance / self.step
         first, weights = _cubic_weights(np.minimum(index, self._last))
         weights = weights * (index <= self._last)
 
-        # Entry 1 of the table belongs to the distance 0.
+        # The table begins one step before the distance 0, so entry 1 belongs to the distance 0.
         shape = (len(index),) + (1,) * (table.ndim - 1)
         weights = weights.reshape(4, *shape)
         neighbours = [weights[j] * table[first + j] for j in range(4)]
@@ -486,19 +533,23 @@ def hertz_pressure(distance: Array, size: float) -> Array:
 
 
 def disc_spectrum(x: Array) -> Array:
-    """Compute the spectrum B of Hertz's pressure with a force of 1 N.
+    """Compute the spectrum (Fourier transform) B of the pressure of a Hertz contact with 1 N.
 
     Args:
-        x: Wavenumbers k multiplied by the radius a of the contact.
+        x: Wavenumbers in 1/m multiplied by the radius of the contact in m.
     """
-    # Near zero, the difference of sin and cos would lose all digits.
+    # Near x = 0, sin x - x cos x would lose all digits, so a Taylor series replaces it.
     safe = np.maximum(x, 1e-2)
     exact = 3 * (np.sin(safe) - safe * np.cos(safe)) / safe**3
     return np.where(x < 1e-2, 1 - x**2 / 10, exact)
 
 
 def _prior_spectrum(wavenumber: Array) -> Array:
-    """Return the spectrum S of the prior divided by depth^2, over wavenumber times depth."""
+    """Return the spectrum S of the prior pressure, divided by depth^2.
+
+    Args:
+        wavenumber: Wavenumbers multiplied by the depth of the cubes.
+    """
     parts = [
         2 * np.pi * length**2 * np.exp(-((wavenumber * length) ** 2) / 2)
         for length in PRIOR_LENGTHS
@@ -513,19 +564,19 @@ def _polar(place: Array) -> tuple[Array, Array]:
 
 
 def _phases(angle: Array, order: Orders) -> Complex:
-    """Return exp(i m angle) (N, n) of angles (N,) and orders m (n,)."""
+    """Return the phases exp(i m angle) (N, n) for angles (N,) in rad and orders m (n,)."""
     phases: Complex = np.exp(1j * angle[:, None] * order)
     return phases
 
 
 def _cubic_weights(index: Array | float) -> tuple[Index, Array]:
-    """Return Lagrange's cubic weights between the two middle ones of four entries.
+    """Return the weights of cubic Lagrange interpolation from four neighbouring table entries.
 
     Args:
-        index: Fractional index (...) into a table.
+        index: Fractional index (...), which lies between the second and the third entry.
 
     Returns:
-        Index (...) of the second of the four entries, and the weights (4, ...).
+        Index (...) of the second entry, and the weights (4, ...) of all four.
     """
     first = np.floor(index).astype(np.intp)
     t = index - first

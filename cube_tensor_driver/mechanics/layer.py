@@ -1,17 +1,18 @@
 """Stress in an elastic layer under traction on its surface, in wavenumber space.
 
 The layer fills -thickness < z < 0. The traction t acts on its surface z = 0, and its bottom is
-bonded to rigid ground; an infinite thickness is a half space. A traction t exp(i k.x) with k = |k|
-causes plane strain in the plane of k and z (axis L along k), and a twist perpendicular to that
-plane (axis T). With zeta = k z, h = k thickness, eta = zeta + h and an Airy function psi / k^2::
+bonded to rigid ground; an infinite thickness is a half space. A wave of traction t exp(i k.x) with
+the wavenumber k = |k| causes plane strain in the plane of k and z (axis L along k), and shear
+perpendicular to this plane (axis T). With zeta = k z, h = k thickness, eta = zeta + h, Poisson's
+ratio nu, shear modulus mu, displacements u and an Airy function psi / k^2, the stress sigma is::
 
     psi = (A + B zeta) exp(zeta) + (C + D eta) exp(-eta)
     sigma_zz = -psi,  sigma_Lz = -i psi',  sigma_LL = psi'',  sigma_TT = nu (psi'' - psi)
     2 mu k (i u_L, u_z) = (1 - nu) psi'' + nu psi,  (1 - nu) psi''' - (2 - nu) psi'
     sigma_Tz = t_T cosh(eta) / cosh(h),  sigma_LT = i t_T sinh(eta) / cosh(h)
 
-The traction determines psi(0) = -t_z and psi'(0) = i t_L; the bond means u_L = u_z = 0 at zeta =
--h.
+The constants A to D follow from the traction, psi(0) = -t_z and psi'(0) = i t_L, and from the bond
+to the ground, u_L = u_z = 0 at zeta = -h.
 
 Source: I. N. Sneddon, Fourier Transforms (1951), 45-47 and 52; K. L. Johnson, Contact Mechanics
 (1985), 2.2 and 5.8. The tests compare the layer with the point forces of contact.py and with finite
@@ -35,8 +36,9 @@ FIELD = STRESS + tuple(f"{name}_{axis}" for name in STRESS for axis in "xyz")
 of each of them along x, y and z in Pa/m."""
 
 _WaveStress = dict[str, tuple[Any, Any]]
-"""Stress under a wave of traction, and its derivative along z. A key such as "LzT" names the stress
-component Lz and the load T, in the axes of the wave: L along it, T across it."""
+"""Stress under a wave of traction on the surface, and the derivative of this stress along z. A key
+such as "LzT" names the stress component Lz and the direction T of the traction, in the axes of the
+wave: L along its wave vector, T across it."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ class Layer:
         """Check that a depth in m lies within the layer.
 
         Raises:
-            ElasticError: It does not.
+            ElasticError: The depth is not between 0 and the thickness.
         """
         if not 0 < depth < self.thickness:
             raise ElasticError(
@@ -82,10 +84,10 @@ class Layer:
         ky: Array,
         depth: float,
     ) -> Complex:
-        """Compute the stress field under a unit traction exp(i k.x) on the surface.
+        """Compute stress and gradient at one depth under a traction exp(i k.x) on the surface.
 
-        The mean traction (k = 0) of a half space has no limit of sigma_xx and sigma_yy, because
-        their values depend on the direction of k. The mean over all directions is returned.
+        In a half space, sigma_xx and sigma_yy have no limit for k -> 0 (uniform traction), because
+        their values depend on the direction of k. Their mean over all directions is returned there.
 
         Args:
             kx: Wavenumber along x (...) in 1/m.
@@ -103,7 +105,7 @@ class Layer:
         kx = np.asarray(kx, float)
         ky = np.asarray(ky, float)
         kx, ky = np.broadcast_arrays(kx, ky)
-        # L = (cosine, sine, 0); its direction does not matter where k is 0.
+        # Axis along the wave vector: L = (cosine, sine, 0). Any direction will do where k is 0.
         k = np.hypot(kx, ky)
         is_zero = k == 0
         k_safe = np.where(is_zero, 1.0, k)
@@ -127,15 +129,23 @@ class Layer:
         return np.concatenate([stress, gradient], axis=-2)
 
     def _plane_strain(self, k: Array, depth: float) -> _WaveStress:
-        """Return the stress under traction along z and along L, the horizontal axis of the wave."""
-        # Derivatives 0 to 3; on the last axis for psi(0) = 1 and for psi'(0) = 1
+        """Return the stress of the plane strain under a unit traction along z and along L.
+
+        L is the horizontal axis along the wave vector.
+
+        Args:
+            k: Wavenumbers (...) in 1/m, greater than 0.
+            depth: Distance below the surface in m.
+        """
+        # psi and its derivatives 1 to 3 by zeta; on the last axis for the boundary conditions
+        # psi(0) = 1 and psi'(0) = 1.
         psi = self._airy(k, -k * depth)
         by_load = {"L": 1j * psi[..., 1], "z": -psi[..., 0]}
 
         nu = self.poisson
         waves: _WaveStress = {}
         for load, p in by_load.items():
-            # Each pair is a stress and its derivative by zeta, see the module head.
+            # Each pair is a stress and its derivative by zeta, from the formulas of the file head.
             parts = {
                 "zz": (-p[0], -p[1]),
                 "Lz": (-1j * p[1], -1j * p[2]),
@@ -147,17 +157,22 @@ class Layer:
         return waves
 
     def _airy(self, k: Array, zeta: Array) -> Array:
-        """Return psi and its first three derivatives by zeta for both unit boundary conditions.
+        """Return the function psi of the file head and its first three derivatives by zeta.
+
+        Args:
+            k: Wavenumbers (...) in 1/m.
+            zeta: Height z (...) multiplied by the wavenumber; negative below the surface.
 
         Returns:
-            Array (4, ..., 2); the last axis is psi(0) = 1, psi'(0) = 0 and psi(0) = 0, psi'(0) = 1.
+            Array (4, ..., 2). The last axis is for the boundary conditions psi(0) = 1, psi'(0) = 0
+            and psi(0) = 0, psi'(0) = 1.
         """
         if np.isinf(self.thickness):
             return self._airy_half_space(zeta)
         h = k * self.thickness
 
         def differentiate(n: int, zeta: Array) -> Array:
-            """Return the factors (..., 4) of A, B, C and D in the n-th derivative of psi."""
+            """Return the factors (..., 4) of the constants A to D in the n-th derivative of psi."""
             eta = zeta + h
             rise = np.exp(zeta)
             fall = (-1) ** n * np.exp(-eta)
@@ -171,7 +186,7 @@ class Layer:
                 axis=-1,
             )
 
-        # Boundary conditions: psi(0), psi'(0), u_L and u_z at the bottom.
+        # Four boundary conditions: psi and psi' at the surface, u_L and u_z at the bottom.
         nu = self.poisson
         psi, psi1, psi2, psi3 = (differentiate(n, -h) for n in range(4))
         conditions = [
@@ -189,7 +204,7 @@ class Layer:
 
     @staticmethod
     def _airy_half_space(zeta: Array) -> Array:
-        """Return psi and its derivatives as `_airy`, for a half space: C = D = 0."""
+        """Return psi and its derivatives as `_airy`, for a half space, where C = D = 0."""
         decay = np.exp(zeta)[..., None]
         a = np.array([1.0, 0.0])
         b = np.array([-1.0, 1.0])  # psi'(0) = A + B
@@ -198,11 +213,17 @@ class Layer:
         return np.stack(derivatives)
 
     def _twist(self, k: Array, depth: float) -> _WaveStress:
-        """Return the stress under traction along T, the horizontal axis across the wave."""
+        """Return the shear stress under a unit traction along T, horizontally across the wave.
+
+        Args:
+            k: Wavenumbers (...) in 1/m, greater than 0.
+            depth: Distance below the surface in m.
+        """
         decay = np.exp(-k * depth)
         cosh = sinh = decay
         if np.isfinite(self.thickness):
-            # cosh(eta) / cosh(h) and sinh(eta) / cosh(h), without overflow for large k
+            # cosh(eta) / cosh(h) and sinh(eta) / cosh(h), written with decaying exponentials, which
+            # cannot overflow for large k
             reflected = np.exp(-2 * k * (self.thickness - depth))
             base = decay / (1 + np.exp(-2 * k * self.thickness))
             cosh = base * (1 + reflected)
@@ -214,8 +235,8 @@ class Layer:
 
     def _uniform(self) -> Array:
         """Return the stress (6, 3) under uniform unit traction along x, y and z."""
-        # Lateral stress per normal stress: the mean over directions in a half space, zero lateral
-        # strain in a layer.
+        # Ratio of lateral to normal stress: in a half space, the mean over all directions of k; in
+        # a layer, the value without lateral strain.
         lateral = (1 + 2 * self.poisson) / 2
         if np.isfinite(self.thickness):
             lateral = self.poisson / (1 - self.poisson)
@@ -236,17 +257,17 @@ def _add_rotated(
     name: str,
     value: Complex,
 ) -> None:
-    """Add one stress component of a wave to a stress in the axes x, y, z.
+    """Rotate one stress component from the axes L, T, z of a wave to the axes x, y, z and add it.
 
     Args:
-        out: Stress (..., 6, 3) under loads along x, y and z, to which is added.
+        out: Stress (..., 6, 3) under tractions along x, y and z, which is changed.
         cosine: First component (...) of the axis L = (cosine, sine, 0); T = (-sine, cosine, 0).
         sine: Second component (...) of L.
-        name: Stress component and load in the axes L, T and z, such as "LzT".
-        value: Amplitude (...).
+        name: Stress component and direction of the traction in the axes of the wave, such as "LzT".
+        value: Amplitude (...) of the component in Pa.
     """
     c, s = cosine, sine
-    # Contribution of a component in the wave's axes to the rows xx yy zz yz zx xy.
+    # Contribution of a stress component in the wave's axes to the rows xx, yy, zz, yz, zx, xy.
     stress_rows: dict[str, dict[int, Any]] = {
         "LL": {0: c * c, 1: s * s, 5: c * s},
         "TT": {0: s * s, 1: c * c, 5: -c * s},
@@ -259,7 +280,7 @@ def _add_rotated(
         "Lz": {4: c, 3: s},
         "Tz": {4: -s, 3: c},
     }
-    # Component of a unit load along x, y or z in the wave's axes.
+    # Components in the wave's axes of a unit traction along x, y and z (columns).
     load_columns: dict[str, dict[int, Any]] = {
         "L": {0: c, 1: s},
         "T": {0: -s, 1: c},

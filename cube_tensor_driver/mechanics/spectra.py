@@ -1,20 +1,23 @@
 """Response of circular components to waves of traction, independent of the direction of the wave.
 
-A layer is the same in all directions. A circular component of order m (circular.py) therefore
-responds to a traction of the wavenumber k in the direction phi as follows, with F+ = F_x + i F_y
-and F- = F_x - i F_y::
+A circular component (circular.py) of order m is a combination of stresses and gradients at a point
+that a rotation about z by an angle multiplies by exp(-i m angle). A layer is the same in all
+directions. The component c therefore responds to a wave of the traction F on the surface, with the
+wavenumber k and the direction phi, as follows; F+ = F_x + i F_y and F- = F_x - i F_y::
 
     c(k) = (-i)^m exp(i m phi) (N F_z + (i/2) P exp(-i phi) F+  -  (i/2) M exp(i phi) F-)
 
-The spectra P (plus), M (minus) and N (normal) are real functions of k. A force that is spread over
-the surface with the spectrum S causes, at the distance r, components with the R, T and Z of
-circular.py. They are Hankel transforms, [k dk / 2 pi]::
+The spectra P (plus), M (minus) and N (normal) are real functions of k. A force that is distributed
+over the surface with the spectrum (Fourier transform) S causes circular components at the distance
+r that the functions R, T and Z of circular.py describe. They are Hankel transforms, integrals over
+k dk / 2 pi::
 
     R + T = int P S J_{m-1}(kr),   R - T = int M S J_{m+1}(kr),   Z = int N S J_m(kr)
 
-A random traction of the spectrum S has independent axes, and its shear has s^2 times the variance
-of the pressure. Two components c of order m and d of order n, at a distance r in the direction phi,
-then have the covariances::
+A random traction has a pressure with the spectrum S and independent shears along x and y with s^2
+times this spectrum. Two components c of order m and d of order n at two positions, with a distance
+r in the direction phi, then have the following covariances (* is the complex conjugate, P', M', N'
+are the spectra of d)::
 
     <c d*> = exp(i (m - n) phi) int S (N N' + (P P' + M M') s^2 / 2) J_{m-n}(kr)
     <c d>  = exp(i (m + n) phi) (-1)^n int S (N N' - (P M' + M P') s^2 / 2) J_{m+n}(kr)
@@ -40,24 +43,25 @@ BesselTable = Callable[[int], Array]
 wavenumbers."""
 
 MAX_WAVENUMBER_TIMES_DEPTH = 25.0
-"""Upper limit of the integrals over k, multiplied by the depth. There, the field has decayed by the
-factor exp(-25)."""
+"""Upper limit of integrals over the wavenumber k, multiplied by the depth of the cubes. At this
+depth, a wave of this wavenumber has decayed by a factor of about exp(-25)."""
 
 N_WAVENUMBERS = 256
-"""Number of Gauss points in k. They resolve the Bessel functions up to a distance of 20 depths."""
+"""Number of Gauss points in integrals over the wavenumber k. They resolve the Bessel functions
+J(k r) up to distances r of 20 depths of the cubes."""
 
 
 @dataclass(frozen=True, eq=False)
 class Spectra:
-    """Spectra of n circular components.
+    """Spectra P, M and N (file head) of n circular components over the wavenumber k.
 
     Attributes:
         k: Wavenumbers (waves,) in 1/m.
         weight: Weights (waves,) of integrals over k dk / 2 pi, in 1/m^2.
         order: Order (n,) m of each component.
-        plus: Spectra P (waves, n), response to F+.
-        minus: Spectra M (waves, n), response to F-.
-        normal: Spectra N (waves, n), response to F_z.
+        plus: Spectra P (waves, n): response to F+ = F_x + i F_y.
+        minus: Spectra M (waves, n): response to F- = F_x - i F_y.
+        normal: Spectra N (waves, n): response to F_z.
     """
 
     k: Array
@@ -68,11 +72,11 @@ class Spectra:
     normal: Array
 
     def radial(self, bessel: BesselTable, load_spectra: Array) -> Array:
-        """Compute R, Z and T of circular.py for forces that are spread over the surface.
+        """Compute the functions R, Z and T of circular.py for distributed forces on the surface.
 
         Args:
-            bessel: Bessel functions at the wanted distances.
-            load_spectra: Spectra S (loads, waves) of the loads.
+            bessel: Bessel functions at the distances from the load at which to compute them.
+            load_spectra: Spectra S (loads, waves) of the distributions of the forces.
 
         Returns:
             R, Z and T (loads, distances, 3, n), in this order, in units of the component per N.
@@ -114,7 +118,9 @@ class Spectra:
         prior: Array,
         shear: float,
     ) -> tuple[Array, Array]:
-        """Compute covariances under a random traction, for positions along x from the other ones.
+        """Compute covariances of the components at two positions under a random traction.
+
+        The first position lies in the direction x from the other one.
 
         Args:
             other: Spectra of the n' components at the other position.
@@ -123,15 +129,15 @@ class Spectra:
             shear: Standard deviation s of the shear divided by that of the pressure.
 
         Returns:
-            Covariances (distances, n, n') of the real parts, and of the imaginary parts. On the x
-            axis, real and imaginary parts are independent of each other.
+            Covariances (distances, n, n') of the real parts, and of the imaginary parts. For
+            positions along x, real parts are independent of imaginary parts.
         """
         normal = _outer(self.normal, other.normal)
         same = _outer(self.plus, other.plus) + _outer(self.minus, other.minus)
         crossed = _outer(self.plus, other.minus) + _outer(self.minus, other.plus)
         half = shear**2 / 2
 
-        # <c d*> and <c d> of the module head at phi = 0
+        # Covariances <c d*> and <c d> of the file head, for the direction phi = 0.
         order_difference = self.order[:, None] - other.order
         order_sum = self.order[:, None] + other.order
         sign = (-1.0) ** other.order
@@ -158,7 +164,7 @@ class Spectra:
         Args:
             spectrum: Products (waves, n, n') of two spectra.
             order: Order (n, n') of the Bessel function for each pair.
-            bessel: Bessel functions at the wanted distances.
+            bessel: Bessel functions at the distances of the result.
             prior: Spectrum S (waves,) of the pressure.
 
         Returns:
@@ -178,15 +184,15 @@ def _outer(first: Array, second: Array) -> Array:
 
 
 def tabulate_bessel(k: Array, r: Array) -> BesselTable:
-    """Tabulate Bessel functions.
+    """Return a function that computes Bessel functions J_m(k r) for fixed k and r.
 
     Args:
         k: Wavenumbers (waves,) in 1/m.
         r: Distances (positions,) in m.
 
     Returns:
-        Function that returns J_m(kr) (positions, waves) of any order m. It computes each order
-        once.
+        Function that returns J_m(kr) (positions, waves) for any order m. Every order is computed
+        once and then kept.
     """
     x = np.outer(r, k)
 
@@ -200,7 +206,10 @@ def tabulate_bessel(k: Array, r: Array) -> BesselTable:
 
 
 def wavenumber_quadrature(depth: float) -> tuple[Array, Array]:
-    """Return Gauss points for integrals over all wavenumbers at a depth in m.
+    """Return Gauss points for integrals over the wavenumber k.
+
+    Args:
+        depth: Depth below the surface in m, which limits the wavenumbers that have an effect.
 
     Returns:
         Wavenumbers (waves,) in 1/m, and their weights (waves,) in integrals over k dk / 2 pi.
@@ -225,7 +234,7 @@ def layer_spectra(layer: Layer, depth: float) -> Spectra:
     along_x = layer.transfer(k, np.zeros_like(k), depth)
     circular = np.einsum("cf,kfi->kci", CIRCULAR_FROM_FIELD, along_x)
 
-    # At phi = 0, i^m c = N F_z + (i/2) P (F_x + i F_y) - (i/2) M (F_x - i F_y).
+    # For a wave along x (phi = 0), i^m c = N F_z + (i/2) P (F_x + i F_y) - (i/2) M (F_x - i F_y).
     rotated = 1j ** ORDERS[:, None] * circular
     x, y, z = np.moveaxis(rotated, -1, 0)
     plus = x.imag - y.real
