@@ -1,6 +1,6 @@
 """Simulated cubes: frequencies of their pads under a stress field, and the cubes of each hub.
 
-Response and pad law are those of the core.
+The response matrix and the law from stress to frequency are those of the driver's core.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from .imperfections import Imperfections, PadBehaviour
 from .sample_log import ABSENT
 
 Millihertz = NDArray[np.uint32]
-"""Frequencies in mHz as on the wire; `NOT_MEASURED` stands for a pad without a frequency."""
+"""Array of frequencies in mHz as in SAMPLE frames; `NOT_MEASURED` is a pad without a frequency."""
 
 
 class SimulatedCubes:
-    """Cubes with the same number of pads.
+    """Computes the frequencies of simulated cubes with the same number of pads.
 
     Attributes:
         n_pads: Number of pads of each cube.
@@ -45,11 +45,12 @@ class SimulatedCubes:
 
         Args:
             calibrations: Calibration of each cube.
-            noise: Standard deviation of a frequency divided by the frequency, 0 for none; None: as
-                the calibration of each cube states.
+            noise: Standard deviation of a frequency divided by the frequency, 0 for no noise. None:
+                the noise in the calibration of each cube.
             drift: Relative change of every rest frequency per second.
-            imperfections: Deviations of the pads from their calibrations.
-            seed: Seed of the noise and, with their own seed, of the imperfections.
+            imperfections: Deviations of the pads from their calibrations; None: no deviations.
+            seed: Seed of the noise. Together with the seed of the imperfections, it also determines
+                the deviation of each pad.
         """
         self.n_pads = calibrations[0].layout.n_pads
         self._drift = drift
@@ -81,14 +82,14 @@ class SimulatedCubes:
             seconds: Simulated time in s.
 
         Returns:
-            Frequencies (cubes, pads) in mHz. A pad beyond the range of its law reads
-            `NOT_MEASURED`, as an oscillator does that stopped.
+            Frequencies (cubes, pads) in mHz. A pad whose stress is beyond the range of the law from
+            stress to frequency has `NOT_MEASURED`, like a pad whose oscillator has stopped.
         """
         pad_stress = np.empty((len(stress), self.n_pads))
         for calibration, rows in self._groups:
             state = true_state(calibration, stress[rows], gradient[rows])
             pad_stress[rows] = state @ calibration.response.T
-        # Deviations of real pads act between the stress and the frequency.
+        # Imperfections change the stress that determines a pad's frequency.
         if self._behaviour is not None:
             pad_stress = self._behaviour.reported(pad_stress, seconds)
 
@@ -109,10 +110,10 @@ class HubCubes:
     """The cubes of one simulated hub.
 
     Attributes:
-        link: Link that the hub is on.
-        members: Index (hub cubes,) in the skin of each of its cubes, `ABSENT` where the skin has
-            none.
-        cubes: The cubes that the skin has.
+        link: Link of the skin that the hub is on.
+        members: Index in the skin of each cube (hub cubes,) of the hub, in the order of the hub;
+            `ABSENT` for cubes that are not in the skin.
+        cubes: Those cubes of the hub that are in the skin.
     """
 
     link: SkinLink
@@ -121,7 +122,7 @@ class HubCubes:
 
     @property
     def skin_cubes(self) -> Index:
-        """Index in the skin of each of its cubes that the skin has, in the order of the hub."""
+        """Indices in the skin of the hub's cubes, without absent ones, in the order of the hub."""
         return np.asarray(self.members[self.members != ABSENT])
 
     def frequency(
@@ -144,7 +145,7 @@ class HubCubes:
 
 
 def frequency_noise(calibration: Calibration) -> Array:
-    """Compute the noise of the frequencies that causes the noise in Pa of a calibration at rest.
+    """Convert the noise of a calibration from Pa to noise of the frequencies, for pads at rest.
 
     Returns:
         Standard deviation (pads,) of each frequency divided by the frequency.
@@ -163,7 +164,7 @@ def hub_cubes(
 ) -> list[HubCubes]:
     """Create the cubes of all simulated hubs of a skin, in the order of its links.
 
-    Links without cubes are left out. The other arguments are those of `SimulatedCubes`.
+    Links without cubes are left out. The keyword arguments are those of `SimulatedCubes`.
 
     Raises:
         ConfigError: Cubes of one hub have different numbers of pads.
@@ -180,7 +181,7 @@ def hub_cubes(
                 f"link {link.name}: its cubes have {sorted(n_pads)} pads; all cubes of a hub must "
                 "have the same number"
             )
-        # With the number as seed, hubs have different noise.
+        # The index of the link is the seed, so that the noise of different hubs differs.
         cubes = SimulatedCubes(
             calibrations, noise=noise, drift=drift, imperfections=imperfections, seed=number
         )
@@ -189,10 +190,11 @@ def hub_cubes(
 
 
 def hub_members(skin: Skin, link: str) -> Index:
-    """Return the index in the skin of each cube (hub cubes,) of the hub on a link, or `ABSENT`.
+    """Return the indices in the skin of the cubes (hub cubes,) of the hub on a link.
 
-    Cubes that have a uid but no index take the free places; those without a link are on the first
-    link.
+    A cube whose index on the hub is given in the skin file has this index. The others (with a uid
+    instead) take the free indices in the order of the skin; without a link, they are on the first
+    link. The value is `ABSENT` for indices that remain free.
     """
     by_index = {
         cube.index: number
@@ -206,7 +208,7 @@ def hub_members(skin: Skin, link: str) -> Index:
         if cube.index is None and (cube.link or first_link) == link
     ]
 
-    # A hub may have cubes that the skin does not use: their indices stay free.
+    # A hub may have cubes that are not in the skin, whose indices then stay free.
     highest = max(by_index, default=-1)
     size = max(len(by_index) + len(by_uid), highest + 1)
     members = np.full(size, ABSENT)
@@ -217,7 +219,14 @@ def hub_members(skin: Skin, link: str) -> Index:
 
 
 def calibration_groups(calibrations: Sequence[Calibration]) -> list[tuple[Calibration, Index]]:
-    """Return each different calibration with the indices of the cubes that have it."""
+    """Group cubes by calibration.
+
+    Args:
+        calibrations: Calibration of each cube.
+
+    Returns:
+        Each different calibration, with the indices of the cubes that have it.
+    """
     cubes_by_id: dict[str, list[int]] = {}
     for number, calibration in enumerate(calibrations):
         cubes_by_id.setdefault(calibration.id, []).append(number)
@@ -231,8 +240,8 @@ def true_state(
 ) -> Array:
     """Project true stress fields onto the modes of a calibration.
 
-    What the modes do not contain, such as yy for a planar cube, is left out: the response does not
-    tell how the pads would react to it.
+    The modes are the stress states for which the calibration contains the response of the pads.
+    Other parts of the field, such as yy for a planar cube, are left out.
 
     Args:
         calibration: Calibration of the cubes.
@@ -242,7 +251,7 @@ def true_state(
     Returns:
         Amplitudes (N, modes) in Pa.
     """
-    # The gradient of the modes is that over one half side.
+    # Modes of gradients are in Pa: change of the stress over half the side of the cube.
     by_axis = to_matrix(np.moveaxis(gradient, -1, -2))  # (N, axis, i, j)
     scaled = np.moveaxis(by_axis, -3, -1) * calibration.half_side
     return calibration.modes.state(stress, scaled)
@@ -253,11 +262,11 @@ def true_components(
     stress: Array,
     gradient: Array,
 ) -> Array:
-    """Return the components (N, 15) in Pa and Pa/m that a cube should report of true fields.
+    """Return the components (N, 15) in Pa and Pa/m that cubes without errors would measure.
 
     Arguments as in `true_state`.
     """
-    # The modes of gradients are in Pa; published gradients are in Pa/m.
+    # Modes of gradients are in Pa (change over half a side), the components in Pa/m.
     is_stress = np.arange(len(COMPONENTS)) < len(STRESS)
     scale = np.where(is_stress, 1.0, 1 / calibration.half_side)
     state = true_state(calibration, stress, gradient)
@@ -269,7 +278,13 @@ def skin_components(
     stress: Array,
     gradient: Array,
 ) -> Array:
-    """Return the `true_components` (cubes, 15) of all cubes of a skin."""
+    """Return the `true_components` (cubes, 15) of all cubes of a skin under true fields.
+
+    Args:
+        skin: Skin.
+        stress: Stress (cubes, 6) in Pa.
+        gradient: Gradient (cubes, 6, 3) in Pa/m.
+    """
     components = np.empty((len(skin.cubes), len(COMPONENTS)))
     for calibration, rows in calibration_groups(skin.calibrations):
         components[rows] = true_components(calibration, stress[rows], gradient[rows])

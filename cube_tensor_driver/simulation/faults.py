@@ -1,4 +1,4 @@
-"""Faults of simulated hubs: which there are, and how they are written.
+"""Kinds of faults of simulated hubs, and how they are written in YAML.
 
 A fault is a table with the key `kind` and further keys where the kind needs them; `Fault` lists
 them. `injector.py` carries faults out.
@@ -40,16 +40,17 @@ KINDS = {
     "pads": "send one pad too many for `seconds`",
     "version": "speak protocol version 2 for `seconds`",
 }
-"""What each kind of fault does, with the keys that it uses."""
+"""Effect of each kind of fault. Words in backquotes are the keys of `Fault` that the kind uses."""
 
 MAX_COUNT = (1 << 32) - 1
-"""Largest number of samples that a fault affects, and largest index of a cube or pad."""
+"""Maximum value of the whole numbers of a fault: number of affected samples, index of a cube, index
+of a pad."""
 
 FRAME_FAULTS = ("drop", "flip", "insert", "duplicate", "reorder", "truncate")
-"""Faults of the frames of single samples."""
+"""Kinds of faults that alter or lose the frames of single samples."""
 
 PAD_FAULTS = ("open", "short", "stuck", "noisy", "report")
-"""Faults of one pad."""
+"""Kinds of faults of one pad (sensing element) of a cube."""
 
 CUT_FAULTS = (
     "stall",
@@ -64,11 +65,12 @@ CUT_FAULTS = (
     "pads",
     "version",
 )
-"""Faults that interrupt a link, change what its hub reports of itself, or disturb the hub's
-clock."""
+"""Kinds of faults that interrupt a link, restart its hub, change the hub's description of itself,
+or disturb the hub's clock."""
 
 MOMENTARY_FAULTS = (*FRAME_FAULTS, "reset", "wrap", "drift", "step")
-"""Faults that end as soon as they have begun. All others last `seconds`."""
+"""Kinds of faults without a duration: they end as soon as they have begun. All other kinds last for
+the time `seconds` of the fault."""
 
 
 # Only `value` may be negative: a clock may run slow, a temperature may fall.
@@ -93,16 +95,16 @@ _SCHEMA = Schema(
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault.
+    """One fault of a simulated hub. `KINDS` names the attributes that each kind uses.
 
     Attributes:
-        kind: One of `KINDS`.
-        at: Simulated time at which it begins, in s; 0 by default.
+        kind: Kind of the fault, a key of `KINDS`.
+        at: Simulated time in s at which the fault begins.
         link: Name of the link; empty for all links.
         seconds: Duration in s.
         count: Number of samples that are affected.
-        cube: Index of the cube on the hub.
-        pad: Index of the pad.
+        cube: Index of the cube on its hub.
+        pad: Index of the pad on its cube.
         value: Size of the fault, in the unit that `KINDS` names.
     """
 
@@ -117,26 +119,26 @@ class Fault:
 
     @classmethod
     def parse(cls, data: Any, place: str) -> Fault:
-        """Check the plain values of a fault.
+        """Create a fault from plain values and check them.
 
         Args:
-            data: Values as from YAML.
-            place: Where they come from, for messages.
+            data: Dictionary as read from YAML.
+            place: Source of the values (such as a file name), with which error messages begin.
 
         Raises:
-            ConfigError: A key or a value is wrong. The message names the key, the value and what is
-                allowed.
+            ConfigError: A key or a value is wrong. The message names the key, the value and the
+                allowed values.
         """
         for _, mistake in _SCHEMA.mistakes(data):
             raise ConfigError(f"{place}: {mistake}")
-        # YAML may contain 2 for 2.0 and the reverse.
+        # YAML may contain 2 where a float is needed, and 2.0 where an integer is needed.
         types: dict[str, Any] = {field.name: type(field.default) for field in fields(cls)}
         types["kind"] = str
         return cls(**{key: types[key](value) for key, value in data.items()})
 
 
 def parse_faults(data: Any, place: str) -> list[Fault]:
-    """Check a list of faults; arguments and errors as in `Fault.parse`."""
+    """Create faults from a list of dictionaries; arguments and errors as in `Fault.parse`."""
     if not isinstance(data, list):
         raise ConfigError(f"{place}: found {str(data)[:60]!r}, allowed: a list of faults")
     return [Fault.parse(item, f"{place}: [{number}]") for number, item in enumerate(data)]
@@ -144,14 +146,14 @@ def parse_faults(data: Any, place: str) -> list[Fault]:
 
 @dataclass(frozen=True)
 class HubSize:
-    """Number of cubes of a simulated hub, and of pads of each of them."""
+    """Number of cubes on a simulated hub, and number of pads of each of these cubes."""
 
     cubes: int
     pads: int
 
 
 def check_target(fault: Fault, hubs: Mapping[str, HubSize]) -> list[str]:
-    """Check the link, cube and pad of a fault.
+    """Check that the link, cube and pad of a fault exist.
 
     Args:
         fault: Fault to check.

@@ -1,6 +1,6 @@
-"""A simulated hub: answers requests, takes samples and logs them.
+"""A simulated hub: it answers requests of the host, takes samples and logs them.
 
-Like the protocol code, it has no input, output or clock; its caller passes bytes and the time.
+Like the protocol code, this code reads no port and no clock: its caller passes bytes and the time.
 """
 
 from __future__ import annotations
@@ -30,40 +30,43 @@ from .prepared_frames import PreparedFrame
 from .sample_log import SampleRun
 
 FIRMWARE = 0x00010000
-"""Firmware version that a simulated hub reports."""
+"""Firmware version that a simulated hub reports in HELLO."""
 
 PERIOD_LIMITS_US = (100, 10_000_000)
 """Shortest and longest sample period in µs that a simulated hub accepts."""
 
 _BUFFER_SIZE = 5000
-"""Free buffer that a simulated hub reports in STATS, in bytes."""
+"""Free size, in bytes, of the send buffer that a simulated hub reports in STATS; it is constant."""
 
 _UINT32_MASK = 0xFFFFFFFF
-"""Counters on the wire have 32 bits; those in the log do not wrap."""
+"""Mask that reduces a counter of the simulation, which does not wrap around, to the 32 bits of the
+counters in frames."""
 
 
 @dataclass
 class SimulatedHub:
-    """The device side of the protocol. Simulated times are in µs.
+    """A hub, the device side of the protocol. Simulated times are in µs.
+
+    The attributes from `drift_ppm` on are changed by faults.
 
     Attributes:
-        uid: Uid that it reports in HELLO.
-        cube_uids: Uids of its cubes that it reports in HELLO.
+        uid: Unique number of the hub, which HELLO contains.
+        cube_uids: Unique numbers of its cubes, which HELLO contains.
         n_pads: Number of pads of each cube.
-        boot_us: Value of its clock at simulated time 0.
-        period_us: Sample period.
-        started: Whether it takes samples.
-        next_us: Simulated time of the next sample.
-        sequence: Number of the next sample since the last restart; it does not wrap.
+        boot_us: Value of the hub's clock at simulated time 0, in µs.
+        period_us: Time between two samples in µs.
+        started: Whether the hub takes samples.
+        next_us: Simulated time of the next sample in µs.
+        sequence: Number of the next sample since the last restart; it does not wrap at 2^32.
         dropped: Number of samples since the last restart for which the line had no room.
         decoder: Decoder of the incoming requests.
         boots: Number of restarts.
-        drift_ppm: Excess rate of its clock in ppm; this and all below are set by faults.
-        version: Protocol version of its frames.
-        false_uid: Uid that it reports instead of its own.
-        extra_pads: Number of pads that it reports in addition to `n_pads`.
-        celsius: Temperature in 0.01 °C.
-        pad_fault: Bits (cubes,) of the pads that it reports as failed; None for no pads.
+        drift_ppm: Excess rate of the hub's clock over simulated time, in ppm.
+        version: Protocol version of the hub's frames.
+        false_uid: Unique number that HELLO contains instead of `uid`; None: `uid`.
+        extra_pads: Number of pads that HELLO contains in addition to `n_pads`.
+        celsius: Temperature in 0.01 °C in the SAMPLE frames.
+        pad_fault: Bit masks (cubes,) of the pads that the hub reports as failed; None for no pads.
     """
 
     uid: int
@@ -91,7 +94,7 @@ class SimulatedHub:
     _prepared: dict[int, tuple[Millihertz, PreparedFrame]] = field(default_factory=dict)
 
     def hello(self) -> bytes:
-        """Return the HELLO frame."""
+        """Return the HELLO frame, the description of the hub and its cubes."""
         uid = self.uid if self.false_uid is None else self.false_uid
         n_pads = self.n_pads + self.extra_pads
         uids = np.array(self.cube_uids, "<u8")
@@ -101,19 +104,19 @@ class SimulatedHub:
         )
 
     def stats(self, now_us: int) -> bytes:
-        """Return the STATS frame."""
+        """Return the STATS frame, the hub's counters, at simulated time `now_us`."""
         uptime_ms = self._positive_device_us(now_us) // 1000
         sequence = self.sequence & _UINT32_MASK
         dropped = self.dropped & _UINT32_MASK
         return encode(Stats(uptime_ms, sequence, dropped, _BUFFER_SIZE), self.version)
 
     def device_us(self, now_us: int) -> int:
-        """Return the value of the hub's clock."""
+        """Return the value of the hub's clock in µs at simulated time `now_us`."""
         gained = round(1e-6 * self.drift_ppm * (now_us - self._drift_since_us))
         return self.boot_us + now_us + gained
 
     def _positive_device_us(self, now_us: int) -> int:
-        """Return the value of the hub's clock as it is sent: without a sign."""
+        """Return the value of the hub's clock in µs, or 0 if it is negative, as frames hold it."""
         return max(0, self.device_us(now_us))
 
     def set_clock(
@@ -122,8 +125,15 @@ class SimulatedHub:
         step_us: int = 0,
         drift_ppm: float | None = None,
     ) -> None:
-        """Set the clock forward, or change its rate from now on."""
-        # Time gained so far becomes part of the offset, so that only a step changes the clock.
+        """Step the clock of the hub, or change its rate.
+
+        Args:
+            now_us: Simulated time in µs.
+            step_us: Time in µs by which the clock is set forward.
+            drift_ppm: New excess rate of the clock in ppm; None: the rate does not change.
+        """
+        # The time that the clock has gained so far becomes part of its offset. So a new rate does
+        # not change the clock's present value.
         self.boot_us = self.device_us(now_us) - now_us + step_us
         self.drift_ppm = self.drift_ppm if drift_ppm is None else drift_ppm
         self._drift_since_us = now_us
@@ -133,7 +143,7 @@ class SimulatedHub:
         self.started = False
 
     def reset(self, now_us: int, sequence: int) -> None:
-        """Restart: sampling stopped, clock at 0, numbers from `sequence` on."""
+        """Restart the hub: it stops sampling, its clock is 0, its next sample number `sequence`."""
         self.off()
         self.boots += 1
         self.boot_us = -now_us
@@ -143,23 +153,23 @@ class SimulatedHub:
         self.decoder = PythonDecoder()
 
     def receive(self, data: bytes, now_us: int) -> bytes:
-        """Return the answers to bytes from the host."""
+        """Carry out the requests in bytes from the host and return the answers."""
         frames = self.decoder.feed(data)
         requests = [frame for frame in frames if isinstance(frame, Request)]
         return b"".join(self._answer(request, now_us) for request in requests)
 
     def prepare(self, frequency: Millihertz) -> None:
-        """Encode a SAMPLE in advance, except for number, time and checksum.
+        """Encode a SAMPLE frame in advance, except for number, time and checksum.
 
         Args:
-            frequency: Frequencies (cubes, pads) in mHz. `sample` uses the frame for the same
-                object.
+            frequency: Frequencies (cubes, pads) in mHz. `sample` uses the prepared frame if it is
+                called with the same array object.
         """
         sample = self._build_sample(0, 0, frequency)
         self._prepared[id(frequency)] = frequency, PreparedFrame(sample)
 
     def sample(self, frequency: Millihertz) -> bytes:
-        """Take the sample of `next_us`.
+        """Take the sample that is due at `next_us`, log it and schedule the next one.
 
         Args:
             frequency: Frequencies (cubes, pads) in mHz.
@@ -174,7 +184,8 @@ class SimulatedHub:
         self.next_us += self.period_us
 
         _, prepared = self._prepared.get(id(frequency), (None, None))
-        # Prepared frames have no temperature and no reported faults.
+        # A prepared frame has an unknown temperature and no reported pad faults, and so cannot be
+        # used while a fault sets one of these.
         is_plain = self.celsius == TEMPERATURE_UNKNOWN and self.pad_fault is None
         if prepared is not None and is_plain and self.version == VERSION:
             return prepared.encode(sequence, device_us)
@@ -203,14 +214,15 @@ class SimulatedHub:
 
     @property
     def runs(self) -> list[SampleRun]:
-        """All samples that were taken, in the order of time."""
+        """Runs of all samples that the hub has taken, in the order of time."""
         if self._run is None:
             return []
         return [*self._ended_runs, replace(self._run, last=self._last)]
 
     def _log_sample(self) -> None:
-        """Continue the run with the sample of `next_us`, or begin a new run."""
-        # A run ends where samples were skipped, the period changed or the hub restarted.
+        """Add the sample of `next_us` to the newest run of the log, or begin a new run with it."""
+        # A run is a sequence of samples at equal intervals. It ends when samples are skipped, the
+        # period changes or the hub restarts.
         if (self.next_us, self.period_us, self.boots) != self._expected:
             self._ended_runs = self.runs
             self._run = SampleRun(
@@ -224,14 +236,15 @@ class SimulatedHub:
         self._expected = self.next_us + self.period_us, self.period_us, self.boots
 
     def skip(self, now_us: int) -> None:
-        """Schedule the next sample after now; samples that are due are never taken.
+        """Schedule the next sample after simulated time `now_us`; earlier samples are left out.
 
-        Samples fall on whole multiples of the period, so that hubs sample together.
+        Simulated times of samples are whole multiples of the period, so that all hubs of a skin
+        sample at the same times.
         """
         self.next_us = (now_us // self.period_us + 1) * self.period_us
 
     def _answer(self, request: Request, now_us: int) -> bytes:
-        """Carry out a request and return the answer."""
+        """Carry out a request of the host and return the frames of the answer."""
         result = Result.DONE
         argument = 0
         match request.request:
@@ -241,7 +254,7 @@ class SimulatedHub:
                 device_us = self._positive_device_us(now_us)
                 return encode(Time(request.argument, device_us), self.version)
             case Command.START:
-                # A second START must not shift the samples.
+                # A START while sampling runs must not change the times of the samples.
                 if not self.started:
                     self.skip(now_us)
                 self.started = True

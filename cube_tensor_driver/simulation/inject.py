@@ -18,15 +18,15 @@ def inject(ports: Path | None, words: Sequence[str]) -> str:
     """Send a fault to a simulator.
 
     Args:
-        ports: Folder of the simulator's ports; None: that of the demo that was started last.
-        words: The fault as key=value, such as ``kind=unplug``.
+        ports: Folder of the simulator's ports; None: the folder of the demo that was started last.
+        words: Keys and values of the fault, such as ``kind=unplug``.
 
     Returns:
-        What happens now, in words.
+        Description of the fault and its links, for the user.
 
     Raises:
-        ConfigError: The fault is wrong, no simulator runs there, or it does not have the link, cube
-            or pad.
+        ConfigError: The fault is wrong, no simulator runs with this folder, or the link, cube or
+            pad does not exist there.
     """
     unclear = [word for word in words if "=" not in word]
     if unclear:
@@ -35,7 +35,7 @@ def inject(ports: Path | None, words: Sequence[str]) -> str:
             "seconds=2"
         )
     pairs = dict(word.split("=", 1) for word in words)
-    # Names are texts even if they look like numbers.
+    # The values of these two keys stay texts, even if they look like numbers.
     fault = {
         key: value if key in ("kind", "link") else parse_yaml(value, "fault")
         for key, value in pairs.items()
@@ -44,7 +44,7 @@ def inject(ports: Path | None, words: Sequence[str]) -> str:
     folder = ports or _newest_demo()
 
     with os.fdopen(_open_pipe(folder / FAULT_PIPE), "w") as stream:
-        # The file exists before the pipe.
+        # The simulator writes this file before it creates the pipe, so the file exists.
         sizes = read_yaml(folder / HUBS_FILE)
         hubs = {name: HubSize(**size) for name, size in sizes.items()}
         links = check_target(parsed, hubs)
@@ -60,7 +60,7 @@ def fault_line(fault: dict[str, object]) -> str:
 def _open_pipe(pipe: Path) -> int:
     """Open the pipe of a simulator for writing."""
     try:
-        # Without O_NONBLOCK, opening a pipe without a reader would wait for ever.
+        # Without O_NONBLOCK, opening the pipe would block until a simulator reads it.
         return os.open(pipe, os.O_WRONLY | os.O_NONBLOCK)
     except OSError as error:
         reason = "no simulator reads it" if error.errno == errno.ENXIO else error.strerror
@@ -70,7 +70,7 @@ def _open_pipe(pipe: Path) -> int:
 
 
 def _describe(fault: Fault) -> str:
-    """Return what a fault does, with its values."""
+    """Return the effect of a fault in words, with its values."""
     text = KINDS[fault.kind]
     for name, unit in (("seconds", " s"), ("count", ""), ("value", "")):
         text = text.replace(f"`{name}`", f"{getattr(fault, name):g}{unit}")

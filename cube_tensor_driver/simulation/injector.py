@@ -1,4 +1,4 @@
-"""Carries faults out on simulated hubs, by schedule or at once, and records them."""
+"""Carries out faults on simulated hubs, at given times or at once, and records them."""
 
 from __future__ import annotations
 
@@ -18,45 +18,48 @@ from .line import SimulatedLine
 from .sample_log import FaultRecord
 
 RELATIVE_CHANGE_PER_CELSIUS = 50e-6
-"""Relative change of every rest frequency per °C."""
+"""Relative change of the rest frequency (frequency without stress) of every pad per °C, which the
+fault `temperature` causes."""
 
 ROOM_CELSIUS = 25.0
-"""Temperature in °C to which the rest frequencies belong."""
+"""Temperature in °C at which pads have the rest frequencies of their calibration."""
 
 OPEN_FACTOR = 8
-"""Factor of the frequency of a pad whose lead is open. Only its parasitic capacitance remains, and
-the frequency rises above everything that the pad law with β = 0.3 can reach."""
+"""Factor by which the frequency of a pad rises if its lead is broken (fault `open`). Only the
+parasitic capacitance remains, so the frequency is above the range that stress can cause if this
+capacitance is β = 0.3 times that of the pad at rest."""
 
 MAX_MILLIHERTZ = 0xFFFFFFFF
-"""Highest frequency in mHz that a frame can hold."""
+"""Highest frequency, in mHz, that the 32-bit field of a SAMPLE frame can hold."""
 
 DAMAGING_FAULTS = ("drop", "flip", "insert", "truncate")
-"""Faults after which a frame may no longer be readable."""
+"""Kinds of faults after which the host may not be able to decode a SAMPLE frame."""
 
 _MAX_INSERTED_BYTES = 20
-"""Number of inserted bytes, exclusive upper limit."""
+"""Exclusive upper limit of the random number of bytes that the fault `insert` adds to a frame."""
 
 _FALSE_UID_BITS = 0xBAD
-"""Bits of the uid that are inverted in a false uid."""
+"""Bits of a hub's uid (unique number) that the fault `uid` inverts."""
 
 _LASTING_STATES = ("stall", "burst", "temperature")
-"""Faults that need no action at their end: the line itself ends a stall and a burst, a temperature
-stays until the next one."""
+"""Kinds of faults whose end needs no action: the line ends a stall and a burst by itself, and a
+temperature stays until the next fault of this kind."""
 
 _Schedule = list[tuple[int, int, Fault]]
-"""Heap of simulated time in µs, number and fault; of equal times, the lower number comes first."""
+"""Heap of (simulated time in µs, number, fault). Of faults at the same time, the one with the lower
+number comes first."""
 
 
 @dataclass
 class SimulatedLink:
-    """A link: the simulated hub at its far end, and the line between.
+    """A link of the skin: a simulated hub and its line to the host.
 
     Attributes:
         name: Name of the link.
-        hub: Hub at its far end.
-        line: Line to the host.
-        damaged: Number of restarts of the hub, and number of the sample, for each sample that was
-            not sent as it was taken.
+        hub: Simulated hub.
+        line: Line between hub and host.
+        damaged: Samples whose frame was altered or not sent: for each, the number of the hub's
+            restarts before, and the number of the sample.
     """
 
     name: str
@@ -70,13 +73,13 @@ class SimulatedLink:
         return HubSize(len(self.hub.cube_uids), self.hub.n_pads)
 
     def mark_damaged(self) -> None:
-        """Note that the newest sample of the hub is not sent as it was taken."""
+        """Record that the frame of the hub's newest sample is altered or not sent."""
         self.damaged.append((self.hub.boots, self.hub.sequence - 1))
 
 
 @dataclass
 class _BrokenPad:
-    """A pad under a fault, and its frequency in mHz when the fault began."""
+    """A pad under a fault, and its frequency in mHz at the first sample after the fault began."""
 
     fault: Fault
     reading: int | None = None
@@ -87,11 +90,12 @@ class _LinkState:
     """Faults that affect one link now.
 
     Attributes:
-        frames: Faults of the next SAMPLE frames, in order.
-        held_back: Frame that is sent after the next one.
+        frames: Kinds of faults for the next SAMPLE frames, one for each frame.
+        held_back: Frame that is sent after the next one (fault `reorder`).
         pads: Pads under a fault.
-        warming: Simulated time at which the temperature began to change, and the fault.
-        hold: Simulated time whose load stays, and the fault; None: the load goes on.
+        warming: Simulated time in µs at which the temperature began to change, and the fault.
+        hold: Simulated time in µs whose load acts for the duration of a fault `hold`, and the
+            fault; None: the load changes with time.
     """
 
     frames: list[str] = field(default_factory=list)
@@ -105,7 +109,7 @@ class Injector:
     """Carries out faults on the links of one simulator.
 
     Attributes:
-        records: Faults that have begun.
+        records: Records of all faults that have begun.
     """
 
     def __init__(
@@ -119,7 +123,7 @@ class Injector:
         Args:
             links: All links of the simulator.
             faults: Faults to carry out at their times.
-            seed: Seed of what is random in the faults.
+            seed: Seed of the random numbers in the faults.
 
         Raises:
             ConfigError: A fault names a link, cube or pad that does not exist.
@@ -138,7 +142,7 @@ class Injector:
         """Schedule a fault at a simulated time in µs.
 
         Raises:
-            ConfigError: It names a link, cube or pad that does not exist.
+            ConfigError: The fault names a link, cube or pad that does not exist.
         """
         sizes = {name: link.size for name, link in self._links.items()}
         # A fault without a link becomes one fault per link.
@@ -146,13 +150,14 @@ class Injector:
             self._schedule(self._begins, at_us, replace(fault, link=name))
 
     def due_us(self) -> int | None:
-        """Return the simulated time at which `step` has to be called next."""
+        """Return the simulated time in µs at which the next fault begins or ends, or None."""
         times = [schedule[0][0] for schedule in (self._begins, self._ends) if schedule]
         return min(times, default=None)
 
     def step(self, now_us: int) -> None:
-        """Begin and end the faults that are due."""
-        # Ends first: a fault may begin in the instant in which another one on the same pad ends.
+        """Begin and end the faults that are due at simulated time `now_us`."""
+        # Faults end before others begin, because a fault may begin at the time at which another one
+        # on the same pad ends.
         while self._ends and self._ends[0][0] <= now_us:
             _, _, fault = heapq.heappop(self._ends)
             self._end(fault, now_us)
@@ -166,7 +171,7 @@ class Injector:
         frequency: Millihertz,
         now_us: int,
     ) -> Millihertz:
-        """Return what the hub measures.
+        """Return the frequencies (cubes, pads) in mHz that a hub measures under its faults.
 
         Args:
             link: Link of the hub.
@@ -176,9 +181,10 @@ class Injector:
         state = self._states[link.name]
         hub = link.hub
         if not state.pads and state.warming is None and not hub.extra_pads:
-            return frequency  # the same array: the hub may have prepared its frame
+            # The hub finds a frame that it encoded in advance by the identity of the array.
+            return frequency
 
-        # A copy, because the fields of a load may be kept for its next period.
+        # The array is copied, because it may be used again for a later sample.
         frequency = frequency.copy()
         if state.warming is not None:
             begin_us, fault = state.warming
@@ -201,7 +207,10 @@ class Injector:
         return now_us if hold is None else hold[0]
 
     def transmitted(self, link: SimulatedLink, data: bytes) -> bytes:
-        """Return the bytes that are sent for one SAMPLE frame; none if it is lost or held back."""
+        """Return the bytes that are sent on a link in place of one SAMPLE frame.
+
+        They are empty if the frame is lost or held back, and end with a frame that was held back.
+        """
         state = self._states[link.name]
         kind = state.frames.pop(0) if state.frames else ""
         held_back = state.held_back
@@ -214,7 +223,7 @@ class Injector:
         return self._alter_frame(kind, data) + held_back
 
     def _alter_frame(self, kind: str, data: bytes) -> bytes:
-        """Return the bytes of a frame after a fault of this kind."""
+        """Return the bytes of a frame after a fault of this kind; "" does not change them."""
         random = self._random
         match kind:
             case "drop":
@@ -223,7 +232,7 @@ class Injector:
                 return data + data
             case "flip":
                 altered = bytearray(data)
-                # The zeros at both ends of the frame stay.
+                # The zero bytes that delimit the frame at both ends are not altered.
                 byte = int(random.integers(1, len(data) - 1))
                 altered[byte] ^= 1 << int(random.integers(8))
                 return bytes(altered)
@@ -255,7 +264,7 @@ class Injector:
                 line.burst_until_us = end_us
             case "unplug" | "rename":
                 state.held_back = b""
-                hub.off()  # the power comes from the port
+                hub.off()  # a hub is powered by its port
                 line.unplug()
             case "reset":
                 self._restart(link, now_us, 0)
@@ -287,7 +296,7 @@ class Injector:
         now_us: int,
         sequence: int,
     ) -> None:
-        """Restart a hub, which then numbers its samples from `sequence` on and reports itself."""
+        """Restart a hub, which then sends HELLO and numbers its samples from `sequence` on."""
         self._states[link.name].held_back = b""
         link.hub.reset(now_us, sequence)
         link.line.send(link.hub.hello(), now_us)
@@ -303,12 +312,12 @@ class Injector:
                 state.pads = [broken for broken in state.pads if broken.fault is not fault]
                 _report_pads(hub, state)
             case "hold":
-                # A later hold has replaced it if it is not this one.
+                # If the hold that acts now is another fault, it began later and replaced this one.
                 if state.hold is not None and state.hold[1] is fault:
                     state.hold = None
             case "unplug" | "rename":
                 if line.plugged:
-                    return  # the end of another fault has plugged it in
+                    return  # the end of another fault has plugged the line in already
                 renamed = None
                 if fault.kind == "rename":
                     renamed = line.port.with_name(f"{link.name}_{len(self.records)}")
@@ -342,8 +351,8 @@ def broken_reading(
     Args:
         fault: Fault of the pad.
         sound: Frequency in mHz without the fault.
-        first: Frequency in mHz without the fault when it began.
-        time_us: Simulated time.
+        first: Frequency in mHz at the first sample after the fault began.
+        time_us: Simulated time in µs.
     """
     match fault.kind:
         case "short":
@@ -351,7 +360,7 @@ def broken_reading(
         case "open":
             return min(OPEN_FACTOR * sound, MAX_MILLIHERTZ)
         case "noisy":
-            # The noise depends on the time alone, so that a check can compute it again.
+            # The simulated time is the seed of the noise, so that a check can compute the same one.
             noise = np.random.default_rng(time_us).standard_normal()
             return round(sound * (1 + fault.value * noise))
         case "stuck":
@@ -364,28 +373,47 @@ def warming(
     begin_us: int,
     time_us: Times | int,
 ) -> Any:
-    """Return the °C above room temperature at simulated times while a temperature fault acts."""
-    # Linear over the duration of the fault, then constant.
+    """Return the temperature rise above room temperature under a fault `temperature`.
+
+    Args:
+        fault: Fault with the final rise `value` in °C and the duration `seconds`.
+        begin_us: Simulated time in µs at which the fault began.
+        time_us: Simulated times (...) in µs.
+
+    Returns:
+        Temperature rise (...) in °C.
+    """
+    # The temperature rises linearly during the fault and then stays constant.
     fraction = (np.asarray(time_us) - begin_us) * 1e-6 / max(fault.seconds, 1e-6)
     return fault.value * np.minimum(1.0, fraction)
 
 
 def warmed(millihertz: Millihertz, warmer: Any) -> Millihertz:
-    """Return the frequencies in mHz of pads that are some °C above room temperature."""
+    """Return the frequencies in mHz after a temperature rise of `warmer` °C above room temperature.
+
+    Args:
+        millihertz: Frequencies in mHz at room temperature.
+        warmer: Temperature rise in °C, a number or an array that broadcasts.
+    """
     factor = 1 + RELATIVE_CHANGE_PER_CELSIUS * warmer
     changed: Millihertz = np.rint(millihertz * factor).astype("<u4")
     return changed
 
 
 def centi_celsius(warmer: Any) -> Any:
-    """Return the temperature in 0.01 °C that a hub reports; at room temperature, it is unknown."""
+    """Return the temperature in 0.01 °C that a hub reports.
+
+    Args:
+        warmer: Temperature rise in °C above room temperature. At 0, no fault acts, and the hub
+            reports an unknown temperature.
+    """
     warmer = np.asarray(warmer)
     known = np.rint(100 * (ROOM_CELSIUS + warmer)).astype(int)
     return np.where(warmer != 0, known, TEMPERATURE_UNKNOWN)
 
 
 def _report_pads(hub: SimulatedHub, state: _LinkState) -> None:
-    """Let the hub report the pads whose fault is `report`."""
+    """Set the pads that a hub reports as failed: those under the fault `report`."""
     bits = np.zeros(len(hub.cube_uids), "<u4")
     for broken in state.pads:
         if broken.fault.kind == "report":

@@ -1,6 +1,6 @@
 """Line between a simulated hub and the host: a pseudo-terminal or a TCP connection.
 
-It can be unplugged, stalled, and made to send in bursts.
+The faults of injector.py can unplug it, stall it, or let it send in bursts.
 """
 
 from __future__ import annotations
@@ -15,16 +15,19 @@ from ..core.errors import ConfigError
 from ..device.links.tcp import parse_url
 
 MAX_QUEUED_BYTES = 1 << 16
-"""Largest number of bytes that wait for the line. The hub drops and counts samples beyond it."""
+"""Maximum number of bytes that wait to be sent on a line. A hub drops and counts samples for which
+there is no room."""
 
 BURST_PERIOD_US = 16_000
-"""Period in µs at which a line in bursts sends: the latency timer of common USB serial chips."""
+"""Period, in µs, at which a line under the fault `burst` sends all waiting bytes. It is that of the
+latency timer of common USB serial chips."""
 
 _READ_BYTES = 65536
+"""Maximum number of bytes that one read from a line returns."""
 
 
 class SimulatedLine:
-    """A pseudo-terminal. One end is the hub's, the other one appears as the symbolic link `port`.
+    """A pseudo-terminal. The hub has one end; the other end appears as the symbolic link `port`.
 
     Attributes:
         port: Path of the port.
@@ -50,10 +53,14 @@ class SimulatedLine:
         return self.fd >= 0
 
     def plug(self, port: Path | None = None) -> None:
-        """Create the port, under another name if `port` is given."""
+        """Create the port.
+
+        Args:
+            port: New path of the port; None: the path does not change.
+        """
         self.port = port or self.port
-        # The far end stays open here. Otherwise, the near end reports an error whenever the driver
-        # closes the port.
+        # The host's end stays open in this process. Otherwise, the hub's end would report an error
+        # whenever the driver closes the port.
         self.fd, self._far_end = os.openpty()
         tty.setraw(self._far_end)
         os.set_blocking(self.fd, False)
@@ -61,7 +68,7 @@ class SimulatedLine:
         self.port.symlink_to(os.ttyname(self._far_end))
 
     def unplug(self) -> None:
-        """Remove the port; bytes that wait are lost."""
+        """Remove the port; bytes that wait to be sent are lost."""
         if self.plugged:
             self.port.unlink(missing_ok=True)
             os.close(self.fd)
@@ -70,10 +77,14 @@ class SimulatedLine:
         self._queue.clear()
 
     def send(self, data: bytes, now_us: int) -> bool:
-        """Queue bytes and write what the line takes.
+        """Queue bytes, and write as many of the waiting bytes as the line takes now.
+
+        Args:
+            data: Bytes to send.
+            now_us: Simulated time in µs.
 
         Returns:
-            Whether there was room for the bytes.
+            Whether there was room for the bytes in the queue; otherwise they are lost.
         """
         has_room = self.plugged and len(self._queue) + len(data) <= MAX_QUEUED_BYTES
         if has_room:
@@ -82,7 +93,7 @@ class SimulatedLine:
         return has_room
 
     def flush(self, now_us: int) -> None:
-        """Write the waiting bytes that the line takes now."""
+        """Write as many waiting bytes as the line takes at simulated time `now_us`."""
         if not self.plugged or now_us < self.held_until_us:
             return
         if now_us < self.burst_until_us:
@@ -97,7 +108,11 @@ class SimulatedLine:
                 del self._queue[: os.write(self.fd, self._queue)]
 
     def due_us(self, now_us: int) -> int | None:
-        """Return when `flush` should be called again; None if nothing waits for its time."""
+        """Return the simulated time in µs at which a stall or burst lets waiting bytes be sent.
+
+        Returns:
+            Time at which `flush` has to be called; None if no bytes wait or they can be sent now.
+        """
         if not self._queue:
             return None
         if now_us < self.held_until_us:
@@ -107,7 +122,7 @@ class SimulatedLine:
         return None
 
     def read(self) -> bytes:
-        """Return what the host sent."""
+        """Return the bytes that the host has sent since the last call."""
         if not self.plugged:
             return b""
         try:
@@ -117,17 +132,17 @@ class SimulatedLine:
 
 
 class TcpLine(SimulatedLine):
-    """A line behind a bridge that listens at a URL socket://host:port.
+    """A line that listens for one TCP connection of the host at a URL socket://host:port.
 
-    Unplugging removes the bridge. It always comes back at the same address.
+    `unplug` closes the connection and stops listening; `plug` listens again at the same address.
     """
 
     def __init__(self, url: str) -> None:
         """Listen at the address.
 
         Raises:
-            LinkError: The URL is no such address.
-            ConfigError: The address cannot be used.
+            LinkError: The URL does not have the form socket://host:port.
+            ConfigError: Listening at this address failed.
         """
         self._address = parse_url(url)
         self._listener: socket.socket | None = None
@@ -135,7 +150,7 @@ class TcpLine(SimulatedLine):
         super().__init__(Path(url))
 
     def plug(self, port: Path | None = None) -> None:
-        """Listen; the address is the same whatever `port` is."""
+        """Listen at the address of the line; `port` is ignored."""
         try:
             self._listener = socket.create_server(self._address, backlog=1)
         except OSError as error:
@@ -147,7 +162,7 @@ class TcpLine(SimulatedLine):
         self.fd = self._listener.fileno()
 
     def unplug(self) -> None:
-        """Close connection and listener; bytes that wait are lost."""
+        """Close the connection and stop listening; bytes that wait to be sent are lost."""
         self._hang_up()
         if self._listener is not None:
             self._listener.close()
@@ -156,7 +171,7 @@ class TcpLine(SimulatedLine):
         self._queue.clear()
 
     def flush(self, now_us: int) -> None:
-        """Write the waiting bytes that the line takes; without a connection they wait."""
+        """Write as many waiting bytes as the connection takes now; without one, they wait."""
         if self._connection is None:
             return
         try:
@@ -165,7 +180,7 @@ class TcpLine(SimulatedLine):
             self._hang_up()
 
     def read(self) -> bytes:
-        """Return what the host sent. The first call accepts its connection."""
+        """Return the bytes that the host has sent; without a connection, accept one instead."""
         if self._connection is None:
             self._accept()
             return b""
@@ -184,7 +199,7 @@ class TcpLine(SimulatedLine):
         with contextlib.suppress(OSError):  # the host has closed it again
             self._connection, _ = self._listener.accept()
             self._connection.setblocking(False)
-            # Samples must not wait to be sent together.
+            # Without this option, TCP would delay samples to send several of them together.
             self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self.fd = self._connection.fileno()
 

@@ -1,8 +1,8 @@
-"""The simulator as a process: plays all hubs of a skin on pseudo-terminals under a load.
+"""Process that simulates all hubs of a skin on pseudo-terminals under a load.
 
-The port of each link appears as PORTS/<link name>. With --tcp, links that the skin file has on TCP
-are played there. On SIGINT or SIGTERM the simulator ends and writes its sample log, from which
-others can tell what should have arrived.
+The port of each link appears as PORTS/<link name>. With --tcp, links whose port in the skin file is
+a TCP address listen there. On SIGINT or SIGTERM, the simulator ends and writes its sample log, with
+which a check compares the samples that arrived.
 """
 
 from __future__ import annotations
@@ -22,10 +22,18 @@ from .simulator import Simulator, StopSignal
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the simulator until a signal; return 0, or 1 after a mistake in its input."""
+    """Run the simulator until SIGINT or SIGTERM.
+
+    Args:
+        arguments: Command line arguments; None: those of the process.
+
+    Returns:
+        Exit code: 0, or 1 if an input file cannot be used.
+    """
     options = _parser().parse_args(arguments)
     stop = StopSignal()
-    # Signals that arrive while the files are read end the simulator, too.
+    # The signal handlers exist before the files are read, so that a signal in this time also ends
+    # the simulator properly.
     try:
         simulator = _create_simulator(options)
         try:
@@ -122,7 +130,7 @@ def _create_simulator(options: argparse.Namespace) -> Simulator:
 
 
 def _read_load(skin: Skin, options: argparse.Namespace) -> AnyLoad:
-    """Return the load that the options name."""
+    """Read the MuJoCo scene or load script that the options name, or the default script."""
     if options.mujoco:
         # MuJoCo is optional, and importing it takes long.
         from .mujoco.scene import MujocoLoad

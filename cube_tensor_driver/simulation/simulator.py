@@ -1,6 +1,6 @@
-"""Plays all hubs of a skin in one process, under a load and faults, and logs what they sampled.
+"""Simulates all hubs of a skin in one process, under a load and faults, and logs their samples.
 
-The hubs are on pseudo-terminals or TCP.
+The hubs are connected to the host by pseudo-terminals or TCP.
 """
 
 from __future__ import annotations
@@ -30,40 +30,46 @@ from .load import Fields, LoadMemory
 from .sample_log import ABSENT, LinkLog, SampleLog
 
 FIRST_UID = 0xC0BE_0000_0000_0001
-"""Uid of the skin's first cube if the skin file gives none; the following cubes count up."""
+"""Uid (unique number of a device) of the skin's first cube if the skin file gives none. Every
+following cube without a uid gets this number plus its index in the skin."""
 
 ABSENT_UID = FIRST_UID + 0xFFFF
-"""Uid of the first cube of a hub that the skin does not have; the following cubes count down."""
+"""Uid (unique number of a device) of a cube that is on a simulated hub but not in the skin. The
+cube's index on its hub is subtracted."""
 
 FIRST_BOOT_US = 1_000_003
-"""Clock of the first hub at simulated time 0, in µs; that of the second one shows twice as much,
-and so on. The clocks of real hubs start at different times, too."""
+"""Value of the first hub's clock at simulated time 0, in µs. The clock of hub n starts at n times
+this value, because the clocks of real hubs start at different times, too."""
 
 MAX_DELAY_US = 500_000
-"""Delay in µs beyond which a hub leaves samples out. Otherwise, a simulator that is too slow would
-fall behind without limit."""
+"""Maximum delay, in µs, of a simulated sample behind the time at which it is due. Beyond it, the
+hub leaves samples out. Otherwise, the delay of a simulator that is too slow would grow without
+limit."""
 
 SECOND_US = 1_000_000
-"""Period in µs of HELLO and STATS."""
+"""Period, in µs, at which a hub sends the HELLO frame (its description) and the STATS frame (its
+counters)."""
 
 FAULT_PIPE = ".faults"
-"""Name of a pipe in the folder of the ports. Each line that is written to it is a fault in YAML."""
+"""Name of a pipe in the folder of the simulated ports. Each line that another process writes to it
+is a fault in YAML, which the simulator carries out at once."""
 
 HUBS_FILE = ".hubs"
-"""Name of a file in the folder of the ports with the `HubSize` of each link in YAML. It exists
-before the pipe."""
+"""Name of a YAML file in the folder of the simulated ports with the number of cubes and pads of
+each link's hub (`HubSize`). It is written before the pipe for faults is created."""
 
 _PIPE_BYTES = 65536
+"""Number of bytes that are read from the pipe for faults at once."""
 
 
 @dataclass
 class PlayedLink(SimulatedLink):
-    """A link with the cubes of the skin that its hub carries.
+    """A simulated link and the cubes on its hub.
 
     Attributes:
-        carried: The cubes.
-        prepared: Frequencies (hub cubes, pads) in mHz at each instant, if they are computed in
-            advance.
+        carried: Cubes on the hub.
+        prepared: Frequencies (hub cubes, pads) in mHz at a number of times of the load that repeat;
+            empty if the load is computed for each sample.
     """
 
     carried: HubCubes
@@ -71,15 +77,17 @@ class PlayedLink(SimulatedLink):
 
     @property
     def computes_load(self) -> bool:
-        """Whether the hub takes samples whose load is not computed in advance."""
+        """Whether the hub takes samples now and their load is not computed in advance."""
         return self.hub.started and not self.prepared
 
 
 class Simulator:
-    """All hubs of a skin.
+    """Simulates all hubs of a skin in real time.
+
+    Simulated times count from the creation of the simulator, in µs.
 
     Attributes:
-        start_time_ns: Wall clock at simulated time 0, in ns.
+        start_time_ns: Wall clock at simulated time 0, in ns since the Unix epoch.
     """
 
     def __init__(
@@ -99,17 +107,19 @@ class Simulator:
         """Create the hubs and their ports.
 
         Args:
-            skin: Skin whose hubs are played.
-            load: Load on the skin.
+            skin: Skin whose hubs are simulated.
+            load: Stress and gradient at the cubes over time.
             ports: Folder in which the ports appear, each under the name of its link.
             noise: Noise of the pads as in `SimulatedCubes`.
             drift: Drift of the pads as in `SimulatedCubes`.
             imperfections: Imperfections of the pads as in `SimulatedCubes`.
-            instants: Number of times at which the load is computed in advance. They are repeated,
-                one for each sample. 0: the load is computed for each sample.
-            faults: Faults to carry out.
-            seed: Seed of what is random in the faults.
-            tcp: Whether links whose port is socket://host:port are played there.
+            instants: Number of times, equally spaced over the period of the load, at which the load
+                is computed in advance; successive samples use successive times, again and again.
+                0: the load is computed for each sample.
+            faults: Faults to carry out at their times.
+            seed: Seed of the random numbers in the faults.
+            tcp: Whether a link whose port in the skin file is socket://host:port listens at this
+                address; otherwise it gets a pseudo-terminal.
 
         Raises:
             ConfigError: Cubes of one hub have different numbers of pads, the folder or a TCP
@@ -117,7 +127,8 @@ class Simulator:
         """
         self._ports = ports
         self._load = LoadMemory(load)
-        # Both clocks are read together: the log converts simulated time to wall clock.
+        # Both clocks are read at the same time, because the log converts simulated times to wall
+        # clock times.
         self._start_ns = time.monotonic_ns()
         self.start_time_ns = time.time_ns()
         self._links: list[PlayedLink] = []
@@ -147,7 +158,7 @@ class Simulator:
             link.line.send(link.hub.hello(), 0)
 
     def _prepare(self, load: Fields, instants: int) -> None:
-        """Compute frequencies and frames at equally spaced times of the load in advance."""
+        """Compute frequencies and frames at `instants` equally spaced times of the load."""
         for number in range(instants):
             stress, gradient = load.at(number * load.period / instants)
             for link in self._links:
@@ -156,12 +167,15 @@ class Simulator:
                 link.hub.prepare(frequency)
 
     def now_us(self) -> int:
-        """Return the simulated time: µs since the start."""
+        """Return the simulated time in µs since the creation of the simulator."""
         return (time.monotonic_ns() - self._start_ns) // 1000
 
     def run(self, stop: Stop) -> None:
-        """Play the hubs until a stop is requested: HELLO and STATS at 1 Hz, samples on request."""
-        # SelectSelector, because epoll rounds waiting times to ms.
+        """Simulate the hubs until a stop is requested.
+
+        They send HELLO and STATS at 1 Hz, and samples after the host has requested them (START).
+        """
+        # SelectSelector is used, because epoll rounds waiting times to milliseconds.
         with selectors.SelectSelector() as selector:
             watched: dict[str, int] = {}
             selector.register(stop.fd, selectors.EVENT_READ, None)
@@ -181,7 +195,8 @@ class Simulator:
                 for link in self._links:
                     link.line.flush(now)
                     if link.computes_load:
-                        # Computed before it is due: real hubs do not have to compute their load.
+                        # The load of the next sample is computed and kept before the sample is due,
+                        # because a real hub spends no time on computing a load.
                         self._load.at(link.hub.next_us)
                 self._injector.step(now)
                 if now >= report_us:
@@ -189,13 +204,13 @@ class Simulator:
                     self._report(now)
 
     def _report(self, now_us: int) -> None:
-        """Send HELLO and STATS of all hubs."""
+        """Send the HELLO and STATS frames of all hubs whose line is plugged in."""
         for link in self._links:
             if link.line.plugged:
                 link.line.send(link.hub.hello() + link.hub.stats(now_us), now_us)
 
     def log(self) -> SampleLog:
-        """Return the log of all samples so far."""
+        """Return the log of all samples and faults so far."""
         links = tuple(
             LinkLog(
                 name=link.name,
@@ -209,11 +224,11 @@ class Simulator:
         return SampleLog(self.start_time_ns, links, tuple(self._injector.records))
 
     def close(self) -> None:
-        """Remove the ports."""
+        """Remove the ports, the pipe for faults, and the folder if it is empty then."""
         for link in self._links:
             link.line.unplug()
         os.close(self._fault_pipe)
-        # These files tell `inject` that a simulator runs.
+        # `inject` recognises a running simulator by these files.
         for name in (FAULT_PIPE, HUBS_FILE):
             (self._ports / name).unlink(missing_ok=True)
         # The folder stays if it contains other files.
@@ -221,7 +236,11 @@ class Simulator:
             self._ports.rmdir()
 
     def _due_us(self, report_us: int) -> int:
-        """Return the simulated time at which something has to be done next."""
+        """Return the earliest simulated time in µs of a sample, report, fault or pending send.
+
+        Args:
+            report_us: Simulated time in µs of the next HELLO and STATS.
+        """
         now = self.now_us()
         times: list[int | None] = [report_us, self._injector.due_us()]
         times += [link.hub.next_us for link in self._links if link.hub.started]
@@ -229,25 +248,27 @@ class Simulator:
         return min(time for time in times if time is not None)
 
     def _skip_late(self, now_us: int) -> None:
-        """Leave samples out where a hub is late by more than `MAX_DELAY_US`.
+        """Leave out the samples of hubs that are late by more than `MAX_DELAY_US`.
 
-        Prepared samples are never left out: they take little time, and the hub catches up.
+        Samples whose load was computed in advance are never left out, because they take so little
+        time that a late hub catches up.
         """
         for link in self._links:
             if link.computes_load and now_us - link.hub.next_us > MAX_DELAY_US:
                 link.hub.skip(now_us)
 
     def _take_samples(self, now_us: int, stop: Stop) -> None:
-        """Take all samples that are due.
+        """Take all samples that are due at simulated time `now_us`, unless a stop is requested.
 
-        The hubs take turns, one sample each. If this loop is late, no hub falls behind the others.
+        The hubs take one sample in turn. So if the simulator is late, all hubs are equally late.
         """
         is_behind = True
         while is_behind and not stop.requested:
             is_behind = False
             for link in self._links:
                 if link.hub.started and link.hub.next_us <= now_us:
-                    # Faults take place between the right samples, however late this loop is.
+                    # Faults that are due before this sample are carried out first, so that they
+                    # affect the right samples even if this loop is late.
                     self._injector.step(link.hub.next_us)
                     if link.hub.started:
                         self._take_sample(link, now_us)
@@ -264,7 +285,7 @@ class Simulator:
             stress, gradient = self._load.at(load_us)
             frequency = link.carried.frequency(stress, gradient, time_us * 1e-6)
         frame = link.hub.sample(self._injector.measured(link, frequency, time_us))
-        # Without room on the line, a hub drops the sample and counts it.
+        # If the line has no room for the frame, the hub drops the sample and counts it.
         if not link.line.send(self._injector.transmitted(link, frame), now_us):
             link.hub.dropped += 1
             link.mark_damaged()
@@ -275,11 +296,11 @@ class Simulator:
         watched: dict[str, int],
         link: PlayedLink,
     ) -> None:
-        """Let the selector wait for bytes on a line, which may have been plugged or unplugged.
+        """Register the file descriptor of a line, which changes when the line is plugged in again.
 
         Args:
             selector: Selector of the main loop.
-            watched: File descriptor that is registered for each link.
+            watched: Registered file descriptor by the name of the link, -1 for none; it is changed.
             link: Link to watch.
         """
         fd = link.line.fd
@@ -294,12 +315,12 @@ class Simulator:
         watched[link.name] = fd
 
     def _answer(self, link: PlayedLink) -> None:
-        """Answer what the host sent on a link."""
+        """Read the requests of the host on a link and send the hub's answers."""
         now = self.now_us()
         link.line.send(link.hub.receive(link.line.read(), now), now)
 
     def _read_faults(self) -> None:
-        """Carry out the faults that were written into the pipe."""
+        """Schedule the faults that were written into the pipe to begin now."""
         text = os.read(self._fault_pipe, _PIPE_BYTES).decode(errors="replace")
         for line in text.splitlines():
             try:
@@ -308,7 +329,7 @@ class Simulator:
                     self.now_us(),
                 )
             except ConfigError as error:
-                # Anybody may write into the pipe: a mistake must not end the simulator.
+                # Any process may write into the pipe, so a wrong fault does not end the simulator.
                 print(f"simulator: {error}", file=sys.stderr, flush=True)
 
 
@@ -321,17 +342,17 @@ class Stop(Protocol):
 
     @property
     def fd(self) -> int:
-        """File descriptor that becomes readable with the request."""
+        """File descriptor that becomes readable when the stop is requested."""
 
 
 class StopSignal:
-    """Request to end by SIGINT or SIGTERM, a `Stop`."""
+    """A `Stop` that the signals SIGINT and SIGTERM request; it installs the signal handlers."""
 
     def __init__(self) -> None:
         self.requested = False
         self.fd, write = os.pipe()
-        os.set_blocking(write, False)  # Python requires it
-        # Python writes a byte for each signal, which wakes a selector.
+        os.set_blocking(write, False)  # `set_wakeup_fd` requires it
+        # Python writes a byte into the pipe for each signal, which ends a selector's waiting.
         signal.set_wakeup_fd(write)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._request)
@@ -346,7 +367,14 @@ def _connect(
     ports: Path,
     tcp: bool,
 ) -> PlayedLink:
-    """Create a link with its hub and its line."""
+    """Create a simulated link with its hub and its line.
+
+    Args:
+        skin: Skin that contains the link.
+        carried: Link and cubes of the hub.
+        ports: Folder in which the pseudo-terminal appears under the name of the link.
+        tcp: Whether a port socket://host:port of the skin file is used instead.
+    """
     link = carried.link
     number = skin.links.index(link) + 1
     uids = []
@@ -368,8 +396,9 @@ def _connect(
 
 
 def _open_pipe(path: Path) -> int:
-    """Create a named pipe and open it for reading."""
+    """Create a named pipe, open it without blocking and return the file descriptor."""
     path.unlink(missing_ok=True)
     os.mkfifo(path)
-    # Also open for writing: otherwise it would end whenever a writer closes it.
+    # The pipe is also opened for writing. Otherwise, it would be at its end, and always readable,
+    # after a writer has closed it.
     return os.open(path, os.O_RDWR | os.O_NONBLOCK)

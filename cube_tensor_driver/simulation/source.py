@@ -38,32 +38,34 @@ def simulate(
         skin: Skin to simulate.
         load: Load on the skin (a `Load`, a `MujocoLoad`), or the file of a load script; None: the
             shipped script, an indenter that wanders over the skin.
-        rate: Samples per second; None: those of the skin, or 100.
+        rate: Samples per second; None: the rate in the skin file, or 100.
         duration: Simulated time in s; None: without end.
         noise: Standard deviation of a frequency divided by the frequency (8e-6 is usual).
         drift: Relative change of every rest frequency per second.
-        imperfections: Spread, creep and failure of the pads; None: they are as calibrated.
+        imperfections: Spread, creep and failure of the pads; None: pads without deviations from
+            their calibrations.
 
     Returns:
         Source of frequency rows.
 
     Raises:
-        ConfigError: Hubs refuse the rate, the duration is not positive, the load script cannot be
-            used, or cubes of one hub have different numbers of pads.
+        ConfigError: The rate is out of the range of the hubs, the duration is not positive, the
+            load script cannot be used, or cubes of one hub have different numbers of pads.
     """
     if load is None or isinstance(load, (Path, str)):
         script = default_script() if load is None else read_script(Path(load))
         load = Load(skin, script)
     if rate is None:
         rate = skin.rate or 1e6 / SimulatedHub.period_us
-    # The longest period is the lowest rate.
+    # The limits are sample periods; the longest period gives the lowest rate.
     low, high = (1e6 / limit for limit in reversed(PERIOD_LIMITS_US))
     if not low <= rate <= high:
         raise ConfigError(f"rate is {rate!r}, allowed: {low:g} to {high:g} samples per second")
     if duration is not None and not duration > 0:
         raise ConfigError(f"duration is {duration!r}, allowed: a time greater than 0 s, or None")
 
-    hub_cubes(skin)  # raises here, and not at the first iteration
+    # Errors of the skin are raised here instead of at the first iteration.
+    hub_cubes(skin)
     return SimulatedSource(
         skin,
         load,
@@ -77,13 +79,13 @@ def simulate(
 
 @dataclass
 class SimulatedSource:
-    """A `core.rows.Source`. Every iteration starts the same skin again at time 0.
+    """A `core.rows.Source` of simulated frequencies. Every iteration starts again at time 0.
 
     One scan has a row of every cube, in the order in which the driver delivers them: link by link.
     All rows of scan k have the sequence number k and stamp_ns = k × period; simulated time 0 is the
-    start of the load script. Values are those that the driver makes of a hub's: a whole number of
-    mHz in float32 Hz; NaN for pads that a cube does not have or whose oscillator stopped;
-    temperature unknown.
+    start of the load script. Frequencies are rounded as those of a real hub: whole mHz, in Hz as
+    float32. They are NaN for pads that a cube does not have or whose oscillator stopped. The
+    temperature is unknown.
 
     Attributes:
         skin: Skin to simulate.
@@ -107,7 +109,7 @@ class SimulatedSource:
 
     @property
     def is_live(self) -> bool:
-        """Whether the source has to be read in real time: it has not."""
+        """Whether the source has to be read in real time; always False."""
         return False
 
     def statistics(self) -> dict[str, object]:
@@ -142,7 +144,7 @@ class SimulatedSource:
 
 
 class SkinPads:
-    """Pads of a whole skin."""
+    """Computes the frequencies of all pads of a skin under given fields."""
 
     def __init__(
         self,
@@ -182,7 +184,7 @@ class SkinPads:
         """
         count = len(self._cube)
         millihertz = np.full((count, self._n_pads), NOT_MEASURED, np.uint32)
-        # Link by link, as the driver delivers the rows.
+        # The rows are sorted link by link, as the driver delivers them.
         start = 0
         for hub in self._hubs:
             cubes = hub.skin_cubes
@@ -191,7 +193,7 @@ class SkinPads:
             millihertz[start:end, : hub.cubes.n_pads] = own
             start = end
 
-        # Rounded to mHz and float32, as the values of a hub are.
+        # Frequencies from a real hub are also whole mHz, which the driver converts to float32 Hz.
         frequency = (millihertz * 1e-3).astype(np.float32)
         frequency[millihertz == NOT_MEASURED] = np.nan
         return FrequencyRows(
