@@ -1,7 +1,7 @@
 """Simulated hubs in the background of a program that computes the load itself.
 
-Such a program is a robot in simulation under a controller. The real driver reads the hubs as it
-reads hardware::
+An example is a program that simulates a robot with its controller. The driver reads the simulated
+hubs in the same way as real ones::
 
     touch = MujocoSkin(model, data, skin)
     with BackgroundHubs(skin, "ports") as hubs:
@@ -26,10 +26,10 @@ from .simulator import Simulator
 
 
 class BackgroundHubs:
-    """All hubs of a skin on pseudo-terminals, played in real time by a thread until `close`.
+    """Simulates all hubs of a skin on pseudo-terminals, in real time in a thread, until `close`.
 
     Each sample is computed from the last load that was set before the previous sample was taken.
-    Without a load, the skin is at rest.
+    Before the first `set_load`, the skin is without load.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class BackgroundHubs:
             gradient: Gradient (cubes, 6, 3) in Pa/m.
 
         Raises:
-            ConfigError: The shapes are different.
+            ConfigError: Stress or gradient has another shape.
         """
         self._load.set(np.array(stress, float), np.array(gradient, float))
 
@@ -114,7 +114,8 @@ class _SetLoad:
                 f"the load has a stress of shape {stress.shape} and a gradient of shape "
                 f"{gradient.shape}; a skin of {cubes} cubes takes ({cubes}, 6) and ({cubes}, 6, 3)"
             )
-        self._field = stress, gradient  # one assignment is atomic
+        # A single assignment is atomic, so no lock is needed.
+        self._field = stress, gradient
 
     def at(self, seconds: float) -> tuple[Array, Array]:
         return self._field

@@ -1,9 +1,9 @@
 """Deviations of real pads from their calibrations: spread of gains, creep with hysteresis, failure.
 
-Foam creeps: under a constant stress its strain keeps growing, and so does the stress that a pad
-reports. In linear viscoelasticity the compliance is a Prony series (chain of Kelvin-Voigt
-elements), J(t) = J(0) (1 + sum_i c_i (1 - exp(-t / tau_i))), so that a pad under the stress v(t)
-reports::
+The foam of the pads creeps: under a constant stress, its strain keeps growing, and so does the
+stress that a pad reports. In linear viscoelasticity, the compliance J (strain per stress) is a
+Prony series (chain of Kelvin-Voigt elements), J(t) = J(0) (1 + sum_i c_i (1 - exp(-t / tau_i))).
+So a pad under the stress v(t) reports the stress::
 
     v + sum_i c_i q_i,     tau_i dq_i/dt = v - q_i
 
@@ -30,7 +30,7 @@ from ..core.arrays import Array
 from ..core.errors import ConfigError
 
 MAX_SEED = (1 << 63) - 1
-"""Largest seed of the random deviations; it has to fit a 64-bit integer."""
+"""Largest seed of the random deviations of the pads: the largest signed 64-bit integer."""
 
 _CREEP_TERM: JsonSchema = {
     "type": "array",
@@ -67,8 +67,8 @@ class Imperfections:
     Attributes:
         gain_spread: Standard deviation of a pad's sensitivity divided by the calibrated one.
         dead: Fraction of the pads whose oscillators do not run, 0 to 1.
-        creep: Terms (c, tau) of the series in the module head: relative size, and time in s.
-        seed: Seed that determines which pad is how.
+        creep: Terms (c, tau) of the creep (file head): relative size c and time constant tau in s.
+        seed: Seed of the random numbers that determine the deviation of each pad.
 
     Raises:
         ConfigError: A value is out of range.
@@ -108,7 +108,7 @@ def _raise_first_mistake(data: Any) -> None:
 
 
 class PadBehaviour:
-    """Imperfect pads of some cubes, with the creep that they have accumulated."""
+    """Computes the stress that imperfect pads of some cubes report, with the creep so far."""
 
     def __init__(
         self,
@@ -123,7 +123,8 @@ class PadBehaviour:
             shape: Number of cubes and of pads per cube.
             seed: Seed that differs between the hubs of a skin.
         """
-        # With the same seeds, the same pads are dead, whatever the other deviations are.
+        # Gains and dead pads are always drawn in this order, so that the same seeds give the same
+        # dead pads whatever the spread of the gains and the creep are.
         random = np.random.default_rng([imperfections.seed, seed])
         self._gain = 1 + imperfections.gain_spread * random.standard_normal(shape)
         self._dead = random.random(shape) < imperfections.dead
@@ -135,16 +136,16 @@ class PadBehaviour:
         self._seconds = 0.0
 
     def reported(self, stress: Array, seconds: float) -> Array:
-        """Compute the stress that pads report.
+        """Compute the stress that the pads report, and advance their creep.
 
         Args:
-            stress: True stress (cubes, pads) in Pa since the previous call.
-            seconds: Simulated time in s.
+            stress: True stress (cubes, pads) in Pa, constant since the previous call.
+            seconds: Simulated time in s; it should not decrease from call to call.
 
         Returns:
             Reported stress (cubes, pads) in Pa; NaN for a dead pad.
         """
-        # NaN as the frequency of an oscillator that does not run
+        # NaN stands for the missing frequency of an oscillator that does not run.
         reported = np.where(self._dead, np.nan, stress * self._gain)
         if len(self._creep_time):
             elapsed = max(seconds - self._seconds, 0.0)

@@ -19,26 +19,27 @@ from ..mechanics import contact
 from .spline import CubicSpline
 
 FRICTION_SPEED = 1e-3
-"""Speed in m/s at which friction has reached 0.7 of its full size. It makes friction change
-smoothly where a slide reverses its direction."""
+"""Speed, in m/s, at which the friction force of a slide has 0.7 of its full size. It lets the force
+change smoothly where a slide reverses its direction."""
 
 MAX_RADIUS_DEPTHS = 12
-"""Largest radius of a contact divided by the depth of the cubes. The quadrature of larger contacts
-needs so many points that it takes minutes."""
+"""Largest allowed radius of a contact, divided by the depth of the cubes' centres. Larger contacts
+would be represented by so many point forces that computing their stress takes minutes."""
 
 MAX_CACHED_BYTES = 64 << 20
-"""Maximum memory of the fields that `LoadMemory` keeps, in bytes."""
+"""Maximum memory, in bytes, of the stress fields that `LoadMemory` keeps for a repeated load."""
 
 _ORDERS = np.array([2, 3, 4, 6, 8, 11, 16, 23, 32, 45, 64])
-"""Quadrature orders in use. They are few, so that many cubes have the same order and are computed
-together."""
+"""Quadrature orders (number of rings of point forces that represent a contact) in use. They are
+few, so that many cubes have the same order and are computed together."""
 
 _FAR_RATIO = 0.15
-"""Radius of a contact divided by its distance below which one ring of points is enough."""
+"""Radius of a contact, divided by the distance from a cube to its rim, below which one ring of
+point forces represents the contact accurately enough."""
 
 
 def default_script() -> Script:
-    """Read the shipped script for any skin: an indenter wanders over all of it."""
+    """Read the load script in the package: an indenter moves over a whole skin of any size."""
     return read_script(package_data() / "config" / "load_demo.yaml")
 
 
@@ -46,7 +47,7 @@ class ContactLoad(NamedTuple):
     """One contact at one time, in the skin's parent frame.
 
     Attributes:
-        shape: `disc` for uniform traction, `sphere` for Hertz's.
+        shape: `disc` for uniform traction, `sphere` for the traction of a Hertz contact.
         position: Centre (3,) of the contact in m.
         normal: Unit normal (3,) out of the skin.
         force: Force (3,) in N on the skin.
@@ -65,14 +66,14 @@ class Fields(Protocol):
 
     @property
     def repeats(self) -> float | None:
-        """Time in s after which everything repeats; None: never."""
+        """Time in s after which the load repeats; None: it never repeats."""
 
     @property
     def period(self) -> float:
-        """Time in s after which the load repeats, or that stands for such a time."""
+        """Time in s after which the load repeats; if it never does, a typical duration instead."""
 
     def at(self, seconds: float) -> tuple[Array, Array]:
-        """Compute the fields at a time.
+        """Compute stress and gradient at the cubes at a simulated time in s.
 
         Returns:
             Stress (cubes, 6) in Pa and gradient (cubes, 6, 3) in Pa/m, order xx yy zz yz zx xy, in
@@ -92,23 +93,25 @@ class AnyLoad(Fields, Protocol):
         """Distance from the centres of the cubes to the surface, in m."""
 
     def total(self, seconds: float) -> tuple[Array, Array, Array]:
-        """Return the function `total` of all contacts at a time."""
+        """Return force, centre and normal of all contacts at a time in s, as `total`."""
 
 
 class Load:
-    """A script on a skin. It is the same at the same time in every process.
+    """The load of a script on a skin. It depends on the time only, and so is reproducible.
 
-    Each cube sees a half space whose surface lies `depth` above it, perpendicular to its own z
-    axis. The load acts at its position in the cube's x-y plane. A cube that is tilted away from the
-    load by an angle sees the load times the cosine of the angle, and no load beyond a right angle.
-    The contact of a sphere is Hertz's: a³ = 3 F R (1 − ν²) / (4 E). The tangential force of a slide
-    is friction × normal force along its velocity v, times v / √(v² + FRICTION_SPEED²).
+    The stress at each cube is that in a half space whose surface lies `depth` above the cube,
+    perpendicular to its z axis. The position of a contact is projected onto this surface. If the
+    cube is tilted by an angle against the normal of the contact, the force is multiplied by the
+    cosine of the angle; beyond a right angle, it is 0. A sphere of radius R under the normal force
+    F has a Hertz contact of the radius a, a³ = 3 F R (1 − ν²) / (4 E). The tangential force of a
+    slide is friction × normal force along its velocity v, multiplied by v / √(v² +
+    FRICTION_SPEED²).
 
     Source: K. L. Johnson, Contact Mechanics (1985), 4.2 (Hertz), 7.1 (sliding), 8.1 (rolling with
     traction).
 
     Attributes:
-        script: The script.
+        script: Script with the actions of all indenters.
         poses: Poses of the cubes.
         depth: Distance from the centres of the cubes to the surface, in m.
         repeats: Time in s after which the script repeats; None: it plays once.
@@ -119,8 +122,8 @@ class Load:
         """Prepare the paths of all indenters.
 
         Raises:
-            ConfigError: A sphere sinks in deeper than Hertz's contact holds, or a contact is too
-                wide for the depth.
+            ConfigError: The contact of a sphere is wider than the sphere, or a contact is wider
+                than `MAX_RADIUS_DEPTHS` allows.
         """
         self.script = script
         self.depth = script.depth
@@ -129,7 +132,8 @@ class Load:
         self.poses = skin.poses
         self._pitch = self.poses.pitch
 
-        # Relative positions of a script, from -1 to 1, range over the box around all cubes.
+        # A script may contain relative positions, from -1 to 1 along each side of the box around
+        # all cubes.
         half = self.poses.half_side[:, None]
         low = (self.poses.position - half).min(axis=0)
         high = (self.poses.position + half).max(axis=0)
@@ -145,7 +149,7 @@ class Load:
 
     def at(self, seconds: float) -> tuple[Array, Array]:
         """Compute the fields at a time, as `Fields.at`."""
-        # In the frame of each cube, the surface is the plane z = 0 and the cube lies below it.
+        # For each cube, the surface is the plane z = 0, and the cube is at z = -depth.
         position, rotation, _ = self.poses
         n = len(position)
         stress = np.zeros((n, 6))
@@ -171,7 +175,7 @@ class Load:
         return stress, gradient
 
     def contact_loads(self, seconds: float) -> list[ContactLoad]:
-        """Return the contacts of all indenters that touch the skin at a time."""
+        """Return the contacts of all indenters that touch the skin at a time in s."""
         if self.script.period is not None:
             seconds %= self.script.period
         loads = [
@@ -180,11 +184,12 @@ class Load:
             for action in indenter.actions
             if action.start <= seconds < action.end
         ]
-        # At the start and at the end of an action, the force is 0.
+        # The force is 0 at the start and at the end of an action, where the indenter does not
+        # touch the skin.
         return [load for load in loads if load.force.any()]
 
     def total(self, seconds: float) -> tuple[Array, Array, Array]:
-        """Return the function `total` of the contacts at a time."""
+        """Return force, centre and normal of all contacts at a time in s, as `total`."""
         return total(self.contact_loads(seconds))
 
     def _check(self, indenter: Indenter) -> None:
@@ -210,7 +215,7 @@ class Load:
         action: Action,
         seconds: float,
     ) -> ContactLoad:
-        """Return the contact of an indenter during an action."""
+        """Return the contact of an indenter at a time in s during one of its actions."""
         duration = action.end - action.start
         progress = (seconds - action.start) / duration  # 0 to 1
         path = self._paths[id(action)]
@@ -218,14 +223,15 @@ class Load:
         normal = surface_normal(self.poses, self._pitch, position)
         size = float(interpolate_knots(action.force, progress))
         if path and action.kind == "slide":
-            # Only the motion along the skin rubs.
+            # Friction acts along the part of the velocity that is tangential to the skin.
             velocity = path.velocity(progress) / duration
             velocity -= normal * (velocity @ normal)
             speed = float(np.linalg.norm(velocity))
             shear = indenter.friction * size * velocity / math.hypot(speed, FRICTION_SPEED)
         else:
             if len(action.shear) == 1:
-                # One value belongs to the largest force, and shear follows the force.
+                # A single shear value is that at the largest normal force; in between, shear is
+                # proportional to the normal force.
                 shear = action.shear[0] * size / action.force.max()
             else:
                 shear = interpolate_knots(action.shear, progress)
@@ -248,9 +254,10 @@ class Load:
         return np.asarray(self._centre + position * self._half_extent)
 
     def _plan_path(self, action: Action) -> CubicSpline | None:
-        """Return the path through all positions at equal intervals; None for a single position.
+        """Return the path of an indenter through all positions of an action, at equal intervals.
 
-        It starts and ends at rest, unless the last position is the first one.
+        It starts and ends at rest, unless the last position is equal to the first one. It is None
+        for an action with a single position.
         """
         if len(action.path) == 1:
             return None
@@ -269,7 +276,8 @@ def surface_normal(
 
     Args:
         poses: Poses of the cubes.
-        pitch: Pitch of the poses in m; computing it takes long.
+        pitch: Typical distance of neighbouring cubes in m (`poses.pitch`, whose computation takes
+            long).
         position: Position (3,) in m.
     """
     square = ((poses.position - position) ** 2).sum(axis=1)
@@ -277,12 +285,12 @@ def surface_normal(
     weight = np.exp((square[nearest] - square) / (2 * pitch**2))
     normal = weight @ poses.rotation[:, :, 2]
     length = np.linalg.norm(normal)
-    # Opposite axes may cancel: then the nearest cube decides.
+    # Opposite z axes may add up to 0; then the axis of the nearest cube is the normal.
     return np.asarray(normal / length if length > 0 else poses.rotation[nearest, :, 2])
 
 
 def total(loads: Sequence[ContactLoad]) -> tuple[Array, Array, Array]:
-    """Return the sum of all contacts.
+    """Return the total force of some contacts, their centre of pressure and mean normal.
 
     Returns:
         Force (3,) on the skin in N, centre of pressure (3,) in m and mean normal (3,). Without a
@@ -299,10 +307,9 @@ def total(loads: Sequence[ContactLoad]) -> tuple[Array, Array, Array]:
 
 
 class LoadMemory:
-    """Fields of a load at whole microseconds.
+    """Computes the fields of a load at whole microseconds and keeps those of a load that repeats.
 
-    Those of a periodic script are kept for the next period, because each of them is a contact
-    problem for every cube.
+    Fields are kept for the next period of the load, because computing them takes long.
     """
 
     def __init__(self, load: Fields) -> None:
@@ -318,7 +325,8 @@ class LoadMemory:
         field = self._fields.get(time_us)
         if field is None:
             field = self._load.at(time_us * 1e-6)
-            # All at once instead of the oldest one: a period that does not fit never repeats.
+            # If the fields of a whole period do not fit into memory, keeping some of them is of no
+            # use, so all are removed at once.
             field_bytes = sum(part.nbytes for part in field)
             if (len(self._fields) + 1) * field_bytes > MAX_CACHED_BYTES:
                 self._fields.clear()
@@ -332,20 +340,20 @@ def _choose_orders(
     depth: float,
     distance: Array,
 ) -> Index:
-    """Return the quadrature order (cubes,), lower for cubes far from the contact.
+    """Return the quadrature order (cubes,) for each cube; it is lower far from the contact.
 
-    Stress and gradient are within 1e-3 of their largest value. Equilibrium holds exactly, because
-    any sum of point forces satisfies it.
+    The errors of stress and gradient are at most 1e-3 of their largest values. The stress is
+    exactly in equilibrium with the force, because every sum of point forces is.
 
     Args:
-        shape: Shape of the contact.
+        shape: Shape of the contact, `disc` or `sphere`.
         radius: Radius of the contact in m.
-        depth: Depth of the cubes in m.
+        depth: Distance from the centres of the cubes to the surface, in m.
         distance: Distance (cubes,) of the cubes from the axis of the contact, in m.
     """
     to_rim = np.maximum(distance - radius, 0.0)
     ratio = radius / np.hypot(depth, to_rim)
-    # Measured: the error decreases exponentially with order / ratio.
+    # Numerical tests gave these factors; the error decreases exponentially with order / ratio.
     wanted = 5 * ratio + 1 if shape == "sphere" else 3.3 * ratio + 0.5
     orders = _ORDERS[np.searchsorted(_ORDERS, wanted)]
     return np.where(ratio < _FAR_RATIO, 1, orders)
@@ -356,8 +364,8 @@ def _unit_points(shape: str, order: int) -> tuple[Array, Array]:
     """Return the point forces that represent a contact of radius 1.
 
     Args:
-        shape: Shape of the contact.
-        order: Quadrature order.
+        shape: Shape of the contact, `disc` or `sphere`.
+        order: Quadrature order (number of rings of point forces).
 
     Returns:
         Positions (L, 3) of the forces, and the fraction (L, 1) of the total force on each.
@@ -366,8 +374,8 @@ def _unit_points(shape: str, order: int) -> tuple[Array, Array]:
     if shape == "sphere" and order > 1:
         points, forces = contact.hertz(1.0, unit_force, order=order)
     else:
-        # From far away, the contact of a sphere looks like a disc with the same second moment: 2/5
-        # a² for the sphere, 1/2 a² for a disc.
+        # Far away, the stress under a sphere is that under a disc with the same second moment of
+        # the pressure: 2/5 a² for a Hertz contact of radius a, 1/2 a² for a disc.
         radius = math.sqrt(0.8) if shape == "sphere" else 1.0
         points, forces = contact.disc(radius, unit_force, order=order)
     return points, forces[:, 2:]

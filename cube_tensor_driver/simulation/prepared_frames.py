@@ -1,6 +1,7 @@
 """SAMPLE frames that are encoded once and sent again with other sequence numbers and times.
 
-Simulated hubs must use little time where the speed of the driver is measured.
+This saves computing time of the simulated hubs, which must be small where the speed of the driver
+is measured on the same machine.
 """
 
 from __future__ import annotations
@@ -12,10 +13,11 @@ from ..device.wire import cobs
 from ..device.wire.protocol import Sample, encode
 
 _HEAD_BYTES = 24
-"""Number of bytes of a SAMPLE before its frequencies; the last one is spare and 0."""
+"""Number of bytes of a SAMPLE frame, before COBS encoding, in front of its frequencies. The last of
+them is not used and always 0."""
 
 _CRC_BYTES = 4
-"""Number of bytes of the checksum at the end of a frame."""
+"""Number of bytes of the checksum (CRC-32) at the end of a frame."""
 
 _SEQUENCE = struct.Struct("<I")
 _SEQUENCE_OFFSET = 4
@@ -24,11 +26,12 @@ _DEVICE_US_OFFSET = 12
 
 
 class PreparedFrame:
-    """A SAMPLE frame that is encoded except for sequence number, time and checksum.
+    """A SAMPLE frame that is encoded in advance, except for sequence number, time and checksum.
 
-    COBS encodes the bytes between two zeros in the same way wherever they stand. So the frame is
-    encoded in three parts: up to the last byte of the head, up to the last zero before the
-    checksum, and the rest.
+    COBS (the encoding that removes zero bytes from frames) encodes the bytes between two zeros
+    independently of all others. So the frame is encoded in three parts: up to the zero at the end
+    of its head, from there to the last zero before the checksum, and the rest. Only the middle part
+    is the same in all frames.
     """
 
     def __init__(self, sample: Sample) -> None:
@@ -40,14 +43,14 @@ class PreparedFrame:
         self._encoded_middle = cobs.encode(body[_HEAD_BYTES:last_zero])
         self._rest = body[last_zero + 1 :]
 
-        # Without such a zero, or with 254 bytes without a zero before one of these two zeros, COBS
-        # encodes differently. Such a sample is encoded as a whole each time.
+        # Without a zero before the checksum, or with a run of 254 bytes without a zero, the parts
+        # cannot be encoded separately. Such a sample is encoded as a whole each time.
         self._sample: Sample | None = None
         if last_zero < 0 or self.encode(sample.sequence, sample.device_us) != frame:
             self._sample = sample
 
     def encode(self, sequence: int, device_us: int) -> bytes:
-        """Encode the sample with these numbers, with the result of `protocol.encode`.
+        """Return the frame with this number and time, the same bytes as from `protocol.encode`.
 
         Args:
             sequence: Sequence number of the sample.
@@ -60,7 +63,7 @@ class PreparedFrame:
 
         _SEQUENCE.pack_into(self._head, _SEQUENCE_OFFSET, sequence)
         _DEVICE_US.pack_into(self._head, _DEVICE_US_OFFSET, device_us)
-        # The checksum covers head and tail, and its four bytes may contain zeros.
+        # The checksum is encoded with the rest of the frame, because its bytes may be zeros.
         crc = zlib.crc32(self._tail, zlib.crc32(self._head)).to_bytes(_CRC_BYTES, "little")
         start = cobs.encode(bytes(self._head[:-1]))
         end = cobs.encode(self._rest + crc)

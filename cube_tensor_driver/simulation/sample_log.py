@@ -1,6 +1,6 @@
 """Log of a simulator: the samples that its hubs took, and the faults that were carried out.
 
-The simulator writes it when it ends. Checks of what arrived read it.
+The simulator writes the log when it ends. Checks compare it with the samples that arrived.
 """
 
 from __future__ import annotations
@@ -20,16 +20,17 @@ from ..core.matching import NO_MATCH, SampleKeys, SampleRows, match_rows
 from .faults import Fault
 
 ABSENT = -1
-"""Index in the skin of a cube of a hub that the skin does not have."""
+"""Value in place of the index in the skin, for a cube of a hub that is not in the skin."""
 
 NO_LINK = -1
-"""Index of the link of a cube that is on no link."""
+"""Value in place of the index of a link, for a cube that is on no link of the log."""
 
 CUBE_RANGE = 1 << 16
-"""Number of possible indices of a cube, which are 16 bits wide in messages."""
+"""Number of possible indices of a cube in a skin, which have 16 bits in messages."""
 
 SEQUENCE_RANGE = 1 << 32
-"""Number of different sequence numbers on the wire, where they wrap. Those in the log do not."""
+"""Number of different sequence numbers in frames and messages, where they wrap around after 32
+bits. The sample numbers in this log do not wrap."""
 
 
 @dataclass(frozen=True)
@@ -37,11 +38,11 @@ class SampleRun:
     """Samples of one hub at equal intervals.
 
     Attributes:
-        first: Number of the first sample; numbers do not wrap at 2^32.
+        first: Number of the first sample since the restart of the hub; it does not wrap at 2^32.
         last: Number of the last sample.
         start_us: Simulated time of the first sample in µs.
         period_us: Time between two samples in µs.
-        boot: Number of restarts of the hub before.
+        boot: Number of restarts of the hub before the first sample.
     """
 
     first: int
@@ -55,7 +56,7 @@ class SampleRun:
 
     @property
     def end_us(self) -> int:
-        """Simulated time in µs of the sample that would follow the last one."""
+        """Simulated time in µs at which the sample after the last one would be due."""
         return self.start_us + len(self) * self.period_us
 
 
@@ -67,8 +68,9 @@ class LinkLog:
         name: Name of the link.
         cubes: Index in the skin of each of the hub's cubes, `ABSENT` where the skin has none.
         dropped: Number of samples since the last restart for which the line had no room.
-        runs: All samples that it took, in the order of time.
-        damaged: Boot and number of each sample that was altered, or for which the line had no room.
+        runs: All samples that the hub took, in the order of time.
+        damaged: Samples whose frame was altered or not sent: for each, the number of restarts
+            before (boot) and the number of the sample.
     """
 
     name: str
@@ -79,7 +81,7 @@ class LinkLog:
 
     @property
     def members(self) -> list[int]:
-        """Index in the skin of each of its cubes that the skin has."""
+        """Indices in the skin of the hub's cubes, without those that are not in the skin."""
         return [cube for cube in self.cubes if cube != ABSENT]
 
 
@@ -90,7 +92,7 @@ class FaultRecord:
     Attributes:
         start_us: Simulated time in µs at which it began.
         end_us: Simulated time in µs at which it ended.
-        fault: The fault; its `link` is set.
+        fault: The fault, with the name of the link on which it was carried out.
     """
 
     start_us: int
@@ -103,7 +105,7 @@ class SampleLog:
     """Samples of all hubs of a skin, and their faults.
 
     Attributes:
-        start_time_ns: Wall clock at simulated time 0, in ns.
+        start_time_ns: Wall clock at simulated time 0, in ns since the Unix epoch.
         links: Logs of all links with cubes, in the order of the skin file.
         faults: Faults in the order in which they began.
     """
@@ -172,7 +174,7 @@ class SampleLog:
         lengths = np.array([len(run) for _, run in runs], int)
         number = [np.arange(run.first, run.last + 1) for _, run in runs]
         time_us = [run.start_us + run.period_us * np.arange(len(run)) for _, run in runs]
-        # It gives the columns their type if there are no runs.
+        # An empty array in front gives the columns their type even if there are no runs.
         no_samples = np.empty(0, np.int64)
 
         link_of_cube = np.full(CUBE_RANGE, NO_LINK, np.int64)
@@ -193,10 +195,10 @@ class SampleTable:
     """Columns of all samples (S,) that the hubs of a skin took.
 
     Attributes:
-        start_time_ns: Wall clock at time 0 of the hubs, in ns.
-        link: Index of the link whose hub took the sample (S,).
-        number: Number of the sample (S,); it does not wrap around.
-        time_ns: Wall clock at which it was taken (S,), in ns.
+        start_time_ns: Wall clock at simulated time 0, in ns since the Unix epoch.
+        link: Index of the link whose hub took each sample (S,).
+        number: Number of each sample (S,), which does not wrap at 2^32.
+        time_ns: Wall clock at which each sample was taken (S,), in ns since the Unix epoch.
         rows_per_sample: Number of the skin's cubes on each link (links,).
         link_of_cube: Link of each possible index of a cube (`CUBE_RANGE`,), or `NO_LINK`.
     """
@@ -212,18 +214,21 @@ class SampleTable:
         return len(self.link)
 
     def match(self, rows: SampleRows, among: Index | None = None) -> Index:
-        """Find the sample of each row (N,), or `NO_MATCH` for what no hub took.
+        """Find the logged sample from which each of N received rows comes.
 
-        A hub that restarts gives its numbers again. Among the samples with the number of the row,
-        the one whose time is nearest to the row's stamp is chosen.
+        A hub that restarts uses the same sample numbers again. So among the samples of the row's
+        link with the row's number, the one whose time is nearest to the row's stamp is chosen.
 
         Args:
-            rows: The rows.
-            among: Indices of the samples to search, all of them by default.
+            rows: Cube, sequence number and stamp of the received rows.
+            among: Indices of the samples to search; None: all samples.
+
+        Returns:
+            Index (N,) of the sample, or `NO_MATCH` for a row that comes from no logged sample.
         """
         if among is None:
             among = np.arange(len(self))
-        # Cubes of one hub are sampled together: samples are identified by link instead of cube.
+        # A sample contains all cubes of a hub, so it is identified by the link instead of the cube.
         number = self.number[among] % SEQUENCE_RANGE
         known = SampleKeys(self.link[among], number, self.time_ns[among])
         wanted = SampleKeys(self.link_of_cube[rows.cube], rows.sequence, rows.stamp_ns)
@@ -232,6 +237,11 @@ class SampleTable:
         return np.append(among, NO_MATCH)[found]
 
     def rows_taken(self, start_ns: int, end_ns: int) -> int:
-        """Count the rows (one cube, one sample) taken from `start_ns` to before `end_ns`."""
+        """Count the rows (one cube, one sample) that were taken in an interval of time.
+
+        Args:
+            start_ns: Begin of the interval, in ns since the Unix epoch.
+            end_ns: End of the interval (exclusive), in ns since the Unix epoch.
+        """
         is_within = (self.time_ns >= start_ns) & (self.time_ns < end_ns)
         return int(self.rows_per_sample[self.link[is_within]].sum())

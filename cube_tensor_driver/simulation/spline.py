@@ -1,7 +1,7 @@
 """Cubic splines through points at equal intervals.
 
-They are computed here because importing scipy.interpolate would take longer than the rest of the
-simulator's start.
+They are computed here, because importing scipy.interpolate would more than double the time that the
+simulator needs to start.
 """
 
 from __future__ import annotations
@@ -14,25 +14,26 @@ from ..core.arrays import Array
 class CubicSpline:
     """A twice continuously differentiable curve through K >= 2 points.
 
-    Point i is reached at the time i / (K - 1). Between two points p and q with the slopes m and n
-    per interval, the curve is Hermite's cubic. Continuous curvature requires
-    m[i-1] + 4 m[i] + m[i+1] = 3 (p[i+1] - p[i-1]).
+    The time runs from 0 to 1, and point i is reached at the time i / (K - 1). Between two points,
+    the curve is the cubic Hermite polynomial with given slopes m (change per interval) at both
+    points p. A continuous second derivative requires m[i-1] + 4 m[i] + m[i+1] = 3 (p[i+1] -
+    p[i-1]).
 
     Source: C. de Boor, A Practical Guide to Splines (1978), chapter IV.
     """
 
     def __init__(self, points: Array, *, closed: bool) -> None:
-        """Solve for the slopes.
+        """Compute the slopes of the curve at all points.
 
         Args:
-            points: Points (K, D).
+            points: Positions (K, D) of the points.
             closed: Whether the last point is the first one and the curve passes it smoothly.
                 Otherwise the velocity is 0 at both ends.
         """
         self._points = np.asarray(points, float)
         n = len(points)
         if closed:
-            # One equation for each point except the last, which is the first one again.
+            # There is one equation for each point except the last, which is equal to the first.
             ring = self._points[:-1]
             identity = np.eye(n - 1)
             matrix = 4 * identity + np.roll(identity, 1, axis=1) + np.roll(identity, -1, axis=1)
@@ -64,7 +65,11 @@ class CubicSpline:
         return per_interval * (len(self._points) - 1)
 
     def _interval(self, time: float) -> tuple[float, Array, Array, Array, Array]:
-        """Return the fraction of the interval at a time, and points and slopes at its two ends."""
+        """Return the interval between two points in which a time from 0 to 1 lies.
+
+        Returns:
+            Elapsed fraction of the interval, the points at its two ends, and the slopes there.
+        """
         scaled = time * (len(self._points) - 1)
         i = min(int(scaled), len(self._points) - 2)
         points = self._points[i : i + 2]
