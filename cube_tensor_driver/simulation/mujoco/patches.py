@@ -7,8 +7,9 @@ there (the effective area of a footing that is loaded off its centre)::
 
     q -> c + s (q - g),     s = min over the hull's edges of  distance(c) / distance(g)
 
-Force and moments are then those of the points, and nothing pulls. The remaining moment about the
-normal, the torsion, is tangential traction in proportion to the distance from c.
+The force and the moments of this traction are those of the points, and the traction nowhere pulls.
+The moment about the normal (torsion) becomes a tangential traction that is proportional to the
+distance from c.
 
 Source: K. L. Johnson, Contact Mechanics (1985), 4.2 (Hertz); G. G. Meyerhof, Proc. 3rd Int. Conf.
 Soil Mechanics (1953), 440 (effective area).
@@ -25,14 +26,14 @@ from ...core.arrays import Array
 
 
 class Polygon(NamedTuple):
-    """Uniform traction on a polygon, plus a tangential traction that turns about its centroid.
+    """Uniform traction on a polygon, plus a tangential traction that circulates about its centroid.
 
     Attributes:
         corners: Corners (K, 3) in m, counterclockwise about the normal.
         centre: Centroid (3,) in m.
         traction: Traction (3,) in Pa on the skin at the centroid.
-        twist: Gradient in Pa/m of the turning traction: at q, the traction is larger by
-            twist normal x (q - centre).
+        twist: Gradient in Pa/m of the circulating traction, which is twist normal x (q - centre) at
+            the position q.
     """
 
     corners: Array
@@ -46,7 +47,7 @@ def hertz_radius(
     curvature: float,
     stiffness: float,
 ) -> float:
-    """Return the contact radius in m of a rigid sphere: a^3 = 3 F / (4 E* curvature).
+    """Return the Hertz contact radius in m of a rigid sphere: a^3 = 3 F / (4 E* curvature).
 
     Args:
         force: Normal force in N.
@@ -65,13 +66,13 @@ def flat_contact(
     normal: Array,
     min_width: float,
 ) -> Polygon:
-    """Return the polygon of a flat contact.
+    """Return the polygon that represents the contact of a flat body (see the file head).
 
     Args:
         points: Positions (K, 3) of the contact points in m.
-        forces: Forces (K, 3) in N; all of them press.
+        forces: Forces (K, 3) in N on the skin; all of them press.
         normal: Unit normal (3,) out of the skin.
-        min_width: Width in m that a contact along a line or at a point gets.
+        min_width: Smallest width of the polygon in m, for contacts along a line or at a point.
     """
     basis = _plane_basis(*normal.tolist())
     origin = points.mean(axis=0)
@@ -86,7 +87,7 @@ def flat_contact(
     corners = _convex_hull(flat)
     area, centroid, polar = _area_moments(corners)
     if area < min_width * np.abs(corners).max():
-        # Points on a line: each of them becomes a square.
+        # The points lie on a line. Each becomes a square, so that the polygon has an area.
         square = min_width / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
         corners = _convex_hull((flat[:, None] + square).reshape(-1, 2))
         area, centroid, polar = _area_moments(corners)
@@ -138,7 +139,7 @@ def _area_moments(corners: Array) -> tuple[float, Array, float]:
 
 
 def _next_corners(corners: Array) -> Array:
-    """Return the corner (K, 2) after each of them. np.roll takes five times as long."""
+    """Return the next corner (K, 2) for each corner; np.roll would take five times as long."""
     return np.concatenate([corners[1:], corners[:1]])
 
 

@@ -1,6 +1,6 @@
-"""A MuJoCo scene as the load of a simulated skin, so that the real driver runs against a robot.
+"""A MuJoCo scene as the load of a simulated skin, so that the driver can be run with a robot.
 
-The scene is one XML file that plays by itself:
+The scene is one XML file, whose motion is given by its keyframes:
 
 - The text `skin` in `<custom>` names its skin file, relative to the scene's folder.
 - It starts in the first keyframe, if that is at time 0.
@@ -26,15 +26,15 @@ if TYPE_CHECKING:
     from mujoco import MjModel
 
 KEPT_S = 2.0
-"""Time in s for which the contacts of a scene that does not repeat are kept. The hubs of a skin ask
-for slightly different times."""
+"""Time, in s, for which the contacts of a scene that does not repeat are kept in memory. The hubs
+of a skin need the contacts at slightly different times, and a scene is only computed forwards."""
 
 UNBOUNDED_PERIOD_S = 10.0
-"""Time in s that is taken as the period of a scene that does not repeat, wherever a period is
-needed."""
+"""Value, in s, of the attribute `period` of a scene that never repeats."""
 
 CAMERA_ELEVATION = -12.0
-"""Elevation of the camera in degrees; negative values look down."""
+"""Elevation of the camera's viewing direction in degrees; a negative value means that it looks
+down."""
 
 
 def read_scene(path: Path) -> MjModel:
@@ -76,12 +76,12 @@ def scene_skin(path: Path) -> Path:
 
 
 class MujocoLoad:
-    """A scene that plays by itself, as a `load.AnyLoad`.
+    """The contacts in a scene with a given motion, as a `load.AnyLoad`.
 
     The contacts depend on the time only, so that several processes compute the same load.
 
     Attributes:
-        touch: The skin as a sensor, in the state that was computed last.
+        touch: The skin as a sensor; its `data` is the state of the scene that was computed last.
         poses: Poses of the cubes.
         depth: Distance from the centres of the cubes to the surface, in m.
         repeats: Time in s after which the scene repeats; None: never.
@@ -106,7 +106,7 @@ class MujocoLoad:
 
         Raises:
             ConfigError: The scene cannot be read, or the skin does not fit it.
-            ElasticError: Thickness and depth make no layer.
+            ElasticError: The thickness is not above 0, or the cubes lie deeper than the layer.
         """
         self._mujoco = load_mujoco()
         model = read_scene(path)
@@ -129,15 +129,15 @@ class MujocoLoad:
         self._restart()
 
     def at(self, seconds: float) -> tuple[Array, Array]:
-        """Compute the fields as `AnyLoad.at`, for the last step of the scene before this time."""
+        """Compute the fields as `AnyLoad.at`, with the contacts of the last step before a time."""
         return self.touch.field(self._touches_at(seconds))
 
     def total(self, seconds: float) -> tuple[Array, Array, Array]:
-        """Return the sum of all contacts, as `AnyLoad.total`."""
+        """Return force, centre and normal of all contacts at a time in s, as `AnyLoad.total`."""
         return total([touch.press for touch in self._touches_at(seconds)])
 
     def play(self, seconds: float) -> None:
-        """Bring `touch.data` to a time."""
+        """Compute the scene from its start, so that `touch.data` is its state at a time in s."""
         self._restart()
         while self._step < self._step_number(seconds):
             self._advance()
@@ -184,8 +184,9 @@ class MujocoLoad:
         return pixels
 
     def _touches_at(self, seconds: float) -> list[Touch]:
-        """Return the contacts at a time, playing the scene up to it if necessary."""
-        # A scene can only be played forwards: earlier times are remembered or played again.
+        """Return the contacts at a time in s; the scene is computed up to it if necessary."""
+        # A scene can only be computed forwards. Contacts at an earlier time are still in memory, or
+        # the scene is computed again from its start.
         number = self._step_number(seconds)
         if number not in self._touches:
             if number < self._step:
@@ -195,14 +196,14 @@ class MujocoLoad:
         return self._touches[number]
 
     def _step_number(self, seconds: float) -> int:
-        """Return the number of the step during which a time lies."""
+        """Return the number of the last step of the scene before a time in s."""
         if self.repeats is not None:
             seconds %= self.repeats
         # The small addition keeps exact multiples of the time step from being rounded down.
         return int(np.floor(seconds / self.touch.model.opt.timestep + 1e-6))
 
     def _restart(self) -> None:
-        """Bring the scene to its start."""
+        """Reset the scene to its start."""
         model = self.touch.model
         data = self.touch.data
         if model.nkey and model.key_time[0] == 0:
@@ -214,7 +215,7 @@ class MujocoLoad:
         self._touches[0] = self.touch.touches()
 
     def _advance(self) -> None:
-        """Play one step and keep its contacts."""
+        """Compute one step of the scene and keep its contacts."""
         model = self.touch.model
         data = self.touch.data
         if len(self._times):
@@ -234,12 +235,12 @@ def _keyframe_controls(path: Path, model: MjModel) -> tuple[Array, Array]:
     Both are empty if all keyframes are at time 0.
 
     Raises:
-        ConfigError: The keyframes go back in time.
+        ConfigError: The keyframes are not sorted by time.
     """
     times = np.array(model.key_time)
     if np.any(np.diff(times) < 0):
         raise ConfigError(f"{path}: keyframes go back in time; sort them by their time")
-    # Keyframes at time 0 are only named states.
+    # If all keyframes are at time 0, they are only named states and no motion.
     if not len(times) or times[-1] <= 0:
         return np.empty(0), np.empty((0, model.nu))
     return times, np.array(model.key_ctrl).reshape(len(times), model.nu)

@@ -17,10 +17,10 @@ another body sit on that one, so that the two fingers of a hand can be one skin.
 skin file hold in the reference configuration of the model (qpos0). The surface is that of the
 bodies' geoms above the cubes.
 
-Each cube sees a layer whose surface lies `depth` above it, perpendicular to its own z axis, as in
-`load.py`. patches.py turns contact points into tractions, mechanics/contact_tables.py tractions
-into stress at the cubes. Contacts with the back of a body, where no cube looks, are not felt. The
-damping of contacts is MuJoCo's.
+The stress at each cube is that in a layer whose surface lies `depth` above the cube, perpendicular
+to its z axis, as in `load.py`. patches.py converts contact points to tractions, and
+mechanics/contact_tables.py computes the stress at the cubes from them. Contacts on the side of a
+body that no cube faces cause no stress. MuJoCo determines the damping of contacts.
 
 MuJoCo is the extra `mujoco` of this package. It is imported when a skin is created.
 """
@@ -51,11 +51,12 @@ if TYPE_CHECKING:
 
 
 MAX_DEPTH_DEVIATION = 0.1
-"""Largest deviation of the depth of a cube from the median of all cubes, divided by the median. All
-cubes share one table."""
+"""Largest allowed deviation of the depth of a cube below the surface from the median depth of all
+cubes, divided by the median. The stress of all cubes is computed for the median."""
 
 MIN_WIDTH_DEPTHS = 0.3
-"""Width divided by the depth that a flat body gets if it touches along a line."""
+"""Smallest width of the contact of a flat body, divided by the depth of the cubes. A body that
+touches along a line or at an edge gets this width."""
 
 
 def load_mujoco() -> Any:
@@ -81,7 +82,7 @@ class _BodyCubes(NamedTuple):
         body: Number of the body.
         cubes: Indices (n,) of the cubes in the skin.
         poses: Poses of these cubes in the parent frame.
-        pitch: Their pitch in m.
+        pitch: Typical distance of neighbouring cubes in m.
         rotation: Rotation (3, 3) from the body's frame to the parent frame.
         position: Origin (3,) of the body's frame in the parent frame, in m.
     """
@@ -99,8 +100,8 @@ class Touch(NamedTuple):
 
     Attributes:
         body: Number of the body that is touched.
-        press: The contact as a round one of the same area.
-        polygon: The contact if it is flat, None if it is round.
+        press: Round contact with the same force, centre and area.
+        polygon: Traction on a polygon if the contact is flat; None if it is round.
     """
 
     body: int
@@ -149,7 +150,8 @@ class MujocoSkin:
         Raises:
             ConfigError: MuJoCo is not installed, the model has no body of that name, or a cube does
                 not lie below the surface of its body.
-            ElasticError: Thickness, Poisson's ratio and depth make no layer.
+            ElasticError: Thickness or Poisson's ratio is out of range, or the cubes lie deeper than
+                the layer.
         """
         self._mujoco = load_mujoco()
         self.model = model
@@ -157,7 +159,8 @@ class MujocoSkin:
         self.skin = skin
         self.poses = skin.poses
         self._parts, self.depth = self._attach()
-        # Rounded, so that skins whose depths differ by rounding errors share their tables.
+        # The depth is rounded to µm, so that skins whose depths differ only by rounding errors
+        # share their tables.
         self._discs, self._polygons = _tables(Layer(thickness, poisson), round(self.depth, 6))
         self._stiffness = young / (1 - poisson**2)
         self._curvature = _curvatures(model, self._mujoco)
@@ -166,7 +169,7 @@ class MujocoSkin:
         self._scans = 0
 
     def read(self) -> StressRows:
-        """Return the tensors of all cubes in the state of `data`; call it after mj_step."""
+        """Return stress and gradient of all cubes in the state of `data`; call it after mj_step."""
         return self._reconstructor.process(self.frequencies())
 
     def frequencies(self) -> FrequencyRows:
@@ -208,7 +211,7 @@ class MujocoSkin:
         n = len(self.poses.position)
         stress = np.zeros((n, 6))
         gradient = np.zeros((n, 6, 3))
-        # Bodies are far apart: a contact acts only on the cubes of its own body.
+        # A contact causes stress only at the cubes of the body that is touched.
         for part in self._parts:
             own = [touch for touch in touches if touch.body == part.body]
             loads = [touch.press for touch in own if touch.polygon is None]
@@ -234,7 +237,8 @@ class MujocoSkin:
         Args:
             part: Body of the skin and its cubes.
             rows: Contact points of the pair in MuJoCo's list.
-            side: 1 where the skin is the second of the two bodies, on which MuJoCo's forces act.
+            side: 0 if the body with the skin is the first of the two bodies, 1 if it is the second.
+                MuJoCo's contact forces act on the second one.
         """
         # MuJoCo's normal points from the first body to the second one.
         data = self.data
@@ -250,7 +254,7 @@ class MujocoSkin:
         force = force[is_felt]
         total = force.sum(axis=0)
         if len(place) > 1:
-            # The round contact of the same area stands for it where one position is wanted.
+            # The round contact with the same area is used where a single position is needed.
             polygon = flat_contact(place, force, normal, MIN_WIDTH_DEPTHS * self.depth)
             area = total @ normal / (polygon.traction @ normal)
             radius = float(np.sqrt(area / np.pi))
@@ -307,7 +311,7 @@ class MujocoSkin:
                 f"the MuJoCo model has no body {skin.parent_frame}, which is the parent_frame of "
                 f"skin {skin.name}; its bodies are {', '.join(filter(None, names))}"
             )
-        # Cubes whose link is no body sit on the body of the parent frame.
+        # A cube whose link does not have the name of a body is on the body of the parent frame.
         bodies = np.array([self._body_number(cube.link) for cube in skin.cubes])
         bodies[bodies < 0] = base
 
@@ -453,7 +457,8 @@ def _field_of_polygons(
     corners = (places - origin) @ in_plane
     centre = (np.stack([polygon.centre for polygon in polygons]) - origin) @ in_plane
 
-    # The twist turns about the centroid; the tables want it about the point above the cube.
+    # The twist of a polygon is given about its centroid. The tables need it about the point of the
+    # surface above the cube.
     facing = np.maximum(rotation[:, :, 2] @ normals, 0.0)
     twist = facing * [polygon.twist for polygon in polygons]
     traction = np.stack([polygon.traction for polygon in polygons]) @ rotation
@@ -471,8 +476,8 @@ def _field_of_polygons(
 def _curvatures(model: MjModel, mujoco: Any) -> Array:
     """Return the curvature (geoms + 1,) of each geom in 1/m.
 
-    Spheres, capsules and cylinders have that of their radius, all others 0. The last entry belongs
-    to flexible bodies, which have no geom.
+    It is 1 / radius for spheres, capsules and cylinders, and 0 for all others. The last entry, 0,
+    is for flexible bodies, which have no geom.
     """
     kinds = mujoco.mjtGeom
     round_kinds = (kinds.mjGEOM_SPHERE, kinds.mjGEOM_CAPSULE, kinds.mjGEOM_CYLINDER)
