@@ -79,7 +79,12 @@ def load_or_compute(
 
 
 def _hash_inputs(inputs: Iterable[Any]) -> str:
-    """Return a hash of the source code and of the values, types and shapes of the inputs."""
+    """Return a hash of everything a cached result depends on, as 32 hexadecimal digits.
+
+    Args:
+        inputs: Numbers and arrays; their values, types and shapes enter the hash, together with the
+            source files `_CODE`.
+    """
     digest = hashlib.sha256()
     package = Path(__file__).parents[1]
     for name in _CODE:
@@ -95,7 +100,11 @@ def _hash_inputs(inputs: Iterable[Any]) -> str:
 
 
 def _load(path: Path) -> Arrays | None:
-    """Load a file, or return None if it is missing or damaged."""
+    """Load the arrays of a cached file and mark the file as used now.
+
+    Returns:
+        Arrays by name; None if the file is missing or damaged, or cannot be marked.
+    """
     try:
         # NumPy checks the checksums of the zip file and raises an error for a damaged one.
         with np.load(path, allow_pickle=False) as file:

@@ -210,7 +210,13 @@ def _check(
     forces: Array,
     poisson: float,
 ) -> None:
-    """Raise ElasticError for arguments that `field` cannot use."""
+    """Check the arguments of `field`.
+
+    Raises:
+        ElasticError: An array has a wrong shape or is not finite, numbers of sources and forces
+            differ, Poisson's ratio is out of range, a point lies above the surface z = 0, or a
+            source lies off it.
+    """
     for name, array in (
         ("points", points),
         ("sources", sources),
@@ -380,7 +386,11 @@ def _airy(
 
 
 def _gauss_points(order: int) -> tuple[Array, Array]:
-    """Return Gauss-Legendre nodes (order,) and weights (order,) on the interval from 0 to 1."""
+    """Return Gauss-Legendre nodes (order,) and weights (order,) on the interval from 0 to 1.
+
+    Raises:
+        ElasticError: `order` is below 1.
+    """
     if order < 1:
         raise ElasticError(f"quadrature order is {order}; it must be at least 1")
     # NumPy's nodes and weights are for the interval from -1 to 1.
@@ -433,11 +443,11 @@ def _place_forces(
     """Return L point forces around a centre.
 
     Args:
-        x: Positions (L,) relative to the centre, in m.
-        y: Positions (L,) relative to the centre, in m.
-        fractions: Fraction (L,) of the force at each position.
+        x: Coordinates x (L,) of the point forces relative to the centre, in m.
+        y: Coordinates y (L,) of the point forces relative to the centre, in m.
+        fractions: Fraction (L,) of the total force that acts at each position.
         force: Total force (3,) in N.
-        centre: Centre (2,) in m.
+        centre: Centre (2,) on the surface, in m.
 
     Returns:
         Sources (L, 3) in m, with z = 0, and forces (L, 3) in N.

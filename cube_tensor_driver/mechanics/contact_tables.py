@@ -69,7 +69,8 @@ _GRID_COLUMNS = 2 * _CENTRE_COLUMN + 1
 negative on one side of the point that is nearest to the cube."""
 
 _ORIGIN_TOLERANCE = 1e-12
-"""Length of an edge, divided by the depth of the cubes, below which the edge counts as a point."""
+"""Length of a polygon's edge, divided by the depth of the cubes, below which the edge counts as a
+point and has no effect. The limit avoids a division by 0."""
 
 
 class _ContactTables:
@@ -210,7 +211,11 @@ class DiscTables(_ContactTables):
         return self._sum_loads(weights, rows, loads.astype(complex), direction)
 
     def _nearest_size(self, radius: ArrayLike) -> Index:
-        """Return, for each radius in m, the index of the nearest tabulated radius."""
+        """Return the index (L,) in `CONTACT_SIZES` of the tabulated radius nearest to each radius.
+
+        Args:
+            radius: Radii (L,) in m, which are compared with the table on a logarithmic scale.
+        """
         size = np.clip(
             np.asarray(radius, float) / self.depth,
             CONTACT_SIZES[0],
@@ -352,7 +357,7 @@ class PolygonTables(_ContactTables):
 
 
 def _to_complex(vectors: Array) -> Complex:
-    """Return x + i y (...) of vectors (..., 2) or (..., 3)."""
+    """Return x + i y (...) of vectors (..., 2) or (..., 3); their z component is ignored."""
     result: Complex = vectors[..., 0] + 1j * vectors[..., 1]
     return result
 

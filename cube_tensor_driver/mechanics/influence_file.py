@@ -72,6 +72,9 @@ def write_influence(
 def read_influence(path: Path) -> Influence:
     """Read and check influence functions that were computed in space (three force components).
 
+    Args:
+        path: File (.npz) as from `write_influence`.
+
     Raises:
         ConfigError: The file is missing, damaged or inconsistent.
     """
@@ -93,8 +96,15 @@ def read_influence(path: Path) -> Influence:
 
 
 def _load_arrays(data: bytes) -> Arrays:
-    """Decompress the arrays of a file after checking their size."""
-    # A small zip file may decompress to any size, so the sizes are checked before.
+    """Decompress the arrays of a file of influence functions after a check of their size.
+
+    Args:
+        data: Content of the file (.npz, a zip file of NumPy arrays).
+
+    Raises:
+        ConfigError: The decompressed content is larger than `MAX_FILE_BYTES`.
+    """
+    # A small zip file may decompress to any size, so the total size is checked first.
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         size = sum(member.file_size for member in archive.infolist())
     if size > MAX_FILE_BYTES:
@@ -104,7 +114,16 @@ def _load_arrays(data: bytes) -> Arrays:
 
 
 def _parse(arrays: Arrays) -> Influence:
-    """Build the influence functions from the arrays of a file."""
+    """Build the influence functions from the arrays of a file.
+
+    Args:
+        arrays: Arrays by the names under which `write_influence` stores them.
+
+    Raises:
+        ConfigError: The file has another version of the format (`SCHEMA`).
+        ElasticError: The layer's thickness or Poisson's ratio is out of range.
+        KeyError: An array is missing.
+    """
     if int(arrays["schema"]) != SCHEMA:
         raise ConfigError(f"schema is {arrays['schema']}, this package reads {SCHEMA}")
     layout = Layout(
@@ -124,7 +143,13 @@ def _parse(arrays: Arrays) -> Influence:
 
 
 def _check(influence: Influence) -> None:
-    """Raise ElasticError or ConfigError if the quantities of a file contradict each other."""
+    """Check that the quantities of a file of influence functions do not contradict each other.
+
+    Raises:
+        ElasticError: The depth is not within the layer.
+        ConfigError: The cube reaches the surface, an array has a wrong shape or is not finite, or
+            the positions of the forces are no rectangular grid around the cube.
+    """
     influence.layer.check_depth(influence.depth)
     if not 0 < influence.side < 2 * influence.depth:
         raise ConfigError(

@@ -188,7 +188,7 @@ class Kernels:
 
     @property
     def _unit_factors(self) -> Array:
-        """Factors (15,) that convert the gradients from Pa/m to Pa."""
+        """Factors (15,) that convert components to Pa: 1 for stresses, `scale` for gradients."""
         return np.where(_IS_GRADIENT, self.scale, 1.0)
 
     def add_variant(self, components: Array) -> int:
@@ -201,7 +201,7 @@ class Kernels:
         Returns:
             Index of the variant in `component_matrices`.
         """
-        # Cubes without the same pad share a variant, so that there are few variants to compare.
+        # Cubes in which the same pads are left out share a variant, so there are few to compare.
         matrix = components * self._unit_factors
         is_equal = self.component_matrices == matrix
         equal = np.flatnonzero(is_equal.all(axis=(1, 2)))
@@ -439,9 +439,17 @@ class Kernels:
         return np.concatenate([rotated.real, rotated.imag], axis=2)
 
     def _measure(self, circular: Array, variant: Index) -> Array:
-        """Convert circular components (N, 3, 2 n) of N cubes to measured components (N, 15, 3)."""
+        """Convert the n circular components at N cubes to the components that the cubes measure.
+
+        Args:
+            circular: Real parts and then imaginary parts (N, 3, 2 n), for loads along x, y and z.
+            variant: Index (N,) of each cube's variant in the measurement model.
+
+        Returns:
+            Measured components (N, 15, 3), for the same loads.
+        """
         matrices = self.component_matrices
-        # One product for all rows is faster than one for each row.
+        # With only one variant, a single matrix product for all cubes is faster than one per cube.
         matrix = matrices[0] if len(matrices) == 1 else matrices[variant]
         return np.asarray((circular @ matrix).swapaxes(1, 2))
 
@@ -520,10 +528,10 @@ class Kernels:
 
 
 def hertz_pressure(distance: Array, size: float) -> Array:
-    """Compute the pressure in Pa of a Hertz contact with a force of 1 N.
+    """Compute the pressure in Pa on the surface in a Hertz contact with a force of 1 N.
 
     Args:
-        distance: Distances from the centre in m.
+        distance: Distances (...) from the centre of the contact, in m.
         size: Radius of the contact in m.
     """
     # p = 3 F / (2 pi a^2) sqrt(1 - r^2 / a^2), and 0 outside
@@ -536,7 +544,7 @@ def disc_spectrum(x: Array) -> Array:
     """Compute the spectrum (Fourier transform) B of the pressure of a Hertz contact with 1 N.
 
     Args:
-        x: Wavenumbers in 1/m multiplied by the radius of the contact in m.
+        x: Wavenumbers (...) in 1/m multiplied by the radius of the contact in m.
     """
     # Near x = 0, sin x - x cos x would lose all digits, so a Taylor series replaces it.
     safe = np.maximum(x, 1e-2)
@@ -545,7 +553,9 @@ def disc_spectrum(x: Array) -> Array:
 
 
 def _prior_spectrum(wavenumber: Array) -> Array:
-    """Return the spectrum S of the prior pressure, divided by depth^2.
+    """Return the spectrum S of the random pressure that serves as prior, divided by depth^2.
+
+    The pressure has the variance 1 Pa^2 and the correlation lengths `PRIOR_LENGTHS`.
 
     Args:
         wavenumber: Wavenumbers multiplied by the depth of the cubes.
@@ -558,13 +568,25 @@ def _prior_spectrum(wavenumber: Array) -> Array:
 
 
 def _polar(place: Array) -> tuple[Array, Array]:
-    """Return distance (N,) and direction (N,) in rad of positions (N, 2)."""
+    """Convert positions (N, 2) in the x-y plane to polar coordinates about the origin.
+
+    Returns:
+        Distances (N,) from the origin, and directions (N,) from the x axis on, in rad.
+    """
     x, y = place.T
     return np.hypot(x, y), np.arctan2(y, x)
 
 
 def _phases(angle: Array, order: Orders) -> Complex:
-    """Return the phases exp(i m angle) (N, n) for angles (N,) in rad and orders m (n,)."""
+    """Return the phases exp(i m angle) by which rotations multiply circular components of order m.
+
+    Args:
+        angle: Angles (N,) in rad.
+        order: Orders m (n,) of the circular components.
+
+    Returns:
+        Phases (N, n).
+    """
     phases: Complex = np.exp(1j * angle[:, None] * order)
     return phases
 

@@ -159,7 +159,7 @@ class Spectra:
         bessel: BesselTable,
         prior: Array,
     ) -> Array:
-        """Integrate the products of spectra, Bessel functions and prior over k.
+        """Integrate products of spectra, Bessel functions and the prior spectrum over k.
 
         Args:
             spectrum: Products (waves, n, n') of two spectra.
@@ -179,7 +179,15 @@ class Spectra:
 
 
 def _outer(first: Array, second: Array) -> Array:
-    """Return the products (waves, n, n') of all pairs of two sets of spectra."""
+    """Return the products of all pairs of two sets of spectra.
+
+    Args:
+        first: Spectra (waves, n).
+        second: Spectra (waves, n').
+
+    Returns:
+        Products (waves, n, n').
+    """
     return first[:, :, None] * second[:, None]
 
 
