@@ -32,7 +32,7 @@ class ContactSettings:
     Attributes:
         method: One of `CONTACT_METHODS`.
         depth: Distance from the centres of the cubes to the surface, in m.
-        least: Smallest pressure of a contact at the depth of the cubes, in Pa.
+        least: Smallest pressure in Pa, at the depth of the cubes, at which a contact is found.
         thickness: Thickness of the elastomer on rigid ground in m; 0 for a half space. Only the
             method inverse uses it.
         poisson: Poisson's ratio of the elastomer. Only the method inverse uses it.

@@ -97,7 +97,7 @@ class Interpolation:
 
         Args:
             known: Whether each value and derivative (cubes, C) is known.
-            columns: Columns as in `values`.
+            columns: Column of the quantity and, if they are used, columns of its two derivatives.
         """
         wanted = known[:, columns]
         key = tuple(columns)
@@ -188,7 +188,7 @@ class _Weights:
 
         Args:
             near: Indices (cubes, neighbours) of the cubes from which each patch is interpolated.
-            points: Number of points of a patch.
+            points: Number of points of a patch (grid of points around a cube).
             known: Initial value (cubes, width) of the attribute `known`.
         """
         n, width = known.shape

@@ -149,7 +149,12 @@ class SurfaceInverse:
         side: int,
         model: MeasurementModel | None,
     ) -> None:
-        """Compute points and matrices; arguments as in `from_poses`."""
+        """Compute the points on the surface and all matrices; arguments as in `from_poses`.
+
+        Raises:
+            ElasticError: `side` is below 1, the layer does not contain the depth, or no cube
+                observes any component.
+        """
         if side < 1:
             raise ElasticError(f"{side} points a side of a patch; it must be at least 1")
         n = len(poses.position)
@@ -197,9 +202,14 @@ class SurfaceInverse:
         self._prediction = MissingValuePrediction(self._windows, self.observed, self._known)
 
     def scaled(self, values: Array) -> Array:
-        """Select the observed components (cubes, C) of values (cubes, 15) and convert them to Pa.
+        """Select the components that some cube of the skin observes, and convert them to Pa.
 
-        Gradients, in Pa/m, are multiplied by half the side of a cube.
+        Args:
+            values: Components (cubes, 15), stresses in Pa and gradients in Pa/m.
+
+        Returns:
+            The C components `columns` (cubes, C) in Pa; gradients are multiplied by half the side
+            of a cube.
         """
         return np.asarray(values)[:, self.columns] * self._unit_factors
 
@@ -207,11 +217,12 @@ class SurfaceInverse:
         """Lay cubes of a bent skin flat around one cube, from which they keep their distance.
 
         Args:
-            centre: Index of the cube that stays in place.
-            cubes: Indices (n,) of the cubes.
+            centre: Index of the cube in whose x-y plane the others are laid.
+            cubes: Indices (n,) of the cubes to be laid flat.
 
         Returns:
-            Positions (n, 2) in m and rotations (n,) in rad, in the frame of the centre cube.
+            Positions (n, 2) in m and rotations (n,) about z in rad of these cubes, in the frame of
+            the centre cube.
         """
         place, angle = unroll(
             self.poses,
@@ -258,16 +269,26 @@ class SurfaceInverse:
         return self.field_of_scaled(self.scaled(values))
 
     def field_of_scaled(self, scaled: Array) -> TractionField:
-        """Compute the field as `field`, from values (cubes, C) in Pa as returned by `scaled`."""
+        """Compute the traction that explains values in Pa.
+
+        Args:
+            scaled: Values (cubes, C) in Pa as from `scaled`, NaN where unknown.
+
+        Returns:
+            Traction at all points, as from `field`.
+        """
         # The results are sorted by cube and then by point of its patch, as `points` are.
         result = self._windows.product(self._fill(scaled))
         rows = result.reshape(len(self.points), -1).astype(np.float64)
         return TractionField(rows[:, :3], rows[:, 3])
 
     def deviation(self, values: Array) -> FieldDeviation:
-        """Compute the standard deviations of the result of `field`, with the same argument.
+        """Compute the standard deviations of the traction field that `field` returns.
 
         This takes several times as long as `field`.
+
+        Args:
+            values: Components (cubes, 15) in Pa and Pa/m, NaN where unknown, as for `field`.
         """
         scaled = self.scaled(values)
         return self.residual_deviation(scaled, scaled)

@@ -98,7 +98,10 @@ def model_pads(influence: Influence, calibrations: Sequence[Calibration]) -> Mea
 
 
 def _match_pads(influence: Influence, calibration: Calibration) -> list[int]:
-    """Return, for each pad of a calibration, the index of the influence function of this pad.
+    """Find the influence function of each pad of a calibration by the pad's position and normal.
+
+    Returns:
+        Index of the influence function for each pad, in the order of the calibration's pads.
 
     Raises:
         ElasticError: The size of the cube differs, or a pad has no influence function.

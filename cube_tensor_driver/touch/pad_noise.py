@@ -58,9 +58,14 @@ def noise_by_pad(
 
 
 def noise_of_all_pads(calibrations: Sequence[Calibration]) -> Array:
-    """Return the noise matrices (cubes, 15, P) as `noise_by_pad`, one for each calibration.
+    """Return the noise matrices of all cubes of a skin if every cube uses all of its P pads.
 
-    All pads of every cube are used.
+    Args:
+        calibrations: Calibration of each cube.
+
+    Returns:
+        Change (cubes, 15, P) of each component, in Pa or Pa/m, for one standard deviation of the
+        noise of each pad, as from `noise_by_pad`.
     """
     n = len(calibrations)
     no_pads = np.zeros(n, np.uint32)

@@ -78,9 +78,10 @@ class ObservationModel(NamedTuple):
     variant: Index
 
     def select(self, cubes: Index) -> ObservationModel:
-        """Return the model of the cubes with these indices (...).
+        """Return the observation model of some of the cubes.
 
-        The leading axis n of every array is replaced by the axes of the indices.
+        Args:
+            cubes: Indices (...) of the cubes. Their axes replace the leading axis n of the arrays.
         """
         return ObservationModel(
             self.columns, self.known[cubes], self.by_pad[cubes], self.variant[cubes]
@@ -98,14 +99,16 @@ class WindowPosteriors:
             centre cube, which comes first.
         inner: Number of inner cubes: the first ones of each window.
         kind: Index (cubes,) of the kind of each window.
-        gain: Matrix G (kinds, rows, W C) from values to traction, in single precision.
-        precision: Matrix P (kinds, inner C, inner C), the inverse covariance of the values of the
-            inner cubes.
+        gain: Matrix G (kinds, points x ROWS_PER_POINT, W C) from the values of the window's cubes
+            to the results at the points around its centre cube, in single precision.
+        precision: Matrix P (kinds, inner C, inner C) in 1/Pa^2, the inverse covariance of the
+            values of the inner cubes.
         prior: Posterior variance (kinds, points x 2) in Pa^2 of the pressure on the surface and at
             the cubes' depth, at the scale s = 1 and without pad noise.
         by_pad: Variance (kinds, points x 2, W P) in Pa^2 of these pressures that the noise of each
             pad causes.
-        trace: Contribution (kinds, inner P) of the noise of each pad to tr P M.
+        trace: Contribution (kinds, inner P) of the noise of each pad to the trace of P M, where M
+            is the covariance of the values that the errors of the pads cause.
         pads: Noise matrices (cubes, C, P) of all cubes in Pa, 0 where nothing is observed.
     """
 
@@ -147,7 +150,11 @@ class WindowPosteriors:
         points = square_points(spacing, side)
 
         def solve_kinds() -> Arrays:
-            """Compute the matrices of all kinds of windows, with an axis of kinds in front."""
+            """Compute the arrays of `_Window` for all kinds of windows.
+
+            Returns:
+                Arrays by their names in `_Window`, each with the kinds as an additional first axis.
+            """
             solved: dict[str, AnyArray] = {}
             # The matrices of a kind are copied into the result as soon as they are computed,
             # because a list of all of them would double the memory.
@@ -168,7 +175,8 @@ class WindowPosteriors:
         self.by_pad = solved["by_pad"]
         self.trace = solved["trace"]
 
-        # Kinds with one window each are multiplied in one batch, the others one kind at a time.
+        # In `product`, all windows that are the only ones of their kind are multiplied in one
+        # batch, the others one kind at a time.
         self._rows = [(kind, np.flatnonzero(self.kind == kind)) for kind in kinds]
         self._shared_kinds = [(kind, rows) for kind, rows in self._rows if len(rows) > 1]
         counts = np.bincount(self.kind)
@@ -219,8 +227,8 @@ class WindowPosteriors:
             y: Values (cubes, C) in Pa, 0 where unknown.
 
         Returns:
-            Posterior mean (cubes, rows) in Pa. There are `ROWS_PER_POINT` rows for each point of
-            the patch of a cube.
+            Posterior mean (cubes, points x ROWS_PER_POINT) in Pa. Each point of the patch of a cube
+            has `ROWS_PER_POINT` results: traction along x, y, z, and pressure at the cubes' depth.
         """
         # All values of a window form one row, in the order of the columns of G.
         gathered = y[self.near].reshape(len(self.near), -1)
@@ -303,7 +311,9 @@ def _solve_window(
     angle: Array,
     points: Array,
 ) -> _Window:
-    """Compute the matrices of one window.
+    """Compute the matrices of one window from W cubes to the points around its centre cube.
+
+    Positions and rotations are in the frame of the centre cube, around which the skin is laid flat.
 
     Args:
         kernels: Covariances between components and traction in the elastic layer.
@@ -368,6 +378,8 @@ def _cross_covariance(
 ) -> Array:
     """Compute the prior covariance K_ty of the results at all points with the values of W cubes.
 
+    Positions and rotations are in the frame of the centre cube, around which the skin is laid flat.
+
     Args:
         kernels: Covariances between components and traction in the elastic layer.
         model: Components that the W cubes of the window observe.
@@ -396,9 +408,14 @@ def _cross_covariance(
 
 
 def _invert_known(matrix: Array, known: Mask) -> Array:
-    """Invert the part of a covariance matrix (D, D) that belongs to known values (D,).
+    """Invert the part of a covariance matrix that belongs to known values.
 
-    The rows and columns of unknown values are 0 in the result (D, D).
+    Args:
+        matrix: Covariance (D, D) of all values.
+        known: Whether each value (D,) is known.
+
+    Returns:
+        Inverse (D, D), in which the rows and columns of unknown values are 0.
     """
     inverse = np.zeros_like(matrix)
     block = np.ix_(known, known)
@@ -408,13 +425,15 @@ def _invert_known(matrix: Array, known: Mask) -> Array:
 
 
 def select_pressure(rows: Array) -> Array:
-    """Select the rows of the pressure on the surface and of the pressure at the cubes' depth.
+    """Select the pressures from results that also contain the shear traction.
 
     Args:
-        rows: Results (..., points x ROWS_PER_POINT).
+        rows: Results (..., points x ROWS_PER_POINT). Each point has the traction along x, y and z
+            and the pressure at the cubes' depth.
 
     Returns:
-        Both pressures of every point (..., points x 2).
+        Results (..., points x 2): for each point the traction along z, whose negative is the
+        pressure on the surface, and the pressure at the cubes' depth.
     """
     leading = rows.shape[:-1]
     chosen = rows.reshape(*leading, -1, ROWS_PER_POINT)[..., 2:]
@@ -451,6 +470,13 @@ def _nearest_cubes(poses: CubePoses) -> Index:
 
 
 def _number_distinct(rows: Array) -> Index:
-    """Return, for each row (n, k), its number (n,) among the distinct rows."""
+    """Number the distinct rows of a matrix.
+
+    Args:
+        rows: Matrix (n, k).
+
+    Returns:
+        Number (n,) of each row, from 0 on; equal rows have the same number.
+    """
     _, number = np.unique(rows, axis=0, return_inverse=True)
     return np.asarray(number).reshape(-1)

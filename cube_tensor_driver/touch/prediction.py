@@ -64,7 +64,7 @@ class MissingValuePrediction:
         """Prepare the predictions.
 
         Args:
-            windows: Matrices of all windows.
+            windows: Matrices of all windows (a cube and its nearest neighbours).
             observed: Whether each cube normally observes each component (cubes, C).
             known: Whether each component (cubes, C) is known now.
         """
@@ -84,9 +84,9 @@ class MissingValuePrediction:
         """Prepare the prediction of the missing values of one cube and add to `variance`.
 
         Args:
-            windows: Matrices of all windows.
+            windows: Matrices of all windows (a cube and its nearest neighbours).
             missing: Whether each component (cubes, C) is observed normally but not known now.
-            cube: Index of the cube.
+            cube: Index of the cube whose missing values are to be predicted.
         """
         width = missing.shape[1]
         near = windows.near[cube, : windows.inner]
@@ -117,7 +117,14 @@ class MissingValuePrediction:
         self._predictions.append(_Prediction(cube, own, near, weights, by_pad, rows, gain))
 
     def fill(self, y: Single) -> Single:
-        """Return values (cubes, C) whose missing entries, 0 in `y`, are replaced by predictions."""
+        """Replace missing values by predictions from the neighbouring cubes.
+
+        Args:
+            y: Values (cubes, C) in Pa, 0 where missing.
+
+        Returns:
+            Copy (cubes, C) of the values in which the missing ones are predicted.
+        """
         filled: Single = y.copy()
         for one in self._predictions:
             neighbours = y[one.near].ravel()

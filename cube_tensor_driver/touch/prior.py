@@ -8,7 +8,8 @@ from ..core.arrays import Array, Index
 from ..mechanics.kernels import Kernels
 
 AMPLITUDE = 20e3
-"""Prior standard deviation of the pressure on the surface, in Pa: the pressure of a firm touch."""
+"""Prior standard deviation of the pressure on the surface, in Pa, before any value is measured. The
+value is the pressure of a firm touch."""
 
 _EXTRA_VARIANCES = (1e-6, 1e-3, 1e-2, 1e-1)
 """Factors, tried one after the other, by which `make_positive_definite` increases the variances of
@@ -27,8 +28,8 @@ def covariance_matrix(
     Args:
         kernels: Covariances between components and traction in the elastic layer.
         columns: Indices (C,) of the components in `COMPONENTS`.
-        place: Positions (n, 2) of the cubes on the unrolled (flattened) skin, in m.
-        angle: Rotations (n,) of the cubes about z, in rad.
+        place: Positions (n, 2) of the cubes in m, on the skin laid flat in the x-y plane of a cube.
+        angle: Rotations (n,) of the cubes about z, the normal of this plane, in rad.
         variant: Index (n,) of each cube's calibration in the measurement model of `kernels`.
 
     Returns:

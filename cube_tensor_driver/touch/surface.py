@@ -175,7 +175,8 @@ class Surface:
             Contacts, strongest first. Every patch of the skin belongs to the contact nearest to it,
             and its whole pressure and shear are part of the force of this contact.
         """
-        # Around cubes without any value, the pressure is unknown and counts as zero.
+        # Where neither a cube nor its neighbours have a value, the pressure is unknown (NaN) and
+        # counts as zero.
         pressure = np.nan_to_num(self._pressure(values))
         inside = pressure > max(threshold, RELATIVE_THRESHOLD * float(pressure.max()))
         if not inside.any():
@@ -203,7 +204,14 @@ class Surface:
         return np.stack(columns, axis=1)
 
     def _by_patch(self, on_points: Array) -> Array:
-        """Reshape values (M,) at all points to (cubes, points of a patch)."""
+        """Group values at all points by patch, the square grid of points around each cube.
+
+        Args:
+            on_points: Values (M,) at all points.
+
+        Returns:
+            The same values (cubes, points of a patch).
+        """
         return on_points.reshape(len(self._patches), -1)
 
     def _assign_patches(self, inside: Mask) -> Index:
@@ -346,7 +354,7 @@ def patches(
 
 
 def _weighted_sum(weights: Array, vectors: Array) -> Array:
-    """Return the sum (3,) of weights (...) times vectors (..., 3).
+    """Return the weighted sum (3,) of vectors (..., 3) with the weights (...).
 
     The function uses einsum, because a BLAS matrix product would start threads that occupy a second
     core.

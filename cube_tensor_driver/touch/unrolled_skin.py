@@ -15,9 +15,9 @@ def unroll(
 ) -> tuple[Array, Array]:
     """Lay the neighbours of n cubes flat, each time in the x-y plane of the cube in the centre.
 
-    This is necessary because the kernels (covariances between the cubes' values and the surface
-    traction) hold for a flat layer. A neighbour keeps its distance from the centre cube, and its
-    direction within the x-y plane. On a flat skin, nothing changes.
+    The skin has to be laid flat, because the kernels (covariances between the cubes' values and the
+    surface traction) hold for a flat layer. A neighbour keeps its distance from the centre cube,
+    and its direction within the x-y plane. On a flat skin, nothing changes.
 
     Args:
         poses: Poses of all cubes.
@@ -25,8 +25,8 @@ def unroll(
         near: Indices (n, W) of the neighbours of each centre cube that are laid flat.
 
     Returns:
-        Positions (n, W, 2) in m and rotations (n, W) about z in rad, in the frame of the centre
-        cube.
+        Positions (n, W, 2) in m and rotations (n, W) about z in rad of the neighbours, each in the
+        frame of its centre cube, with the origin in the centre of this cube.
     """
     to_centre = poses.rotation[centres]
     offset = poses.position[near] - poses.position[centres][:, None]

@@ -34,14 +34,14 @@ _MIN_NORMAL_FORCE = 1e-12
 
 
 class ContactEstimate(NamedTuple):
-    """Estimate of one contact, in the plane of the flattened skin.
+    """Estimate of one contact on the flattened skin (skin laid out in the plane z = 0 for the fit).
 
     Attributes:
-        force: Force (3,) in N on the skin.
+        force: Force (3,) in N on the skin, along x, y and z.
         force_variance: Variance (3,) of the force in N^2.
-        place: Position (2,) of the contact in m.
+        place: Position (2,) in m, where the line of action of the normal force meets the surface.
         place_variance: Variance (2,) of the position in m^2.
-        moment: Moment about the normal through this position, in N m.
+        moment: Moment of the traction about the normal (z) through this position, in N m.
         moment_variance: Variance of the moment in N^2 m^2.
         area: Area of the fitted Hertz contact in m^2.
         area_uncertainty: Standard deviation of the area in m^2.
@@ -67,7 +67,7 @@ def estimate_contact(
     Args:
         observations: Known values of the cubes, their noise and prior covariance.
         fit: Fit of one or several contacts to these values.
-        j: Index of the contact in the fit.
+        j: Index in the fit of the contact to estimate.
     """
     depth = observations.kernels.depth
     centre = fit.centres[j]
@@ -88,7 +88,7 @@ def estimate_contact(
         covariance = observations.cross(centre + offset)
         cross = fit.residual_scale**2 * covariance * weight[:, None, None]
 
-    # The position is the point about which the first moment of the pressure vanishes.
+    # The position of a contact is the point about which the first moment of the pressure is 0.
     total = cross.sum(axis=0)  # (3, D)
     force = contact_force + total @ fit.weighted_residual
     normal_force = force[2] if abs(force[2]) > _MIN_NORMAL_FORCE else -_MIN_NORMAL_FORCE
@@ -96,7 +96,7 @@ def estimate_contact(
     shift = first_moment @ fit.weighted_residual / normal_force
     lever = (first_moment - np.outer(shift, total[2])) / normal_force
 
-    # Moment about the normal through this position, from the shear traction.
+    # Moment of the shear traction about the normal through the position of the contact
     arm = offset - shift
     twist = arm[:, 0] @ cross[:, 1] - arm[:, 1] @ cross[:, 0]
     contact_moment = shift[1] * contact_force[0] - shift[0] * contact_force[1]
@@ -143,8 +143,9 @@ def _functional_variance(
 ) -> Array:
     """Return the prior variances k_LL (6,) of force (3), position (2) and moment.
 
-    They are the variances that the residual field (traction that the contacts do not explain) on a
-    disc causes before any value is measured.
+    The force, position and moment of a contact include the residual field (traction that the
+    contacts do not explain) on a disc around it. The prior variances are those that this field
+    causes before any value is measured.
 
     Args:
         residual_scale: Standard deviation of the pressure of the residual field, in Pa.
@@ -152,8 +153,8 @@ def _functional_variance(
         radius: Radius of the disc over which the residual field is integrated, in m.
         normal_force: Normal force of the contact in N.
     """
-    # Variance of the integral of the pressure over an area, per m^2 of this area. It holds for
-    # areas wider than the correlation lengths of the prior.
+    # Variance of the integral of the pressure over an area, per m^2 of this area. The formula
+    # holds for areas that are wider than the correlation lengths of the prior.
     lengths = np.array(PRIOR_LENGTHS) * depth
     density = residual_scale**2 * np.mean(2 * np.pi * lengths**2)
 

@@ -13,9 +13,10 @@ of the values (prior.py) and N the covariance of their noise (pad_noise.py). alp
 scale, is the standard deviation of the pressure of the residual field.
 
 A shape is a deviation of a contact from a circular Hertz contact. The shape functions D move
-pressure within a contact without changing its force and position: two make it longer along x or
-along a diagonal, the third moves pressure between centre and rim. Their coefficients s have the
-prior standard deviations `SHAPE_DEVIATIONS`, which cause the covariance S of the values.
+pressure within a contact without changing its force and position: two make the contact longer along
+x or along a diagonal, the third one (flatness) moves pressure between centre and rim. Their
+coefficients s have the prior standard deviations `SHAPE_DEVIATIONS`, which cause the covariance S
+of the values.
 
 alpha is chosen for the greatest evidence, the likelihood with forces, centres and radii integrated
 over their priors. If the model does not fit the true contacts, alpha grows, and with alpha all
@@ -196,12 +197,18 @@ class Observations:
 
     @cached_property
     def rough_noise(self) -> Array:
-        """Noise covariance (D, D) in Pa^2 with `ROUGH_GAIN_ERROR` instead of `GAIN_ERROR`."""
+        """Noise covariance (D, D) in Pa^2 of the D known values, far from the solution of a fit.
+
+        The errors of the pads' gains have the standard deviation `ROUGH_GAIN_ERROR` instead of
+        `GAIN_ERROR`.
+        """
         mean_square = self._squared_stresses.mean(axis=1, keepdims=True)
         return self._noise_covariance(ROUGH_GAIN_ERROR**2 * mean_square)
 
     def _noise_covariance(self, gain_variance: Array) -> Array:
-        """Return the covariance (D, D) in Pa^2 that noise and gain errors of the pads cause.
+        """Return the covariance (D, D) in Pa^2 of the D known values' errors.
+
+        The errors are caused by the noise and by the gain errors of the pads (sensing elements).
 
         Args:
             gain_variance: Variance (n, P, 1) that the gain error of each pad causes, divided by the
@@ -218,14 +225,14 @@ class Observations:
         return np.asarray(all_components[known])
 
     def responses(self, centres: Array, size: float) -> Array:
-        """Compute the values under single contacts with a force of 1 N.
+        """Compute the known values of the cubes under single Hertz contacts with a force of 1 N.
 
         Args:
             centres: Centres (K, 2) of K contacts on the flattened skin, in m.
             size: Radius of each contact in m.
 
         Returns:
-            Values (K, D, 3) in Pa/N, for a force along x, y and z.
+            Values (K, D, 3) in Pa/N, for a force along x, y and z of the flattened skin.
         """
         responses = self.kernels.response(*self._cubes_from(centres), size)
         return self._select_known(responses, len(centres))
@@ -244,7 +251,10 @@ class Observations:
         return np.asarray(known.swapaxes(1, 2))
 
     def _cubes_from(self, points: Array) -> tuple[Array, Array, Index]:
-        """Return arguments for `Kernels`: all pairs of the points (K, 2) with the n cubes.
+        """List all pairs of some points with the n cubes, as arguments for methods of `Kernels`.
+
+        Args:
+            points: Positions (K, 2) on the flattened skin, in m.
 
         Returns:
             Positions (K n, 2) of the cubes from the points in m, rotations (K n,) of the cubes in
@@ -256,11 +266,15 @@ class Observations:
         return offset.reshape(-1, 2), angle, np.tile(self._variant, count)
 
     def _select_known(self, components: Array, count: int) -> Array:
-        """Select the known values (K, D, 3) from all components (K n, 15, 3) of n cubes.
+        """Select the D known values from all 15 components of n cubes.
 
         Args:
-            components: Components of the cubes for K points.
+            components: Components (K n, 15, 3) of the cubes for each of K points on the surface,
+                sorted by point and then by cube.
             count: Number K of points.
+
+        Returns:
+            Known values (K, D, 3).
         """
         observed = components[:, self._columns].reshape(count, -1, 3)
         return np.asarray(observed[:, self._known])
@@ -270,9 +284,9 @@ class ContactFit(NamedTuple):
     """Result of a fit of J contacts to D values.
 
     Attributes:
-        centres: Centres (J, 2) in m.
+        centres: Centres (J, 2) of the contacts on the flattened skin, in m.
         sizes: Radii (J,) in m.
-        forces: Forces (J, 3) in N.
+        forces: Forces (J, 3) in N on the skin, in the axes of the flattened skin.
         residual_scale: Standard deviation alpha, in Pa, of the pressure that the contacts do not
             explain (residual field).
         factor: Cholesky factor (D, D) of W^-1 = alpha^2 K + S + N (file head).
@@ -371,8 +385,9 @@ def fit_contacts(
             for centre, log_size in zip(centres, log_sizes, strict=True)
         ]
 
-        # The effect of the shapes is proportional to the forces. It is computed with the forces of
-        # the previous step, then the new forces follow by linear regression.
+        # The effect of the shapes (deviations from a circular contact) is proportional to the
+        # forces. It is computed with the forces of the previous step. The new forces then follow by
+        # linear regression.
         pairs = zip(responses, forces, strict=True)
         shape_parts = [one.shapes @ force for one, force in pairs]
         shapes = np.concatenate(shape_parts).T  # (D, 3 contacts)
@@ -427,7 +442,8 @@ def fit_contacts(
         is_last = is_settled and not is_rough
         is_rough &= not is_settled and step < steps - FINE_STEPS
 
-        # Far from the solution, the linearised problem holds only for small steps.
+        # Far from the solution, the linearised problem holds only for small steps, so their length
+        # is limited.
         max_step = _MAX_STEP_DEPTHS * depth
         centres += np.clip(shift, -max_step, max_step)
         centres = np.clip(centres, start - max_shift, start + max_shift)
@@ -448,7 +464,7 @@ def fit_contacts(
 
 
 def _prior_precision(count: int, pitch: float) -> Array:
-    """Return the prior precisions (1 / variance) of the parameters of all contacts.
+    """Return the prior precisions (1 / prior variance) of the parameters of all J contacts.
 
     Args:
         count: Number J of contacts.
@@ -478,7 +494,7 @@ def _regress(
 
     Args:
         factor: Cholesky factor (D, D) of the covariance W^-1 of the values.
-        response: Values (D, 3 J) in Pa per N of each force component.
+        response: Values (D, 3 J) in Pa that a force of 1 N on each contact along x, y and z causes.
         y: Measured values (D,) in Pa.
 
     Returns:
@@ -519,13 +535,13 @@ class ContactResponse(NamedTuple):
         centre: Array,
         size: float,
     ) -> ContactResponse:
-        """Compute response and derivatives by central differences.
+        """Compute the response to a contact, and its derivatives by central differences.
 
         Args:
             respond: Function that returns the values (K, D, 3) in Pa/N for K centres (K, 2) in m
                 and one radius in m.
             depth: Distance from the centres of the cubes to the surface, in m.
-            centre: Centre (2,) of the contact in m.
+            centre: Centre (2,) of the contact in m, in the frame that `respond` uses.
             size: Radius of the contact in m.
         """
         step = _DIFFERENCE_STEP * depth
@@ -540,11 +556,13 @@ class ContactResponse(NamedTuple):
         by_log_size = (wider - narrower) / (2 * SHAPE_WIDENING)
         slopes = np.concatenate([by_centre, by_log_size[None]])
 
-        # Elongation shapes: contacts shifted along an axis, minus contacts shifted across it.
+        # Change of the response by an elongated contact: contacts shifted along an axis, minus
+        # contacts shifted across it.
         both_sides = moved[5:].reshape(4, 2, *response.shape)
         axes = both_sides.sum(axis=1) / 4
-        # Flatness shape: the contact minus a mixture of a narrower and a wider contact. The share
-        # of the wider contact is chosen so that the second moment of the pressure stays the same.
+        # Change of the response by a flatter pressure: the contact minus a mixture of a narrower
+        # and a wider contact. The share of the wider one is chosen so that the second moment of the
+        # pressure about the centre stays the same.
         shrink = np.exp(-2 * SHAPE_WIDENING)
         grow = np.exp(2 * SHAPE_WIDENING)
         share = (1 - shrink) / (grow - shrink)
@@ -607,7 +625,8 @@ def _factorise(
         noise: Covariance (D, D) of noise and shapes, in Pa^2.
         residual_scale: Standard deviation alpha of the pressure that the contacts do not explain.
     """
-    # The matrix is symmetric; its transpose has the memory order of LAPACK, which avoids a copy.
+    # The covariance matrix is symmetric. Its transpose has the memory order that LAPACK expects
+    # (columns one after the other), which avoids a copy.
     matrix = (residual_scale**2 * observations.prior + noise).T
     factor: _Factor = cho_factor(
         matrix,

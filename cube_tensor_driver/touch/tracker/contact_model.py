@@ -35,7 +35,7 @@ class HertzContact:
     """A Hertz contact in the frame of its home, the cube nearest to it.
 
     Attributes:
-        id: Number that stays the same as long as the contact is tracked.
+        id: Number of the contact, which stays the same as long as the contact is tracked.
         home: Index of the home cube.
         place: Position (2,) of the centre in the x-y plane of the home cube, in m.
         size: Radius in m.
@@ -50,7 +50,8 @@ class HertzContact:
         split_tested_at: Residual scale in Pa at the last test whether the contact is in fact two
             contacts; 0 if it was not tested.
         was_split: Whether the contact is one of two into which a contact was split
-            (contact_split.py). The pressure between such contacts need not have a valley.
+            (contact_split.py). Two contacts with this mark are not merged if the pressure between
+            them has no valley (minimum), but only if they overlap too much.
     """
 
     id: int
@@ -87,7 +88,12 @@ class ContactModel:
         return np.asarray(poses.position[contact.home] + offset)
 
     def response(self, contacts: list[HertzContact]) -> Array:
-        """Compute the components (cubes, C) in Pa that all cubes measure under some contacts."""
+        """Compute the values that all cubes measure under some contacts together.
+
+        Returns:
+            Values (cubes, C) in Pa of the C components `SurfaceInverse.columns`. Gradients are
+            multiplied by half the side of a cube. Cubes far from a contact do not respond to it.
+        """
         inverse = self.inverse
         total = np.zeros(inverse.observed.shape)
         for contact in contacts:
@@ -100,7 +106,11 @@ class ContactModel:
         return total
 
     def depth_pressure(self, contacts: list[HertzContact]) -> Array:
-        """Compute the pressure (M,) in Pa of contacts, at the cubes' depth below all M points."""
+        """Compute the pressure that contacts cause at the depth of the cubes' centres.
+
+        Returns:
+            Pressure (M,) in Pa below each of the M points of the surface, positive in compression.
+        """
         pressure = np.zeros(len(self.inverse.points))
         for contact in contacts:
             points, offset, _ = self._points_around(contact)
@@ -149,7 +159,13 @@ class ContactModel:
         return total
 
     def _add_pressure_variance(self, total: Array, contact: HertzContact) -> None:
-        """Add the pressure variances of one contact to `total` (M, 2): on the surface, at depth."""
+        """Add the variances of the pressure that the covariance of one contact causes.
+
+        Args:
+            total: Variances (M, 2) in Pa^2 at the M points of the surface, which are changed: first
+                column on the surface, second column at the depth of the cubes' centres.
+            contact: Contact with the covariance of its parameters.
+        """
         inverse = self.inverse
         points, offset, rotation = self._points_around(contact)
         # A contact with its deviations from a circle (shapes) ends within twice its radius.
@@ -158,7 +174,15 @@ class ContactModel:
         subpoints = offset[touched][:, None] + self._subpoints
 
         def surface_pressure(centres: Array, size: float) -> Array:
-            """Return the pressure (K, n, 3) at n touched points under 1 N at K centres (K, 2)."""
+            """Return the pressure on the surface at n points under K contacts with 1 N each.
+
+            Args:
+                centres: Centres (K, 2) in m, from the centre of `contact`.
+                size: Radius of each contact in m.
+
+            Returns:
+                Pressure (K, n, 3) in Pa/N, for a force along x, y and z of the home cube.
+            """
             x, y = np.moveaxis(
                 subpoints - centres[:, None, None],
                 -1,
@@ -168,7 +192,10 @@ class ContactModel:
             return np.asarray(-share[..., None] * rotation[touched, 2])
 
         def pressure_at_depth(centres: Array, size: float) -> Array:
-            """Return the pressure (K, n, 3) below n points under 1 N at K centres (K, 2)."""
+            """Return the pressure at the cubes' depth.
+
+            Arguments and result are those of `surface_pressure`, for all points near the contact.
+            """
             from_centre = (offset - centres[:, None]).reshape(-1, 2)
             pressure = -inverse.kernels.field(from_centre, size)[:, FIELD.index("zz")]
             return pressure.reshape(len(centres), -1, 3)
@@ -195,7 +222,7 @@ class ContactModel:
             total[chosen, column] += np.maximum(variance, 0)
 
     def _points_around(self, contact: HertzContact) -> tuple[Index, Array, Array]:
-        """Find the points near a contact.
+        """Find the surface points within `_PRESSURE_REACH_DEPTHS` depths of a contact's centre.
 
         Returns:
             Indices (n,) of the points, their positions (n, 2) from the contact's centre in the
@@ -219,12 +246,14 @@ class ContactModel:
     def _cubes_around(self, home: int) -> tuple[Index, Array, Array]:
         """Find the cubes that measure a contact whose nearest cube (home) is given.
 
+        These are the cubes within `REACH_DEPTHS` depths of the home that do not face away from it.
+
         Args:
-            home: Index of the home cube.
+            home: Index of the cube nearest to the contact.
 
         Returns:
             Indices (n,) of the cubes, and their positions (n, 2) in m and rotations (n,) in rad on
-            the skin laid flat around the home cube.
+            the skin laid flat around the home cube, in the frame of the home cube.
         """
         inverse = self.inverse
         poses = inverse.poses
@@ -237,11 +266,18 @@ class ContactModel:
         return cubes, *inverse.unroll(home, cubes)
 
     def nearest_cubes(self, contact: HertzContact, count: int) -> Index:
-        """Return the indices of the cubes nearest to a contact, at most `count`."""
+        """Return the indices of the `count` cubes nearest to a contact, the nearest first.
+
+        If the skin has fewer cubes, all of them are returned.
+        """
         count = min(count, len(self.inverse.poses.position))
         found = self._cubes.query(self.centre(contact), count)[1]
         return np.asarray(found, dtype=np.intp).reshape(-1)
 
     def nearest_points(self, positions: Array) -> Index:
-        """Return the index (n,) of the surface point nearest to each position (n, 3) in m."""
+        """Return the index (n,) of the surface point nearest to each position.
+
+        Args:
+            positions: Positions (n, 3) in m, in the skin's parent frame.
+        """
         return np.asarray(self._points.query(positions)[1], dtype=np.intp)

@@ -40,8 +40,8 @@ MERGE_VALLEY = 0.92
 lower pressure at its ends) above which two contacts are merged into one."""
 
 SPLIT_OVERLAP = 0.6
-"""Distance of two contacts, divided by the sum of their radii, below which they are merged if both
-were made by splitting a contact (contact_split.py)."""
+"""Distance of the centres of two contacts, divided by the sum of their radii, below which the two
+are merged if both were made by splitting one contact in two (contact_split.py)."""
 
 _VALLEY_SAMPLES = 9
 """Number of positions on the line between two contacts at which the pressure is compared, the ends
@@ -61,18 +61,21 @@ def detect_contact(
 ) -> int | None:
     """Find the point of the surface at which a new contact is started.
 
+    All pressures are at the depth of the cubes' centres, below the M points of the surface.
+
     Args:
-        model: Model of the skin.
-        contacts: Present contacts.
-        residual: Pressure (M,) that the present contacts do not explain, in Pa.
-        pressure: Total pressure (M,) in Pa.
-        tried: Positions (3,) in m at which a contact was already started in this scan.
+        model: Surface points of the skin, and the response of its cubes to contacts.
+        contacts: Contacts that are tracked at present.
+        residual: Pressure (M,) that these contacts do not explain, in Pa.
+        pressure: Total pressure (M,), that of the contacts included, in Pa.
+        tried: Positions (3,) in m, in the skin's parent frame, at which a contact was already
+            started with the values of this scan. No contact is started near them again.
         min_pressure: Smallest pressure of a new contact in Pa.
 
     Returns:
         Index of the point with the highest residual among those whose residual is above the
         thresholds and that are separated from all contacts, both by `MIN_DISTANCE_PITCHES` and by a
-        valley of the pressure. None if there is no such point.
+        valley of the pressure (`DETECTION_VALLEY`). None if there is no such point.
     """
     threshold = max(
         min_pressure,
@@ -86,7 +89,7 @@ def detect_contact(
         is_candidate &= distance > MIN_DISTANCE_PITCHES * model.inverse.pitch
 
     # The highest residual may lie on the flank of a present contact, without a valley in between.
-    # Then the point with the next lower residual is tested.
+    # Such a point is rejected, and the point with the next lower residual is tested.
     highest_first = np.argsort(-np.where(is_candidate, residual, -np.inf))
     for candidate in highest_first[: is_candidate.sum()].tolist():
         position = points[candidate]
@@ -103,16 +106,17 @@ def find_pair_to_merge(
 ) -> tuple[HertzContact, HertzContact] | None:
     """Find two contacts that are really one, because the pressure between them has no valley.
 
+    A valley is a clear minimum of the pressure on the line between two contacts (`MERGE_VALLEY`).
     Two contacts that were made by splitting one contact need no valley. They count as one if they
     overlap too much (`SPLIT_OVERLAP`).
 
     Args:
-        model: Model of the skin.
+        model: Surface points of the skin, and the response of its cubes to contacts.
         contacts: Contacts, the oldest first.
-        pressure: Total pressure (M,) at all points in Pa.
+        pressure: Total pressure (M,) in Pa at the cubes' depth, below all points of the surface.
 
     Returns:
-        The first such pair, the older contact first; None if there is no such pair.
+        The first pair to merge, its older contact first; None if no pair is to be merged.
     """
     for older, younger in itertools.combinations(contacts, 2):
         first = model.centre(older)
@@ -135,12 +139,14 @@ def prune_contacts(
     """Remove contacts that pull at the skin, are weak, or lie close to an older one.
 
     Args:
-        model: Model of the skin.
+        model: Surface points of the skin, and the response of its cubes to contacts.
         contacts: Contacts to check.
-        min_pressure: Smallest pressure of a new contact in Pa; a contact is weak below half of it.
+        min_pressure: Smallest peak pressure of a new contact at the depth of the cubes, in Pa. A
+            contact is weak if its peak pressure is below half of this, or below `PRUNING_FRACTION`
+            of the peak pressure of the strongest contact.
 
     Returns:
-        The other contacts, the oldest first.
+        The contacts that are kept, the oldest first.
     """
     origin = np.zeros((1, 2))
     kernels = model.inverse.kernels
@@ -153,7 +159,8 @@ def prune_contacts(
     # threshold is not removed and detected again in turn.
     threshold = max(min_pressure / 2, PRUNING_FRACTION * strongest)
 
-    # Ids increase with time, so older contacts come first: they stay, younger ones beside them end.
+    # Ids increase with time, so older contacts come first. They are kept, and younger contacts
+    # that lie close to a kept one are removed.
     kept: list[HertzContact] = []
     for contact in sorted(contacts, key=lambda one: one.id):
         centre = model.centre(contact)
@@ -174,13 +181,13 @@ def valley_ratio(
     second: Array,
     pressure: Array,
 ) -> float:
-    """Measure how deep the pressure falls between two positions.
+    """Measure how far the pressure falls on the line between two positions.
 
     Args:
-        model: Model of the skin.
-        first: Position (3,) of one end of a line, in m.
-        second: Position (3,) of its other end, in m.
-        pressure: Pressure (M,) at all points of the surface, in Pa.
+        model: Surface points of the skin.
+        first: Position (3,) of one end of the line, in m in the skin's parent frame.
+        second: Position (3,) of the other end, in the same units and frame.
+        pressure: Pressure (M,) in Pa at the cubes' depth, below all points of the surface.
 
     Returns:
         Lowest pressure along the line, divided by the lower one of the pressures at its ends; 1 if

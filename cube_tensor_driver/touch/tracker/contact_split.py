@@ -26,7 +26,8 @@ with the greatest evidence before the fit."""
 
 MIN_PAIR_DISTANCE = 0.8
 """Smallest distance of the centres of two contacts, divided by the sum of their radii, at which a
-contact is split into them. Two bodies cannot press on the same part of the surface."""
+contact is split into them. A pair that is closer overlaps too much to be two bodies, because two
+bodies cannot press on the same part of the surface."""
 
 MAX_PAIR_DISTANCE = 1.5
 """Largest distance of the centres of two contacts, divided by the sum of their radii, at which a
@@ -35,7 +36,8 @@ contact_selection.py finds the second one."""
 
 MIN_FORCE_RATIO = 0.1
 """Smallest ratio of the smaller to the larger normal force of two contacts into which a contact is
-split. With a smaller ratio, the second contact would describe the rim of a punch."""
+split. A second contact with less force usually does not describe a second body, but the high
+pressure at the rim of a flat punch."""
 
 _ANGLES = 2 * np.pi * np.arange(8) / 8
 _DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
@@ -55,8 +57,8 @@ def split_contact(
 
     Args:
         observations: Known values of the cubes, their noise and prior covariance.
-        one: Fit in which contact j is a single contact.
-        j: Index of this contact.
+        one: Fit of one or several contacts in which contact j is a single contact.
+        j: Index of this contact in `one`.
         start_scale: Residual scale with which the fits begin, in Pa.
         max_scale: Largest residual scale of an acceptable fit with two contacts, in Pa.
 
@@ -94,7 +96,7 @@ def _list_pairs(centre: Array, size: float) -> list[tuple[Array, Array, float]]:
     """List the pairs of contacts that are tried in place of one contact.
 
     Args:
-        centre: Centre (2,) of the fitted contact in m.
+        centre: Centre (2,) of the fitted contact on the flattened skin, in m.
         size: Radius of the fitted contact in m.
 
     Returns:
@@ -132,9 +134,9 @@ def _evaluate_pair(
 
     Args:
         observations: Known values of the cubes, their noise and prior covariance.
-        one: Fit in which contact j is a single contact.
-        j: Index of this contact.
-        pair: Both centres (2,) and the common radius, in m.
+        one: Fit of one or several contacts in which contact j is a single contact.
+        j: Index of this contact in `one`.
+        pair: Centres (2,) of the two contacts on the flattened skin and their common radius, in m.
         start_scale: Standard deviation of the pressure that the contacts do not explain, in Pa.
     """
     first, second, size = pair

@@ -143,7 +143,7 @@ class ContactTracker:
         The computing time is bounded by `MAX_CONTACTS` and by the number of steps of each fit.
 
         Args:
-            values: Components (cubes, 15), NaN where unknown.
+            values: Components (cubes, 15) in Pa and Pa/m, NaN where unknown.
 
         Returns:
             Contacts, strongest first.
@@ -196,10 +196,11 @@ class ContactTracker:
     def deviation(self, values: Array) -> FieldDeviation:
         """Compute the standard deviations of `field`.
 
-        The variances of the residual field and of the contacts' parameters are added.
+        Each variance is the sum of two: that of the residual field (traction that the contacts do
+        not explain) and the variance that the uncertain parameters of the contacts cause.
 
         Args:
-            values: Components (cubes, 15) of the last `update`.
+            values: Components (cubes, 15) in Pa and Pa/m that the last `update` was called with.
         """
         scaled = self._inverse.scaled(values)
         residual = self._inverse.residual_deviation(self._residual, scaled)
@@ -208,7 +209,11 @@ class ContactTracker:
         return FieldDeviation(*np.sqrt(variance).T)
 
     def _start_contact(self, point: int) -> HertzContact:
-        """Create a contact without force at the surface point with index `point`."""
+        """Create a contact with force 0 and the usual radius, from which its fit starts.
+
+        Args:
+            point: Index of the surface point (in `SurfaceInverse.points`) at its centre.
+        """
         inverse = self._inverse
         home = int(inverse.cube[point])
         offset = inverse.points[point] - inverse.poses.position[home]
@@ -223,12 +228,16 @@ class ContactTracker:
         )
 
     def _take_id(self) -> int:
-        """Return an id that no contact of this tracker had before."""
+        """Return a number (id) for a new contact, which no contact of this tracker had before."""
         self._next_id += 1
         return self._next_id - 1
 
     def _neighbours(self, contact: HertzContact, others: list[HertzContact]) -> list[HertzContact]:
-        """Return the contacts of `others` closer than `JOINT_FIT_PITCHES`, nearest first."""
+        """Return the contacts among `others` that should be fitted jointly with a contact.
+
+        These are the contacts at distances below `JOINT_FIT_PITCHES` pitches (distances of
+        neighbouring cubes) from `contact`, the nearest first.
+        """
         centre = self._model.centre(contact)
         centres = [self._model.centre(one) for one in others]
         distances = [float(np.linalg.norm(one - centre)) for one in centres]
@@ -264,7 +273,10 @@ class ContactTracker:
         contacts: list[HertzContact],
         steps: int,
     ) -> None:
-        """Fit contacts jointly and store the results.
+        """Fit contacts jointly and store the results in the contacts and in `_results`.
+
+        For the fit, the skin is laid flat in the x-y plane of the cube nearest to the first contact
+        (flattened skin), because the response of the elastic layer holds for a plane.
 
         Args:
             y: Values (cubes, C) in Pa minus the response to all contacts that are not fitted here.
@@ -337,13 +349,14 @@ class ContactTracker:
         Args:
             observations: Known values of the cubes, their noise and prior covariance.
             fit: Fit from the usual start.
-            contact: Contact; its `place_ambiguity` and `force_ambiguity` are changed.
-            j: Index of the contact in the fit.
+            contact: Contact to fit again; its `place_ambiguity` and `force_ambiguity` (variances
+                over the fits from all starts) are changed.
+            j: Index of this contact in `fit`.
             origin: Position (2,) in m of the contact's home (nearest cube) on the flattened skin.
             rotation: Rotation (2, 2) from the frame of the home to the flattened skin.
 
         Returns:
-            The fit with the smallest score.
+            The most likely of all these fits, which has the smallest `ContactFit.score`.
         """
         fits = [fit]
 
@@ -405,10 +418,11 @@ class ContactTracker:
         Args:
             observations: Known values of the cubes, their noise and prior covariance.
             fit: Joint fit of the contacts.
-            contacts: Contacts of the fit; new contacts are appended.
+            contacts: Contacts of the fit, in its order. The second contact of each split is
+                appended to this list and to the tracker's contacts.
 
         Returns:
-            Fit of all contacts, new ones included.
+            Fit of all contacts in the list; `fit` itself if no contact was split.
         """
         limit = LARGE_RESIDUAL * AMPLITUDE
         for j, contact in enumerate(list(contacts)):
@@ -445,8 +459,9 @@ class ContactTracker:
             fit: Result of the fit.
             j: Index of the contact in the fit.
             cubes: Indices (n,) of the cubes whose values were fitted.
-            place: Positions (n, 2) of these cubes on the flattened skin, in m.
-            angle: Rotations (n,) of these cubes about z, in rad.
+            place: Positions (n, 2) of these cubes in m on the flattened skin, the plane in which
+                the skin is laid out for the fit.
+            angle: Rotations (n,) of these cubes about z (normal of the skin), in rad.
         """
         nearest, to_home = _nearest_home(fit.centres[j], place, angle)
         in_plane = to_home[:2, :2]
@@ -457,7 +472,7 @@ class ContactTracker:
         contact.residual_scale = fit.residual_scale
 
         # The coefficients of the two elongation shapes (x, diagonal) rotate by twice the angle,
-        # because an ellipse is the same after a rotation by 180°.
+        # because an ellipse looks the same after a rotation by 180°.
         double = (to_home @ to_home)[:2, :2]
         rotation = block_diag(to_home, in_plane, 1.0, double, 1.0)
         place_ambiguities = [contact.place_ambiguity / 2] * 2
@@ -479,6 +494,8 @@ class ContactTracker:
         angle: Array,
     ) -> TrackedContact:
         """Convert an estimate from the flattened skin to the skin's parent frame.
+
+        The flattened skin is the plane in which the skin was laid out for the fit.
 
         Args:
             number: Id of the contact.
@@ -559,11 +576,11 @@ def _nearest_home(
     place: Array,
     angle: Array,
 ) -> tuple[int, Array]:
-    """Find the cube nearest to a position on the flattened skin.
+    """Find the cube nearest to a position on the flattened skin (laid out in a plane for a fit).
 
     Args:
-        centre: Position (2,) in m.
-        place: Positions (n, 2) of the cubes in m.
+        centre: Position (2,) on the flattened skin, in m.
+        place: Positions (n, 2) of the cubes on the flattened skin, in m.
         angle: Rotations (n,) of the cubes about z, in rad.
 
     Returns:
