@@ -419,7 +419,8 @@ def _place_rings(
     """
     if not radius > 0.0:
         raise ElasticError(f"patch radius is {radius} m; it must be positive")
-    # With this number of angles, neighbours on the outermost ring are about as close as rings.
+    # Each ring has four times as many forces as there are rings, so that neighbouring forces on the
+    # outermost ring are about as far apart as neighbouring rings.
     n = 4 * len(rings)
     angle = 2.0 * np.pi * (np.arange(n) + 0.5) / n
     x = radius * np.outer(rings, np.cos(angle))

@@ -74,7 +74,7 @@ point and has no effect. The limit avoids a division by 0."""
 
 
 class _ContactTables:
-    """Look-up and summation, which both kinds of tables have in common.
+    """Base of the tables for round contacts and for polygons: look-up and summation of fields.
 
     Args:
         layer: Elastic layer that contains the cubes.
@@ -148,7 +148,8 @@ class DiscTables(_ContactTables):
 
         distance = np.arange(_LAST_DISTANCE + 2) * self.depth / POINTS_PER_DEPTH
         bessel = tabulate_bessel(spectra.k, distance)
-        # (radii, distances, R Z T, 14); the tangential force F_t acts with the factor i.
+        # The table has the axes radius, distance, function (R, Z, T) and circular component (14).
+        # T gets the factor i with which the tangential force F_t acts (circular.py).
         factors = np.array([1, 1, 1j])[:, None]
         table = spectra.radial(bessel, disc_spectra) * factors
         return {"table": table.astype(np.complex64)}
@@ -272,8 +273,8 @@ class PolygonTables(_ContactTables):
 
         load_sign = np.array([-1.0, -1.0, 1.0, -1j])[:, None]
         sign = (-1.0) ** ORDERS * load_sign
-        # Lengths were divided by the depth, so A, B and Z are multiplied by its square (areas) and
-        # W by its cube.
+        # Lengths in the integrals were divided by the depth. So the integrals A, B and Z over an
+        # area are multiplied by depth^2, and W, which contains one more length, by depth^3.
         dimension = np.array([2.0, 2.0, 2.0, 3.0])[:, None]
         unit = self.depth**dimension
         return {"table": (table * sign * unit).astype(np.complex64)}
@@ -337,8 +338,9 @@ class PolygonTables(_ContactTables):
         d = np.abs(signed_distance)
         t = local.real * side[..., None]
 
-        # For an edge beyond the last tabulated distance, the integral over the triangle depends
-        # only on the angle under which the edge appears from the cube.
+        # Beyond the largest tabulated distance, traction has no effect. The integral over the
+        # triangle of a more distant edge therefore depends only on the angle under which the edge
+        # appears from the cube, and the edge can be moved to the largest distance.
         shrink = np.minimum(1.0, REACH_DEPTHS / np.maximum(d, REACH_DEPTHS))
         weights, rows = _triangle_neighbours(d * shrink, t * shrink[..., None])
 

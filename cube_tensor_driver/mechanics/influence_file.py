@@ -24,8 +24,8 @@ MAX_FILE_BYTES = 64 << 20
 protects against damaged or malicious files."""
 
 MAX_INTEGER = 30_000
-"""Integer that stands for the largest stress in a file. Stresses are stored as 16-bit integers; the
-rounding error is a tenth of the error of the finite elements."""
+"""Integer as which the largest absolute stress of a file is stored. Stresses are stored as 16-bit
+integers; their rounding error is a tenth of the error of the finite elements."""
 
 _READ_ERRORS = (OSError, ValueError, KeyError, EOFError, MemoryError, zipfile.BadZipFile)
 """Errors that NumPy and zipfile raise for a damaged file."""

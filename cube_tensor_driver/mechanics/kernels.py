@@ -55,8 +55,14 @@ REACH_DEPTHS = 20
 covariances at larger distances count as zero."""
 
 _OBSERVED = np.array([FIELD.index(name) for name in COMPONENTS])
+"""Indices (15,) in `FIELD` (24 stresses and gradients) of the `COMPONENTS` that cubes measure."""
+
 _IS_GRADIENT = np.arange(len(COMPONENTS)) >= len(STRESS)
+"""Whether each of the 15 `COMPONENTS` is a gradient in Pa/m; the others are stresses in Pa."""
+
 _FIELD_ZZ = FIELD.index("zz")
+"""Index in `FIELD` of the stress zz, whose negative is the pressure."""
+
 _CIRCULAR_ZZ = int(np.argmax(CIRCULAR_FROM_FIELD[:, _FIELD_ZZ].real))
 """Index of the circular component that is the stress zz alone."""
 
@@ -169,7 +175,8 @@ class Kernels:
         ]
         self.inputs = [*table_inputs, self.component_matrices]
 
-        # Cubic interpolation needs one tabulated distance more at the beginning, two at the end.
+        # Cubic interpolation uses two table entries on each side. So the table has one distance
+        # before 0, and two beyond the largest distance.
         self._last = REACH_DEPTHS * POINTS_PER_DEPTH
         distance = np.arange(-1.0, self._last + 3) * self.step
         bessel = tabulate_bessel(spectra.k, distance)
@@ -473,8 +480,8 @@ class Kernels:
             2,
             axis=2,
         )
-        # A rotation of the frame multiplies a circular component by a phase. Here, the phase is
-        # applied to the coefficients of the component.
+        # A rotation of the frame multiplies a circular component by a phase. Here, the coefficients
+        # with which the component enters the measured components are multiplied instead.
         matrices = (real - 1j * imaginary)[variant] * phases
         return matrices.real, -matrices.imag
 

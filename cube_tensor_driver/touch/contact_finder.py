@@ -23,6 +23,8 @@ from .surface import Contact, Surface
 from .tracker.contact_tracker import ContactTracker, TrackedContact
 
 INTERPOLATION, INVERSE = CONTACT_METHODS
+"""Names of the two methods that find contacts: interpolation of the pressure between the cubes, and
+fits of Hertz contacts to the values of all cubes."""
 
 
 @dataclass(frozen=True)
@@ -159,7 +161,8 @@ class _InverseFinder:
         self._tracker = ContactTracker(self._inverse, settings.least)
 
     def update(self, values: Array, left_out: PadMasks) -> list[TrackedContact]:
-        # Noise matrices are computed again only for cubes of which other pads are used than before.
+        # The noise of a cube's components depends on the pads in use. So the noise matrices are
+        # computed again for cubes whose pads in use have changed since the last scan.
         changed = np.flatnonzero(left_out != self._left_out)
         if len(changed):
             by_pad = noise_by_pad(self._pipeline, changed, left_out[changed])

@@ -103,7 +103,8 @@ class Interpolation:
         key = tuple(columns)
         if key not in self._weights:
             n_points = self._patches.shape[1]
-            # New weights start with the opposite of `wanted`, so that all patches are solved below.
+            # `known` of new weights starts as the opposite of `wanted`. So every patch counts as
+            # changed, and its weights are computed below.
             self._weights[key] = _Weights(self._near, n_points, ~wanted)
 
         weights = self._weights[key]
@@ -146,7 +147,8 @@ class Interpolation:
             axes[:, None],
         )
         matrix = np.moveaxis(matrix, 3, 2).reshape(n, size, size)
-        # Unknown values have no covariance with others, so that they get the weight 0.
+        # The covariances of unknown values with all others are set to 0, so that unknown values get
+        # the weight 0.
         matrix *= is_known[:, :, None] & is_known[:, None]
         diagonal = np.arange(size)
         matrix[:, diagonal, diagonal] += np.where(is_known, RIDGE, 1.0)

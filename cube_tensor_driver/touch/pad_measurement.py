@@ -70,7 +70,8 @@ def model_pads(influence: Influence, calibrations: Sequence[Calibration]) -> Mea
         ElasticError: The influence functions belong to a cube of another size, or there is none
             for a pad of a calibration.
     """
-    # Cubes with the same calibration file share one object, so identity finds the distinct ones.
+    # Cubes with the same calibration file share one `Calibration` object, so that the different
+    # calibrations are found by identity.
     variants = list({id(one): one for one in calibrations}.values())
     variant_numbers = {id(one): number for number, one in enumerate(variants)}
     spectra, all_pads = _decompose(influence)
@@ -148,7 +149,8 @@ def _decompose(influence: Influence) -> tuple[Spectra, Array]:
     r = (nodes + 1) * half_reach
     weight = weights * half_reach
 
-    # With sqrt(r dr) as weight, the singular values are norms of functions over the whole plane.
+    # The functions are weighted with sqrt(r dr), so that the singular values are norms over the
+    # whole plane of positions of the force.
     root = np.sqrt(r * weight)
     decompositions = [
         np.linalg.svd(
@@ -243,7 +245,8 @@ def _fourier_series(influence: Influence, r: Array) -> list[Array]:
 
     series = []
     for order in range(N_ORDERS):
-        # exp(i m phi) and exp(-i m phi) both contribute, except at order 0.
+        # The terms exp(i m phi) and exp(-i m phi) of a real function are complex conjugates. Both
+        # contribute to order m, hence the factor 2; at order 0 they are the same term.
         factor = 1.0 if order == 0 else 2.0
         even = factor * coefficients[..., order].real
         odd = -factor * coefficients[..., order].imag

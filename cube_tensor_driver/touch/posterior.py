@@ -200,8 +200,8 @@ class WindowPosteriors:
             Number (cubes,) of the kind of each window.
         """
         n = len(place)
-        # Noise is NaN for components that are not observed. They become -1 instead of 0, because
-        # they differ from components without noise.
+        # The noise of components that are not observed is NaN, which is not equal to itself. It is
+        # replaced by -1 and not by 0, the noise of components without noise.
         noise = np.nan_to_num(model.by_pad, nan=-1.0)
         noise_kind = _number_distinct(noise.reshape(n, -1))
         poses = np.concatenate(
@@ -230,7 +230,8 @@ class WindowPosteriors:
             Posterior mean (cubes, points x ROWS_PER_POINT) in Pa. Each point of the patch of a cube
             has `ROWS_PER_POINT` results: traction along x, y, z, and pressure at the cubes' depth.
         """
-        # All values of a window form one row, in the order of the columns of G.
+        # The values of all cubes of a window are joined to one row, in the order of the columns of
+        # the gain matrix G.
         gathered = y[self.near].reshape(len(self.near), -1)
         n_rows = self.gain.shape[1]
         result = np.empty((len(self.near), n_rows), np.float32)

@@ -26,10 +26,12 @@ from ..core.poses import CubePoses
 from .interpolation import Interpolation
 
 PRESSURE = [COMPONENTS.index(name) for name in ("zz", "zz_x", "zz_y")]
-"""Columns of σzz and of its derivatives along x and y in `COMPONENTS`."""
+"""Columns of the stress σzz (negative pressure) and of its derivatives along x and y in
+`COMPONENTS`, the 15 components that a cube measures."""
 
 SHEAR = [COMPONENTS.index(name) for name in ("zx", "yz")]
-"""Columns of σzx and σyz in `COMPONENTS`."""
+"""Columns of the shear stresses σzx and σyz in `COMPONENTS`, the 15 components that a cube
+measures."""
 
 RELATIVE_THRESHOLD = 0.2
 """Pressure above which a point of the skin counts as in contact, divided by the largest pressure on
@@ -252,7 +254,7 @@ class Surface:
         pressure = loaded.pressure[chosen]
         weight = loaded.moment_pressure[chosen] * self.area
         normal_force = float(pressure.sum() * self.area)
-        # Mean of the cubes' normals, weighted with the pressure.
+        # The normal of the contact is the mean of its cubes' normals, weighted with the pressure.
         normal = _weighted_sum(pressure.sum(axis=1), rotation[:, :, 2])
         normal /= np.linalg.norm(normal)
 

@@ -51,7 +51,7 @@ SIZE_DEVIATION = 1.0
 
 FORCE_DEVIATION = 1e3
 """Prior standard deviation of each component of the force of a contact, in N; the prior mean is 0.
-It is so large that it does not influence the fitted force."""
+The value is so large that the prior does not influence the fitted force."""
 
 ROUGH_GAIN_ERROR = 0.1
 """Standard deviation of the error of every pad (sensing element), divided by the rms stress of the
@@ -72,14 +72,16 @@ SHAPE_WIDENING = 0.2
 made: the contact minus a mixture of a narrower and a wider one."""
 
 STEPS_NEW = 16
-"""Number of Gauss-Newton steps for a contact that has just begun."""
+"""Largest number of Gauss-Newton steps in the fit of a contact that was not fitted before. The fit
+ends earlier if it has converged."""
 
 STEPS_TRACKED = 3
-"""Number of Gauss-Newton steps for a contact that was fitted in the previous scan."""
+"""Largest number of Gauss-Newton steps for a contact that was already fitted in the previous scan
+(set of values of all cubes), so that its start is close to the solution."""
 
 STEPS_EVALUATE = 0
-"""Number of Gauss-Newton steps, zero, of a fit that only computes the evidence (probability of the
-values) of given centres and radii."""
+"""Number of Gauss-Newton steps of a fit that does not move the contacts: it only computes the
+evidence (probability of the values) of given centres and radii."""
 
 MAX_SHIFT_PITCHES = 1.5
 """Largest distance along each axis that one fit may move a contact from its start, divided by the
@@ -131,8 +133,16 @@ _STENCIL = np.array(
     [[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]],
     float,
 )
+"""Shifts (5, 2) of a contact for numerical derivatives by its centre, in units of the step: none,
+then both directions along x and along y."""
+
 _DIAGONALS = np.array([[1, 1], [-1, -1], [1, -1], [-1, 1]]) / np.sqrt(2)
+"""Unit vectors (4, 2): both directions along one diagonal of the x-y plane, then along the other
+one."""
+
 _SHAPE_STENCIL = np.concatenate([_STENCIL[1:], _DIAGONALS])
+"""Unit vectors (8, 2) along which contacts are shifted to make the two elongation shapes (longer
+along x, longer along a diagonal): both directions along x, y and the two diagonals."""
 
 _Factor = tuple[Array, bool]
 """Cholesky factor as `scipy.linalg.cho_factor` returns it: matrix, and whether it is lower."""

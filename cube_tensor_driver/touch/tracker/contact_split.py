@@ -40,6 +40,8 @@ split. A second contact with less force usually does not describe a second body,
 pressure at the rim of a flat punch."""
 
 _ANGLES = 2 * np.pi * np.arange(8) / 8
+"""Angles (8,) in rad of the directions from a fitted contact to a second one that is tried."""
+
 _DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
 """Unit vectors (8, 2) in the plane of the surface, from a fitted contact to a second one."""
 
