@@ -201,7 +201,10 @@ class LiveLinks:
         return self._scans.cubes.uids
 
     def row_counts(self) -> RowCounts:
-        """Return how many rows have been delivered, left out for each reason, or lost so far."""
+        """Return how many rows have been delivered, left out for each reason, or lost so far.
+
+        A row is one sample of one cube.
+        """
         return self._rows.counts
 
     def report(self) -> list[LinkReport]:
@@ -216,7 +219,9 @@ class LiveLinks:
             return [self._report(link, record, logger) for link, record, logger in links]
 
     def receive(self, received: Sequence[LinkFrames]) -> None:
-        """Handle frames of the links, and call back with the rows of the scans they complete.
+        """Handle frames of the links, and call `on_rows` with the rows of the scans they complete.
+
+        A row is one sample of one cube, a scan one sample of every cube.
 
         The reader's thread calls this method once each time it has read data.
         """
@@ -302,7 +307,9 @@ class LiveLinks:
         self._add_samples(link, arrival_ns, samples)
 
     def _add_samples(self, link: int, arrival_ns: int, samples: Sequence[Sample]) -> None:
-        """Convert the device times of samples to host time, and add the samples to the scans.
+        """Convert the times of samples from the hub's to the host's clock, and add them to scans.
+
+        A scan is one sample of every cube.
 
         Args:
             link: Index of the link.
@@ -319,9 +326,10 @@ class LiveLinks:
         self._scans.add(link, samples, stamps_ns, status)
 
     def _deliver(self) -> None:
-        """Call `on_rows` with the rows of all complete scans.
+        """Call `on_rows` with the rows (samples of cubes) of all complete scans.
 
-        A scan that holds no cube of the skin has no rows and is discarded.
+        A scan (one sample of every cube) that holds no cube of the skin has no rows and is
+        discarded.
         """
         while self._scans.is_complete(self._scans_per_call):
             try:
@@ -333,7 +341,7 @@ class LiveLinks:
                 self._count_error(error)
 
     def _count_error(self, error: Exception) -> None:
-        """Count and log an error, and count the rows that were lost because of it."""
+        """Count and log an error, and count the rows (samples of cubes) that it has lost."""
         lost = self._rows.count_lost(error)
         self._errors += 1
         if self._errors in LOGGED_ERRORS:

@@ -17,8 +17,9 @@ from .links.link import LinkConfig
 from .scans.cube_table import CubeAddress
 
 QUEUE_S = 2.0
-"""Longest time, in s, for which rows wait to be taken from a live source. Rows that have waited
-longer are dropped and counted, so that a slow consumer does not fill the memory."""
+"""Longest time, in s, for which rows (samples of cubes) wait to be taken from a live source. Rows
+that have waited longer are dropped and counted, so that a slow consumer does not fill the
+memory."""
 MIN_RATE = 0.1
 """Lowest sample rate that can be requested from a hub, in Hz."""
 MAX_RATE = 10_000.0
@@ -200,7 +201,7 @@ class LinkSource:
         self._links.close()
 
     def __iter__(self) -> Iterator[FrequencyRows]:
-        """Yield rows until the source is closed.
+        """Yield rows (samples of cubes) until the source is closed.
 
         If an error has ended the reader's thread, the rows that wait are yielded first, then the
         error is raised.
@@ -218,9 +219,9 @@ class LinkSource:
         self.close()
 
     def _put(self, rows: FrequencyRows) -> None:
-        """Queue rows, and drop those that have waited for more than `QUEUE_S`.
+        """Queue rows (samples of cubes) for the consumer; drop those that waited over `QUEUE_S`.
 
-        It is called in the reader's thread.
+        This method is called in the reader's thread.
         """
         now = time.monotonic()
         with self._changed:
@@ -237,7 +238,7 @@ class LinkSource:
             self._changed.notify_all()
 
     def _get(self) -> FrequencyRows | None:
-        """Wait for the next rows and return them; return None once the source is closed."""
+        """Wait for the next rows (samples of cubes); return None once the source is closed."""
         with self._changed:
             while not self._closed:
                 if self._queue:

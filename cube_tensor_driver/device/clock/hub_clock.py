@@ -18,11 +18,12 @@ MAX_DELAY_NS = 60_000_000_000
 """Longest credible delay, in ns, between the sampling of a sample and its arrival. If the estimated
 time of sampling is further before the arrival, the arrival time is the stamp of the sample."""
 RESTART_US = 1_000_000
-"""Smallest step back of the device time, in µs, that is taken for a restart of the hub. If the
-device time of a sample is earlier by less, the sample has only come out of order."""
+"""Smallest step back of the device time (the hub's clock), in µs, that is taken for a restart of
+the hub. If the device time of a sample is earlier by less, the sample has only come out of
+order."""
 MIN_STILL_NS = 200_000_000
-"""Time, in ns, for which the device times of samples must stay the same before the hub's clock
-counts as standing still. `MIN_STILL_READS` must be reached, too."""
+"""Time, in ns, for which the device times (hub's clock) of samples must stay the same before the
+hub's clock counts as standing still. `MIN_STILL_READS` must be reached, too."""
 MIN_STILL_READS = 3
 """Number of successive reads with an unchanged device time before the hub's clock counts as
 standing still. It is more than one, because two reads may give two frames of one sample."""
@@ -42,7 +43,7 @@ CLOCK_KEEPS_JUMPING = (
     "rows are stamped by their arrival"
 )
 BAD_ANSWERS = "the hub's answers to TIME contradict its samples: they are not used"
-# This time, in ns, is earlier than every device time, which has 64 bits in µs.
+# This time, in ns, is earlier than every device time (the hub's clock, 64 bits in µs).
 _NEVER = -(2**80)
 
 
@@ -90,12 +91,15 @@ class HubClock:
 
     @property
     def jitter_ns(self) -> float:
-        """Mean delay of samples above the smallest delay, in ns, over about the last 64 reads."""
+        """Mean excess of the samples' delays over the smallest delay, in ns, over about 64 reads.
+
+        The delay is the time between the sampling of a sample and its arrival at the host.
+        """
         return self._line.jitter_ns
 
     @property
     def offset_ns(self) -> int:
-        """Host time minus device time at the newest sample, in ns; 0 before the first sample."""
+        """Host time minus hub's time at the newest sample, in ns; 0 before the first sample."""
         if self._is_fresh:
             return 0
         at_first = self._first_ns - 1000 * self._first_us
@@ -113,13 +117,13 @@ class HubClock:
     def bound_ns(self) -> float | None:
         """Largest error of stamps (host times), in ns; None without round trips.
 
-        It holds for stamps that are not in doubt. A round trip is a question for the hub's time and
-        its answer.
+        It does not hold for stamps of an `update` after which `in_doubt` is true, because the hub's
+        clock may have been set. A round trip is a question for the hub's time and its answer.
         """
         return self._line.error_bound
 
     def reset(self) -> None:
-        """Restart the line from device time to host time, because the hub restarted.
+        """Discard the line (host time over device time) and its samples, because the hub restarted.
 
         The drift is kept as a first guess. Later stamps are still not earlier than the last one.
         """
@@ -203,7 +207,7 @@ class HubClock:
 
     @property
     def _is_fresh(self) -> bool:
-        """Whether there was no sample since the start or the last restart."""
+        """Whether no sample has come since the start or the last restart of the hub."""
         return self._newest == _NEVER
 
     def _restart(self) -> None:
@@ -215,7 +219,10 @@ class HubClock:
         self._decision: StepDecision | None = None
 
     def _count_reset(self) -> None:
-        """Count a restart of the line or a step of the hub's clock, and note when it happened."""
+        """Count a restart of the line (host time over device time) or a step of the hub's clock.
+
+        The time of the event is kept, to find a clock that is set again and again.
+        """
         self.resets += 1
         self._steps_ns.append(self._last_arrival)
 
@@ -297,7 +304,7 @@ class HubClock:
         return not problem
 
     def _find_problem(self, device_us: int, arrival_ns: int) -> str:
-        """Return the text of the problem if device times cannot be converted now; else empty.
+        """Return the text of the problem for which device times cannot be converted; empty if none.
 
         Args:
             device_us: Device time of the newest sample, in µs.
@@ -318,9 +325,10 @@ class HubClock:
         return CLOCK_KEEPS_JUMPING if len(steps_ns) == MAX_STEPS else ""
 
     def _stands_still(self, arrival_ns: int) -> bool:
-        """Return whether the device time has stayed the same for too long.
+        """Return whether the hub's clock stands still, so that device times cannot be used.
 
-        It has if it did not change for `MIN_STILL_NS` and in `MIN_STILL_READS` successive reads.
+        It stands still if the device time of the samples did not change for `MIN_STILL_NS` and in
+        `MIN_STILL_READS` successive reads.
 
         Args:
             arrival_ns: Host time of the newest read, in ns.
@@ -334,7 +342,8 @@ class HubClock:
         If a decision about an earlier step is pending, the two steps are decided as one.
 
         Args:
-            step_us: Deviation of the device time from the sample period, in µs.
+            step_us: Device time of the sample minus the time expected from the sample period, in
+                µs.
             arrival_ns: Host time at which the sample after the step arrived, in ns.
         """
         newest_ns = self._newest

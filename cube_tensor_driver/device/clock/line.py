@@ -100,7 +100,10 @@ class ClockLine:
         self.restart()
 
     def restart(self) -> None:
-        """Discard all points and round trips; the drift is kept as a first guess."""
+        """Discard all samples and round trips; the drift is kept as a first guess.
+
+        A round trip is a question for the hub's time and its answer.
+        """
         self.offset = self.bounded_offset = 0.0
         self.error_bound: float | None = None
         self._bucket_end = BUCKET_NS
@@ -120,7 +123,8 @@ class ClockLine:
     def recent_min_height(self) -> float:
         """Smallest delay, in ns, of the samples of this and the previous bucket of 1 s.
 
-        It is counted from the clock line; without a sample it is 0.
+        It is counted from the clock line (host time over device time, through the samples of
+        smallest delay); without a sample it is 0.
         """
         height = min(self._bucket_height, self._previous_height)
         return height if math.isfinite(height) else 0.0
@@ -162,7 +166,10 @@ class ClockLine:
         return was_set
 
     def add_round_trip(self, trip: ClockRoundTrip) -> bool:
-        """Bound the offset by a round trip: a question for the hub's time and its answer.
+        """Bound the offset (host minus hub time) by a question for the hub's time and its answer.
+
+        Args:
+            trip: Times of the question, of the answer and of the hub.
 
         Returns:
             Whether the answer is consistent with the samples; otherwise it is not used.
@@ -194,8 +201,9 @@ class ClockLine:
         Returns:
             Whether this shows that the hub's or the host's clock was set.
         """
-        # In the first second, the line falls until the smallest delay is known. Such a fall is not
-        # added to _fall, because it does not show that a clock was set.
+        # In the first second, the line (host time over device time) falls until the smallest delay
+        # is known. Such a fall is not added to _fall, because it does not show that a clock was
+        # set.
         self._fall -= height if self._points else 0.0
         was_set = self._fall > MAX_FALL_NS or -height > MAX_RISE_NS
         if was_set:
@@ -265,7 +273,8 @@ class ClockLine:
         drift_error = self._drift_error()
         for trip in reversed(self._round_trips):
             drifted = self.drift * trip.device_ns
-            # The bounds of older round trips are widened by the error of the drift since then.
+            # The bounds of the offset from older round trips are widened by the error of the drift
+            # since then.
             age = abs(self._round_trips[-1].device_ns - trip.device_ns)
             tolerance = drift_error * age
             next_low = max(low, trip.low_ns - drifted - tolerance)

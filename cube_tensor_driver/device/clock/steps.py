@@ -16,9 +16,9 @@ from collections.abc import Callable
 from ..scans.sequence import MAX_DISORDER, MAX_GAP
 
 MIN_STEP_US = 4000.0
-"""Smallest deviation, in µs, of the device time of a sample from the time expected from its number
-and the sample period, at which a step of the hub's clock is suspected. Steps of 5 ms are found,
-with 1 ms for the jitter of the hub."""
+"""Smallest deviation, in µs, of the device time (hub's clock) of a sample from the time expected
+from its number and the sample period, at which a step of the hub's clock is suspected. Steps of 5
+ms are found, with 1 ms for the jitter of the hub."""
 PERIOD_TOLERANCE = 1e-3
 """Largest assumed relative error of the estimated sample period. After lost samples, the threshold
 `MIN_STEP_US` is increased by this fraction of the time between the received samples."""
@@ -152,7 +152,7 @@ class SampleTiming:
         return round(error) if is_step else 0
 
     def _is_ahead(self, number: int, device_us: int) -> bool:
-        """Return whether a number is ahead of the newest one, by at most `MAX_GAP`.
+        """Return whether a sample's number is ahead of the newest one, by at most `MAX_GAP`.
 
         A number that is neither ahead nor that of a late sample comes from a hub that restarted.
         Then all earlier samples are discarded and this sample becomes the first.

@@ -14,7 +14,8 @@ def split_into_scans(rows: FrequencyRows, n_cubes: int) -> tuple[Array, Array]:
     """Arrange rows by scan (one row of every cube) and cube.
 
     Args:
-        rows: Rows of a live source. Within a scan, the index of the cube increases.
+        rows: Rows (samples of cubes) of a live source. Within a scan, the index of the cube
+            increases.
         n_cubes: Number of cubes of the skin.
 
     Returns:
@@ -42,7 +43,7 @@ def average_over_time(
     """Yield the mean frequency of each pad over successive intervals of time.
 
     Args:
-        source: Source of rows, for example a live source.
+        source: Source of rows (samples of cubes), for example a live source.
         n_cubes: Number of cubes of the skin.
         duration_s: Minimum length of each interval, in s of the time stamps of the rows.
 

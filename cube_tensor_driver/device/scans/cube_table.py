@@ -108,7 +108,7 @@ class CubeTable:
             hello: HELLO frame of the hub, which lists the uids of its cubes.
 
         Returns:
-            One text for each kind of cube that does not fit the skin file, with the fix; None if
+            One text for each problem of cubes that do not fit the skin file, with the fix; None if
             nothing has changed since the last HELLO.
         """
         hub = self._hubs[link]
@@ -172,14 +172,15 @@ class CubeTable:
         hub: _HubCubes,
         sample: Sample,
     ) -> tuple[RowIndex, Sample] | None:
-        """Select the rows of a sample whose cubes are in the skin, and count the other rows.
+        """Select the rows (one per cube) of a sample whose cubes are in the skin; count the others.
 
         Args:
             hub: The cubes of the hub that sent the sample.
             sample: The sample, which may hold cubes that the skin does not have.
 
         Returns:
-            See `find`.
+            Index in the skin of the cube of each kept row, and the sample with only these rows;
+            None if no row is left.
         """
         end = sample.first_cube + sample.n_cubes
         cubes = hub.cubes[sample.first_cube : end]
@@ -214,8 +215,8 @@ class CubeTable:
             hello: HELLO frame of the hub, which lists the uids of its cubes.
 
         Returns:
-            Index in the skin of each cube of the hub (n_cubes,), and one text for each kind of cube
-            that does not fit the skin file.
+            Index in the skin of each cube of the hub (n_cubes,), and one text for each problem of
+            cubes that do not fit the skin file.
         """
         uids = hello.cube_uids.tolist()
         index_of_uid: dict[int, int] = {}

@@ -59,9 +59,10 @@ class RowAccount:
 
     @property
     def counts(self) -> RowCounts:
-        """Numbers of rows until now, by what happened to them.
+        """Numbers of rows (samples of cubes) until now, by what happened to them.
 
-        Only `unaccounted`, the number of missing rows, is that of the last call of `check`.
+        All numbers are current, except that `unaccounted`, the number of missing rows, was
+        determined by the last call of `check`.
         """
         return RowCounts(
             delivered=self.delivered,
@@ -74,11 +75,11 @@ class RowAccount:
         )
 
     def count_lost(self, error: Exception) -> int:
-        """Count all rows that have gone missing since the last `check` as lost.
+        """Count all rows (samples of cubes) that have gone missing since the last `check` as lost.
 
         Missing rows were received, but are neither delivered nor left out and do not wait.
 
-        It must be called before further rows are counted as received.
+        This method must be called before further rows are counted as received.
 
         Args:
             error: The exception by which the rows were lost.
@@ -92,7 +93,11 @@ class RowAccount:
         return lost
 
     def check(self) -> None:
-        """Store how many received rows were neither delivered nor left out and do not wait."""
+        """Store how many received rows (samples of cubes) are missing.
+
+        Missing rows were neither delivered, left out nor counted as lost, and do not wait in a
+        scan.
+        """
         self._unaccounted = self._missing()
 
     def _missing(self) -> int:

@@ -114,15 +114,19 @@ class ScanBuilder:
         self._holds_back = False
         # For each link, the host time, in ns, of its newest sample that was built.
         self._built_ns = [0] * n_links
-        # Buffers are kept, because the same few shapes come again and again and allocating memory
-        # would take longer than copying the rows.
+        # Buffers are kept, because the same few shapes (rows, pads) come again and again and
+        # allocating memory would take longer than copying the rows.
         self._columns_of = lru_cache(maxsize=CACHED_SHAPES)(_Columns)
 
     def set_live(self, link: int, live: bool) -> None:
         """Set whether a link delivers samples.
 
-        Scans wait for a sample of each link that does. The cubes of a link that does not may be
-        used from the hub of another link.
+        A scan (one sample of each link) waits for the sample of every link that delivers. The cubes
+        of a link that delivers nothing may be used from the hub of another link.
+
+        Args:
+            link: Index of the link.
+            live: Whether it delivers samples.
         """
         self._holds_back = False
         if live:
@@ -162,11 +166,11 @@ class ScanBuilder:
             self._n_pending[link] = scan + 1
 
     def is_complete(self, n_scans: int = 1) -> bool:
-        """Return whether rows can be built now.
+        """Return whether rows (samples of cubes) can be built from the pending scans now.
 
-        They can if every link that delivers has given `n_scans` samples, or one link has given one
-        more than that. If `n_scans` is 1, rows can also be built if the only pending scan has a
-        sample that came too late for the scan built last.
+        They can be built if every link that delivers has given `n_scans` samples, or one link has
+        given one more than that. If `n_scans` is 1, rows can also be built if the only pending scan
+        has a sample that came too late for the scan built last.
 
         Args:
             n_scans: Number of scans to wait for.
@@ -179,7 +183,8 @@ class ScanBuilder:
             return True
         if len(self._pending) < n_scans:
             return False
-        # These links deliver samples, but have none in the last pending scan yet.
+        # These links deliver samples, but have none in the last pending scan (one sample of each
+        # link) yet.
         missing = self._live - self._pending[-1].keys()
         if not missing:
             return True
@@ -191,6 +196,9 @@ class ScanBuilder:
         max_scans: int | None = None,
     ) -> FrequencyRows | None:
         """Convert the oldest scans that every link has reached to rows, and remove these scans.
+
+        A scan is one sample of each link, a row one sample of one cube. A link has reached a scan
+        if it has a sample in this scan or in a later one.
 
         Args:
             make_rows: Makes the rows to fill, for example in the memory of a message.
@@ -220,14 +228,14 @@ class ScanBuilder:
         return rows
 
     def rows_waiting(self) -> int:
-        """Return how many rows wait here: they were added, but not built or left out yet."""
+        """Return how many rows (samples of cubes) were added, but not yet built or left out."""
         waiting = sum(len(part.cubes) for part in self._deferred)
         for scan in self._pending:
             waiting += sum(stamped.sample.n_cubes for stamped in scan.values())
         return waiting
 
     def _take_scans(self, max_scans: int | None) -> list[_SampleRows]:
-        """Remove the oldest scans, and find the cube of the skin for each of their rows.
+        """Remove the oldest scans (one sample of each link); find the cube of each of their rows.
 
         Args:
             max_scans: Largest number of scans to remove; None for all that can be built.
@@ -343,7 +351,14 @@ class ScanBuilder:
 def _split_by_span(
     parts: list[_SampleRows],
 ) -> tuple[list[_SampleRows], list[_SampleRows]]:
-    """Split samples into those at most `MAX_SPAN_NS` later than the earliest, and the others."""
+    """Split samples into those at most `MAX_SPAN_NS` later than the earliest, and the others.
+
+    Args:
+        parts: Samples with the cubes of their rows, in any order.
+
+    Returns:
+        The samples for this message, and those left for the next one.
+    """
     if not parts:
         return [], []
     stamps_ns = [part.stamp_ns for part in parts]

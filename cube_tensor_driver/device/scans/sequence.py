@@ -10,16 +10,17 @@ from enum import Enum
 from ..wire.protocol import Sample, Stats
 
 MAX_DISORDER = 64
-"""Number of the newest samples of a hub whose numbers are kept, to recognise late and duplicate
-ones. A sample whose number is smaller than that of the newest one by more than this is taken for
-the first one after a restart of the hub."""
+"""Number of newest samples of a hub whose sequence numbers are kept, to recognise late and
+duplicate ones. A sample whose number is smaller than that of the newest one by more than this is
+taken for the first one after a restart of the hub."""
 MAX_GAP = 1 << 20
 """Largest gap in the numbers of successive samples (17 minutes at 1 kHz) that is counted as lost
 samples. A larger gap is taken for a restart of the hub."""
 RESTART_US = 1_000_000
-"""Largest difference of device time, in µs, between the newest sample of a hub and a sample whose
-number is below that of the first counted one. With a smaller difference the sample is only late;
-with a larger one it is taken for the first sample after a restart of the hub."""
+"""Largest difference of device time (the hub's clock), in µs, between the newest sample of a hub
+and a sample whose number is below that of the first counted one. With a smaller difference the
+sample is only late; with a larger one it is taken for the first sample after a restart of the
+hub."""
 _WRAP = 1 << 32
 
 
@@ -191,10 +192,15 @@ class SequenceTracker:
         return fits_before or fits_after
 
     def _restart(self, sequence: int, device_us: int) -> Arrival:
-        """Begin a new count with the first sample after a restart of the hub.
+        """Begin to count the samples anew with the first one after a restart of the hub.
 
         Earlier samples since power-up count as missing, because numbers begin at 0 with power-up.
-        A number above `MAX_GAP` is too large for that, and then nothing counts as missing.
+        If the number is above `MAX_GAP`, so many samples cannot have been lost, and nothing counts
+        as missing.
+
+        Args:
+            sequence: Number of the sample, 32 bits.
+            device_us: Device time (the hub's clock) of the sample, in µs.
         """
         self.counters.resets += 1
         self._seen.clear()
@@ -297,7 +303,7 @@ class SampleAccount:
 
     @property
     def resets(self) -> int:
-        """Number of restarts of the hub, plus steps back of its clock."""
+        """Number of restarts of the hub plus number of times its clock was set back."""
         return sum(tracker.counters.resets for tracker in self._trackers.values())
 
     def counters(self) -> dict[str, int]:
