@@ -71,8 +71,8 @@ _FOOTER_BYTES = RECORD_HEAD.size + 20
 stands just before the closing `MCAP_MAGIC` bytes and states where the summary begins."""
 
 CHECKSUM_BYTES = 4
-"""Size, in bytes, of the checksum (CRC-32) of the summary, with which the footer record of an MCAP
-file ends."""
+"""Size, in bytes, of the checksum (CRC-32) of the summary (topics and offsets of chunks), with
+which the footer record of an MCAP file ends."""
 
 StoredMessage = tuple[int, int, int, bytes]
 """A message of an MCAP file: time of recording in ns since the Unix epoch, byte offset of its chunk

@@ -272,7 +272,12 @@ def merge_connections(of_files: Iterable[Sequence[Connection]]) -> list[Connecti
 
 
 def _time_span(start_ns: int, end_ns: int) -> dict[str, Any]:
-    """Return begin (ns since the Unix epoch) and duration of a span with metadata.yaml's keys."""
+    """Return begin and duration of a span of time with the keys of metadata.yaml.
+
+    Args:
+        start_ns: Begin of the span, in ns since the Unix epoch.
+        end_ns: End of the span, in ns since the Unix epoch.
+    """
     return {
         "starting_time": {"nanoseconds_since_epoch": start_ns},
         "duration": {"nanoseconds": max(0, end_ns - start_ns)},

@@ -53,7 +53,10 @@ class _StressBatch(NamedTuple):
     status: StatusBits
 
     def overlaps(self, begin_ns: int, end_ns: int) -> bool:
-        """Return whether a row can have a stamp between two times, in ns since the Unix epoch."""
+        """Return whether a row of this batch can have a stamp from `begin_ns` to `end_ns`.
+
+        Both are in ns since the Unix epoch.
+        """
         first_ns, last_ns = self.stamp_ns.min(), self.stamp_ns.max()
         return bool(first_ns <= end_ns and last_ns >= begin_ns)
 

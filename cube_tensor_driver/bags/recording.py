@@ -79,6 +79,8 @@ class Recording:
     def number_at(self, newest_ns: Any) -> Any:
         """Return the index in `infos` of the SkinInfo that applies to a message of frequencies.
 
+        A SkinInfo message contains the cubes' poses, calibrations and rest frequencies.
+
         A SkinInfo applies to rows whose stamps are not before its own: the reconstruction node
         stamps it just after the last row that it reconstructed with the previous one.
 
@@ -94,7 +96,10 @@ class Recording:
         return np.maximum(number, 0)
 
     def settings_at(self, rows: FrequencyRows) -> Settings:
-        """Return the calibrations and rest frequencies that applied to the rows of one message."""
+        """Return the calibrations and rest frequencies that applied to the rows of one message.
+
+        A rest frequency is the frequency of a pad without load, a row one sample of one cube.
+        """
         newest_ns = rows.stamp_ns.max(initial=0)
         number = int(self.number_at(newest_ns))
         return self.settings[number]

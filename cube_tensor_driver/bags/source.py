@@ -94,7 +94,8 @@ class BagSource:
     def segments(self) -> Iterator[Segment]:
         """Yield all messages in the order of recording, with their rows (samples of cubes).
 
-        Each segment has messages of the same cubes that were reconstructed with one SkinInfo.
+        Each segment has successive messages of the same cubes to which one SkinInfo (calibrations
+        and rest frequencies) applies.
 
         Raises:
             BagError: The bag is damaged.
@@ -106,7 +107,8 @@ class BagSource:
             newest_ns = times_ns.max(axis=1) if times_ns.size else messages.stamp_ns
             number = self.recording.number_at(newest_ns)
 
-            # A segment ends where the next message has other cubes or a newer SkinInfo applies.
+            # A segment (messages reconstructed together) ends where the next message has other
+            # cubes or a newer SkinInfo message (calibrations, rest frequencies) applies.
             has_other_cubes = (cube[1:] != cube[:-1]).any(axis=1)
             has_other_info = number[1:] != number[:-1]
             ends = np.flatnonzero(has_other_cubes | has_other_info) + 1

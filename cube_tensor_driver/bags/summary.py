@@ -118,7 +118,11 @@ def _summarise(
 
 
 def _columns(bag: Bag, topic: str) -> tuple[AnyArray, AnyArray, Times]:
-    """Return cube index, sequence number and stamp of all rows of frequencies on a topic.
+    """Return cube index, sequence number and stamp of all recorded samples of frequencies.
+
+    Args:
+        bag: Open bag.
+        topic: Topic of the skin's frequencies.
 
     Returns:
         Three arrays (N,); the stamps are in ns since the Unix epoch.

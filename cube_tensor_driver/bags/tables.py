@@ -120,7 +120,7 @@ class TableWriter:
                 self._flush()
 
     def _flush(self) -> None:
-        """Write all collected rows as one row group."""
+        """Write all collected rows as one row group (independent block of a Parquet file)."""
         if self._batches:
             self._writer.write_table(pyarrow.Table.from_batches(self._batches))
         self._batches, self._waiting_rows = [], 0

@@ -273,7 +273,11 @@ class BagWriter:
         part.counts[one.topic] = 0
 
     def _attempt(self, work: Callable[[], object]) -> None:
-        """Do a step of writing; if it fails, close the file and raise a BagError."""
+        """Call a function that writes; if it fails, close the file and raise a BagError.
+
+        Args:
+            work: Function without arguments, which raises one of `WRITE_ERRORS` if it fails.
+        """
         try:
             work()
         except WRITE_ERRORS as error:

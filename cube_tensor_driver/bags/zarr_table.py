@@ -14,7 +14,7 @@ from ..core.rows import StressRows, concatenate
 from .tables import report_write_errors
 
 ROWS_PER_CHUNK = 1 << 16
-"""Number of rows in one chunk (file) of a Zarr array."""
+"""Number of rows (samples of cubes) in one chunk (file) of a Zarr array."""
 
 _UNITS = {
     "stamp_ns": "ns",
@@ -88,7 +88,7 @@ class ZarrWriter:
             self._flush()
 
     def _flush(self) -> None:
-        """Append all collected rows to the arrays."""
+        """Append all collected rows (samples of cubes) to the arrays."""
         if not self._waiting:
             return
         # Rows are collected until they fill a chunk, because appending to a chunk that is not full

@@ -289,7 +289,10 @@ def _find_action_mistakes(action: Action, friction: float, period: float | None)
 
 
 def _max_shear_ratio(action: Action) -> float:
-    """Return the maximum ratio of tangential to normal force during the action."""
+    """Return the maximum ratio of tangential to normal force during the action.
+
+    It is infinite where an indenter has a tangential but no normal force.
+    """
     # Without a tangential force the indenter cannot slip, even where the normal force is 0.
     if not action.shear.any():
         return 0.0

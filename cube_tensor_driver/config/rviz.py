@@ -35,7 +35,8 @@ def rviz_view(skin: Skin) -> dict[str, Any]:
     to_centre = np.linalg.norm(positions - (low + high) / 2, axis=1)
     central_cube = skin.cubes[int(to_centre.argmin())]
 
-    # `markers` draws the legend beside the skin in the direction -y, so the box grows there.
+    # The node `markers` draws the legend beside the skin in the direction -y, so the box grows
+    # there.
     low[1] -= LEGEND_HEIGHT * (high[0] - low[0])
     diagonal = float(np.linalg.norm(high - low))
     focal_point = (low + high) / 2

@@ -158,7 +158,7 @@ class Skin:
 
     @property
     def poses(self) -> CubePoses:
-        """Positions, rotations and half sides of the cubes, in the parent frame."""
+        """Positions, rotations and half sides of the cubes, in m, in the skin's parent frame."""
         half_sides = [calibration.half_side for calibration in self.calibrations]
         return CubePoses(
             position=np.array([cube.xyz for cube in self.cubes]),

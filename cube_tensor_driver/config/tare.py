@@ -20,7 +20,8 @@ from .schema import TEXT, JsonSchema, Schema, mapping
 from .yaml import read_yaml, write_yaml
 
 SCHEMA_VERSION = 1
-"""Version of the format of tare files. Files with another version are refused."""
+"""Version of the format of tare files (a cube's frequencies without load). Files with another
+version are refused."""
 
 _HEADER = "Rest frequencies in Hz that ~/tare measured; ~/clear_tare removes it."
 """Comment in the first line of a tare file, for people who open it."""
@@ -39,7 +40,7 @@ class StoredTare(NamedTuple):
 
 
 def tare_path(folder: Path, uid: int) -> Path:
-    """Return the path of the tare file of the cube with this uid."""
+    """Return the path of the tare file (frequencies without load) of the cube with this uid."""
     return folder / f"{uid:016x}.yaml"
 
 

@@ -71,7 +71,7 @@ def export_lerobot(
         bags: Folders or files of bags.
         folder: Folder of the data set; it must be empty or not exist.
         choices: Frame rate, tasks, topics and overrides that the user chose.
-        report: Function that displays progress.
+        report: Function that displays progress (see `plan.Report`).
 
     Raises:
         BagError: A bag is damaged, the choices do not fit, or the folder cannot be written.
@@ -170,7 +170,10 @@ class EpisodeWriter:
             self._statistics[key] = Statistics(width, rows)
 
     def add(self, rows: StressRows) -> int:
-        """Add those rows of stress whose stamps lie in the episode.
+        """Add those rows of stress (one sample of one cube each) whose stamps lie in the episode.
+
+        Args:
+            rows: Rows of one or several episodes of the bag.
 
         Returns:
             The number of rows that lie in the episode.
@@ -187,7 +190,7 @@ class EpisodeWriter:
         return len(rows)
 
     def write(self) -> bool:
-        """Write the frames of which all rows of stress have been added.
+        """Write the frames (time steps of the data set) of which all rows of stress were added.
 
         The frames of a data set lie episode by episode in its files, so this may only be called for
         the first episode that is not complete.
@@ -247,7 +250,12 @@ class EpisodeWriter:
                 self._count(key, pixels.reshape(-1, bands))
 
     def _count(self, key: str, rows: AnyArray) -> None:
-        """Add values (n, D) of a feature to the statistics of the episode and the data set."""
+        """Add values of a feature (column) to the statistics of the episode and the data set.
+
+        Args:
+            key: Name of the feature.
+            rows: (n, D) values of the feature's D numbers.
+        """
         self._data_set.count(key, rows, self._statistics)
 
 

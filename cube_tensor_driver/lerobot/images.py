@@ -92,7 +92,8 @@ class ImageStream:
             if self._next:
                 shape = self._encode(self._next[1]).shape
         self.shape = shape
-        # Frames that end before the first image of the topic get a black image.
+        # Frames (time steps of the data set) that end before the first image of the topic get a
+        # black image.
         height, width, bands = shape
         black = Image.new(MODE_OF_BANDS[bands], (width, height))
         self._latest = _as_png(black)

@@ -132,7 +132,7 @@ class Episode:
         return (stamp_ns >= self._since_ns) & (stamp_ns < self._until_ns)
 
     def frame_of(self, stamp_ns: Times) -> Index:
-        """Return the number of the frame in which each stamp lies.
+        """Return the number of the frame (time step of the data set) in which each stamp lies.
 
         Args:
             stamp_ns: (N,) stamps, in ns since the Unix epoch.
@@ -199,7 +199,10 @@ class Episode:
         np.add.at(self.counts, (frame, cube), 1)
 
     def finish(self) -> None:
-        """Remove the empty frames after the last sample; call it when all samples are counted."""
+        """Remove the empty frames (time steps) after the last sample.
+
+        It is called once, when all samples of the bag have been counted.
+        """
         has_samples = self.counts.any(axis=1)
         last = np.flatnonzero(has_samples)[-1]
         self.counts = self.counts[: last + 1]

@@ -36,7 +36,7 @@ LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 """First 4 bytes of every serialised message in little-endian CDR."""
 
 PER_PAD = -1
-"""Value of `_Field.width` for a field with one value for each pad of a cube in each row."""
+"""Value of `_Field.width` for a field with one value per pad in each row (sample of a cube)."""
 
 PER_MESSAGE = 0
 """Value of `_Field.width` for a field with a single value in a message, which is no sequence."""
@@ -212,7 +212,7 @@ class MessageBuffer(Generic[AnyRows]):
         self._columns = [getattr(self.rows, name) for name in self._names]
 
     def fill(self, rows: AnyRows) -> None:
-        """Copy rows into the message; there must be as many rows as the message has."""
+        """Copy rows (samples of cubes) into the message, which must have as many rows."""
         for name, column in zip(self._names, self._columns, strict=True):
             column[:] = getattr(rows, name)
 
@@ -488,7 +488,12 @@ class MessageCodec(Generic[AnyRows]):
         )
 
     def _compute_end(self, shape: _Shape, n_fields: int) -> int:
-        """Return the byte offset at which the first `n_fields` fields of a message end."""
+        """Return the byte offset, from the start of a message, where its first fields end.
+
+        Args:
+            shape: Numbers of rows and pads, and length of the frame id.
+            n_fields: Number of fields after the header that are counted.
+        """
         _, end = self._locate_fields(shape, n_fields)
         return end
 

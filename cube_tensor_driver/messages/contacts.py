@@ -90,7 +90,7 @@ def traction_message(
     Args:
         make: Function that constructs a message.
         stamp_ns: Time stamp of the header, in ns since the Unix epoch.
-        frame_id: Coordinate frame of the points.
+        frame_id: Coordinate frame of the points, which is the parent frame of the skin.
         cloud: Points (M, 6) with the columns of `CLOUD`.
     """
     data = cloud.astype("<f4")
@@ -154,7 +154,7 @@ def decode_traction(message: Any) -> Array:
 
 
 def _collect(contacts: Sequence[Any], name: str) -> Array:
-    """Return one attribute of all contacts as an array (contacts,)."""
+    """Return one attribute of all contacts as an array whose first axis counts the contacts."""
     return np.array([getattr(contact, name) for contact in contacts], float)
 
 

@@ -17,7 +17,7 @@ from ..core.tensor import rotation_from_quaternion
 
 
 def cube_poses(info: Any) -> CubePoses:
-    """Return the poses and half sides of the cubes of a skin.
+    """Return the poses (in the skin's parent frame) and half sides of the cubes, in m.
 
     Args:
         info: SkinInfo message (names, poses and calibrations of the cubes).

@@ -63,10 +63,11 @@ class ContactWriter:
         self._last_ns: int | None = None
 
     def set_up(self, info: Any) -> None:
-        """Use a SkinInfo message (poses and calibrations of the cubes) for the rows that follow.
+        """Use a SkinInfo message (poses and calibrations of the cubes) for the stress that follows.
 
         If frame, names, poses and sizes of the cubes are those of the message before, the tracked
-        contacts continue. Otherwise contact estimation begins anew. The node does the same.
+        contacts continue. Otherwise contact estimation begins anew. The ROS node `contacts` does
+        the same.
 
         Raises:
             CubeError: Contacts cannot be computed on a skin with these cubes.

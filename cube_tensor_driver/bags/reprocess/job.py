@@ -165,11 +165,11 @@ def reconstruct(
     source: BagSource,
     overrides: Overrides = AS_RECORDED,
 ) -> Iterator[tuple[Segment, StressRows]]:
-    """Compute the stress of a bag again.
+    """Compute the stress of a bag from its recorded frequencies again.
 
     Args:
         source: The recorded frequencies.
-        overrides: Calibrations and tare that replace those of the recording.
+        overrides: Calibrations and tare (frequencies without load) that replace the recorded ones.
 
     Yields:
         Each segment (consecutive messages of frequencies with the same cubes) and its stress.
@@ -183,6 +183,8 @@ def reconstruct(
 
 def settings_with(source: BagSource, overrides: Overrides) -> list[Settings]:
     """Return the calibrations and rest frequencies to use for each SkinInfo message of a bag.
+
+    A rest frequency is the frequency of a pad without load, as a tare measures it.
 
     Args:
         source: The recorded frequencies with their SkinInfo messages.
@@ -433,6 +435,8 @@ def _measure_rest(
 
 def _infos_with(infos: list[Any], settings: list[Settings]) -> Iterator[Any]:
     """Yield the recorded SkinInfo messages with other calibrations and rest frequencies.
+
+    A rest frequency is the frequency of a pad without load.
 
     Args:
         infos: The recorded SkinInfo messages.
