@@ -44,7 +44,7 @@ class Recording:
     Attributes:
         infos: SkinInfo messages (cubes, calibrations and rest frequencies) in the order of their
             stamps; there is at least one.
-        settings: Calibrations and rest frequencies in each of the infos.
+        settings: Calibrations and rest frequencies in each of the SkinInfo messages.
     """
 
     def __init__(self, bag: Bag, topic: str) -> None:

@@ -420,7 +420,12 @@ def _records(stream: BinaryIO) -> Iterator[tuple[int, int, bytes]]:
 
 
 def _parse(read: Callable[[ReadDataStream], Any], content: bytes) -> Any:
-    """Parse the content of an MCAP record with the function `read` of its class in mcap."""
+    """Parse an MCAP record.
+
+    Args:
+        read: Method `read` of the record's class in the library mcap.
+        content: The record without its opcode and length.
+    """
     return read(ReadDataStream(BytesIO(content)))
 
 

@@ -45,7 +45,7 @@ class BagSource:
         skin: The skin (cubes, their poses and calibrations) as the bag describes it.
         is_live: Always false, because a bag delivers its rows faster than they were measured.
         messages: Number of messages delivered so far.
-        rows: Number of rows delivered so far.
+        rows: Number of rows (samples of cubes) delivered so far.
     """
 
     is_live = False

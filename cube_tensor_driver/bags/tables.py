@@ -42,7 +42,7 @@ _SCHEMA = pyarrow.schema(
 
 @contextmanager
 def report_write_errors(path: Path) -> Iterator[None]:
-    """Turn an error of the file system into a BagError that names the file."""
+    """Turn an error of the file system in the `with` block into a BagError that names `path`."""
     try:
         yield
     except OSError as error:

@@ -88,9 +88,14 @@ def check_folder(option: str, path: Path | None) -> None:
 
 
 def check_yaml(option: str, path: Path | None) -> None:
-    """Raise ConfigError if the output file of `option` should be YAML but has another suffix.
+    """Check that an output file that is written as YAML has a suffix of YAML files.
 
-    None as path means that the option was not given, and passes.
+    Args:
+        option: Option of the command that names the file, for the error message.
+        path: The file; None: the option was not given, and nothing is checked.
+
+    Raises:
+        ConfigError: The file has another suffix.
     """
     if path is not None and path.suffix not in YAML_SUFFIXES:
         suffixes = " or ".join(YAML_SUFFIXES)
@@ -98,7 +103,11 @@ def check_yaml(option: str, path: Path | None) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write a JSON file. Raises ConfigError if it cannot be written."""
+    """Write plain values as a JSON file, completely or not at all.
+
+    Raises:
+        ConfigError: The file cannot be written.
+    """
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(value, indent=2) + "\n", encoding="utf-8")
 

@@ -123,7 +123,10 @@ class Schema:
         self._validator = jsonschema.validators.extend(base, type_checker=number)(schema)
 
     def mistakes(self, data: Any) -> list[tuple[KeyPath, str]]:
-        """Return all mistakes in `data`, sorted by key.
+        """Return all mistakes in plain values (mappings, lists, numbers, texts), sorted by key.
+
+        Args:
+            data: The values, for example the content of a YAML file.
 
         Returns:
             For each mistake, the path of keys to the wrong value and the error message (one line).

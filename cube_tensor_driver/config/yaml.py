@@ -122,7 +122,7 @@ def read_yaml(path: Path) -> Any:
 
 
 def to_yaml(value: Any) -> str:
-    """Return plain values as YAML text. Keys keep the order that they have in their mapping."""
+    """Return plain values (numbers, texts, lists, mappings) as YAML text; keys keep their order."""
     text: str = yaml.dump(
         value,
         Dumper=_Dumper,

@@ -88,18 +88,20 @@ class _LinkRecord:
 
 
 class LiveLinks:
-    """Reads the links of a skin and calls back with rows of frequencies.
+    """Reads the links of a skin and calls back with rows of frequencies (samples of cubes).
 
     Args:
         links: Port of each link, and the unique number of the hub that must answer there.
         cubes: For each cube of the skin, the unique number or the link and index to find it by.
-        on_rows: Called in the reader's thread with the rows of complete scans. If `make_rows`
+        on_rows: Called in the reader's thread with the rows of complete scans (one sample of every
+            cube). If `make_rows`
             returns the same memory again, the rows are valid only until the call returns.
         rate: Sample rate to request from the hubs, in Hz; with None the hubs keep their own rate.
         scans_per_call: Number of complete scans that one call of `on_rows` waits for.
-        make_rows: Makes the arrays that rows are written into.
+        make_rows: Function that makes the arrays into which rows are written.
         clock_ns: Clock of the time stamps, in ns since the Unix epoch.
-        is_host_clock: Returns whether `clock_ns` is now the host's clock, not a simulated time.
+        is_host_clock: Function that returns whether `clock_ns` is now the host's clock and not a
+            simulated time.
         log: Logger for events of the links; None stands for Python's logging.
         on_end: Called in the reader's thread when it ends, after `close` or because of an error.
     """

@@ -178,7 +178,7 @@ class DataSet:
         rows: AnyArray,
         of_episode: dict[str, Statistics],
     ) -> None:
-        """Add values of a feature to the statistics of the data set and of an episode.
+        """Add values of a feature (column) to the statistics of the data set and of an episode.
 
         Args:
             key: Name of the feature.
@@ -195,7 +195,7 @@ class DataSet:
         place: dict[str, int],
         statistics: dict[str, Statistics],
     ) -> None:
-        """Add an episode whose frames are all written to the table of episodes.
+        """Add an episode, whose frames have all been written, to the table of episodes.
 
         Args:
             plan: The bag of the episode.

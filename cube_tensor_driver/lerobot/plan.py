@@ -98,7 +98,7 @@ class Episode:
     """An episode of a bag (one execution of a task), and its numbers of samples.
 
     Attributes:
-        task: Text of the task.
+        task: Text of the task, such as "pick up the cup".
         begin_ns: Time at which frame 0 begins, in ns since the Unix epoch: the earliest stamp among
             the first samples that are counted.
         rows: Number of samples of all cubes.

@@ -35,7 +35,7 @@ class Statistics:
     """
 
     def __init__(self, width: int, rows: int) -> None:
-        """Prepare for the rows of a feature.
+        """Prepare for the rows (values of D numbers) of a feature (column of a data set).
 
         Args:
             width: Number of columns D of the feature.

@@ -36,7 +36,7 @@ at the same time."""
 
 
 class Windows:
-    """The windows (samples of all cubes in one frame) of one episode.
+    """The windows (samples of all cubes in one frame, a time step of the data set) of one episode.
 
     Rows may be added in any order of frames; the windows are made in the order of the frames.
     Within a window the samples of a cube are in the order of recording, the newest at the end. If a

@@ -360,7 +360,7 @@ class MessageCodec(Generic[AnyRows]):
         return [message.tobytes() for message in record]
 
     def make_rows(self, record: AnyArray, stamp_ns: Times) -> AnyRows:
-        """Return the rows of serialised messages.
+        """Return the rows (samples of cubes) of serialised messages.
 
         Args:
             record: Messages (M,) as an array of the structured dtype of their layout.

@@ -103,7 +103,7 @@ class Children:
         return list(self._processes)
 
     def pid(self, executable: str) -> int:
-        """Return the process id of a child."""
+        """Return the process id of the child process with this executable."""
         return self._processes[executable].pid
 
     def log(self, executable: str) -> str:
@@ -146,7 +146,11 @@ class Children:
                 )
 
     def end(self, executables: Iterable[str]) -> None:
-        """End processes: send SIGTERM to all of them, and SIGKILL to those left after `END_S`."""
+        """End child processes: SIGTERM to all, and SIGKILL to those that still run after `END_S`.
+
+        Args:
+            executables: Names of the processes.
+        """
         ending = [self._processes.pop(name) for name in executables]
         for process in ending:
             _signal_session(process, signal.SIGTERM)
@@ -182,8 +186,8 @@ def end_with_parent() -> list[str]:
     """Return a prefix for a command line that ends the command when this process ends.
 
     It uses setpriv: the kernel sends SIGTERM to the command when its parent dies, even by SIGKILL.
-    If this process ended before the kernel was told, the command does not start at all. Without
-    setpriv the prefix is empty, and the command goes on after a SIGKILL of this process.
+    If this process ended before the kernel was asked to do so, the command does not start at all.
+    Without setpriv the prefix is empty, and the command goes on after a SIGKILL of this process.
     """
     if not HAS_SETPRIV:
         return []
@@ -195,6 +199,10 @@ def _signal_session(process: subprocess.Popen[bytes], number: int) -> None:
     """Send a signal to a child and to all processes that the child has started.
 
     Nothing happens if they have ended already.
+
+    Args:
+        process: The child, which is the leader of its session.
+        number: Number of the signal.
     """
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, number)

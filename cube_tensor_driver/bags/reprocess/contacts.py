@@ -36,7 +36,7 @@ class ContactWriter:
     """Computes the contacts of one skin from its stress and writes them into a bag.
 
     The topics `contacts` and `traction` (force per area on the surface) have the same messages as
-    those that the node publishes.
+    those that the ROS node `contacts` publishes.
     """
 
     def __init__(

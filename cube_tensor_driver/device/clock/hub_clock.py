@@ -53,8 +53,8 @@ class HubClock:
     It needs bounded memory and constant time per sample.
 
     Attributes:
-        resets: Number of times that the line was restarted (for example with the hub) or the hub's
-            clock was set.
+        resets: Number of times that the line (host time over device time) was restarted, for
+            example with the hub, or the hub's clock was set.
         in_doubt: Whether the stamps of the last `update` may be wrong, because the hub's clock may
             have been set or cannot be used.
         problems: Texts of problems, which the caller reports and removes.
@@ -229,6 +229,8 @@ class HubClock:
     def _convert(self, times: Sequence[int], arrival_ns: int) -> list[int]:
         """Fit the clock line to the newest of some samples, and convert the device times of all.
 
+        The clock line states host time as a linear function of device time (the hub's clock).
+
         Args:
             times: Device times of samples that arrived together, in µs.
             arrival_ns: Host time at which they arrived, in ns.
@@ -263,6 +265,8 @@ class HubClock:
 
     def _learn(self, newest_us: int, arrival_ns: int) -> bool:
         """Fit the clock line to the newest of some samples, and look for steps of the hub's clock.
+
+        The clock line states host time as a linear function of device time (the hub's clock).
 
         Args:
             newest_us: Device time of the newest sample, in µs.

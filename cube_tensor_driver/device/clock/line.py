@@ -89,8 +89,9 @@ class ClockLine:
             host time runs faster.
         offset: Arrival minus device time on the line at device time 0. It contains the smallest
             delay.
-        bounded_offset: The same without the smallest delay, as far as round trips determine that.
-        error_bound: Largest possible error of `bounded_offset`; None without round trips.
+        bounded_offset: `offset` without the smallest delay, as far as round trips (questions for
+            the hub's time and their answers) determine this delay.
+        error_bound: Largest possible error of `bounded_offset`, in ns; None without round trips.
         jitter_ns: Mean height of the newest points above the line.
     """
 
@@ -130,7 +131,7 @@ class ClockLine:
         return height if math.isfinite(height) else 0.0
 
     def height(self, device_ns: float, arrival_ns: float) -> float:
-        """Return by how much the delay of a sample exceeds the smallest delay, in ns.
+        """Return the delay of a sample (arrival minus sampling) minus the smallest delay, in ns.
 
         This is the height of the point (device time, arrival time) above the clock line.
 
@@ -143,7 +144,8 @@ class ClockLine:
     def add(self, device_ns: float, arrival_ns: int) -> bool:
         """Add the point (device time, arrival time) of a sample to the clock line.
 
-        A point below the line lowers it. After each bucket of 1 s the line is fitted anew.
+        The line states host time over device time for the smallest delay. A point below the line
+        lowers it. After each bucket of 1 s the line is fitted anew.
 
         Args:
             device_ns: Device time of the sample, in ns since the first point.
@@ -215,9 +217,9 @@ class ClockLine:
         return was_set
 
     def _fit(self, arrival_ns: int) -> bool:
-        """Fit the clock line to the points of smallest delay, one per bucket of 1 s.
+        """Fit the clock line, host time over device time, to the samples of smallest delay.
 
-        The next bucket begins with this call.
+        Each bucket (interval of 1 s) contributes one sample; the next one begins with this call.
 
         Args:
             arrival_ns: Host time, in ns since the first point, at which this bucket ends.

@@ -95,7 +95,7 @@ class HostClockWatch:
 class SampleTiming:
     """Finds samples whose device times are not as expected from their numbers.
 
-    The expected device time grows by the estimated sample period of the hub with each number.
+    The expected device time (hub's clock) grows by the estimated sample period with each number.
     """
 
     def __init__(self) -> None:
@@ -176,7 +176,7 @@ class SampleTiming:
 
 
 class StepDecision:
-    """Decides whether a hub's clock was set or the hub sampled late, from the delays that follow.
+    """Decides from the delays of samples whether a hub's clock was set or the hub sampled late.
 
     If the hub sampled late or early, the delays (arrival minus device time) of the next samples are
     as before. If its clock was set, they seem to be shorter by the step. All times but `step_us`
@@ -186,8 +186,8 @@ class StepDecision:
         step_us: Device time of the first sample after the step minus the device time expected from
             its number, in µs.
         newest_ns: Device time of the newest sample before the step.
-        before_ns: Arrival of the newest sample before the step.
-        since_ns: Arrival of the first sample after the step.
+        before_ns: Arrival time of the newest sample before the step.
+        since_ns: Arrival time of the first sample after the step.
         usual_delay_ns: Smallest delay of the samples just before the step, above the clock line.
 
     Attributes:

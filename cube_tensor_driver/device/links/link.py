@@ -183,7 +183,7 @@ class Link:
 
     @property
     def unsent(self) -> bool:
-        """Whether bytes wait to be sent because the kernel does not accept more at the moment."""
+        """Whether bytes wait to be sent because the kernel accepts no more at the moment."""
         return bool(self._out)
 
     def fileno(self) -> int:
@@ -348,7 +348,7 @@ class Link:
         return sorted(glob.glob(self.config.port))  # noqa: PTH207  (Path.glob takes no absolute pattern)
 
     def _open_serial(self) -> None:
-        """Open the first matching path that can be opened, beginning with number `_first_match`.
+        """Open the first path of the port's pattern that can be opened, from `_first_match` on.
 
         If none can be opened, the error of the last one is raised.
         """
@@ -379,7 +379,7 @@ class Link:
             self._connecting = None
 
     def _lost(self, error: OSError) -> LinkError:
-        """Return the LinkError of the kind `lost` for an error of reading or writing."""
+        """Return the LinkError of the kind `lost` for a failed read or write of the port."""
         reason = error.strerror or str(error)
         return LinkError(
             f"{self.path}: connection lost ({reason}): replug the hub, "

@@ -381,7 +381,7 @@ class Reader:
             self._drop(i, error)
 
     def _drop(self, i: int, error: LinkError) -> None:
-        """Close link number `i` because of an error; it is opened again after a pause."""
+        """Close the link with index `i` because of an error; it is opened again after a pause."""
         link = self.links[i]
         if link.is_open:
             link.lost += 1
@@ -391,7 +391,8 @@ class Reader:
     def _watch(self, i: int) -> None:
         """Make the selector report when link number `i` can be written, while bytes wait for it.
 
-        Without waiting bytes it must not, because a port can almost always be written.
+        If no bytes wait, the selector must not report this: a port can almost always be written, so
+        that the reader's thread would never sleep.
         """
         link = self.links[i]
         if not link.is_open:
@@ -401,7 +402,7 @@ class Reader:
             self._selector.modify(link, events, i)
 
     def _call(self, callback: Callable[..., None], *arguments: object) -> None:
-        """Call a callback; if it raises an exception, log and count the exception."""
+        """Call a callback with these arguments; if it raises an exception, log and count it."""
         try:
             callback(*arguments)
         except Exception:  # noqa: BLE001  (whatever a callback raises, the links go on)

@@ -134,7 +134,8 @@ class Session:
     def close(self, error: LinkError) -> None:
         """Close the link because of an error, and set the state WAITING.
 
-        `open` tries again after a pause, or as soon as the device file of the port changes.
+        Later calls of `open` try again after a pause, or as soon as the device file of the port
+        changes.
         """
         link = self.link
         link.close()
@@ -143,9 +144,12 @@ class Session:
         self.set_state(LinkState.WAITING, error)
 
     def send(self, request: Request) -> None:
-        """Send a request if the link is open.
+        """Send a request to the hub if the link is open.
 
         SET_PERIOD, START and STOP are also stored and sent again each time the link is opened.
+
+        Args:
+            request: The request.
 
         Raises:
             LinkError: Sending failed, so the link must be closed.
@@ -163,9 +167,12 @@ class Session:
     def take(self, frame: Frame) -> bool:
         """Update the state of the link from one received frame.
 
+        Args:
+            frame: The frame.
+
         Returns:
-            Whether to deliver the frame. Samples before HELLO and answers to no pending TIME
-            request are not delivered.
+            Whether to deliver the frame. Samples that come before HELLO, and TIME frames
+            that answer no pending request, are not delivered.
 
         Raises:
             LinkError: HELLO shows another hub than the skin file asks for, or sending its settings
@@ -230,7 +237,10 @@ class Session:
     def set_state(self, state: LinkState, error: LinkError | None = None) -> None:
         """Set the state of the link and its reason; call `on_state` if one of them has changed.
 
-        Two errors of the same kind count as the same reason.
+        Args:
+            state: The new state.
+            error: Reason of the state; None if there is none. Two errors of the same kind count as
+                the same reason.
         """
         link = self.link
         before = link.state, link.error and link.error.kind

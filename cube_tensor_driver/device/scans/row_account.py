@@ -14,7 +14,7 @@ from .scan import ScanBuilder
 
 @dataclass(frozen=True)
 class RowCounts:
-    """Numbers of received rows by what happened to them.
+    """Numbers of received rows (samples of cubes) by what happened to them.
 
     Attributes:
         delivered: Rows passed to the callback, which returned without an error.
@@ -37,7 +37,7 @@ class RowCounts:
 
 
 class RowAccount:
-    """Counts the rows of all links. It is used in the reader's thread only.
+    """Counts the rows (samples of cubes) of all links. Only the reader's thread uses it.
 
     Args:
         scans: Builder of the scans, which counts the rows that wait or were left out.

@@ -56,7 +56,7 @@ class SequenceCounters:
         missing: Samples that have not come, according to the gaps in the numbers.
         duplicate: Samples that had come before.
         out_of_order: Samples that came after one with a larger number.
-        resets: Restarts of the hub, plus steps back of its clock.
+        resets: Number of restarts of the hub plus number of times its clock was set back.
     """
 
     delivered: int = 0
