@@ -29,7 +29,7 @@ To find the stress that belongs to given frequencies, stress is read up to this 
 """
 
 HEALTH_BITS = np.uint16(sum(WORDS))
-"""Status bits of a row of stress that state conditions of the cube's pads (open, short, noisy, …).
+"""Status bits in a row of stress that state conditions of the cube's pads (open, short, noisy, …).
 
 Only these are taken from the recorded stress; the other status bits are computed again.
 """

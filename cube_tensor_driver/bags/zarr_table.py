@@ -24,7 +24,8 @@ _UNITS = {
 """Unit of each column that has one, stored as an attribute of the column's array."""
 
 _COMPONENTS = {"stress": STRESS, "gradient": GRADIENT}
-"""Names of the components of each column with several numbers per row."""
+"""Names of the components of each column with several numbers per row, such as xx, yy, … of
+stress."""
 
 _COLUMNS: dict[str, Any] = {
     "stamp_ns": np.int64,
@@ -37,7 +38,8 @@ _COLUMNS: dict[str, Any] = {
     "observed": np.uint16,
     "left_out": np.uint32,
 }
-"""Type of each column; the columns are the attributes of `StressRows` with these names."""
+"""Type of each column of a table of stress, by its name; the columns contain the attributes of
+`StressRows` with these names."""
 
 
 class ZarrWriter:

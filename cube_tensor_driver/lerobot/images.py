@@ -32,7 +32,8 @@ PILLOW_MODES = {
 value of `encoding` in a sensor_msgs/Image that can be exported."""
 
 MODE_OF_BANDS = {1: "L", 3: "RGB", 4: "RGBA"}
-"""Mode of an image in Pillow, for each number of bands (colour channels)."""
+"""Mode (pixel format) of an image in the library Pillow for each number of bands (colour channels):
+grey, colour, and colour with opacity."""
 
 Shape = tuple[int, int, int]
 """Height and width of an image in pixels, and its number of bands (colour channels)."""

@@ -25,14 +25,14 @@ WINDOW_COLUMNS: dict[str, Any] = {
 """Columns of `StressRows` that a data set contains beside stress and gradient, with their types."""
 
 MAX_BLOCK_BYTES = 32 << 20
-"""Largest size, in bytes, of the stress of those frames that are arranged and written together.
+"""Largest size, in bytes, of the stress of those frames (time steps) that are written together.
 
 At least one frame is written, even if it is larger.
 """
 
 MAX_BLOCK_FRAMES = 128
-"""Largest number of frames that are written together. The images of all these frames are in memory
-at the same time."""
+"""Largest number of frames (time steps of the data set) that are written together. The images of
+all these frames are in memory at the same time."""
 
 
 class Windows:

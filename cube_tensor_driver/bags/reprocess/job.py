@@ -77,7 +77,8 @@ class Overrides:
 
 
 AS_RECORDED = Overrides()
-"""Overrides that replace nothing, so that the recorded calibrations and tare are used."""
+"""Overrides that replace nothing, so that the recorded calibrations and tare (frequencies without
+load) are used."""
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ MIN_STILL_READS = 3
 standing still. It is more than one, because two reads may give two frames of one sample."""
 MAX_STEPS = 3
 """Number of steps of a hub's clock within `STEPS_NS` at which its device times are no longer used;
-rows then have their arrival times as stamps."""
+rows (samples of cubes) then have their arrival times as stamps."""
 STEPS_NS = 10_000_000_000
 """Length, in ns, of the time window in which the steps of a hub's clock are counted. Older steps do
 not count, so that the clock is used again."""

@@ -23,7 +23,8 @@ PERIOD_TOLERANCE = 1e-3
 """Largest assumed relative error of the estimated sample period. After lost samples, the threshold
 `MIN_STEP_US` is increased by this fraction of the time between the received samples."""
 PERIOD_SAMPLES = 64
-"""Time constant, in samples, of the low-pass filter that estimates the sample period of a hub."""
+"""Time constant, in samples, of the low-pass filter that estimates the sample period of a hub from
+the device times (hub's clock) of its samples."""
 DECISION_NS = 200_000_000
 """Time, in ns, after which the smallest delay of samples since a suspected step of the hub's clock
 decides whether the clock was set or the hub sampled late. Earlier it is decided only if the delay
@@ -47,7 +48,7 @@ MAX_READ_NS = 100_000
 longer time their difference is not used, because the thread was interrupted between them."""
 MAX_READS = 3
 """Number of attempts to read the host's clock and the monotonic clock within `MAX_READ_NS`. If all
-of them fail, no step is reported."""
+fail, no step of the host's clock is reported; the next comparison finds it."""
 _WRAP = 1 << 32
 _NO_NUMBER = -2  # not -1, because sample number 0 would then seem to follow it
 

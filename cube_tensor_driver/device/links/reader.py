@@ -39,12 +39,14 @@ MIN_SELECT_S = 5e-5
 """Shortest wait for data, in s, after which the reader also waits for the other hubs. If the wait
 was shorter, data had arrived before it, so the thread is behind and must not wait longer."""
 DRAIN_S = 0.05
-"""Longest time, in s, that closing waits until the STOP requests have left the serial ports."""
+"""Longest time, in s, that closing the links waits until the STOP requests (send no more samples)
+have left the serial ports."""
 LOGGED_ERRORS = (1, 10, 100, 1000, 10_000)
 """The 1st, 10th, 100th … exception of a callback is logged. At a sample rate of 1 kHz, logging all
 of them would fill the log."""
 CLOSE_S = 1.5
-"""Longest time, in s, for which closing waits for the end of the reader's thread."""
+"""Longest time, in s, for which `Reader.close` waits for the end of the reader's thread. If the
+thread still runs then, an error is logged."""
 
 
 class LinkRead(NamedTuple):

@@ -18,8 +18,8 @@ from ...config.port import port_problem, tcp_address
 from ...core.errors import LinkError
 
 CONNECT_TIMEOUT_S = 2.0
-"""Longest time, in s, to wait for a connection to each address of the host. A host that is switched
-off does not even refuse the connection."""
+"""Longest time, in s, to wait for a TCP connection to each address of the host. The limit is needed
+because a host that is switched off does not answer at all, not even to refuse the connection."""
 
 
 def parse_url(url: str) -> tuple[str, int]:

@@ -19,7 +19,7 @@ MAX_NAMES = 8
 """Largest number of cubes that one log message lists by name. If there are more, the message ends
 with their number ("and 3 more")."""
 ABSENT = -1
-"""Value used instead of the index in the skin for a hub's cube that is not in the skin file."""
+"""Value that stands for the index in the skin if a hub's cube is not in the skin file."""
 _OTHER_LINK_HAS_IT = "left out here: another link has a cube of the same uid"
 
 

@@ -24,7 +24,7 @@ MAX_SCANS_AHEAD = 4
 """Number of scans (one sample of each link) by which one link may be ahead of the slowest one. If
 it is ahead by more, all scans are built without the missing samples."""
 MAX_SPAN_NS = 2_000_000_000
-"""Longest time, in ns, between the earliest and the latest row that one call of
+"""Longest time, in ns, between the earliest and the latest row (sample of a cube) that one call of
 `ScanBuilder.build` returns. These rows become one message, whose 32-bit offsets in ns reach up to
 2.1 s after its time stamp."""
 CACHED_SHAPES = 4

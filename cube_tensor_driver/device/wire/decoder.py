@@ -187,11 +187,11 @@ class NativeDecoder:
 
 
 def unpack_all(raws: list[bytes]) -> list[Frame]:
-    """Return the frames of decoded bytes.
+    """Return the frames of bytes that are no longer COBS-encoded.
 
     Args:
-        raws: The bytes of each frame, from the type to the CRC, as the decoder in C returns them
-            after its checks.
+        raws: The bytes of each frame, from the type to the CRC (checksum), as the decoder in C
+            returns them after its checks.
     """
     frames: list[Frame] = []
     for raw in raws:

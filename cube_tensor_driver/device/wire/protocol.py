@@ -40,7 +40,7 @@ NOT_MEASURED = 0
 HEADER = struct.Struct("<BBH")
 """Header of a frame: type, protocol version, and length of the payload in bytes."""
 OVERHEAD = HEADER.size + 4
-"""Number of bytes of a frame besides its payload: header and CRC."""
+"""Number of bytes of a frame besides its payload: header and CRC-32 (checksum, 4 bytes)."""
 _HELLO = struct.Struct("<QIHBBI")
 _SAMPLE = struct.Struct("<IHHQB3x")
 _FREQUENCY = HEADER.size + _SAMPLE.size
