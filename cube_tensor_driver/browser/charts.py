@@ -160,7 +160,9 @@ class Charts:
     def offer_observed(self, history: History) -> None:
         """Limit the lists of both charts to groups of values that at least one cube observes.
 
-        A cube observes a component if it has been finite in `history`.
+        Args:
+            history: Values of all cubes in the last seconds. A cube observes a component of stress
+                or gradient if the component is finite in it.
         """
         observed = dict(zip(History.COLUMNS, history.observed, strict=True))
         # Until the first tensors arrive, it is unknown which components the cubes observe, and all
@@ -234,10 +236,12 @@ class Chart:
             self._choice.options = groups
 
     def choose(self, lines: list[ChartLine]) -> None:
-        """Show these lines from now on.
+        """Set the lines that the chart shows from now on.
 
-        If they differ from the present ones, the plot is replaced, because uPlot (the plotting
-        library of the page) cannot add a line to a plot. Without any line nothing changes.
+        Args:
+            lines: The lines, each for one value of one cube; if there are none, nothing changes. If
+                they differ from the present lines, the plot is replaced, because uPlot (the
+                plotting library of the page) cannot add a line to a plot.
         """
         if lines == self._lines or not lines:
             return
@@ -306,6 +310,9 @@ class Chart:
     def panel(self, history: History) -> tuple[str, Array, dict[str, Array]]:
         """Return what `draw_lines` needs to draw this chart into a picture.
 
+        Args:
+            history: Values of all cubes in the M pictures of the last seconds.
+
         Returns:
             Label of the value axis; times (M,) in s before now; name of a line -> values (M,), in
             the unit of the label.
@@ -320,7 +327,14 @@ class Chart:
         return f"{self.group} / {markup.unit(GROUPS[self.group][0])[1]}"
 
     def _values(self, history: History) -> list[Array]:
-        """Return the values (M,) of each line, in the unit of the value axis."""
+        """Return the values of each line of the chart.
+
+        Args:
+            history: Values of all cubes in the M pictures of the last seconds.
+
+        Returns:
+            For each line the values (M,), in the unit of the value axis.
+        """
         size = markup.unit(GROUPS[self.group][0])[0]
         return [history.of(line.cube, line.column) / size for line in self._lines]
 

@@ -74,7 +74,10 @@ class ServiceCalls:
         self._open.append(_Call(what, client.call_async(request), time.monotonic()))
 
     def update(self) -> None:
-        """Show a note for each call that was answered, or that is older than `MAX_ANSWER_S`."""
+        """Show a note for each call of a service that was answered or has timed out.
+
+        A call times out after `MAX_ANSWER_S`. Later updates do not mention these calls again.
+        """
         still_open = []
         for call in self._open:
             if call.future.done():
@@ -180,7 +183,11 @@ class ReplayClient:
         return True
 
     def _finish_jump(self, now_s: float) -> None:
-        """Forget the jump that was sent, if it was answered or is older than `MAX_ANSWER_S`."""
+        """Forget the jump that was sent, if it was answered or is older than `MAX_ANSWER_S`.
+
+        Args:
+            now_s: Present time on the monotonic clock, in s.
+        """
         if self._jump is None:
             return
         if self._jump.done():
@@ -192,7 +199,7 @@ class ReplayClient:
             self._say("The jump had no answer", text, "red")
 
     def forget_if_silent(self) -> None:
-        """Set `state` to None if the replay has sent no state for `STALE_S`."""
+        """Set `state` to None if the replay has sent no state for `STALE_S` (1 s)."""
         if time.monotonic() - self._received_s > STALE_S:
             self.state = None
 
@@ -214,7 +221,10 @@ class ContactsClient:
     def found(self, surface: Surface) -> Found:
         """Return the latest contacts, and pressure and shear interpolated to points of a surface.
 
-        What is older than `MAX_CONTACTS_AGE_S`, or has never arrived, is None.
+        Contacts or a field that arrived more than `MAX_CONTACTS_AGE_S` ago, or never, are None.
+
+        Args:
+            surface: Points to which pressure and shear are interpolated.
         """
         oldest_s = time.monotonic() - MAX_CONTACTS_AGE_S
         contacts = self._contacts if self._contacts_s > oldest_s else None
@@ -256,7 +266,12 @@ class _Interpolation:
         self._weight = weight / weight.sum(axis=1, keepdims=True)
 
     def fits(self, surface: Surface, points: Array) -> bool:
-        """Return whether the weights were computed for this surface and these points (M, 3)."""
+        """Return whether the weights were computed for this surface and these points.
+
+        Args:
+            surface: Surface to whose points values are interpolated.
+            points: (M, 3) points of the topic `traction`, in m, in the parent frame of the skin.
+        """
         return surface is self._surface and np.array_equal(points, self._points)
 
     def values(self, values: Array) -> Array:

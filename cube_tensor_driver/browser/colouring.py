@@ -63,6 +63,9 @@ class Colouring(NamedTuple):
 
         For pressure and its standard deviation, the pressure at the surface above the cube is
         added if it is known.
+
+        Args:
+            cube: Index of the cube in the skin.
         """
         value = markup.value(self.quantity, self.cubes[cube])
         if self.above is None or self.quantity not in (QUANTITIES["pressure"], DEVIATION):

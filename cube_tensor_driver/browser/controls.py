@@ -121,7 +121,12 @@ class ColourControls:
 
 
 def add_part_controls(gui: viser.GuiApi, shown: Shown) -> None:
-    """Add a check box for each field of `shown`; clicking it sets that field."""
+    """Add a check box for each part of the 3-D view, which shows or hides this part.
+
+    Args:
+        gui: The controls of one browser.
+        shown: Which parts are drawn; a click on a check box sets the field of its part.
+    """
     for field in fields(Shown):
         _add_check_box(gui, shown, field.name)
 
@@ -171,7 +176,11 @@ class ReplayControls:
             self._drawn = position
 
     def show(self, replay: ReplayPosition | None) -> None:
-        """Show position, length and state of a replay, or hide the controls if it is None."""
+        """Show position, length and state of a replay.
+
+        Args:
+            replay: State of the replay; None: there is no replay, and the controls are hidden.
+        """
         self.is_held = replay is not None and replay.paused
         self._folder.visible = replay is not None
         if replay is None:

@@ -150,6 +150,10 @@ def _contains(texts: list[str], wanted: str) -> bool:
 
     The comparison always takes the same time, so an attacker cannot learn from its duration how
     many characters of a guessed token are right.
+
+    Args:
+        texts: Tokens or cookies that a browser has sent.
+        wanted: The right token or cookie.
     """
     return any(
         hmac.compare_digest(text.encode(errors="replace"), wanted.encode()) for text in texts

@@ -9,13 +9,22 @@ from ..core.modes import COMPONENTS
 
 
 class History:
-    """The values of all cubes in the last pictures of the page, in a ring buffer."""
+    """The values (stress, gradients and residual) of all cubes in the last pictures of the page.
+
+    They are stored in a ring buffer: a new picture overwrites the oldest one.
+    """
 
     COLUMNS = (*COMPONENTS, "residual")
-    """Names of the 16 values that are stored per cube: 15 components, then the residual."""
+    """Names of the 16 values that are stored per cube: 6 components of the stress, 9 gradients of
+    stress, then the residual (misfit between pads and tensor, relative to the noise)."""
 
     def __init__(self, cubes: int, length: int) -> None:
-        """Make an empty buffer for a number of cubes that keeps the last `length` pictures."""
+        """Make an empty buffer.
+
+        Args:
+            cubes: Number of cubes.
+            length: Maximum number of pictures (instants) that are kept.
+        """
         self._values = np.full((length, cubes, len(self.COLUMNS)), np.nan, np.float32)
         self._times = np.full(length, np.nan)
         self._count = 0

@@ -106,7 +106,11 @@ def box(content: str) -> str:
 
 
 def label(name: str) -> str:
-    """Return the symbol of a component, or "residual" unchanged: σzz for zz, ∂σzz/∂x for zz_x."""
+    """Return the symbol of a component: σzz for the stress zz, ∂σzz/∂x for the gradient zz_x.
+
+    Args:
+        name: Name of a component; the name "residual" is returned unchanged.
+    """
     if name == "residual":
         return name
     return f"∂σ{name[:2]}/∂{name[3]}" if "_" in name else f"σ{name}"
@@ -124,14 +128,24 @@ def unit(name: str) -> tuple[float, str]:
 
 
 def value(quantity: scene.Quantity, si_value: float) -> str:
-    """Return text with the label of a quantity, a value and its unit; the value is in SI units."""
+    """Return text with the label of a quantity, its value and its unit; "unknown" for NaN.
+
+    Args:
+        quantity: The quantity, which has a label and a unit for users.
+        si_value: Its value in SI units, which is converted to the unit for users.
+    """
     if np.isnan(si_value):
         return "unknown"
     return f"{quantity.label} {_hundredths(si_value / quantity.size)} {quantity.unit}"
 
 
 def surface_pressure(pressure: float, sigma: float) -> str:
-    """Return text in kPa for a pressure on the surface and its standard deviation, both in Pa."""
+    """Return text in kPa for a pressure on the surface of the skin.
+
+    Args:
+        pressure: The pressure, in Pa; NaN if it is unknown.
+        sigma: Its standard deviation, in Pa.
+    """
     if np.isnan(pressure):
         return "on the surface unknown"
     deviation = "unknown" if np.isnan(sigma) else f"{sigma / 1e3:.2f}"
@@ -163,8 +177,9 @@ def headline(
     """Return the first line of the page as HTML: state, live cubes, rate, force.
 
     Args:
-        health: (N,) health of the cubes, as in core/latest_stress.py.
-        hertz: Rows per second of the fastest cube.
+        health: (N,) health of the cubes (fine, doubtful, faulty or stale), coded as in
+            core/latest_stress.py.
+        hertz: Number of rows (measurements) per second of the fastest cube.
         contact: The contact with the largest force; None without a load.
         paused: Whether the page or the replay is stopped.
         recording: Whether a bag is being recorded.
@@ -265,7 +280,7 @@ def numbers(moment: Moment, cube: int, hertz: float) -> str:
     Args:
         moment: Values of all cubes.
         cube: Index of the cube.
-        hertz: Rows per second of the cube.
+        hertz: Number of rows (measurements) per second of the cube.
     """
     rows = []
     for name, si_value in zip(COMPONENTS, moment.values[cube], strict=True):
@@ -293,7 +308,8 @@ def conditions(names: list[str], health: AnyArray, links: list[str]) -> str:
 
     Args:
         names: Names of the N cubes.
-        health: (N,) health of the cubes, as in core/latest_stress.py.
+        health: (N,) health of the cubes (fine, doubtful, faulty or stale), coded as in
+            core/latest_stress.py.
         links: One line of text per link (connection to a hub).
     """
     counts = ", ".join(

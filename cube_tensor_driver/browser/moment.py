@@ -59,9 +59,11 @@ class Moment(NamedTuple):
     """The latest values of the N cubes at one instant, with the field and the contacts.
 
     Attributes:
-        values: (N, 15) stress in Pa and gradients in Pa/m; NaN where a cube has no usable tensor.
+        values: (N, 15) 6 stress components in Pa and 9 gradients in Pa/m, in the frames of the
+            cubes; NaN where a cube has no usable tensor.
         residual: (N,) misfit between pads and tensor relative to the noise; 1 for noise alone.
-        health: (N,) health of the cubes, as in core/latest_stress.py.
+        health: (N,) health of the cubes (fine, doubtful, faulty or stale), coded as in
+            core/latest_stress.py.
         status: (N,) status bits, as in core/status.py.
         field: Pressure and shear at the points of the surface.
         contacts: The contacts, strongest first.

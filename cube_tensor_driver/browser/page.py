@@ -26,7 +26,8 @@ from .scene_3d import SPAN, Scene3D
 from .top_view import TopView
 
 MAX_SURFACE_POINTS = 5000
-"""Approximate maximum of the number of points of the surface at which the field is drawn."""
+"""Approximate maximum of the number of points of the skin's surface at which the field (pressure
+and shear between the cubes) is drawn."""
 
 MAX_POINTS_PER_SIDE = 12
 """Maximum number of points of the surface along one side of the square patch around a cube."""
@@ -104,7 +105,7 @@ class ShownSkin:
         name: Name of the skin.
         names: Names of its cubes.
         poses: Poses of its cubes in the parent frame, in m.
-        surface: Points at which the field of pressure and shear is drawn.
+        surface: Grid of points around the cubes at which the field (pressure and shear) is drawn.
         top_view: Drawing of the skin from above.
         history: Values of all cubes in the last seconds.
     """
@@ -164,7 +165,11 @@ class Page:
         self._client.gui.reset()
 
     def show_replay(self, replay: ReplayPosition | None) -> None:
-        """Show position and state of a replay, or hide its controls if there is none (None)."""
+        """Show position and state of a replay.
+
+        Args:
+            replay: State of the replay; None: there is no replay, and its controls are hidden.
+        """
         self._replay.show(replay)
 
     def show(
@@ -178,7 +183,7 @@ class Page:
 
         Args:
             moment: Values, field and contacts at the instant.
-            rate: (N,) rows per second of each cube.
+            rate: (N,) number of rows (measurements) per second of each cube.
             status: Links, recording, and result of the user's last action.
             with_numbers: Whether to update numbers and plots as well as the 3-D view.
         """
@@ -240,6 +245,11 @@ class Page:
         """Update the plots in one call and the numbers in the next.
 
         Each of the two takes a browser as much time as a picture of the 3-D view.
+
+        Args:
+            moment: Values, field and contacts at the instant.
+            rate: (N,) number of rows (measurements) per second of each cube.
+            status: Links, recording, and result of the user's last action.
         """
         self._written += 1
         if self._written % 2:
@@ -269,7 +279,12 @@ class Page:
         self._above.content = self._skin.top_view.draw(self._colouring, moment.contacts, cube)
 
     def _make_controls(self, gui: viser.GuiApi, buttons: Buttons) -> None:
-        """Add the controls to the main panel, from top to bottom."""
+        """Add the controls to the main panel, from top to bottom.
+
+        Args:
+            gui: The controls of one browser.
+            buttons: Functions that the buttons call.
+        """
         # A style sheet applies to the whole page, wherever it is inserted.
         gui.add_html(markup.PHONE_STYLE)
         self._headline = gui.add_html("")

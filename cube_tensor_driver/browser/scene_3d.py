@@ -154,7 +154,8 @@ class Scene3D:
             api: The scene of one browser.
             names: Names of the cubes.
             poses: Poses of the cubes in the parent frame, in metres.
-            surface: Points at which the field of pressure and shear is drawn.
+            surface: Grid of points around the cubes at which the field (pressure and shear) is
+                drawn.
             pick: Function that is called with the index of a cube when the user clicks it.
         """
         placement = Placement.of(poses)
@@ -200,11 +201,13 @@ class Scene3D:
         self._label.show(moment.strongest_contact)
 
     def bar_stress(self) -> float:
-        """Return the traction, in Pa, whose arrow is as long as the scale bar."""
+        """Return the traction (force per area on the upper face of a cube), in Pa, whose arrow is
+        as long as the scale bar."""
         return self.bar * self._unit * self._traction.value_per_length
 
     def bar_gradient(self) -> float:
-        """Return the gradient, in Pa/m, whose arrow is as long as the scale bar."""
+        """Return the gradient of pressure along the skin, in Pa/m, whose arrow is as long as the
+        scale bar."""
         return self.bar * self._unit * self._gradient.value_per_length
 
 
@@ -256,7 +259,8 @@ class ScaleBar:
 
 
 def round_down(length: float) -> float:
-    """Return the largest number of the form 1, 2 or 5 times a power of ten up to `length`."""
+    """Return the largest number of the form 1, 2 or 5 times a power of ten that is at most
+    `length`, which must be positive."""
     power = 10.0 ** np.floor(np.log10(length))
     # Without the tolerance, rounding could reduce a length of exactly 1, 2 or 5.
     limit = length * (1 + 1e-9)
@@ -436,7 +440,8 @@ class Arrows:
         """Update the automatic range of the lengths, and draw the arrows if they are shown.
 
         Args:
-            values: (N, 15) stress in Pa and gradients in Pa/m.
+            values: (N, 15) 6 stress components in Pa and 9 gradients in Pa/m, in the frames of the
+                cubes.
             residual: (N,) misfit between pads and tensor relative to the noise.
             visible: Whether the arrows are shown.
         """
@@ -474,7 +479,8 @@ class PrincipalCrosses:
         """Draw or hide the crosses.
 
         Args:
-            values: (N, 15) stress in Pa and gradients in Pa/m.
+            values: (N, 15) 6 stress components in Pa and 9 gradients in Pa/m, in the frames of the
+                cubes.
             longest: Stress, in Pa, whose line is as long as the pitch (distance of neighbouring
                 cubes).
             visible: Whether the crosses are shown.
@@ -504,7 +510,8 @@ class FaultCrosses:
         """Draw the crosses again if the health of any cube has changed.
 
         Args:
-            health: (N,) health of the cubes, as in core/latest_stress.py.
+            health: (N,) health of the cubes (fine, doubtful, faulty or stale), coded as in
+                core/latest_stress.py.
         """
         # The comparison saves work and data: health seldom changes, and each change of a mesh sends
         # the whole mesh to the browser.
@@ -560,7 +567,11 @@ class ContactLabel:
         )
 
     def show(self, contact: Contact | None) -> None:
-        """Write the forces of a contact at its position, or hide the label if it is None."""
+        """Write normal and shear force of a contact above its position.
+
+        Args:
+            contact: The contact; None: there is none, and the label is hidden.
+        """
         if contact is not None:
             # The distance keeps the label clear of the cubes and of short arrows.
             above = 1.1 * self._placement.arrow * contact.normal

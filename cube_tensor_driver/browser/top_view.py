@@ -132,7 +132,11 @@ class TopView:
         return f"{head} {font}>{''.join(parts)}</svg>"
 
     def _drawn(self, point: Array) -> tuple[float, float]:
-        """Return x and y in the drawing of a point of the parent frame (2,) or (3,), in metres."""
+        """Return the position of a point in the drawing: x and y in user units of the SVG element.
+
+        Args:
+            point: (2,) or (3,) coordinates in the parent frame of the skin, in metres.
+        """
         x = MARGIN + (point[0] - self._raster.low[0]) * self._scale
         # The y axis of an SVG drawing points down, that of the parent frame up.
         y = (self._raster.high[1] - point[1]) * self._scale
@@ -168,7 +172,11 @@ class TopView:
     def _cubes(self, colouring: Colouring, chosen: int) -> list[str]:
         """Return SVG polygons of the cubes in their colours, with tool tips.
 
-        Up to `MAX_NAMED_CUBES` cubes have their names written below them.
+        In a skin of up to `MAX_NAMED_CUBES` cubes, the name of each cube stands below it.
+
+        Args:
+            colouring: The values that are drawn as colours.
+            chosen: Index of the chosen cube, which gets a thick outline.
         """
         colours = scene.colours(colouring.quantity, colouring.cubes, colouring.top)
         rgb = (255 * colours).astype(int)
@@ -189,7 +197,10 @@ class TopView:
         return parts
 
     def _contact(self, contact: Contact) -> str:
-        """Return SVG of a contact: a circle of its area around its position, and its forces."""
+        """Return SVG of a contact: a circle around its position, and its forces as text.
+
+        The circle has the area of the contact.
+        """
         x, y = self._drawn(contact.position)
         radius = max(3.0, np.sqrt(contact.area / np.pi) * self._scale)
         circle = f"<circle cx='{x:.1f}' cy='{y:.1f}' r='{radius:.1f}'"
@@ -214,7 +225,10 @@ def _text(
 
 
 def _ticks(low: float, high: float, step: float) -> list[float]:
-    """Return all multiples of `step` from `low` to `high`, rounded to six significant digits."""
+    """Return the numbers on an axis: all multiples of `step` from `low` to `high`.
+
+    They are rounded to six significant digits.
+    """
     first, last = np.ceil(low / step), np.floor(high / step)
     numbers = np.arange(first, last + 1)
     return [float(f"{number * step:.6g}") for number in numbers]

@@ -75,7 +75,14 @@ class Viewer:
         depth: float,
         recordings: Path,
     ) -> None:
-        """Start the server and the node; the arguments are those of `run_view`."""
+        """Start the web server and the ROS node.
+
+        Args:
+            host: Name or IP address on which the server listens.
+            port: TCP port of the page; if it is in use, the next free one is taken.
+            depth: Distance from the centres of the cubes to the surface of the skin, in metres.
+            recordings: Folder for the bags that are recorded from the page.
+        """
         self._host = host
         # An address that only this machine can reach needs no token: whoever can open it is a user
         # of this machine.
@@ -156,7 +163,11 @@ class Viewer:
             self._server.stop()
 
     def _show_skin(self, skin: FollowedSkin) -> None:
-        """Open new pages in all browsers for a skin that has appeared or has replaced another."""
+        """Open new pages in all browsers for a skin that has appeared or has replaced another.
+
+        Args:
+            skin: The state of the new skin, as received on its topics.
+        """
         names = [cube.name for cube in skin.info.cubes]
         history = History(len(names), round(HISTORY_S / PICTURE_PERIOD_S))
         self._shown = ShownSkin(skin.info.name, names, skin.poses, self._depth, history)
@@ -169,7 +180,11 @@ class Viewer:
             self._open_page(client)
 
     def _open_page(self, client: viser.ClientHandle) -> None:
-        """Open a page in a browser, unless it has one or is no longer connected."""
+        """Open a page in a browser, unless it has one already or is no longer connected.
+
+        Args:
+            client: The browser.
+        """
         # The event waited in the queue, and the browser may have disconnected in that time.
         if client.client_id in self._pages or client.client_id not in self._server.get_clients():
             return
