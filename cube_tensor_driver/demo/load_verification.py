@@ -87,10 +87,10 @@ class ForceHistory:
 
 
 class LoadVerification:
-    """Collects the rows that arrive, and compares those of a period with samples and load.
+    """Collects the rows (one cube at one sampling time) of messages, and compares them with what
+    was simulated: the samples that the hubs took in a period, and the load on the skin.
 
-    Call `compare` when the simulator has ended, then `result` or `forces`. The rows are those of
-    messages: one cube at one sampling time.
+    Call `compare` when the simulator has ended, then `result` or `forces`.
     """
 
     def __init__(self, skin: Skin, load: AnyLoad) -> None:
@@ -98,7 +98,8 @@ class LoadVerification:
 
         Args:
             skin: The simulated skin.
-            load: The load on the skin, as the simulator computes it.
+            load: The load on the skin over time, from which stress, force and contacts at any
+                simulated time can be computed, as the simulator does.
         """
         self._skin, self._load = skin, load
         self._frequencies, self._stress = Arrivals(skin), Arrivals(skin)
@@ -108,7 +109,7 @@ class LoadVerification:
         self._span_ns = (0, 0)
 
     def add_frequencies(self, rows: FrequencyRows) -> None:
-        """Add the rows of one message of the topic `frequencies`."""
+        """Add the rows of one message of `frequencies`. A row is one cube at one sampling time."""
         self._frequencies.add(rows)
 
     def add_stress(self, rows: StressRows, received_ns: int) -> None:
@@ -223,7 +224,7 @@ class LoadVerification:
         """Return the K compared rows of stress that arrived.
 
         Args:
-            comparison: Result of comparing the rows of stress with the samples.
+            comparison: The samples that the hubs took, and which rows of stress of them arrived.
 
         Returns:
             Index of the cube (K,); components (K, 15) in Pa and Pa/m; sampling time (K,), in ns
@@ -239,7 +240,7 @@ class LoadVerification:
         """Compute the errors of the tensors that arrived.
 
         Args:
-            comparison: Result of comparing the rows of stress with the samples.
+            comparison: The samples that the hubs took, and which rows of stress of them arrived.
 
         Returns:
             Rms and largest error relative to the range of each component under the load, and rms
@@ -289,6 +290,10 @@ def rms(values: AnyArray) -> float:
 def component_noise(skin: Skin) -> Array:
     """Compute the standard deviation that the noise of the pads causes in each component.
 
+    Args:
+        skin: The skin, whose calibrations state the noise of each pad (standard deviation of its
+            stress, in Pa).
+
     Returns:
         Standard deviations (cubes, 15) in Pa and Pa/m; NaN where a component is not observed.
     """
@@ -320,8 +325,12 @@ def thin_out(times_ns: Index) -> Index:
 def total_force(contacts: list[Contact]) -> tuple[Array, Array]:
     """Return the sum of the forces of all contacts and their common centre of pressure.
 
+    Args:
+        contacts: Contacts with forces and positions in the parent frame of the skin.
+
     Returns:
-        Force (3,) in N; centre of pressure (3,) in metres, NaN if there is no contact.
+        Force (3,) in N; centre of pressure (3,) in metres, NaN if there is no contact. Both are in
+        the parent frame of the skin.
     """
     if not contacts:
         return np.zeros(3), np.full(3, np.nan)

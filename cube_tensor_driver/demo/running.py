@@ -39,7 +39,15 @@ class Observer:
         interrupted: threading.Event | None,
         on_step: Callable[[], None],
     ) -> None:
-        """Store the node, its executor, and the arguments of `observing`."""
+        """Store the node and what `spin` uses.
+
+        Args:
+            node: The ROS node.
+            executor: The executor that contains the node.
+            children: The processes that are observed.
+            interrupted: Event that lets `spin` raise Interrupted; None: no such event.
+            on_step: Function that `spin` calls repeatedly while it receives messages.
+        """
         self.node, self._executor = node, executor
         self._children, self._interrupted, self._on_step = children, interrupted, on_step
         self._checked_s = 0.0
@@ -125,7 +133,12 @@ def end_simulator(children: Children, log: Path) -> SampleLog:
 
 
 def report(result: dict[str, Any], json_path: Path | None) -> None:
-    """Print results as JSON, and write them to a file as well if `json_path` is not None."""
+    """Print results as JSON, and write them to a file as well if there is a path.
+
+    Args:
+        result: Names and values of the results.
+        json_path: Path of the file; None: no file is written.
+    """
     print(json.dumps(result, indent=2))
     if json_path is not None:
         write_json(json_path, result)

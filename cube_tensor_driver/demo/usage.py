@@ -31,7 +31,8 @@ class Usage:
         self._start_cpu_s = self._cpu_seconds()
 
     def cpu_percent(self) -> dict[str, float]:
-        """Return the processor time of each process per elapsed time, in percent of one core."""
+        """Return the processor time of each process since this object was made, divided by the
+        elapsed time, in percent of one core."""
         elapsed_s = time.monotonic() - self._start_s
         return {
             name: 100 * (cpu_s - self._start_cpu_s[name]) / elapsed_s

@@ -126,7 +126,8 @@ def compare(
     start_ns: int,
     end_ns: int,
 ) -> Comparison:
-    """Compare the rows that arrived with the samples that the hubs took in a period.
+    """Compare the rows (one cube at one sampling time) that arrived with the samples that the
+    simulated hubs took in a period.
 
     Args:
         taken: All samples in the log of the simulator.

@@ -37,7 +37,7 @@ ORANGE = (0.95, 0.55, 0.0)
 WHITE = (0.95, 0.95, 0.95)
 
 MARK = np.array([GREY, ORANGE, RED, WHITE])
-"""Colours (4, 3) of the cross over a cube, indexed by the health of the cube.
+"""Colours (4, 3) of the cross over a cube, indexed by its health (fine, doubtful, faulty, stale).
 
 The entry for `FINE` is not used, because a cube that is fine has no cross.
 """
@@ -70,7 +70,7 @@ class Quantity:
             noise alone gets no strong colour.
         signed: Whether the range is symmetrical around zero; otherwise it begins at zero.
         of: Function that computes the quantity (N,), in SI units, of N cubes from their values
-            (N, 15) and residuals (N,).
+            (N, 15), 6 stress components in Pa and 9 gradients in Pa/m, and residuals (N,).
     """
 
     label: str
@@ -87,10 +87,13 @@ def _component(name: str) -> Callable[[Array, Array], Array]:
 
 
 def _length(*names: str) -> Callable[[Array, Array], Array]:
-    """Return a function that computes the magnitude (N,) of the vector of some components.
+    """Return a function that computes the magnitude (N,) of a vector of components for N cubes.
+
+    The function takes values (N, 15) in the order of COMPONENTS, and residuals (N,), which it does
+    not use.
 
     Args:
-        names: Names of the components, as in COMPONENTS.
+        names: Names of the components of the vector, such as "yz" and "zx".
     """
     columns = [COMPONENTS.index(name) for name in names]
 
@@ -140,7 +143,9 @@ QUANTITIES = {
 
 
 def automatic(quantity: Quantity, values: Array, last_top: float = 0.0) -> float:
-    """Return the upper end of an automatic range, which follows a rise at once and a fall slowly.
+    """Return the upper end, in SI units, of an automatic range of colours or arrow lengths.
+
+    It follows a rise of the values at once, and a fall slowly (factor `RANGE_DECAY` per picture).
 
     Args:
         quantity: The quantity that is shown.
@@ -152,7 +157,7 @@ def automatic(quantity: Quantity, values: Array, last_top: float = 0.0) -> float
 
 
 def colours(quantity: Quantity, values: Array, top: float) -> Array:
-    """Return the colours (N, 3) of values.
+    """Return the colours (N, 3) of values: red, green and blue from 0 to 1.
 
     Args:
         quantity: The quantity that is shown.
@@ -183,8 +188,10 @@ def traction_arrows(poses: CubePoses, values: Array, length: float) -> Array:
     the face; otherwise it begins there. Components that are not observed count as 0.
 
     Args:
-        poses: Poses of the N cubes.
-        values: (N, 15) stress in Pa and gradients in Pa/m.
+        poses: Poses of the N cubes (position of the centre, rotation, half the side) in the parent
+            frame of the skin, in metres.
+        values: (N, 15) 6 stress components in Pa and 9 gradients in Pa/m, in the frames of the
+            cubes.
         length: Length of the arrows, in metres per Pa.
 
     Returns:
@@ -202,8 +209,10 @@ def gradient_arrows(poses: CubePoses, values: Array, length: float) -> Array:
     """Return one arrow per cube, on its upper face (+z), in the direction in which pressure grows.
 
     Args:
-        poses: Poses of the N cubes.
-        values: (N, 15) stress in Pa and gradients in Pa/m; unobserved components count as 0.
+        poses: Poses of the N cubes (position of the centre, rotation, half the side) in the parent
+            frame of the skin, in metres.
+        values: (N, 15) 6 stress components in Pa and 9 gradients in Pa/m, in the frames of the
+            cubes; unobserved components count as 0.
         length: Length of the arrows, in metres per Pa/m.
 
     Returns:
@@ -224,8 +233,10 @@ def principal_crosses(poses: CubePoses, values: Array, length: float) -> tuple[A
     the plane that it measures.
 
     Args:
-        poses: Poses of the N cubes.
-        values: (N, 15) stress in Pa and gradients in Pa/m.
+        poses: Poses of the N cubes (position of the centre, rotation, half the side) in the parent
+            frame of the skin, in metres.
+        values: (N, 15) 6 stress components in Pa and 9 gradients in Pa/m, in the frames of the
+            cubes.
         length: Length of the lines, in metres per Pa.
 
     Returns:
@@ -244,8 +255,10 @@ def fault_crosses(poses: CubePoses, health: AnyArray) -> Array:
     """Return two crossed lines over the upper face (+z) of each cube whose health is not `FINE`.
 
     Args:
-        poses: Poses of the N cubes.
-        health: (N,) health of the cubes, as in core/latest_stress.py.
+        poses: Poses of the N cubes (position of the centre, rotation, half the side) in the parent
+            frame of the skin, in metres.
+        health: (N,) health of the cubes (fine, doubtful, faulty or stale), coded as in
+            core/latest_stress.py.
 
     Returns:
         Both ends of both lines (N, 2, 2, 3), in metres; the lines of a fine cube have no length.

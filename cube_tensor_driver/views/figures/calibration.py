@@ -26,7 +26,11 @@ MAX_TWO_COLUMN_PADS = 12
 
 @print_style()
 def draw_layout(layout: Layout) -> Figure:
-    """Draw a cube with its pads: visible pads are filled, hidden ones are a dashed outline."""
+    """Draw a cube with its pads: visible pads are filled, hidden ones are a dashed outline.
+
+    Args:
+        layout: Names, centres and normals of the pads, which lie on the faces of the cube.
+    """
     figure = Figure(figsize=(5, 4.6))
     # Each part is given its drawing order (zorder), because matplotlib would sort the parts by the
     # distance of their centres, which hides the wrong ones.
@@ -51,7 +55,11 @@ def draw_layout(layout: Layout) -> Figure:
 
 
 def _draw_edges(axes: Any) -> None:
-    """Draw the edges of a cube; the three edges at the corner that is hidden are dotted."""
+    """Draw the edges of a cube; the three edges at the corner that is hidden are dotted.
+
+    Args:
+        axes: The 3-D axes of matplotlib, in units of half the side of the cube.
+    """
     # The hidden corner is the one opposite to the viewer.
     corners = np.array(list(product((-1.0, 1.0), repeat=3)))
     hidden = -np.sign(_VIEW)

@@ -46,7 +46,8 @@ class TimeSeries:
         seconds: (N,) time after the start of the bag, in seconds.
         frequency: (N, P) frequencies of the pads, in Hz.
         rest: (P,) frequencies of the pads without load, in Hz.
-        values: (N, 15) stress in Pa and gradient in Pa/m; NaN where it is not observed.
+        values: (N, 15) 6 stress components in Pa and 9 gradients in Pa/m, in the frames of the
+            cubes; NaN where it is not observed.
         residual: (N,) misfit between pads and tensor relative to the noise; 1 for noise alone.
         status: (N,) status bits, as in core/status.py.
     """
@@ -173,7 +174,10 @@ def draw_series(series: TimeSeries, title: str) -> Figure:
 
 
 def _with_breaks(series: TimeSeries) -> TimeSeries:
-    """Insert a sample of NaN into each gap, because matplotlib interrupts a line at NaN."""
+    """Insert a sample of NaN into each gap (see `MIN_GAP_STEPS`) of a series of samples.
+
+    matplotlib interrupts a line at NaN, so that no line connects the samples beside a gap.
+    """
     step = np.diff(series.seconds)
     if not len(step):
         return series

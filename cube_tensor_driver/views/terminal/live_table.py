@@ -260,7 +260,13 @@ class LiveTable:
         return self._values[:, COMPONENTS.index(name)]
 
     def _state(self, number: int) -> Text:
-        """Return the names of the status bits of a cube that are set, or "ok" or "waiting"."""
+        """Return the names of the status bits that are set in the latest row of a cube.
+
+        The text is "ok" if no bit is set, and "waiting" if no row has arrived yet.
+
+        Args:
+            number: Index of the cube in the skin.
+        """
         bits = self._status[number]
         words = [word.lower().replace("_", " ") for word, bit in STATUS.items() if bits & bit]
         if words:
@@ -274,7 +280,12 @@ def is_gradient(component: str) -> bool:
 
 
 def _in_kpa(component: str, value: float) -> str:
-    """Return a stress in Pa as text in kPa, or a gradient in Pa/m as text in kPa/mm."""
+    """Return a stress as text in kPa, or a gradient as text in kPa/mm.
+
+    Args:
+        component: Name of the component, such as zz (stress) or zz_x (gradient).
+        value: Its value, in Pa or Pa/m.
+    """
     scale = 1e-6 if is_gradient(component) else 1e-3
     return _number(value * scale, "+.2f")
 
