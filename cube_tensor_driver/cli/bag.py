@@ -36,7 +36,12 @@ def run(options: argparse.Namespace) -> int:
 
 
 def repair_bag(path: Path) -> None:
-    """Make a damaged bag readable, and print how many messages are left and what was lost."""
+    """Make a damaged bag (recording) readable, and print how many messages are left and what was
+    lost.
+
+    Args:
+        path: Folder or file of the bag.
+    """
     from ..bags.repair import REST_SUFFIX, repair
     from ..views.terminal.output import say
 

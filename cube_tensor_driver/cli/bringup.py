@@ -306,12 +306,17 @@ class PadScreen:
         self._live.stop()
 
     def show(self, rest: PadsAtRest) -> None:
-        """Draw the live table; nothing is drawn if stdout is no terminal."""
+        """Draw the live table with the pads as measured until now; nothing is drawn if stdout is
+        no terminal."""
         if self._live.is_started:
             self._live.update(self._table(rest), refresh=True)
 
     def finish(self, rest: PadsAtRest) -> None:
-        """End the live table, and print it once more as text that stays on the screen."""
+        """End the live table, and print it once more as text that stays on the screen.
+
+        Args:
+            rest: The pads, as measured without load until the end.
+        """
         self._live.stop()
         self._console.print(self._table(rest))
 
@@ -339,7 +344,13 @@ class PadScreen:
 
 
 def pad_fault(rest: PadsAtRest, cube: int, pad: int) -> str:
-    """Return the fault of a pad: "silent", "stuck" or "noisy"; an empty text if it has none."""
+    """Return the fault of a pad: "silent", "stuck" or "noisy"; an empty text if it has none.
+
+    Args:
+        rest: The pads as measured without load.
+        cube: Index of the cube on the hub.
+        pad: Index of the pad on the cube.
+    """
     faults = [name for name in ("silent", "stuck", "noisy") if getattr(rest, name)[cube, pad]]
     return faults[0] if faults else ""
 
@@ -374,7 +385,11 @@ def show_explanation(name: str, explanation: Explanation, pads: Sequence[str]) -
 
 
 def rpy(rotation: np.ndarray) -> list[float]:
-    """Return roll, pitch and yaw of a rotation matrix (3, 3), in radians, as in a skin file."""
+    """Return roll, pitch and yaw of a rotation matrix, in radians, as in a skin file.
+
+    Args:
+        rotation: Rotation matrix (3, 3) from the frame of a cube to the parent frame of the skin.
+    """
     from ..core.tensor import quaternion_from_rotation, rpy_from_quaternion
 
     angles = rpy_from_quaternion(quaternion_from_rotation(rotation))
@@ -383,7 +398,11 @@ def rpy(rotation: np.ndarray) -> list[float]:
 
 
 def rotation_text(rotation: np.ndarray) -> str:
-    """Return roll, pitch and yaw of a rotation matrix (3, 3) as text in degrees."""
+    """Return roll, pitch and yaw of a rotation as text in degrees, such as "0° 0° 90°".
+
+    Args:
+        rotation: Rotation matrix (3, 3) from the frame of a cube to the parent frame of the skin.
+    """
     import math
 
     return " ".join(f"{math.degrees(angle):.0f}°" for angle in rpy(rotation))

@@ -75,7 +75,8 @@ def reading_line(reading: StressReading) -> str:
 def reading_json(reading: StressReading) -> str:
     """Return a row of a stress message as a JSON object on one line.
 
-    Components that are not observed are null.
+    Args:
+        reading: The row: one cube at one time. Components that are not observed (NaN) become null.
     """
     from ..core.modes import COMPONENTS, STRESS
 
@@ -92,7 +93,7 @@ def reading_json(reading: StressReading) -> str:
 
 
 def status_words(status: int) -> list[str]:
-    """Return the names of the status bits that are set, as in SkinStress.msg.
+    """Return the names of the bits that are set in the status of a row, as in SkinStress.msg.
 
     They are followed by the reasons for which pads were left out of the computation.
     """

@@ -107,7 +107,8 @@ def read_inputs(
 ) -> tuple[Loads, Calibration, Array, str]:
     """Read the loads, and the base calibration, which provides what the fit does not determine.
 
-    This is the pad law (beta and foam modulus), the half side of the cube and the noise.
+    It provides the pad law (relation of the stress on a pad and its relative change of frequency,
+    with the parameters beta and foam modulus), half the side of the cube, and the noise.
 
     Args:
         options: The options of the command.

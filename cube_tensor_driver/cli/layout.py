@@ -118,7 +118,7 @@ def show_layout(layout: Layout, symmetry: str, result: dict[str, Any], source: s
 
 
 def noise_text(result: dict[str, Any], mode: str) -> str:
-    """Return the noise of a mode per unit of pad noise as text, or why it is not known.
+    """Return the standard deviation of a mode per unit of pad noise as text, or why it is unknown.
 
     Args:
         result: Result of `core.estimator.summarize_response`; unknown values are None.

@@ -51,7 +51,7 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Record, and return the exit code: 1 if messages were dropped, otherwise 0."""
+    """Record a bag, and return the exit code: 1 if messages were dropped, otherwise 0."""
     from ..ros.commands.record import record
 
     status = RecordingStatus(options.output)
@@ -111,7 +111,11 @@ class RecordingStatus:
             )
 
     def print_summary(self, recorder: Recorder) -> None:
-        """Print the number of messages of each topic, topics without a publisher, and drops."""
+        """Print the number of messages of each topic, topics without a publisher, and drops.
+
+        Args:
+            recorder: The recorder, whose recording has ended.
+        """
         counts, dropped = recorder.counts, recorder.dropped
         self._console.print(f"{self._path}: {sum(counts.values()) - dropped} messages")
         for topic, count in sorted(counts.items()):

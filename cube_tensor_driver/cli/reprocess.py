@@ -56,7 +56,13 @@ def arguments(parser: Parser) -> None:
 
 
 def add_overrides(parser: Parser) -> None:
-    """Add the options that replace recorded calibrations or the tare; `overrides_of` reads them."""
+    """Add the options that replace recorded calibrations or the recorded tare (rest frequencies).
+
+    `overrides_of` reads them.
+
+    Args:
+        parser: The parser of a command that reprocesses bags.
+    """
     parser.add_argument(
         "--calibration", metavar="FILE", help="calibration of all cubes (default: as recorded)"
     )
@@ -130,7 +136,12 @@ def run(options: argparse.Namespace) -> int:
 
 
 def result_line(output: Path, result: ReprocessResult) -> str:
-    """Return a line with the numbers of messages and rows computed from a bag, and its duration."""
+    """Return a line with the numbers of messages and rows computed from a bag, and its duration.
+
+    Args:
+        output: Path of the result, which the line contains.
+        result: Numbers of messages and rows (one cube at one sampling time), and the duration.
+    """
     return f"{output}: {result.messages} messages, {result.rows} rows, {result.seconds:.1f} s"
 
 

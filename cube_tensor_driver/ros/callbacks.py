@@ -29,7 +29,11 @@ class CallbackErrors:
         self._node = node
 
     def catch(self, callback: Callable[..., Any]) -> Callable[..., Any]:
-        """Wrap the callback of a subscription or a timer so that its exceptions are caught."""
+        """Wrap the callback of a subscription or a timer so that its exceptions are caught.
+
+        Returns:
+            A function that calls the callback; exceptions are logged and counted.
+        """
 
         @wraps(callback)
         def call(*arguments: Any) -> Any:

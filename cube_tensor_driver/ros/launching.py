@@ -257,7 +257,12 @@ def _read_skin(context: LaunchContext) -> Skin:
 
 
 def _convert(name: str, text: str, kind: type) -> Any:
-    """Convert the text of a launch argument to a type.
+    """Convert the text of a launch argument to the type of the parameter that it sets.
+
+    Args:
+        name: Name of the launch argument, for the error message.
+        text: The text that the user gave.
+        kind: Type of the parameter, such as float or bool.
 
     Raises:
         ConfigError: The type is float, and the text is no number.
@@ -271,7 +276,15 @@ def _convert(name: str, text: str, kind: type) -> Any:
 
 
 def _check_installed(name: str, packages: tuple[str, ...]) -> None:
-    """Raise ConfigError if a ROS package that a launch argument needs is not installed."""
+    """Check that the ROS packages that a launch argument needs are installed.
+
+    Args:
+        name: Name of the launch argument.
+        packages: Names of the ROS packages.
+
+    Raises:
+        ConfigError: A package is not installed.
+    """
     for package in packages:
         try:
             get_package_prefix(package)

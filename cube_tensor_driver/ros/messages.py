@@ -213,7 +213,8 @@ def info_message(
 
 
 def _cube_info(cube: SkinCube, frame_id: str) -> CubeInfo:
-    """Return the part of a SkinInfo message about one cube, as stated in the skin file."""
+    """Return the part of a SkinInfo message about one cube (name, pose, layout, hub), as stated in
+    the skin file."""
     calibration = cube.calibration
     px, py, pz = cube.xyz
     x, y, z, w = quaternion_from_rpy(*cube.rpy).tolist()

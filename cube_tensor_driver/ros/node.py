@@ -83,7 +83,12 @@ class CubeNode(LifecycleNode):
     """
 
     def __init__(self, name: str, parameters: Sequence[Parameter]) -> None:
-        """Make the node, and declare its parameters."""
+        """Make the node, and declare its parameters.
+
+        Args:
+            name: Name of the node.
+            parameters: The parameters, with defaults, limits and whether they may change later.
+        """
         self.callback_errors = CallbackErrors(self)
         super().__init__(name)
         self.is_configured = False
@@ -119,6 +124,9 @@ class CubeNode(LifecycleNode):
         """Take over the new value of a live parameter.
 
         Called only while the node is configured, for parameters that may change in this state.
+
+        Args:
+            name: Name of the parameter; `value` returns its new value.
         """
 
     @property
@@ -130,7 +138,10 @@ class CubeNode(LifecycleNode):
     # Methods that subclasses call.
 
     def own(self, entity: Entity) -> Entity:
-        """Register a publisher, subscription, timer or service to be destroyed at clean-up.
+        """Register an object of the node to be destroyed at clean-up.
+
+        Args:
+            entity: A publisher, subscription, timer or service.
 
         Returns:
             The same object.
@@ -255,7 +266,12 @@ class CubeNode(LifecycleNode):
         return SetParametersResult(successful=True)
 
     def _refusal(self, name: str, value: Any) -> str:
-        """Return why a parameter must not get a value now, or "" if it may."""
+        """Return why a parameter must not get a value now, or "" if it may.
+
+        Args:
+            name: Name of the parameter.
+            value: The requested value.
+        """
         # rclpy also calls this for its own parameters, such as use_sim_time, which have no entry.
         known = self._parameters_by_name.get(
             name,
@@ -395,7 +411,12 @@ def run(make: Callable[[], Sequence[CubeNode]]) -> None:
 
 
 def _run_nodes(nodes: Sequence[CubeNode], stopping: threading.Event) -> bool:
-    """Start nodes, spin them until `stopping` is set, and end them.
+    """Start nodes, spin them until a signal asks the process to end or a node fails, and end them.
+
+    Args:
+        nodes: The nodes, in the order in which they start.
+        stopping: Event that ends the spinning; the signal handler sets it, or this function after a
+            failure.
 
     Returns:
         Whether all nodes could start and none has reported a `failure`.
@@ -438,7 +459,7 @@ def _run_nodes(nodes: Sequence[CubeNode], stopping: threading.Event) -> bool:
 
 
 def _start(node: CubeNode) -> bool:
-    """Configure and activate a node, and return whether both transitions succeeded."""
+    """Configure and activate a node, and return whether both lifecycle transitions succeeded."""
     return all(
         transition() == TransitionCallbackReturn.SUCCESS
         for transition in (node.trigger_configure, node.trigger_activate)

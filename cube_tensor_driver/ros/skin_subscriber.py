@@ -140,7 +140,13 @@ class SkinSubscriberNode(CubeNode):
         self._depth = depth
 
     def prepare(self, skin: FollowedSkin) -> None:
-        """Prepare for messages about a skin. Called for the first skin and when it has changed."""
+        """Prepare for messages about a skin.
+
+        Called at the first `info` message, and when names or poses of the cubes have changed.
+
+        Args:
+            skin: The state of the skin, as received on its topics.
+        """
 
     def compute_message(self, skin: FollowedSkin, health: Index) -> Any:
         """Return the message to publish now, or its serialised bytes; None: none is published.

@@ -101,6 +101,10 @@ def listen(topic: str, once: bool) -> Iterator[list[Item]]:
 def resolve_topics(node: Node, topics: tuple[str, ...] | list[str]) -> list[str]:
     """Return the full names of topics, with the namespace and remaps of a node.
 
+    Args:
+        node: The node.
+        topics: Names as users write them, such as `stress`.
+
     Raises:
         ConfigError: ROS does not allow one of the names.
     """
@@ -116,7 +120,12 @@ def resolve_topics(node: Node, topics: tuple[str, ...] | list[str]) -> list[str]
 
 
 def to_plain(value: Any) -> Any:
-    """Convert a message, or the value of a field, to dicts, lists, numbers and texts."""
+    """Convert a message, or the value of one of its fields, to plain Python values.
+
+    Args:
+        value: A message, which becomes a dict of its fields; an array, which becomes a list; a
+            number or text, which stays as it is; or a byte, which becomes a number.
+    """
     if hasattr(value, "get_fields_and_field_types"):
         names = value.get_fields_and_field_types()
         return {name: to_plain(getattr(value, name)) for name in names}

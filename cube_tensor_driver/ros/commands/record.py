@@ -296,7 +296,11 @@ def _why_nothing(recorder: Recorder) -> str:
 
 
 def _close(recorder: Recorder, folder: Path) -> None:
-    """Close the bag in `folder`, and repair it if that fails.
+    """Close a bag, and repair it if closing fails.
+
+    Args:
+        recorder: The recorder of the bag.
+        folder: Folder of the bag.
 
     Raises:
         BagError: Writing has failed. The message states how many messages are readable.

@@ -73,7 +73,7 @@ class Player:
     `run` must be called only once; the other methods may be called from any thread meanwhile.
 
     Attributes:
-        position: Time of the message published last, in s from the begin of the bag.
+        position: Time of the message published last, in s from the start of the bag.
         length: Duration of the bag, in s.
         published: Number of messages published so far.
         stop: Event that ends the method `run`; the method `end` sets it.
@@ -147,7 +147,7 @@ class Player:
         """Continue the replay at another position.
 
         Args:
-            position: The position, in s from the begin of the bag.
+            position: The position, in s from the start of the bag.
             paused: Whether the replay pauses there, after `SHOWN_NS` of the recording.
 
         Raises:
@@ -168,7 +168,7 @@ class Player:
         """Publish the bag to its end.
 
         Args:
-            start: Position at which the replay begins, in s from the begin of the bag.
+            start: Position at which the replay begins, in s from the start of the bag.
             loop: Whether the replay begins at `start` again after the end of the bag.
             hold: Whether the replay pauses at the end of the bag and waits for `jump`, `pause` or
                 `end`, instead of returning.
@@ -210,7 +210,11 @@ class Player:
             self._latched.add(topic)
 
     def _await_subscribers(self) -> None:
-        """Wait until no new subscriber has come for `SETTLE_S`, or `MAX_WAIT_S` without one."""
+        """Wait until the topics have their subscribers, before the replay begins.
+
+        The wait ends if `frequencies` has subscribers and no new one has come for `SETTLE_S`, or if
+        no new one has come for `MAX_WAIT_S`.
+        """
         everything = [*self._publishers.values(), *([self._clock] if self._clock else [])]
         # A subscriber of each topic `frequencies` is awaited. It may never come, if no
         # reconstruction runs; then the replay begins after MAX_WAIT_S.
@@ -224,7 +228,10 @@ class Player:
                 wait_s = SETTLE_S if all_heard else MAX_WAIT_S
 
     def _to_ns(self, position: float) -> int:
-        """Convert a position, in s from the begin of the bag, to the time of recording, in ns.
+        """Convert a position in the bag to the time of recording, in ns since the Unix epoch.
+
+        Args:
+            position: The position, in s from the start of the bag.
 
         Raises:
             BagError: The position is negative or after the end of the bag.
@@ -240,7 +247,7 @@ class Player:
         """Publish messages until the end of the bag, a call of `jump`, or a call of `end`.
 
         Args:
-            start_ns: Time of recording of the first message, in ns.
+            start_ns: Time of recording of the first message, in ns since the Unix epoch.
         """
         # Latched messages (such as `info`) from before the start are still valid at the start.
         for entry in self._bag.entries(self._latched, None, start_ns):
@@ -261,14 +268,18 @@ class Player:
                     self._steps -= 1
 
     def _set_time(self, bag_ns: int) -> None:
-        """Define that the time of recording `bag_ns`, in ns, is replayed now."""
+        """Store that a time of recording is replayed at the present time of the monotonic clock.
+
+        Args:
+            bag_ns: Time of recording, in ns since the Unix epoch.
+        """
         self._anchor_ns, self._anchor_s = bag_ns, time.monotonic()
 
     def _wait_until_due(self, bag_ns: int) -> bool:
         """Wait until a message is due, with pauses and steps.
 
         Args:
-            bag_ns: Time of recording of the message, in ns.
+            bag_ns: Time of recording of the message, in ns since the Unix epoch.
 
         Returns:
             Whether the message is to be published. False means that `end` or `jump` was called.
@@ -372,7 +383,7 @@ def replay(
         bag: The bag.
         rate: Speed of the replay, divided by the speed of the recording.
         loop: Whether the replay begins at `start` again after the end of the bag.
-        start: Position at which the replay begins, in s from the begin of the bag.
+        start: Position at which the replay begins, in s from the start of the bag.
         clock: Whether to publish /clock (simulated time).
         stress: Whether to publish the recorded topics of a reconstruction (stress and wrenches) as
             well.

@@ -164,7 +164,12 @@ class _NodeParameters:
     """Reads and sets the parameters of another node through the services of that node."""
 
     def __init__(self, node: Node, executor: Any, name: str) -> None:
-        """Find the node with this name.
+        """Find the node whose parameters are read and set.
+
+        Args:
+            node: The node of this process, which calls the services.
+            executor: The executor that contains `node`.
+            name: Name of the other node.
 
         Raises:
             ConfigError: No node of this name was found within `MAX_DISCOVERY_S`.
@@ -181,7 +186,14 @@ class _NodeParameters:
         return sorted(answer.result.names)
 
     def check_name(self, parameter: str) -> None:
-        """Raise ConfigError if the node has no parameter of this name."""
+        """Check that the node has a parameter.
+
+        Args:
+            parameter: Name of the parameter.
+
+        Raises:
+            ConfigError: The node has no parameter of this name.
+        """
         names = self.names()
         if parameter not in names:
             raise ConfigError(

@@ -97,7 +97,13 @@ def _count_messages(
     executor: Any,
     topics: list[ListedTopic],
 ) -> None:
-    """Count the messages of topics for `COUNT_S`, and store the number in each `ListedTopic`."""
+    """Count the messages of topics for `COUNT_S`, and store the number in each `ListedTopic`.
+
+    Args:
+        node: The node that subscribes to the topics.
+        executor: The executor that contains `node`.
+        topics: The topics, whose `count` is set.
+    """
     subscriptions = [_subscribe(node, topic) for topic in topics]
     # Counting begins after a pause: DDS needs time to connect the subscriptions, and latched
     # messages, which were published earlier, arrive in this time and are not counted.
@@ -118,6 +124,10 @@ def _subscribe(node: Node, topic: ListedTopic) -> Any:
     """Return a subscription that counts messages in `topic.count`.
 
     None means that the type of the messages is not installed; the count is then None, too.
+
+    Args:
+        node: The node that subscribes.
+        topic: The topic, whose `count` is increased by each message.
     """
     try:
         kind = message_class(topic.listened, topic.kinds[0])

@@ -76,6 +76,9 @@ def _link_status(report: LinkReport) -> DiagnosticStatus:
     """Return the status of one link.
 
     Its level is that of the worst state that the link has had since the previous status.
+
+    Args:
+        report: State and counts of the link (connection to a hub) since the previous status.
     """
     levels = [LEVELS[state] for state in (report.state, *report.past_states)]
     if report.notes:

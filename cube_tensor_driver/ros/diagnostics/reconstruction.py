@@ -76,7 +76,8 @@ class ReconstructionDiagnostics:
         self._was_inactive = False
 
     def count(self, rows: StressRows) -> None:
-        """Count the rows of one published message, and the invalid ones among them."""
+        """Count the rows (one cube at one sampling time) of one published message of `stress`, and
+        the invalid ones among them."""
         self._rows += len(rows)
         self._invalid_rows += int(np.count_nonzero(rows.status & INVALID))
 
@@ -129,7 +130,10 @@ class ReconstructionDiagnostics:
 
 
 class CubeHealth:
-    """Makes statuses of cubes from the conditions that `Health` has found in the last second."""
+    """Makes statuses of cubes for /diagnostics from what `Health` has found in the last second.
+
+    `Health` finds faulty conditions of pads (such as open or noisy) and high residuals of cubes.
+    """
 
     def __init__(self, skin: Skin, reconstructor: Reconstructor) -> None:
         self._skin, self._pipeline = skin, reconstructor.pipeline

@@ -111,6 +111,11 @@ def _make_pair(name: str, key: str, value: str) -> KeyValue:
 
     The previous pair is returned if the value has not changed, because rclpy takes 2 µs to make a
     new one.
+
+    Args:
+        name: Name of the diagnostic status.
+        key: Key within this status.
+        value: Value as text.
     """
     pair = _newest_pairs.get((name, key))
     if pair is None or pair.value != value:

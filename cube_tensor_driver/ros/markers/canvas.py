@@ -166,7 +166,8 @@ class Canvas:
         """Draw the arrows of traction and gradient of each cube.
 
         Args:
-            values: Stress and gradients of each cube, (cubes, 15), in Pa and Pa/m.
+            values: 6 stress components (Pa) and 9 gradients (Pa/m) of each cube in its own frame,
+                (cubes, 15).
             ranges: Traction and gradient of the longest arrows.
         """
         normal = self._poses.rotation[:, :, 2]
@@ -192,7 +193,8 @@ class Canvas:
         """Draw crosses over cubes whose health is not fine, unless nothing has changed.
 
         Args:
-            health: Health of each cube, (cubes,), as `LatestStress.health` returns it.
+            health: Health of each cube, (cubes,): fine, doubtful, faulty or stale, as
+                `LatestStress.health` returns it.
         """
         is_unchanged = self._health is not None and np.array_equal(health, self._health)
         if is_unchanged:
@@ -208,7 +210,8 @@ class Canvas:
         """Draw the principal stresses of each cube as three lines, if the picture shows them.
 
         Args:
-            values: Stress and gradients of each cube, (cubes, 15), in Pa and Pa/m.
+            values: 6 stress components (Pa) and 9 gradients (Pa/m) of each cube in its own frame,
+                (cubes, 15).
             longest_pa: Stress, in Pa, whose line is as long as the pitch (distance of neighbouring
                 cubes).
         """

@@ -191,7 +191,8 @@ class Legend:
         Args:
             quantity: The quantity that colours show.
             top: Value at the upper end of the colour scale, in SI units.
-            health: Health of each cube, (cubes,), as `LatestStress.health` returns it.
+            health: Health of each cube, (cubes,): fine, doubtful, faulty or stale, as
+                `LatestStress.health` returns it.
         """
         low = -top if quantity.signed else 0.0
         values = np.linspace(low, top, BAR_BOXES)

@@ -275,5 +275,10 @@ class _CdrWalk:
 
 
 def _align(start: int, size: int) -> int:
-    """Return the smallest multiple of `size` that is not smaller than `start`, both in bytes."""
+    """Return the byte offset at which a number begins that is aligned to its size.
+
+    Args:
+        start: Byte offset at which the previous value ended.
+        size: Size of the number, in bytes; the result is a multiple of it, at least `start`.
+    """
     return -(-start // size) * size

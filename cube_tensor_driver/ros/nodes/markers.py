@@ -68,8 +68,12 @@ class Markers(SkinSubscriberNode):
         return bytes(canvas.data)
 
     def _newest_contacts(self, skin: FollowedSkin) -> SkinContacts | None:
-        """Return the newest contacts; None: none came, or they are older than
-        `MAX_CONTACTS_AGE_NS`."""
+        """Return the newest contacts; None if no message of `contacts` has arrived, or the newest
+        is more than `MAX_CONTACTS_AGE_NS` older than the newest stress.
+
+        Args:
+            skin: The state of the skin, with the stamp of the newest stress.
+        """
         contacts = self._contacts
         if contacts is None:
             return None
@@ -89,7 +93,8 @@ class Markers(SkinSubscriberNode):
         """Return the ranges of colours and arrows, which adapt to the values step by step.
 
         Args:
-            values: Stress and gradients of each cube, (cubes, 15), in Pa and Pa/m.
+            values: 6 stress components (Pa) and 9 gradients (Pa/m) of each cube in its own frame,
+                (cubes, 15).
             residual: Residual of each cube, (cubes,).
             shown: The quantity that the colours show, (cubes,), in SI units.
         """

@@ -120,7 +120,11 @@ class Reconstruction(CubeNode):
         self._reconstructor.drift_time = float(self.value("drift_time"))
 
     def on_rows(self, rows: FrequencyRows) -> None:
-        """Process the rows that a driver in the same process would send as one message."""
+        """Process the rows that a driver in the same process would send as one message.
+
+        Args:
+            rows: Rows of frequencies: one cube at one sampling time each.
+        """
         if self.is_active:
             frame_id = self._skin.parent_frame.encode() + b"\0"
             self._process(rows, int(rows.stamp_ns.min()), frame_id)
@@ -169,7 +173,14 @@ class Reconstruction(CubeNode):
         log_refused_message(self, "frequencies", error)
 
     def _check_scans(self, rows: FrequencyRows) -> None:
-        """Raise MessageError if a message has more than the allowed number of rows of one cube."""
+        """Check that a message does not have too many rows of one cube, see `MAX_SCANS`.
+
+        Args:
+            rows: Rows of frequencies: one cube at one sampling time each.
+
+        Raises:
+            MessageError: The message has more than the allowed number of rows of one cube.
+        """
         # A message with few rows in total, as almost all are, need not be counted by cube.
         if len(rows) <= self._max_scans:
             return

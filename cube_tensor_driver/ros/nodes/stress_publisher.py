@@ -214,6 +214,9 @@ class CubeTopics:
         """Publish rows on the topics of their cubes that have subscribers.
 
         A wrench is published only for valid rows.
+
+        Args:
+            rows: Rows of stress: one cube at one sampling time each.
         """
         # In a process with the driver this runs in the reader's thread, while `find_listeners` may
         # replace the lists in the main thread.

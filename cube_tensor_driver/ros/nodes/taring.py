@@ -171,9 +171,12 @@ class Taring:
             log.info(f"cube {cube.name}: tare of {stored.created} restored")
 
     def _forget_tare(self, number: int, rest: Array) -> None:
-        """Write the rest frequencies of the calibration of cube `number` into `rest`, in Hz.
+        """Replace the tare of a cube that was exchanged by the rest frequencies of its calibration.
 
-        It is called for a cube that was exchanged.
+        Args:
+            number: Index of the cube in the skin.
+            rest: Rest frequencies (without load) of all cubes, (cubes, pads), in Hz, which are
+                changed.
         """
         calibration = self._skin.cubes[number].calibration
         rest[number, : calibration.layout.n_pads] = calibration.rest_frequency
@@ -183,6 +186,10 @@ class Taring:
         """Write or remove the tare file of a cube, as was requested before its uid was known.
 
         A failure gives a warning in the log.
+
+        Args:
+            number: Index of the cube in the skin.
+            rest: Rest frequencies (without load) of all cubes, (cubes, pads), in Hz.
         """
         created = self._pending.pop(number)
         try:
