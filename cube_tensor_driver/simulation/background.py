@@ -46,8 +46,9 @@ class BackgroundHubs:
             skin: Skin whose hubs are simulated.
             ports: Folder in which the ports appear, each under the name of its link. `open_links`
                 and the driver node take it as `port_directory`.
-            noise: Noise of the pads as in `simulate`.
-            drift: Drift of the pads as in `simulate`.
+            noise: Standard deviation of a frequency divided by the frequency; None: that of the
+                calibration of each cube.
+            drift: Relative change of every rest frequency (frequency without load) per second.
 
         Raises:
             ConfigError: Cubes of one hub have different numbers of pads, or the folder cannot be
@@ -96,7 +97,7 @@ class BackgroundHubs:
 
 
 class _SetLoad:
-    """A `load.Fields` that another thread sets.
+    """Stress and gradient at the cubes (`load.Fields`) that another thread sets.
 
     Stress and gradient are replaced together, so that the reading thread never mixes two loads.
     """
@@ -114,7 +115,8 @@ class _SetLoad:
                 f"the load has a stress of shape {stress.shape} and a gradient of shape "
                 f"{gradient.shape}; a skin of {cubes} cubes takes ({cubes}, 6) and ({cubes}, 6, 3)"
             )
-        # A single assignment is atomic, so no lock is needed.
+        # A single assignment of both arrays is atomic in Python, so no lock between the threads is
+        # needed.
         self._field = stress, gradient
 
     def at(self, seconds: float) -> tuple[Array, Array]:
@@ -122,7 +124,7 @@ class _SetLoad:
 
 
 class _StopRequest:
-    """A `simulator.Stop` that another thread requests."""
+    """A request to end the simulator (`simulator.Stop`) that another thread makes."""
 
     def __init__(self) -> None:
         self.requested = False

@@ -74,11 +74,11 @@ class SimulatedCubes:
         gradient: Array,
         seconds: float,
     ) -> Millihertz:
-        """Compute the frequencies under true stress fields.
+        """Compute the frequencies of all pads under given stress fields.
 
         Args:
-            stress: Stress (cubes, 6) in Pa.
-            gradient: Gradient (cubes, 6, 3) in Pa/m.
+            stress: Stress (cubes, 6) in Pa, order xx yy zz yz zx xy, in the frames of the cubes.
+            gradient: Gradient (cubes, 6, 3) in Pa/m: derivatives of the stress along x, y and z.
             seconds: Simulated time in s.
 
         Returns:
@@ -101,7 +101,7 @@ class SimulatedCubes:
             )
         if self._is_noisy:
             hertz *= 1 + self._noise * self._random.standard_normal(hertz.shape)
-        # The pad law returns NaN beyond its range.
+        # The pad law (stress to frequency) returns NaN for a stress that no frequency belongs to.
         return np.nan_to_num(np.rint(hertz * 1e3), nan=NOT_MEASURED).astype("<u4")
 
 
@@ -131,10 +131,16 @@ class HubCubes:
         gradient: Array,
         seconds: float,
     ) -> Millihertz:
-        """Compute the frequencies (hub cubes, pads) under the fields of the whole skin.
+        """Compute the frequencies of the hub's cubes under the stress fields of the whole skin.
 
-        Arguments as in `SimulatedCubes.frequency`. Cubes that the skin does not have read
-        `NOT_MEASURED`.
+        Args:
+            stress: Stress (cubes of the skin, 6) in Pa, order xx yy zz yz zx xy.
+            gradient: Gradient (cubes of the skin, 6, 3) in Pa/m.
+            seconds: Simulated time in s.
+
+        Returns:
+            Frequencies (cubes of the hub, pads) in mHz; `NOT_MEASURED` for the pads of cubes that
+            are not in the skin.
         """
         shape = (len(self.members), self.cubes.n_pads)
         frequency = np.full(shape, NOT_MEASURED, "<u4")
@@ -145,7 +151,10 @@ class HubCubes:
 
 
 def frequency_noise(calibration: Calibration) -> Array:
-    """Convert the noise of a calibration from Pa to noise of the frequencies, for pads at rest.
+    """Convert the noise (standard deviation) of unloaded pads from Pa to frequencies.
+
+    Args:
+        calibration: Calibration, which states the noise of each pad in Pa.
 
     Returns:
         Standard deviation (pads,) of each frequency divided by the frequency.
@@ -251,7 +260,8 @@ def true_state(
     Returns:
         Amplitudes (N, modes) in Pa.
     """
-    # Modes of gradients are in Pa: change of the stress over half the side of the cube.
+    # Amplitudes of modes (linear stress fields) with a gradient are in Pa: the change of the stress
+    # over half the side of the cube.
     by_axis = to_matrix(np.moveaxis(gradient, -1, -2))  # (N, axis, i, j)
     scaled = np.moveaxis(by_axis, -3, -1) * calibration.half_side
     return calibration.modes.state(stress, scaled)
@@ -262,9 +272,15 @@ def true_components(
     stress: Array,
     gradient: Array,
 ) -> Array:
-    """Return the components (N, 15) in Pa and Pa/m that cubes without errors would measure.
+    """Return the 15 components of stress and gradient that cubes without errors would measure.
 
-    Arguments as in `true_state`.
+    Args:
+        calibration: Calibration of the cubes.
+        stress: Stress (N, 6) in Pa, order xx yy zz yz zx xy.
+        gradient: Gradient (N, 6, 3) in Pa/m.
+
+    Returns:
+        Components (N, 15): six stresses in Pa, then nine gradients of normal stresses in Pa/m.
     """
     # Modes of gradients are in Pa (change over half a side), the components in Pa/m.
     is_stress = np.arange(len(COMPONENTS)) < len(STRESS)
@@ -278,12 +294,15 @@ def skin_components(
     stress: Array,
     gradient: Array,
 ) -> Array:
-    """Return the `true_components` (cubes, 15) of all cubes of a skin under true fields.
+    """Return the components that the cubes of a skin would measure without errors.
 
     Args:
         skin: Skin.
-        stress: Stress (cubes, 6) in Pa.
+        stress: Stress (cubes, 6) in Pa that acts on each cube, order xx yy zz yz zx xy.
         gradient: Gradient (cubes, 6, 3) in Pa/m.
+
+    Returns:
+        Components (cubes, 15): six stresses in Pa, then nine gradients in Pa/m.
     """
     components = np.empty((len(skin.cubes), len(COMPONENTS)))
     for calibration, rows in calibration_groups(skin.calibrations):

@@ -73,7 +73,8 @@ MOMENTARY_FAULTS = (*FRAME_FAULTS, "reset", "wrap", "drift", "step")
 the time `seconds` of the fault."""
 
 
-# Only `value` may be negative: a clock may run slow, a temperature may fall.
+# Times and counts of a fault are not negative. Only its size (`value`) may be: a clock may run
+# slow, and a temperature may fall.
 _AMOUNT = real("a number from 0 up", minimum=0)
 _COUNT = integer(0, MAX_COUNT, "a whole number from 0 up")
 _SCHEMA = Schema(
@@ -138,7 +139,15 @@ class Fault:
 
 
 def parse_faults(data: Any, place: str) -> list[Fault]:
-    """Create faults from a list of dictionaries; arguments and errors as in `Fault.parse`."""
+    """Create faults from a list of dictionaries and check them.
+
+    Args:
+        data: List of dictionaries as read from YAML, one per fault.
+        place: Source of the values (such as a file name), with which error messages begin.
+
+    Raises:
+        ConfigError: The data are no list, or a key or a value of a fault is wrong.
+    """
     if not isinstance(data, list):
         raise ConfigError(f"{place}: found {str(data)[:60]!r}, allowed: a list of faults")
     return [Fault.parse(item, f"{place}: [{number}]") for number, item in enumerate(data)]

@@ -125,7 +125,7 @@ class SimulatedHub:
         step_us: int = 0,
         drift_ppm: float | None = None,
     ) -> None:
-        """Step the clock of the hub, or change its rate.
+        """Set the clock of the hub forward, or change its rate relative to simulated time.
 
         Args:
             now_us: Simulated time in µs.
@@ -143,7 +143,12 @@ class SimulatedHub:
         self.started = False
 
     def reset(self, now_us: int, sequence: int) -> None:
-        """Restart the hub: it stops sampling, its clock is 0, its next sample number `sequence`."""
+        """Restart the hub: it stops sampling, and its clock starts again at 0.
+
+        Args:
+            now_us: Simulated time in µs.
+            sequence: Number of the next sample.
+        """
         self.off()
         self.boots += 1
         self.boot_us = -now_us
@@ -153,7 +158,15 @@ class SimulatedHub:
         self.decoder = PythonDecoder()
 
     def receive(self, data: bytes, now_us: int) -> bytes:
-        """Carry out the requests in bytes from the host and return the answers."""
+        """Carry out the requests of the host.
+
+        Args:
+            data: Bytes from the host, which may end within a request.
+            now_us: Simulated time in µs.
+
+        Returns:
+            Frames with the answers, empty if there are none.
+        """
         frames = self.decoder.feed(data)
         requests = [frame for frame in frames if isinstance(frame, Request)]
         return b"".join(self._answer(request, now_us) for request in requests)
@@ -214,7 +227,7 @@ class SimulatedHub:
 
     @property
     def runs(self) -> list[SampleRun]:
-        """Runs of all samples that the hub has taken, in the order of time."""
+        """All samples taken so far, as runs (samples at equal intervals) in the order of time."""
         if self._run is None:
             return []
         return [*self._ended_runs, replace(self._run, last=self._last)]
@@ -254,7 +267,8 @@ class SimulatedHub:
                 device_us = self._positive_device_us(now_us)
                 return encode(Time(request.argument, device_us), self.version)
             case Command.START:
-                # A START while sampling runs must not change the times of the samples.
+                # If the hub takes samples already, another START request must not change the times
+                # at which it takes them.
                 if not self.started:
                     self.skip(now_us)
                 self.started = True

@@ -42,8 +42,9 @@ _FALSE_UID_BITS = 0xBAD
 """Bits of a hub's uid (unique number) that the fault `uid` inverts."""
 
 _LASTING_STATES = ("stall", "burst", "temperature")
-"""Kinds of faults whose end needs no action: the line ends a stall and a burst by itself, and a
-temperature stays until the next fault of this kind."""
+"""Kinds of faults whose end needs no action of the injector. The line ends a stall and a burst at
+their times by itself; a changed temperature stays until the next fault of the kind
+`temperature`."""
 
 _Schedule = list[tuple[int, int, Fault]]
 """Heap of (simulated time in µs, number, fault). Of faults at the same time, the one with the lower
@@ -150,7 +151,10 @@ class Injector:
             self._schedule(self._begins, at_us, replace(fault, link=name))
 
     def due_us(self) -> int | None:
-        """Return the simulated time in µs at which the next fault begins or ends, or None."""
+        """Return the simulated time in µs at which the next fault begins or ends.
+
+        The result is None if no fault is scheduled.
+        """
         times = [schedule[0][0] for schedule in (self._begins, self._ends) if schedule]
         return min(times, default=None)
 
@@ -181,7 +185,8 @@ class Injector:
         state = self._states[link.name]
         hub = link.hub
         if not state.pads and state.warming is None and not hub.extra_pads:
-            # The hub finds a frame that it encoded in advance by the identity of the array.
+            # The array is returned itself and not copied, because the hub recognises the array for
+            # which it encoded a frame in advance by its identity.
             return frequency
 
         # The array is copied, because it may be used again for a later sample.
@@ -202,14 +207,27 @@ class Injector:
         return frequency
 
     def load_us(self, link: SimulatedLink, now_us: int) -> int:
-        """Return the simulated time whose load acts on the cubes of a hub."""
+        """Return the simulated time, in µs, whose load acts on the cubes of a hub.
+
+        It is earlier than the present time during the fault `hold`, which keeps the load constant.
+
+        Args:
+            link: Link of the hub.
+            now_us: Present simulated time in µs.
+        """
         hold = self._states[link.name].hold
         return now_us if hold is None else hold[0]
 
     def transmitted(self, link: SimulatedLink, data: bytes) -> bytes:
         """Return the bytes that are sent on a link in place of one SAMPLE frame.
 
-        They are empty if the frame is lost or held back, and end with a frame that was held back.
+        Args:
+            link: The link.
+            data: The frame.
+
+        Returns:
+            The frame, altered if a fault acts on it; empty if the frame is lost or held back. A
+            frame that was held back before (fault `reorder`) follows at the end.
         """
         state = self._states[link.name]
         kind = state.frames.pop(0) if state.frames else ""
@@ -346,7 +364,7 @@ def broken_reading(
     first: int,
     time_us: int,
 ) -> int:
-    """Return the frequency in mHz of a broken pad.
+    """Return the frequency in mHz that a hub measures for a pad under a fault.
 
     Args:
         fault: Fault of the pad.
@@ -360,7 +378,8 @@ def broken_reading(
         case "open":
             return min(OPEN_FACTOR * sound, MAX_MILLIHERTZ)
         case "noisy":
-            # The simulated time is the seed of the noise, so that a check can compute the same one.
+            # The simulated time is the seed of the random noise, so that a check can compute the
+            # same noise again.
             noise = np.random.default_rng(time_us).standard_normal()
             return round(sound * (1 + fault.value * noise))
         case "stuck":
@@ -413,7 +432,12 @@ def centi_celsius(warmer: Any) -> Any:
 
 
 def _report_pads(hub: SimulatedHub, state: _LinkState) -> None:
-    """Set the pads that a hub reports as failed: those under the fault `report`."""
+    """Set the pads that a hub reports as failed in its frames: those under the fault `report`.
+
+    Args:
+        hub: The hub, which is changed.
+        state: Faults that affect its link now.
+    """
     bits = np.zeros(len(hub.cube_uids), "<u4")
     for broken in state.pads:
         if broken.fault.kind == "report":

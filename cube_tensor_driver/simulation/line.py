@@ -32,8 +32,8 @@ class SimulatedLine:
     Attributes:
         port: Path of the port.
         fd: File descriptor of the hub's end, -1 while it is unplugged.
-        held_until_us: Simulated time until which nothing is sent.
-        burst_until_us: Simulated time until which all waiting bytes are sent once per
+        held_until_us: Simulated time in µs until which nothing is sent (fault `stall`).
+        burst_until_us: Simulated time in µs until which all waiting bytes are sent once per
             `BURST_PERIOD_US`.
     """
 
@@ -97,18 +97,22 @@ class SimulatedLine:
         if not self.plugged or now_us < self.held_until_us:
             return
         if now_us < self.burst_until_us:
-            # At most one write per period.
+            # During the fault `burst`, waiting bytes are written at most once per
+            # `BURST_PERIOD_US`.
             burst = now_us // BURST_PERIOD_US
             if burst == self._newest_burst:
                 return
             self._newest_burst = burst
-        # The rest stays in the queue until the host reads.
+        # If the line takes no more bytes, the rest stays in the queue until the host reads.
         with contextlib.suppress(BlockingIOError):
             while self._queue:
                 del self._queue[: os.write(self.fd, self._queue)]
 
     def due_us(self, now_us: int) -> int | None:
         """Return the simulated time in µs at which a stall or burst lets waiting bytes be sent.
+
+        Args:
+            now_us: Present simulated time in µs.
 
         Returns:
             Time at which `flush` has to be called; None if no bytes wait or they can be sent now.

@@ -93,7 +93,14 @@ class AnyLoad(Fields, Protocol):
         """Distance from the centres of the cubes to the surface, in m."""
 
     def total(self, seconds: float) -> tuple[Array, Array, Array]:
-        """Return force, centre and normal of all contacts at a time in s, as `total`."""
+        """Return total force (3,) in N, centre (3,) in m and mean normal (3,) at a time.
+
+        The centre is the centre of pressure. They are those of all contacts together, in the skin's
+        parent frame.
+
+        Args:
+            seconds: Simulated time in s.
+        """
 
 
 class Load:
@@ -148,7 +155,7 @@ class Load:
             self._check(indenter)
 
     def at(self, seconds: float) -> tuple[Array, Array]:
-        """Compute the fields at a time, as `Fields.at`."""
+        """Compute stress and gradient at the cubes at a simulated time in s, as `Fields.at`."""
         # For each cube, the surface is the plane z = 0, and the cube is at z = -depth.
         position, rotation, _ = self.poses
         n = len(position)
@@ -193,7 +200,11 @@ class Load:
         return total(self.contact_loads(seconds))
 
     def _check(self, indenter: Indenter) -> None:
-        """Raise ConfigError if the contact of an indenter is too wide."""
+        """Raise ConfigError if an indenter's contact under its largest force is too wide.
+
+        A sphere's contact must not be wider than the sphere, and no contact wider than
+        `MAX_RADIUS_DEPTHS` allows.
+        """
         force = max(action.force.max() for action in indenter.actions)
         radius = self._contact_radius(indenter, force)
         if radius > indenter.radius:
@@ -243,12 +254,17 @@ class Load:
         """Return the radius in m of a contact under a normal force in N."""
         if indenter.shape == "disc":
             return indenter.radius
-        # a³ = 3 F R / (4 E*), Johnson 4.2
+        # Hertz: a³ = 3 F R / (4 E*) for the contact radius a, with E* = E / (1 − ν²); Johnson 4.2
         stiffness = self.script.young / (1 - self.script.poisson**2)
         return float(np.cbrt(3 * force * indenter.radius / (4 * stiffness)))
 
     def _to_metres(self, position: Array) -> Array:
-        """Convert positions of the script to m in the skin's parent frame."""
+        """Convert positions of the script to metres in the skin's parent frame.
+
+        Args:
+            position: Positions (..., 3), in m or, in a script with relative positions, from -1 to 1
+                along each side of the box around all cubes.
+        """
         if not self.script.relative:
             return position
         return np.asarray(self._centre + position * self._half_extent)
@@ -298,7 +314,8 @@ def total(loads: Sequence[ContactLoad]) -> tuple[Array, Array, Array]:
     """
     if not loads:
         return np.zeros(3), np.full(3, np.nan), np.full(3, np.nan)
-    # The centre of pressure is weighted with the normal forces.
+    # The centre of pressure is the mean of the contacts' centres, weighted with their forces along
+    # the normal into the skin.
     weight = np.array([-load.force @ load.normal for load in loads])
     force = np.sum([load.force for load in loads], axis=0)
     centre = weight @ np.array([load.position for load in loads]) / weight.sum()
@@ -319,7 +336,7 @@ class LoadMemory:
         self._fields: dict[int, tuple[Array, Array]] = {}
 
     def at(self, time_us: int) -> tuple[Array, Array]:
-        """Return the fields at a time in µs, as `Fields.at`."""
+        """Return stress and gradient at the cubes at a simulated time in µs, as `Fields.at`."""
         if self._period_us is not None:
             time_us %= self._period_us
         field = self._fields.get(time_us)
@@ -353,7 +370,7 @@ def _choose_orders(
     """
     to_rim = np.maximum(distance - radius, 0.0)
     ratio = radius / np.hypot(depth, to_rim)
-    # Numerical tests gave these factors; the error decreases exponentially with order / ratio.
+    # Numerical tests gave these factors, with which the errors are at most 1e-3.
     wanted = 5 * ratio + 1 if shape == "sphere" else 3.3 * ratio + 0.5
     orders = _ORDERS[np.searchsorted(_ORDERS, wanted)]
     return np.where(ratio < _FAR_RATIO, 1, orders)

@@ -63,7 +63,8 @@ class PreparedFrame:
 
         _SEQUENCE.pack_into(self._head, _SEQUENCE_OFFSET, sequence)
         _DEVICE_US.pack_into(self._head, _DEVICE_US_OFFSET, device_us)
-        # The checksum is encoded with the rest of the frame, because its bytes may be zeros.
+        # The bytes of the checksum may be zeros, which the encoding removes. So the checksum is
+        # encoded each time, together with the last part of the frame.
         crc = zlib.crc32(self._tail, zlib.crc32(self._head)).to_bytes(_CRC_BYTES, "little")
         start = cobs.encode(bytes(self._head[:-1]))
         end = cobs.encode(self._rest + crc)

@@ -163,13 +163,14 @@ class SampleLog:
 
     @property
     def dropped(self) -> int:
-        """Number of samples for which the lines had no room."""
+        """Number of samples of all hubs that were lost because their lines had no room."""
         return sum(link.dropped for link in self.links)
 
     @cached_property
     def table(self) -> SampleTable:
         """All samples of the log, link after link, in the order of time."""
-        # Runs become columns: one row per sample.
+        # The log holds runs (samples at equal intervals). They become columns with one row per
+        # sample.
         runs = [(number, run) for number, link in enumerate(self.links) for run in link.runs]
         lengths = np.array([len(run) for _, run in runs], int)
         number = [np.arange(run.first, run.last + 1) for _, run in runs]
@@ -237,7 +238,7 @@ class SampleTable:
         return np.append(among, NO_MATCH)[found]
 
     def rows_taken(self, start_ns: int, end_ns: int) -> int:
-        """Count the rows (one cube, one sample) that were taken in an interval of time.
+        """Count the rows (one for each cube of the skin and sample) taken in an interval of time.
 
         Args:
             start_ns: Begin of the interval, in ns since the Unix epoch.

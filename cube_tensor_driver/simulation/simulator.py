@@ -110,8 +110,9 @@ class Simulator:
             skin: Skin whose hubs are simulated.
             load: Stress and gradient at the cubes over time.
             ports: Folder in which the ports appear, each under the name of its link.
-            noise: Noise of the pads as in `SimulatedCubes`.
-            drift: Drift of the pads as in `SimulatedCubes`.
+            noise: Standard deviation of a frequency divided by the frequency; None: that of the
+                calibration of each cube.
+            drift: Relative change of every rest frequency (frequency without load) per second.
             imperfections: Imperfections of the pads as in `SimulatedCubes`.
             instants: Number of times, equally spaced over the period of the load, at which the load
                 is computed in advance; successive samples use successive times, again and again.
@@ -158,7 +159,12 @@ class Simulator:
             link.line.send(link.hub.hello(), 0)
 
     def _prepare(self, load: Fields, instants: int) -> None:
-        """Compute frequencies and frames at `instants` equally spaced times of the load."""
+        """Compute the frequencies and encode the frames of all hubs in advance.
+
+        Args:
+            load: Stress and gradient at the cubes over time.
+            instants: Number of times, equally spaced over the period of the load.
+        """
         for number in range(instants):
             stress, gradient = load.at(number * load.period / instants)
             for link in self._links:
@@ -236,7 +242,9 @@ class Simulator:
             self._ports.rmdir()
 
     def _due_us(self, report_us: int) -> int:
-        """Return the earliest simulated time in µs of a sample, report, fault or pending send.
+        """Return the simulated time in µs at which the simulator has to act next.
+
+        It is that of the next sample, report, begin or end of a fault, or delayed sending.
 
         Args:
             report_us: Simulated time in µs of the next HELLO and STATS.
@@ -275,7 +283,12 @@ class Simulator:
                     is_behind |= link.hub.started and link.hub.next_us <= now_us
 
     def _take_sample(self, link: PlayedLink, now_us: int) -> None:
-        """Take and send the next sample of a hub."""
+        """Take the next sample of a hub, and send its frame unless a fault loses it.
+
+        Args:
+            link: Link of the hub.
+            now_us: Present simulated time in µs; the sample may have been due earlier.
+        """
         time_us = link.hub.next_us
         load_us = self._injector.load_us(link, time_us)
         if link.prepared:

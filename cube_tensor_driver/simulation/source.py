@@ -92,9 +92,9 @@ class SimulatedSource:
         load: Load on the skin.
         period_us: Time between two scans in µs.
         duration: Simulated time in s; None: without end.
-        noise: As in `simulate`.
-        drift: As in `simulate`.
-        imperfections: As in `simulate`.
+        noise: Standard deviation of a frequency divided by the frequency.
+        drift: Relative change of every rest frequency (frequency without load) per second.
+        imperfections: Deviations of the pads from their calibrations; None: none.
         scans: Number of scans since the last iteration began.
     """
 
@@ -144,7 +144,7 @@ class SimulatedSource:
 
 
 class SkinPads:
-    """Computes the frequencies of all pads of a skin under given fields."""
+    """Computes the frequencies of all pads of a skin under given stress fields at the cubes."""
 
     def __init__(
         self,
@@ -177,7 +177,7 @@ class SkinPads:
         """Compute one scan with a row of every cube.
 
         Args:
-            stress: Stress (cubes, 6) in Pa, cubes in the order of the skin.
+            stress: Stress (cubes, 6) in Pa, order xx yy zz yz zx xy, in the frames of the cubes.
             gradient: Gradient (cubes, 6, 3) in Pa/m.
             number: Sequence number of the scan.
             time_us: Simulated time in µs.

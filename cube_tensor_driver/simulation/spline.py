@@ -49,7 +49,7 @@ class CubicSpline:
 
     def position(self, time: float) -> Array:
         """Return the position (D,) at a time from 0 to 1."""
-        # Hermite's basis functions
+        # Cubic Hermite polynomial with the points p and q at the ends and the slopes m and n there
         t, p, q, m, n = self._interval(time)
         value = (1 + 2 * t) * (1 - t) ** 2 * p
         value = value + t**2 * (3 - 2 * t) * q
@@ -57,7 +57,7 @@ class CubicSpline:
         return value + t**2 * (t - 1) * n
 
     def velocity(self, time: float) -> Array:
-        """Return the derivative (D,) of the position by time."""
+        """Return the derivative (D,) of the position by the time, at a time from 0 to 1."""
         t, p, q, m, n = self._interval(time)
         per_interval = 6 * t * (1 - t) * (q - p)
         per_interval = per_interval + (1 - t) * (1 - 3 * t) * m

@@ -110,7 +110,7 @@ def _edge_distances(corners: Array, place: Array) -> Array:
 
     Args:
         corners: Corners (K, 2) of the polygon, counterclockwise.
-        place: Position (2,).
+        place: Position (2,) in the same plane.
 
     Returns:
         Distance (K,) from the line of each edge, positive inside, multiplied by the edge's length.
@@ -121,7 +121,13 @@ def _edge_distances(corners: Array, place: Array) -> Array:
 
 
 def _area_moments(corners: Array) -> tuple[float, Array, float]:
-    """Return area, centroid (2,) and polar moment of area about it of a polygon (K, 2)."""
+    """Return the area in m², centroid (2,) in m and polar moment of area in m⁴ of a polygon.
+
+    The moment is about the centroid.
+
+    Args:
+        corners: Corners (K, 2) in m, counterclockwise.
+    """
     x, y = corners.T
     next_x, next_y = _next_corners(corners).T
     double_area = x * next_y - next_x * y
@@ -172,7 +178,7 @@ def _plane_basis(
 ) -> Array:
     """Return two axes (3, 2) perpendicular to the normal (x, y, z); the three are right-handed.
 
-    It is cached, because a flat skin has one normal.
+    The result is cached, because all contacts on a flat skin have the same normal.
     """
     normal = np.array([x, y, z])
     axis = np.zeros(3)

@@ -101,8 +101,9 @@ class MujocoLoad:
         Args:
             path: File of the scene.
             skin: Skin on its bodies.
-            thickness: As in `MujocoSkin`.
-            noise: As in `MujocoSkin`.
+            thickness: Thickness of the elastomer on rigid ground, in m; infinite for a half space.
+            noise: Standard deviation of a frequency divided by the frequency; None: that of the
+                calibration of each cube.
 
         Raises:
             ConfigError: The scene cannot be read, or the skin does not fit it.

@@ -76,12 +76,12 @@ def load_mujoco() -> Any:
 
 
 class _BodyCubes(NamedTuple):
-    """The cubes on one body.
+    """The cubes on one body of the MuJoCo model.
 
     Attributes:
         body: Number of the body.
         cubes: Indices (n,) of the cubes in the skin.
-        poses: Poses of these cubes in the parent frame.
+        poses: Poses of these cubes in the parent frame of the skin.
         pitch: Typical distance of neighbouring cubes in m.
         rotation: Rotation (3, 3) from the body's frame to the parent frame.
         position: Origin (3,) of the body's frame in the parent frame, in m.
@@ -143,8 +143,9 @@ class MujocoSkin:
             young: Young's modulus of the elastomer in Pa, which determines how wide round contacts
                 are.
             poisson: Poisson's ratio of the elastomer.
-            noise: Noise of the pads as in `simulate`.
-            drift: Drift of the pads as in `simulate`.
+            noise: Standard deviation of a frequency divided by the frequency; None: that of the
+                calibration of each cube.
+            drift: Relative change of every rest frequency (frequency without load) per second.
             imperfections: Imperfections of the pads as in `simulate`.
 
         Raises:
@@ -260,7 +261,7 @@ class MujocoSkin:
             radius = float(np.sqrt(area / np.pi))
             load = ContactLoad("disc", polygon.centre, normal, total, radius)
             return Touch(part.body, load, polygon)
-        # The curvatures of both bodies add up (Johnson 4.2).
+        # For a Hertz contact, the curvatures (1 / radius) of both bodies add up (Johnson 4.2).
         curvature = self._curvature[contact.geom[rows[0]]].sum()
         radius = hertz_radius(-float(total @ normal), curvature, self._stiffness)
         return Touch(
@@ -274,7 +275,11 @@ class MujocoSkin:
         rows: Index,
         sign: int,
     ) -> tuple[Array, Array, Array]:
-        """Return positions in m, forces in N and outward normals (n, 3) in the parent frame."""
+        """Return the positions in m, forces in N and normals (each (n, 3)) of n contact points.
+
+        They are in the parent frame of the skin; the forces act on the skin, the normals point out
+        of it.
+        """
         data = self.data
         frames = data.contact.frame[rows].reshape(-1, 3, 3)
         in_frames = np.empty((len(rows), 3))
@@ -407,7 +412,14 @@ class MujocoSkin:
 
 @lru_cache(maxsize=8)
 def _tables(layer: Layer, depth: float) -> tuple[DiscTables, PolygonTables]:
-    """Return the tables of a layer; the skins of a robot often share them."""
+    """Return the tables of the stress under discs and polygons in a layer of elastomer.
+
+    They are cached, because the skins of a robot often have the same layer and depth.
+
+    Args:
+        layer: Thickness and Poisson's ratio of the layer.
+        depth: Depth of the cubes below the surface, in m.
+    """
     return DiscTables(layer, depth), PolygonTables(layer, depth)
 
 
@@ -416,7 +428,13 @@ def _field_of_discs(
     loads: list[ContactLoad],
     tables: DiscTables,
 ) -> tuple[Array, Array]:
-    """Compute stress and gradient at the cubes of a body under round contacts."""
+    """Compute stress and gradient at the cubes of a body under round contacts.
+
+    Args:
+        part: The cubes on the body.
+        loads: Round contacts, in the parent frame of the skin.
+        tables: Stress under discs, for the layer and the depth of the cubes.
+    """
     position, rotation, _ = part.poses
     normals = np.stack([load.normal for load in loads], axis=1)
     centres = np.array([load.position for load in loads])
@@ -424,7 +442,8 @@ def _field_of_discs(
     radii = [load.radius for load in loads]
 
     facing = np.maximum(rotation[:, :, 2] @ normals, 0.0)
-    # In the frame of each cube, relative to the centre of the contact
+    # Positions of the cubes relative to the centre of each contact, and the forces of the contacts,
+    # both in the frame of each cube
     place = (position[:, None] - centres) @ rotation
     force = forces @ rotation * facing[..., None]
     return tables.field(place[..., :2], force, radii)
