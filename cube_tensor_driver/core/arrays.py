@@ -11,16 +11,17 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 Real = NDArray[np.floating[Any]]
-"""Float32 or float64, whichever the caller chose for the reconstruction."""
+"""Array of float32 or float64, whichever precision the caller chose for the computation of
+stress."""
 Complex = NDArray[np.complex128]
 Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 Times = NDArray[np.int64]
 """Times or durations, in nanoseconds."""
 PadMasks = NDArray[np.uint32]
-"""Bit masks of pads: bit p of a row stands for pad p."""
+"""Bit masks of pads, one integer per row (sample of one cube); bit p stands for pad p."""
 StatusBits = NDArray[np.uint16]
-"""Bits of `status.py`, per row or per pad."""
+"""Status bits (defined in `status.py`), per row (sample of one cube) or per pad."""
 AnyArray = NDArray[Any]
 
 

@@ -27,7 +27,8 @@ MAX_UID = 2**64 - 1
 """Largest unique id of a cube, because a hub sends the id in 8 bytes."""
 
 PAD_QUANTITIES = ("rest_frequency", "noise", "modulus", "gain", "beta")
-"""Names of the attributes of a calibration that have one value per pad."""
+"""Names of the attributes of a calibration that have one value per pad: frequency without load,
+noise, modulus of the foam, gain, and beta (ratio of parasitic to active capacitance)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +102,10 @@ class Calibration:
         return f"Calibration({self.id}, layout {self.layout.name!r}, {owner}, {source})"
 
     def _set(self, name: str, value: Any) -> None:
-        """Replace a given value by the checked one; a frozen dataclass refuses an assignment."""
+        """Replace the attribute with this name by its checked value.
+
+        A frozen dataclass refuses an ordinary assignment.
+        """
         object.__setattr__(self, name, value)
 
     def _read_pad_quantity(self, name: str) -> Array:
@@ -330,8 +334,8 @@ def illustrative(
         rest_frequency=np.array(REST_FREQUENCY),
         beta=np.array(BETA),
         modulus=np.array(FOAM_MODULUS),
-        # Noise of the stress is noise of the frequency times the slope dv/df = E (1 + beta) / f0 of
-        # the pad law at rest.
+        # Noise of the stress v is noise of the frequency f times the slope dv/df = E (1 + beta) /
+        # f0 of the pad law (v as a function of f) without load.
         noise=np.array(FOAM_MODULUS * (1 + BETA) * FREQUENCY_NOISE),
         source="illustrative",
     )

@@ -42,12 +42,15 @@ no pad responds cannot be measured. If this part is larger, the component is not
 """
 
 FALSE_ALARM = 1e-3
-"""Probability that a row of a cube without fault is reported with a high residual, only because of
-the noise that its calibration states."""
+"""Probability that a row (sample of one cube) of a cube without fault is reported with a high
+residual, only because of the noise of the pads that its calibration states.
+
+The residual measures how far the stresses on the pads are from any linear stress field.
+"""
 
 SUSPECT_MARGIN = 2 * math.log(100)
-"""Difference of two values of chi-square at which one explanation is 100 times as likely as the
-other.
+"""Difference of two values of chi-square (sum of squared residuals divided by the noise) at which
+one broken pad explains a sample 100 times as well as another pad: 2 ln(100).
 
 A pad is not suspected to be broken if leaving out another pad lowers chi-square by this much more.
 """
@@ -90,11 +93,13 @@ class Estimator:
     def suspects(self, pad_stress: Array) -> Mask:
         """Find the pads that explain a high chi-square if just this one pad is broken.
 
-        Leaving out pad p lowers chi-square by (u_p . z)^2 / |u_p|^2, with z = null v and
-        u_p = noise_p times column p of `null`. A row has suspects if its chi-square is above the
-        limit, and falls below the limit for one degree of freedom less when the best pad (the one
-        that lowers it most) is left out. The suspects are the best pad and all pads that lower
-        chi-square as much within `SUSPECT_MARGIN`. If these are all pads, none is a suspect.
+        Leaving out pad p lowers chi-square by (u_p . z)^2 / |u_p|^2. Here z = `null` v are the
+        residuals, whose squares add up to chi-square, v the stresses on the pads, and u_p column p
+        of `null` times the noise of pad p. A row (sample of one cube) has suspects if its
+        chi-square is above the limit, and falls below the limit for one degree of freedom less when
+        the best pad (the one that lowers it most) is left out. The suspects are the best pad and
+        all pads that lower chi-square as much within `SUSPECT_MARGIN`. If these are all pads, none
+        is a suspect.
 
         Two pads that are opposite each other through the centre of a symmetric cube are always
         suspects together, because a gradient absorbs their difference.
@@ -122,7 +127,7 @@ class Estimator:
         best = drop.max(axis=1)
         is_similar = drop > best[:, None] - SUSPECT_MARGIN
         # After leaving out the broken pad, chi-square is that of noise alone, with one degree of
-        # freedom less.
+        # freedom less because there is one pad less.
         limit_without = chi2_limit(self.dof - 1, FALSE_ALARM)
         is_explained = (chi2 > self.limit) & (chi2 - best < limit_without)
         is_specific = is_similar.sum(axis=1) < is_checked.sum()
@@ -160,11 +165,11 @@ def make_estimator(
     present = np.setdiff1d(all_pads, np.asarray(missing, dtype=int))
     kept = np.setdiff1d(all_modes, modes.index(neglect))
 
-    # Dividing by the noise gives all pads the standard deviation 1, so that the sum of squared
-    # residuals is chi-square.
+    # Dividing by the noise (standard deviation) of each pad gives all pads the standard deviation
+    # 1, so that the sum of the squared residuals is chi-square.
     whitened = response[np.ix_(present, kept)] / noise[present, None]
-    # The full matrix u is needed, because its last columns are orthogonal to the response of every
-    # mode and so give the residual.
+    # The full matrix u is needed. Its last columns are orthogonal to the response of every mode
+    # (linear stress field), so only noise and faults have a part along them: the residual.
     u, s, vt = np.linalg.svd(whitened, full_matrices=True)
     rank = 0
     if s.size and s[0] > 0:
@@ -181,7 +186,8 @@ def make_estimator(
     size = np.linalg.norm(targets, axis=1)
     observed = (size > 0) & (unseen + neglected <= LEAK_TOLERANCE * size)
 
-    # Pad stresses divided by their noise have the variance 1, so half @ half.T is the covariance.
+    # `half` maps pad stresses divided by their noise to targets. Those stresses have the variance
+    # 1, so half @ half.T is the covariance of the targets.
     half = kept_targets @ v1 / s[:rank]
     matrix = np.zeros((n_targets, n_pads))
     matrix[:, present] = half @ u[:, :rank].T / noise[present]
@@ -301,7 +307,8 @@ def chi2_limit(dof: int, probability: float) -> float:
     low, high = 0.0, 1.0
     while chi2_tail(high, dof) > probability:
         high *= 2
-    # A float has 53 bits of precision, so a hundred bisections find the value to its last bit.
+    # Each bisection halves the interval, and a float has 53 bits of precision. So a hundred of them
+    # find the value to its last bit.
     for _ in range(100):
         centre = (low + high) / 2
         if chi2_tail(centre, dof) > probability:

@@ -59,21 +59,32 @@ class Forces:
         self._rotation = np.array(rotations)
 
     def __call__(self, rows: StressRows) -> Array:
-        """Compute the force of each of N rows (N, 3), in N, in the parent frame of the skin."""
+        """Compute the force on the skin at the cube of each row.
+
+        Args:
+            rows: Stresses of N samples, each of one cube.
+
+        Returns:
+            Forces (N, 3), in N, in the parent frame of the skin; NaN where the pads determine no
+            component of the traction.
+        """
         side = self.side[rows.cube, None]
         rotation = self._rotation[rows.cube]
         in_cube_frame = face_force(rows.stress, side)
         force: Array = np.einsum("nij,nj->ni", rotation, in_cube_frame)
         traction = rows.stress[:, TRACTION_COMPONENTS]
-        # `face_force` counts unknown components as 0, which would claim that nothing presses.
+        # `face_force` counts unknown components of the traction as 0. If all three are unknown, a
+        # force of 0 would claim that nothing presses.
         is_unobserved = np.isnan(traction).all(axis=1)
         force[is_unobserved] = np.nan
         return force
 
     def of_skin(self, rows: StressRows) -> Array:
-        """Return the force of the last row of each cube (cubes, 3), in N.
+        """Return the force at each cube (cubes, 3), in N, in the parent frame of the skin.
 
-        Cubes without a row have NaN.
+        Args:
+            rows: Stresses of samples, each of one cube. The last sample of each cube is used; cubes
+                without a sample have NaN.
         """
         force = np.full(self.position.shape, np.nan)
         # If a cube has several rows, numpy keeps the last assignment.

@@ -14,8 +14,8 @@ from .status import INVALID, RESIDUAL
 FINE = 0
 """Health of a cube: the latest stress is usable without reservation."""
 DOUBTFUL = 1
-"""Health of a cube: the latest stress has a status bit other than that of the residual, or many
-recent rows have a high residual."""
+"""Health of a cube: the latest stress has a status bit other than that for a high residual
+(disagreement of the pads), or many recent samples of the cube have a high residual."""
 FAULTY = 2
 """Health of a cube: all components of the latest stress are unknown (NaN)."""
 STALE = 3
@@ -30,14 +30,15 @@ STALE_S = 1.0
 
 
 class LatestStress:
-    """The latest row of stress of each of N cubes, and the time at which it arrived.
+    """The latest row (stress of one sample) of each of N cubes, and the time at which it arrived.
 
     The class reads no clock: the caller states the time, in seconds from any origin.
 
     Attributes:
         values: Components of stress in Pa and of gradient in Pa/m (N, 15); NaN before the first
             row of a cube.
-        residual: Residual of the latest row (N,).
+        residual: Residual (disagreement of the pads) of the latest row (N,), about 1 for noise
+            alone.
         status: Status bits of the latest row (N,).
         left_out: Bit masks of the pads that were not used for the latest row (N,).
         arrived: Time of arrival of the latest row (N,), in s; minus infinity before the first row.
@@ -61,7 +62,7 @@ class LatestStress:
         self._over_limit = np.zeros(n_cubes, np.int64)
 
     def update(self, rows: StressRows, now: float) -> None:
-        """Store new rows; of several rows of one cube, the last is kept.
+        """Store new rows (stress of one cube each); of several of one cube, the last is kept.
 
         Rows of cubes that the skin does not have are ignored.
 
@@ -98,8 +99,8 @@ class LatestStress:
         Returns:
             `FINE`, `DOUBTFUL`, `FAULTY` or `STALE` of each cube (N,).
         """
-        # A high residual of a single row may be noise. Whether many rows have one is stated by
-        # `high_residual`.
+        # A high residual of a single row may be noise, so its bit is ignored. `high_residual`
+        # states whether many recent rows have a high residual.
         other_bits = self.status & ~np.uint16(RESIDUAL)
         is_doubtful = self.high_residual | (other_bits != 0)
         health = np.where(is_doubtful, DOUBTFUL, FINE)
@@ -118,7 +119,9 @@ class LatestStress:
         return np.where(is_usable[:, None], self.values, np.nan)
 
     def _close_window_when_over(self, now: float) -> None:
-        """Evaluate the counts of high residuals every `WINDOW_S`, and start new counts.
+        """Decide, every `WINDOW_S` seconds, which cubes have many rows with a high residual.
+
+        The counts of rows then start again at 0.
 
         Args:
             now: Present time, in s. A time before the start of the counts also ends them.

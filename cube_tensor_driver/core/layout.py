@@ -79,7 +79,11 @@ class Layout:
             self._check_pad(number)
 
     def _check_pad(self, number: int) -> None:
-        """Raise LayoutError if a pad is not on its face, or coincides with a pad before it."""
+        """Raise LayoutError if a pad is not on the face of its normal, or coincides with another.
+
+        Args:
+            number: Number of the pad (from 0); it is compared with the pads of lower numbers.
+        """
         position, normal = self.positions[number], self.normals[number]
         pad = f"pad {number + 1}"
         if sorted(np.abs(normal)) != [0, 0, 1]:
@@ -236,7 +240,7 @@ def _read_vectors(value: Any, name: str) -> Array:
 
 
 def _name_axes(vector: Array) -> str:
-    """Return sign and axis of each nonzero coordinate of a vector, such as "+z" or "-x+y"."""
+    """Return sign and axis of each nonzero coordinate of a vector (3,): (-1, 1, 0) gives "-x+y"."""
     return "".join(
         ("+" if coordinate > 0 else "-") + axis
         for coordinate, axis in zip(vector, AXES, strict=True)
@@ -268,10 +272,12 @@ def _make_layout(name: str, pads: str) -> Layout:
 
 
 _QUAD_PADS = "+z-x +z+x -z-x -z+x"
-# These are the pads V1 to V8 of Kiyota & Shinoda, in their order.
+# Names of the pads of the layout "planar": V1 to V8 of the paper by Kiyota & Shinoda, in that
+# order.
 _PLANAR_PADS = f"{_QUAD_PADS} +x-z +x+z -x-z -x+z"
 _NEXT_AXES = str.maketrans("xyz", "yzx")
-# The layout "cube" has the pads of "planar" in each of the planes z-x, x-y and y-z.
+# The layout "cube" has the eight pads of "planar" in each of the planes z-x, x-y and y-z. The names
+# of the pads in the next plane follow by renaming the axes.
 _SECOND_SECTION = _PLANAR_PADS.translate(_NEXT_AXES)
 _THIRD_SECTION = _SECOND_SECTION.translate(_NEXT_AXES)
 

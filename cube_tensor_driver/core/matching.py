@@ -1,4 +1,4 @@
-"""Search for the row of one table that is the same sample as a row of another table.
+"""Search for the row of one table that is the same sample of a cube as a row of another table.
 
 A sample is identified by its cube and its sequence number. A hub that restarts gives the same
 numbers again; then the time stamps tell the samples apart.
@@ -13,7 +13,7 @@ import numpy as np
 from .arrays import AnyArray, Index
 
 NO_MATCH = -1
-"""Index in the result of `match_rows` that stands for "no known row is this sample"."""
+"""Index in the result of `match_rows` for a wanted row whose sample is in no known row."""
 
 _SEQUENCE_BITS = 32
 """Number of bits of a sequence number.
@@ -53,7 +53,9 @@ class SampleKeys(NamedTuple):
 
 
 def match_rows(known: SampleRows, wanted: SampleRows) -> Index:
-    """Find, for each wanted row, the known row of the same cube and sequence number.
+    """Find, for each wanted row (sample of one cube), the known row of the same sample.
+
+    Rows of the same sample have the same cube and the same sequence number.
 
     Args:
         known: M rows to search, in any order.

@@ -211,7 +211,14 @@ class Modes:
 
 
 def _split_fields(flat: Array) -> tuple[Array, Array]:
-    """Return stress (N, 3, 3) and gradient (N, 3, 3, 3) of fields (N, 36) of 9 + 27 entries."""
+    """Split linear stress fields into the stress at the centre and its gradient.
+
+    Args:
+        flat: Fields (N, 36): 9 entries of the stress, then 27 of the gradient, row-major.
+
+    Returns:
+        Stress (N, 3, 3), and gradient times half the side of the cube (N, 3, 3, 3).
+    """
     stress, gradient = flat[:, :9], flat[:, 9:]
     return stress.reshape(-1, 3, 3), gradient.reshape(-1, 3, 3, 3)
 
@@ -256,8 +263,8 @@ def _make_modes(
     stress, gradient = _split_fields(flat)
 
     if symmetric:
-        # So far, only the entry sigma_ij that stands in a mode's name is set, and not the equal
-        # entry sigma_ji.
+        # So far, only the entry of the stress tensor that stands in a mode's name is set, such as
+        # xy (sigma_xy), and not the equal entry yx.
         transposed_stress = stress.transpose(0, 2, 1)
         transposed_gradient = gradient.transpose(0, 2, 1, 3)
         stress = np.where(stress == 0, transposed_stress, stress)

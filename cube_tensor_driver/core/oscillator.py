@@ -50,7 +50,8 @@ def pad_stress(
     """
     f, f0 = np.asarray(frequency), np.asarray(rest_frequency)
     with np.errstate(all="ignore"):
-        # The difference is formed first, because f / f0 - 1 would lose digits in float32.
+        # The difference of the frequencies is formed first: f / f0 - 1 would lose digits in
+        # float32, as f / f0 is near 1.
         u = (f - f0) / f0
         # The denominator is zero at the highest frequency that the pad law allows, at which the
         # foam is infinitely thick.

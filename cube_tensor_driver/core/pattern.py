@@ -24,7 +24,7 @@ Computed = TypeVar("Computed")
 
 
 class PatternCache(Generic[Computed]):
-    """Cache of the results of a function of a column of cube numbers (N,).
+    """Cache of the results of a function of a column of cube numbers (one for each row).
 
     If the cache is full, the columns that were not used for longest are removed.
     """
@@ -38,8 +38,9 @@ class PatternCache(Generic[Computed]):
     def get(self, cube: AnyArray) -> Computed:
         """Return the function's result for a column of cube numbers (N,), from the cache if
         possible."""
-        # The key is short, so that the search is fast. Two columns may have the same key, so the
-        # cached column is compared with the given one below.
+        # The key holds only length, first and last number of the column, so that the search is
+        # fast. Two columns may have the same key, so the cached column is compared with the given
+        # one below.
         key: tuple[int, ...] = (0,)
         if len(cube):
             key = (len(cube), int(cube[0]), int(cube[-1]))

@@ -1,4 +1,4 @@
-"""Pipeline: rows of frequencies to rows of stress, without a loop over rows or cubes.
+"""Pipeline: from frequencies of pads to stresses of cubes, without a loop over samples or cubes.
 
 A row (sample of one cube) is computed in two steps: the pad law (`oscillator.py`) gives the stress
 on each pad from its frequency, and a matrix product gives the 15 components of stress and gradient.
@@ -40,17 +40,19 @@ There is one for each combination of a calibration and a set of bad pads that ha
 """
 
 MIN_BETA = 1e-12
-"""Smallest value of beta (ratio of a pad's parasitic to its active capacitance) in the pad law.
+"""Smallest value of beta (ratio of a pad's parasitic to its active capacitance) in the pad law (the
+formula from the frequency of a pad to the stress on it).
 
 The computation divides by beta, so a pad with beta = 0 is computed with this value. It changes the
 strain of the pad by 1e-12.
 """
 
 LOWEST_STRESS_MARGIN = 1e-6
-"""Relative margin around the pad stress that a frequency of 0 would give.
+"""Margin above the stress on a pad that belongs to a frequency of 0, relative to that stress.
 
-If a stress is lower than that stress plus the margin, each pad is checked for a frequency outside
-the pad law. The margin covers a few rounding errors of float32.
+If any stress of a scan is below this margin, each pad is checked for a frequency outside the range
+of the pad law (formula from frequency to stress). The margin covers a few rounding errors of
+float32.
 """
 
 MAX_SEPARATE_PRODUCTS = 8
@@ -60,7 +62,9 @@ faster."""
 
 
 class _Table(NamedTuple):
-    """Matrix and limits for the rows with one calibration and one set of good pads.
+    """Matrix and limits for rows (samples) with the same calibration and the same good pads.
+
+    P is the number of pads, D the number of degrees of freedom of the residual.
 
     Attributes:
         matrix: Map (15 + D, P) from v (pad stresses divided by the stiffness) to 15 components, and
@@ -186,7 +190,8 @@ class Pipeline:
         self._estimator = lru_cache(maxsize=MAX_CACHED_ESTIMATORS)(self._make_estimator)
         self._table = lru_cache(maxsize=MAX_CACHED_ESTIMATORS)(self._make_table)
         groups = range(len(self._groups))
-        # Even if no calibration has a residual, the tables have one row for it, which is NaN.
+        # Calibrations with no more pads than modes have no residual. Even if this holds for all,
+        # the matrices have one row for the residual, which is NaN.
         most_dof = max(self._estimator(group, 0).dof for group in groups)
         self._n_residual = most_dof or 1
         tables = [self._make_table(group, 0) for group in groups]
@@ -264,7 +269,8 @@ class Pipeline:
             pattern, v, bad = law.pattern, law.v, law.bad
             out = self._multiply(pattern, v)
             limit = pattern.limit
-            # This makes a copy of the cached array, in which rows with bad pads are changed.
+            # concatenate makes a copy, so that the changes below for rows with bad pads do not
+            # reach the cached array.
             observed = np.concatenate([pattern.observed] * len(v))
             if bad is not None:
                 limit = np.tile(pattern.limit, (len(v), 1))
@@ -318,7 +324,8 @@ class Pipeline:
                 out[:, rows] = v[:, rows, :pads] @ matrix
             else:
                 part = out[:, rows]
-                # Pads come first, so that the inner loop of einsum runs over neighbours in memory.
+                # The axis of the pads comes first and that of the cubes last, so that the inner
+                # loop of einsum runs over neighbours in memory.
                 by_pad = v[:, rows, :pads].transpose(2, 0, 1)
                 product = np.einsum("pin,pbn->bni", matrix, np.ascontiguousarray(by_pad))
                 part[:, :, self._recovered] = product
@@ -506,7 +513,8 @@ class Pipeline:
         n = len(pattern.group)
         count = len(rows) // n if n else 1
         if count > 1:
-            # A single scan keeps two axes, because numpy is faster with two axes than with three.
+            # A single scan keeps the two axes (rows, pads), because numpy is faster with them than
+            # with a third axis of length 1.
             f = f.reshape(count, n, self.n_pads)
         rest, highest = pattern.rest, pattern.highest
         no_temperature = None
@@ -658,7 +666,8 @@ class Pipeline:
         dof = len(null)
         limit = np.nan
         if dof:
-            # These rows give sqrt(chi-square / dof), which is about 1 for noise alone.
+            # The root of the sum of squares that these rows give is sqrt(chi-square / dof), which
+            # is about 1 for noise alone.
             end = N_COMPONENTS + dof
             matrix[N_COMPONENTS:, :n_pads] = 0
             matrix[N_COMPONENTS:end, :n_pads] = null / np.sqrt(dof)

@@ -35,7 +35,8 @@ class CubePoses(NamedTuple):
             return 3.0 * side
         square = (self.position**2).sum(axis=1)
         products = self.position @ self.position.T
-        # |a - b|² = a² + b² - 2 ab saves the memory of an array of all differences (N, N, 3).
+        # The form a² + b² - 2 ab of the squared distance |a - b|² saves the memory of an array of
+        # all differences (N, N, 3).
         square_distance = square[:, None] + square - 2 * products
         np.fill_diagonal(square_distance, np.inf)
         nearest = np.median(square_distance.min(axis=1))

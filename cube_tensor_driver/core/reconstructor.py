@@ -1,4 +1,4 @@
-"""Reconstructor: from rows of frequencies to rows of stress, the central step of the program.
+"""Reconstructor: from frequencies of pads to stresses of cubes, the central step of the program.
 
 It combines the health of the pads (which of them are broken), the pipeline (the computation of the
 stress), the tracking of drift, and tare (taking the present load as the unloaded state). It reads
@@ -130,7 +130,8 @@ class Reconstructor:
                 problem of a row becomes a bit of its status.
         """
         windows = self.health.closed
-        # Health comes first, so that a pad that breaks is left out of this very row.
+        # The health of the pads is updated before the stress is computed, so that a broken
+        # pad is left out of the very row (sample of one cube) that shows it.
         left_out, pad_status = self.health.update(rows)
         if recorded is not None:
             left_out = np.where(recorded.known, recorded.left_out, left_out)

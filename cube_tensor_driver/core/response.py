@@ -192,7 +192,10 @@ def prototype(shift: Array) -> Array:
 
 
 def _list_names(names: Iterable[str]) -> str:
-    """Return the first few names in alphabetical order, and how many more there are."""
+    """Return a text with the first `MAX_LISTED_NAMES` names in alphabetical order.
+
+    If there are more, it ends with their number.
+    """
     ordered = sorted(names)
     if not ordered:
         return "none"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 PAD_FAULT = 1
-"""Status bit: at least one pad of the cube was not used for this row.
+"""Status bit: at least one pad of the cube was not used for this row (sample of one cube).
 
 The device reports a fault of the pad, the frequency of the pad is impossible, or the diagnosis of
 the pads found it stuck or noisy.
@@ -47,8 +47,8 @@ OPEN = 16
 SHORT = 32
 """Condition of a pad: no frequency is measured (0 or NaN), as with a short circuit."""
 RANGE = 64
-"""Condition of a pad: by the pad law, its frequency means a strain that the foam would not
-survive."""
+"""Condition of a pad: by the pad law (frequency to stress), its frequency means a strain that the
+foam would not survive."""
 STUCK = 128
 """Condition of a pad: its frequency does not change while those of the cube's other pads do."""
 NOISY = 256

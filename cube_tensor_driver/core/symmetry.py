@@ -89,7 +89,9 @@ def generate_group(generators: Sequence[Matrix]) -> Index:
 
 @lru_cache
 def find_group(name: str) -> Index:
-    """Return the elements (G, 3, 3) of a symmetry group, which are signed permutation matrices.
+    """Return the elements (G, 3, 3) of a symmetry group: its rotations and mirrors.
+
+    Each is a matrix with one entry 1 or -1 in each row and column.
 
     Raises:
         SymmetryError: There is no group of this name.

@@ -37,7 +37,7 @@ def principal_stresses(stress: Real) -> tuple[Array, Array]:
     matrices[~is_known] = 0
     ascending, vectors = np.linalg.eigh(matrices)
     values = ascending[..., ::-1].copy()
-    # LAPACK returns vectors as columns.
+    # LAPACK returns the eigenvectors as columns and in ascending order of the eigenvalues.
     rows = np.swapaxes(vectors, -1, -2)
     directions = rows[..., ::-1, :].copy()
     values[~is_known] = np.nan
@@ -58,7 +58,11 @@ def invariants(stress: Real) -> Array:
 
 
 def von_mises(stress: Real) -> Array:
-    """Compute the von Mises stress sqrt(3/2 |deviator|^2) of each stress tensor (..., 6)."""
+    """Compute the von Mises stress sqrt(3/2 |deviator|^2) of each stress tensor (..., 6).
+
+    The deviator is the tensor minus the mean of its normal stresses. The result has the unit of the
+    stress.
+    """
     xx, yy, zz, yz, zx, xy = _split(stress)
     normal = (xx - yy) ** 2 + (yy - zz) ** 2 + (zz - xx) ** 2
     shear = yz**2 + zx**2 + xy**2

@@ -200,8 +200,8 @@ class PadDiagnosis:
         return valid
 
     def _find_noisy(self, window: Window, state: StatusBits) -> Mask:
-        # Vibration raises the noise of all pads of a cube. It must not make pads noisy, so the
-        # median over the pads counts as usual noise if it is larger than that of the calibration.
+        # Vibration raises the noise of all pads of a cube. They must not be reported as noisy then,
+        # so the median noise of the pads is the usual noise if it is above that of the calibration.
         usual = np.fmax(self.noise, _lower_median(window.noise))
         self.bound = _squared_bound(usual)
         was_noisy = state & NOISY > 0
@@ -214,8 +214,8 @@ class PadDiagnosis:
 
     def _find_stuck(self, span: Real, state: StatusBits) -> Mask:
         others_moved = _lower_median(span / self.noise) > STUCK_MIN_SPAN
-        # A pad with an intermittent contact may show a single value for a window. It is not stuck,
-        # and has another condition already.
+        # A pad with a loose wire may show a single frequency for a window. It is not stuck, and has
+        # the condition open, short or range already.
         is_intermittent = state & (OPEN | SHORT | RANGE) > 0
         stuck: Mask = (span == 0) & others_moved & ~is_intermittent
         return stuck
