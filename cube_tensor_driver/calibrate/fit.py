@@ -229,8 +229,8 @@ def fit(
 
     residuals = model.residuals(theta, design, y) / scale
     covariance = robust_covariance(jacobian, residuals, scale)
-    # The pseudo-inverse in the covariance gives coefficients that the loads do not determine a
-    # small variance, although their variance is unknown.
+    # The covariance is computed with a pseudo-inverse, which gives coefficients that the loads do
+    # not determine a small variance, although their variance is unknown.
     covariance[:n_free][is_open] = np.nan
     covariance[:, :n_free][:, is_open] = np.nan
     # Coefficients that the caller fixed have the variance 0.
@@ -491,7 +491,7 @@ def _cross_validate(
         is_out = fold == k
         theta, _, _ = model.solve(design[~is_out], y[~is_out])
         errors[is_out] = y[is_out] - model.predict(theta, design[is_out])
-    # Outliers are excluded, because they would dominate both means.
+    # Outliers are excluded, because they would dominate the mean squares of errors and readings.
     mean_square_error = np.mean(errors[is_used] ** 2)
     mean_square_reading = np.mean(y[is_used] ** 2)
     return float(np.sqrt(mean_square_error / mean_square_reading))

@@ -43,8 +43,8 @@ MIN_PRESS_CHANGE = 2e-4
 load. It holds if the noise of the pads would allow a smaller change."""
 
 STEADY_SHARE = 0.1
-"""A press is steady if no pad's frequency differs between two successive averages by more than this
-fraction of the largest frequency change that the press caused."""
+"""Limit below which a press counts as steady: no pad's frequency differs between two successive
+averages by more than this fraction of the largest frequency change that the press caused."""
 
 RELEASED_SHARE = 0.4
 """A press has ended when the largest frequency change of all pads is below this fraction of the
@@ -156,7 +156,8 @@ class PressDetector:
             self.is_held = False
         if self.is_held or before is None or strongest < self._limit:
             return None
-        # While the finger still moves, the frequencies of the pads keep changing.
+        # While the finger still moves, the frequencies of the pads change from one average to the
+        # next.
         movement = np.nanmax(np.abs(change[cube] - before[cube]))
         if movement > STEADY_SHARE * strongest:
             return None
@@ -241,7 +242,8 @@ class Explanation:
 
     @property
     def swapped(self) -> list[int]:
-        """Numbers of the wires of the hub that lead to another pad than the layout states."""
+        """Numbers of the wires of the hub that lead to another pad than the layout of the cube
+        states."""
         is_swapped = self.places != np.arange(len(self.places))
         return [int(pad) for pad in np.flatnonzero(is_swapped)]
 
@@ -326,8 +328,8 @@ def _misfit(
     works = np.isfinite(measured).all(axis=0)
     m = measured[:, works]
     e = expected[:, :, places][..., works]  # (K, G, S, pads)
-    # The force of a press is unknown, but a finger cannot pull. So the expected stresses are scaled
-    # by a fitted factor that is not negative.
+    # The force of a press is unknown. So the expected stresses, which are those for 1 N, are scaled
+    # by a fitted factor. It is not negative, because a finger cannot pull.
     projection = np.maximum(0, np.einsum("kp,kgsp->kgs", m, e))
     total = (m**2).sum(axis=1)
     explained = projection**2 / (e * e).sum(axis=3)

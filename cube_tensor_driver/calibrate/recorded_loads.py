@@ -82,8 +82,8 @@ def read_recorded_loads(
         reference_ns, state = _read_reference(
             source.bag, reference, number, layout, area, calibration.half_side
         )
-    # For each sample, the number of the next message of the reference. Limiting it to 1 … last
-    # gives every sample a message before it and one after it.
+    # For each sample of the cube, the number of the next message of the reference sensor. Limiting
+    # it to 1 … last gives every sample a message before it and one after it.
     following = np.searchsorted(reference_ns, stamp_ns)
     following = following.clip(1, len(reference_ns) - 1)
     steps = np.diff(reference_ns)

@@ -143,7 +143,8 @@ def robust_covariance(
     Returns:
         Covariance (C, C) of the parameters.
     """
-    # Setting u to 1 for outliers makes psi and psi' 0 for them.
+    # With u = (r / limit)², Tukey's psi is r (1 - u)². Setting u to 1 for outliers makes psi and
+    # its derivative 0 for them.
     is_inlier = np.abs(r) < TUKEY_LIMIT
     u = np.where(is_inlier, (r / TUKEY_LIMIT) ** 2, 1)
     psi_squared = np.mean((r * (1 - u) ** 2) ** 2)
