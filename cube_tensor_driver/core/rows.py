@@ -30,7 +30,7 @@ COLUMN_TYPES: dict[str, type] = {
 
 
 class _Rows:
-    """Base class of tables of N rows, whose fields are all arrays (N, ...)."""
+    """Base class of tables of N rows (samples of one cube), whose fields are arrays (N, ...)."""
 
     __slots__ = ()
     cube: NDArray[np.uint16]
@@ -62,7 +62,7 @@ _Kind = TypeVar("_Kind", bound=_Rows)
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class FrequencyRows(_Rows):
-    """Measured frequencies: N rows of P pads.
+    """Measured frequencies: N rows (samples of one cube) of P pads.
 
     Attributes:
         cube: Number of the cube in the skin (N,).
@@ -116,7 +116,7 @@ class FrequencyRows(_Rows):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class StressRows(_Rows):
-    """Reconstructed stress: N rows, each in the frame of its cube, tension positive.
+    """Reconstructed stress: N rows (samples of one cube), in the cube's frame, tension positive.
 
     Attributes:
         cube, sequence, stamp_ns: Cube number, sequence number and time stamp (N,), taken from the
@@ -179,7 +179,7 @@ class StressRows(_Rows):
 
 
 def concatenate(parts: Sequence[_Kind]) -> _Kind:
-    """Return one table with the rows of one or more tables of the same kind, in order."""
+    """Return one table with the rows of one or more tables of the same class, in their order."""
     kind = type(parts[0])
     columns = (
         np.concatenate([getattr(part, field.name) for part in parts])

@@ -245,8 +245,8 @@ def _derive_structure(
         is_assigned[rows, columns] = True
         is_same_entry = (rows == pad) & (columns == mode)
         if np.any(is_same_entry & (signs < 0)):
-            # A group element maps the pad onto itself and reverses the sign of the mode. So the
-            # entry equals its own negative and must be zero.
+            # An element of the symmetry group maps the pad onto itself and reverses the sign of the
+            # mode (linear stress field). So the entry equals its own negative and must be zero.
             continue
         mode_name = modes.names[mode]
         own_name = (f"{layout.pads[pad]}:{mode_name}", 1)
@@ -302,7 +302,7 @@ def coefficient_counts(layout: Layout) -> dict[str, int | None]:
 
 
 def largest_symmetry(layout: Layout) -> str:
-    """Return the name of the largest symmetry group that a layout has.
+    """Return the name of the largest symmetry group that maps the pads of a layout onto each other.
 
     Groups under which all responses of the layout would be zero are skipped.
     """

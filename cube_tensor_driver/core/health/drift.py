@@ -88,7 +88,7 @@ class DriftTracker:
         return self._update_when_due()
 
     def _adopt_tare(self) -> None:
-        """Continue from the rest frequencies of the pipeline if a tare has replaced them."""
+        """Track drift from the rest frequencies of the pipeline if a tare has replaced them."""
         current = self._pipeline.rest_frequency
         if not np.array_equal(current, self._rest_in_use, equal_nan=True):
             self._rest_in_use = self._tracked_rest = current
@@ -110,7 +110,7 @@ class DriftTracker:
         return at_rest
 
     def _count_unloaded_windows(self, at_rest: Mask, has_rows: Mask) -> None:
-        """Count the windows since the last contact of each cube.
+        """Count the windows (of 0.5 s) for which each cube has been unloaded.
 
         A cube without rows keeps its count, because nothing shows whether it is loaded.
 

@@ -37,19 +37,24 @@ HISTORY_WINDOWS = 20
 """Number of ended windows whose statistics are kept for a tare: 10 s of data."""
 
 MIN_STRAIN = -0.8
-"""Smallest possible strain d/d_rest - 1 of a pad's foam: pressed to a fifth of its thickness.
+"""Smallest possible strain of a pad's foam (relative change of its thickness): pressed to a fifth
+of the thickness without load.
 
-A frequency that the pad law relates to a smaller strain counts as out of range.
+A frequency that the pad law (frequency to strain and stress) relates to a smaller strain counts as
+out of range.
 """
 
 MAX_STRAIN = 1.0
-"""Largest possible strain d/d_rest - 1 of a pad's foam: stretched to twice its thickness.
+"""Largest possible strain of a pad's foam (relative change of its thickness): stretched to twice
+the thickness without load.
 
-A frequency that the pad law relates to a larger strain counts as out of range.
+A frequency that the pad law (frequency to strain and stress) relates to a larger strain counts as
+out of range.
 """
 
 OPEN_STRAIN = 3.0
-"""Strain d/d_rest - 1 of a pad's foam from which on the pad counts as disconnected.
+"""Strain of a pad's foam (relative change of its thickness) from which on the pad counts as
+disconnected.
 
 The foam cannot reach it, so a frequency that the pad law relates to this strain or a larger one
 shows that the capacitor is disconnected.
@@ -115,7 +120,8 @@ class Health:
         self.closed = 0
         self.newest_ns = 0
         self._window_end_ns: int | None = None
-        # Number of rows of each cube in the present window with a residual above its limit.
+        # Number of rows (samples) of each cube in the present window of 0.5 s whose residual is
+        # above its limit.
         self._over_limit = np.zeros(n_cubes, int)
         # Number of rows, and whether the residual was high, since the last call of `collect`.
         self._rows = np.zeros(n_cubes, int)
@@ -160,9 +166,10 @@ class Health:
         return self._statistics.window()
 
     def refresh(self) -> None:
-        """Compute the limits of the frequencies again, from the rest frequencies of the pipeline.
+        """Compute the possible range of each frequency again.
 
-        The caller must do this after a tare or the tracking of drift has changed them.
+        The caller must do this after a tare or the tracking of drift has changed the rest
+        frequencies (frequencies without load) of the pipeline, from which the range follows.
         """
         calibrations, n_pads = self._pipeline.calibrations, self._pipeline.n_pads
         beta = pad_table([c.beta for c in calibrations], n_pads, fill=1.0)
@@ -215,7 +222,7 @@ class Health:
         return left_out, status
 
     def count_residuals(self, cube: AnyArray, status: StatusBits) -> None:
-        """Count the rows whose residual is above its limit.
+        """Count the rows (samples of one cube) with a high residual (disagreement of the pads).
 
         Args:
             cube: Numbers of the cubes (N,).

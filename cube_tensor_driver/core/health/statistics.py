@@ -158,7 +158,8 @@ class WindowStatistics:
 
     @bound.setter
     def bound(self, value: Array) -> None:
-        # Scans that wait are added first, because the old limit holds for them.
+        # Scans that were received but not added yet are added first, because the old limit holds
+        # for them.
         self._add_waiting()
         self._bound[:] = value
 
@@ -194,7 +195,8 @@ class WindowStatistics:
         """
         frequency = frequency.astype(np.float32, copy=False)
         if len(frequency) > 1 or doubtful is not None or self._is_doubtful.any():
-            # The scans that wait are older, so they are added first.
+            # Single scans that wait to be added are older than the new ones, so they are added
+            # first.
             self._add_waiting()
             self._add(cubes, frequency, stamp_ns, doubtful)
             return
@@ -241,7 +243,7 @@ class WindowStatistics:
         _add_in_order(bounded_squares, second)
         _add_in_order(first_squares, first * first)
         _add_in_order(total, frequency - base)
-        # fmin and fmax ignore NaN, which stands for a row without a frequency.
+        # fmin and fmax ignore NaN, which stands for a sample in which the pad had no frequency.
         lowest_now = np.fmin.reduce(frequency, axis=0)
         highest_now = np.fmax.reduce(frequency, axis=0)
         np.fmin(lowest, lowest_now, out=lowest)
@@ -342,7 +344,7 @@ class WindowStatistics:
         return ratio.astype(np.float32), weight.astype(np.float32)
 
     def _note_gaps(self, cubes: Cubes, interval: Times) -> None:
-        """Keep the longest gap between rows, for the statistics of the window.
+        """Keep the longest gap between two rows (samples) of each cube, for the statistics.
 
         Args:
             cubes: Numbers of the N cubes.
@@ -355,7 +357,8 @@ class WindowStatistics:
             return
         is_first = self._count[cubes] == 0
         before, within = self._gap_before[cubes], self._gap_within[cubes]
-        # The interval that ends at the first row of a window lies before the window.
+        # The interval between the last row of a window and the first row of the next one counts as
+        # the gap before the next window, not within it.
         self._gap_before[cubes] = np.where(is_first, gap[0], before)
         gap[0] = np.where(is_first, 0, gap[0])
         candidates = np.concatenate([within[None], gap])

@@ -213,7 +213,7 @@ def _refuse_gaps(
     # A gap before the first window does not matter, because no earlier row is averaged.
     before = [window.gap_before[chosen] for window in windows[1:]]
     within = [window.gap_within[chosen] for window in windows]
-    # The time since the newest row is a gap, too.
+    # The time from the newest row of a cube to the newest row of any cube is a gap, too.
     gaps_ns = [*before, *within, health.age_ns[chosen]]
     gaps_s = 1e-9 * np.abs(gaps_ns)
     mean_interval_s = len(windows) * WINDOW_S / rows
@@ -241,7 +241,8 @@ def _average(windows: Sequence[Window], chosen: Index) -> _Means:
     highest = np.fmax.reduce([window.highest[chosen] for window in windows])
     lowest = np.fmin.reduce([window.lowest[chosen] for window in windows])
 
-    # The mean of a window without rows is NaN, and NaN times its weight 0 would be NaN.
+    # The mean frequency of a window without rows is NaN. It is replaced, because NaN times the
+    # weight 0 of this window would still be NaN.
     known_mean = np.where(rows > 0, mean, 0)
     total = (known_mean * rows).sum(axis=0)
     # The noise of a window is NaN if it holds the first rows of a cube ever, because these have no
@@ -309,7 +310,8 @@ def _apply_check(
         pipeline: Pipeline with the calibrations, which name the pads.
         names: Names of all cubes.
     """
-    # The comparison is negated, so that NaN counts as above the limit.
+    # A comparison with NaN is False. So "not <=" is used instead of ">", with which NaN counts as
+    # above the limit.
     exceeds = used & ~(check.values <= check.limit)
     if not exceeds.any():
         return
