@@ -22,7 +22,7 @@ from cube_tensor_driver.touch.tracker.contact_tracker import ContactTracker
 from ..fem.body import Body
 from ..fem.reciprocity import compute_influence
 from .field_study import FORCE, FRICTION, FieldExample
-from .traction_study import CUBES, Bench, Errors, Setting
+from .traction_study import CUBES, Errors, Setting, TractionBench
 
 FORMS = ("points", "pads")
 """Models of a cube that the inverse assumes: a point, or pads with influence functions."""
@@ -46,7 +46,7 @@ THIN = tuple(
 layer."""
 
 
-class LayerBench(Bench):
+class LayerBench(TractionBench):
     """A skin in a layer, whose pads have the stress that finite elements of a cube in it give."""
 
     def __init__(

@@ -132,7 +132,7 @@ class Errors:
     found: float
 
 
-class Bench:
+class TractionBench:
     """A skin of one setting, its inverse, and loads on it.
 
     Attributes:
@@ -426,7 +426,7 @@ def traction_example() -> FieldExample:
     The pressure at the cubes' depth is the true one, that of each of `METHODS`, and the "standard
     deviation" that the inverse predicts, in Pa.
     """
-    bench = Bench(
+    bench = TractionBench(
         Setting(
             cubes=CUBES[2],
             pitch=10e-3,
@@ -492,7 +492,7 @@ def traction_study(
     """Return the errors of each setting at each width (m)."""
     results: dict[Setting, list[Errors]] = {}
     for setting in settings:
-        bench = Bench(setting)
+        bench = TractionBench(setting)
         results[setting] = []
         for width in widths:
             errors = bench.errors(width, cases, seed)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg import cho_solve
 
-from cube_tensor_design.studies.traction_study import CUBES, Bench, Setting
+from cube_tensor_design.studies.traction_study import CUBES, Setting, TractionBench
 from cube_tensor_driver.core.modes import STRESS, to_matrix
 from cube_tensor_driver.core.poses import CubePoses
 from cube_tensor_driver.core.tensor import rotate_gradient, rotate_stress, rotation_from_rpy
@@ -90,7 +90,7 @@ def test_a_contact_between_wide_pitches_has_its_force_and_place(
 def test_stated_deviations_are_those_of_the_errors(cubes):
     """Through the whole chain: gains of pads, pad law, counter, pipeline. The number of loads
     leaves 0.65 to 1.35 open."""
-    errors = Bench(Setting(cubes=cubes), side=2).errors(8e-3, cases=8)
+    errors = TractionBench(Setting(cubes=cubes), side=2).errors(8e-3, cases=8)
     force, place = errors.ratio[1]
     assert 0.5 < force < 1.6 and 0.5 < place < 1.6
     assert errors.force[1] < 0.01 and errors.position[1] < 0.1e-3 and errors.found == 1
@@ -104,7 +104,7 @@ def test_stated_deviations_are_those_of_the_errors(cubes):
 def test_the_noise_of_a_cube_is_how_its_values_scatter_with_the_gains_and_the_counter(cubes):
     """In every direction of its components. Pads differ: below a narrow contact some feel ten times
     as much as others, so gains that were off by as many Pa for each would be wrong."""
-    bench, random = Bench(Setting(cubes=cubes), side=1), np.random.default_rng(7)
+    bench, random = TractionBench(Setting(cubes=cubes), side=1), np.random.default_rng(7)
     field = bench.truth(np.array([[1e-3, 2e-3]]), 2e-3, np.array([0.6, 0.3, -3.0]), np.zeros(2))
     count = len(bench.poses.position)
     pads = bench.pads_in(np.repeat(field, count, axis=0))
@@ -125,7 +125,7 @@ def test_the_noise_of_a_cube_is_how_its_values_scatter_with_the_gains_and_the_co
 def test_where_nothing_is_left_the_field_is_as_unsure_as_noise_and_gains_make_it(lost, limit):
     """A contact that is known takes all values away, and leaves the errors of its pads. What is
     predicted of lost cubes counts as independent of what it is predicted from."""
-    bench, random = Bench(Setting(), side=2), np.random.default_rng(3)
+    bench, random = TractionBench(Setting(), side=2), np.random.default_rng(3)
     inverse, force = bench.inverse, np.array([0.6, 0.3, -3.0])
     field = bench.truth(bench.poses.position[:, :2], 8e-3, force, np.array([1e-3, 2e-3]))
     pads = bench.pads_in(field)
@@ -260,7 +260,7 @@ def test_two_balls_beside_each_other_without_a_valley_are_told_apart_by_likeliho
 def test_planar_cubes_six_depths_apart_tell_on_which_side_of_their_row_a_contact_is():
     """Its nearest cube does not. A fit that begins on the wrong side stays there: 7 mm off. Near
     the middle of a cube it did with the noise of the gains from the first step on: 5 mm off."""
-    bench = Bench(Setting(cubes=CUBES[1], pitch=24e-3, depth=4e-3), side=1)
+    bench = TractionBench(Setting(cubes=CUBES[1], pitch=24e-3, depth=4e-3), side=1)
     force, random = np.array([0.6, -0.3, -3.0]), np.random.default_rng(6)
     for centre, width in (((11.7, -4.4), 5e-3), ((6, 9), 5e-3), ((-0.5, 2.5), 2e-3)):
         centre = 1e-3 * np.array(centre)
@@ -274,7 +274,7 @@ def test_planar_cubes_six_depths_apart_tell_on_which_side_of_their_row_a_contact
 def test_a_contact_midway_between_planar_cubes_is_not_looked_for_beside_another_cube(seed):
     """Where the field is highest there. A third of the force was found, 14 mm off."""
     bench, random = (
-        Bench(Setting(cubes=CUBES[1], pitch=24e-3, depth=4e-3)),
+        TractionBench(Setting(cubes=CUBES[1], pitch=24e-3, depth=4e-3)),
         np.random.default_rng(seed),
     )
     centre, angle = np.array([random.uniform(-4e-3, 4e-3), -11.7e-3]), random.uniform(0, 6.28)
@@ -289,7 +289,7 @@ def test_a_contact_midway_between_planar_cubes_is_not_looked_for_beside_another_
 def test_the_size_of_a_flat_punch_settles():
     """Its size and its fullness look alike, and the fit swung between two sizes: 5 % of the force
     off, five stated deviations."""
-    bench = Bench(Setting(pitch=24e-3, depth=4e-3, shape="flat punch"), side=2)
+    bench = TractionBench(Setting(pitch=24e-3, depth=4e-3, shape="flat punch"), side=2)
     random = np.random.default_rng(11)
     load, centre = bench.load(random)
     (found,) = ContactTracker(bench.inverse, LEAST).update(
@@ -301,7 +301,7 @@ def test_the_size_of_a_flat_punch_settles():
 def test_a_fit_from_the_wrong_side_of_a_cube_gets_to_a_contact_half_a_pitch_away():
     """One that was held up just before had as much evidence, and ended 0.04 mm off: six stated
     deviations."""
-    bench = Bench(Setting(cubes=CUBES[1]), side=2)
+    bench = TractionBench(Setting(cubes=CUBES[1]), side=2)
     for seed in (17, 30, 35):
         random = np.random.default_rng(seed)
         side, y = random.choice([-1, 1]), random.uniform(-3e-3, 3e-3)
@@ -317,7 +317,7 @@ def test_a_fit_from_the_wrong_side_of_a_cube_gets_to_a_contact_half_a_pitch_away
 def test_a_force_between_two_likely_ones_is_as_uncertain(seed):
     """On both sides of the middle between two planar cubes, contacts explain the values alike. Here
     the likelier one is the wrong one: 0.03 N off, 7 deviations of its fit alone, and 0.4 mm."""
-    bench = Bench(Setting(cubes=CUBES[2]), side=1)
+    bench = TractionBench(Setting(cubes=CUBES[2]), side=1)
     force, centre = np.array([0.638, -0.635, -3.0]), np.array([3.8e-3, -0.6e-3])
     values = bench.values(10e-3, force, centre, np.random.default_rng(seed))
     (found,) = ContactTracker(bench.inverse, LEAST).update(values)

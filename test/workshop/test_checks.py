@@ -17,7 +17,7 @@ from cube_tensor_driver.simulation.faults import Fault
 from cube_tensor_driver.simulation.sample_log import FaultRecord, LinkLog, SampleLog, SampleRun
 from workshop.checks.all_checks import check_all
 from workshop.checks.expected import ExpectedReadings, load_tables
-from workshop.checks.record import Action, CubeMessages, Received, Record
+from workshop.checks.record import CubeMessages, NodeAction, Received, Record
 from workshop.checks.rest import TRANSPORT_S
 from workshop.checks.samples import Samples
 
@@ -207,7 +207,7 @@ def tared(played):
         rest = np.array([cube.calibration.rest_frequency for cube in skin.cubes])
         instant = start_us // PERIOD_US % INSTANTS
         rest[list(HELD_CUBES)] = readings[instant, HELD_CUBES] * 1e-3 * (1 + error)
-        action = Action(
+        action = NodeAction(
             kind="tare", begin_ns=TARED_NS, end_ns=TARED_NS, succeeded=True, cubes=HELD_CUBES
         )
         return recorded(skin, held, (action,), (TARED_NS, rest))
@@ -259,7 +259,7 @@ def test_what_comes_to_a_reconstruction_that_is_down_has_no_tensor(played):
     rest = received(record.stress.rows.select(~down))
     for late_ns, figures in ((0, set()), (-50_000_000, {"missing_tensors"})):
         begin_ns, end_ns = int(stamp_ns[ROW]) + 10_000_000, int(stamp_ns[down].max()) + late_ns
-        action = Action(
+        action = NodeAction(
             kind="restart reconstruction", begin_ns=begin_ns, end_ns=end_ns, succeeded=True
         )
         killed = check_all(replace(record, stress=rest, actions=(action,)), log)
@@ -270,7 +270,7 @@ def test_what_a_driver_counted_just_before_it_was_killed_is_not_known(played):
     record, log = played
     stamp_ns = record.frequencies.rows.stamp_ns
     dead_ns = int(stamp_ns[-1]) + 1
-    dead = Action(kind="restart driver", begin_ns=dead_ns, end_ns=dead_ns, succeeded=True)
+    dead = NodeAction(kind="restart driver", begin_ns=dead_ns, end_ns=dead_ns, succeeded=True)
     for unreported_ns, figures in ((1_400_000_000, set()), (1_600_000_000, {"miscounted"})):
         unreported = np.count_nonzero(stamp_ns > dead_ns - unreported_ns)
         counters = {**record.counters, "rows published": len(stamp_ns) - int(unreported)}

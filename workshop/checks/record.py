@@ -137,7 +137,7 @@ class CubeMessages:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Action(Span):
+class NodeAction(Span):
     """Something that was done to the nodes, from the request to its end.
 
     Attributes:
@@ -173,11 +173,11 @@ class Record(Span):
     frequencies: Received[FrequencyRows]
     stress: Received[StressRows]
     cube_messages: CubeMessages
-    actions: tuple[Action, ...]
+    actions: tuple[NodeAction, ...]
     counters: Mapping[str, int]
     messages_lost: int
 
-    def actions_of(self, *kinds: str) -> list[Action]:
+    def actions_of(self, *kinds: str) -> list[NodeAction]:
         """Return the actions of some kinds, in order."""
         return [action for action in self.actions if action.kind in kinds]
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from cube_tensor_driver.core.arrays import AnyArray, Array, Mask, Times
 
-from .record import LATEST_NS, NS_PER_S, RECONSTRUCTION_STOPS, Action, Span
+from .record import LATEST_NS, NS_PER_S, RECONSTRUCTION_STOPS, NodeAction, Span
 from .run import Run
 
 TRANSPORT_S = 0.1
@@ -77,11 +77,11 @@ class RestHistory:
             following = Span(action.end_ns, LATEST_NS)
             self._epochs.append((following, current))
 
-    def _changes(self) -> list[Action]:
+    def _changes(self) -> list[NodeAction]:
         actions = self._run.record.actions_of("tare", "clear")
         return [action for action in actions if action.succeeded]
 
-    def _apply(self, action: Action, current: RestFrequencies) -> RestFrequencies:
+    def _apply(self, action: NodeAction, current: RestFrequencies) -> RestFrequencies:
         if action.kind == "clear":
             return self._calibrated
         # The load must have been held for all data that the tare averages.

@@ -21,7 +21,7 @@ from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import Process
 from cube_tensor_driver.srv import Tare
 
-from ..checks.record import NS_PER_S, Action
+from ..checks.record import NS_PER_S, NodeAction
 from .message_log import TopicLog
 from .mix import HELD_CUBES
 
@@ -99,7 +99,7 @@ class Actions:
         on_driver_killed: Callable[[], None],
     ) -> None:
         """on_driver_killed: called when the driver is dead and its last messages have arrived."""
-        self.done: list[Action] = []
+        self.done: list[NodeAction] = []
         self.refused: list[str] = []
         self._observer, self._children, self._processes = observer, children, processes
         self._skin, self._stress = skin, stress
@@ -148,7 +148,7 @@ class Actions:
         self._is_late = delay_s > MAX_DELAY_S
         self._begin_ns = time.time_ns()
         succeeded, answer = self._kinds[kind](event)
-        action = Action(
+        action = NodeAction(
             kind=kind,
             begin_ns=self._begin_ns,
             end_ns=time.time_ns(),

@@ -83,7 +83,7 @@ class _RawSubscription:
         self._node.destroy_subscription(self._subscription)
 
 
-class Topic(NamedTuple, Generic[AnyRows]):
+class BatchTopic(NamedTuple, Generic[AnyRows]):
     """A batch topic: its name, type of message and codec."""
 
     name: str
@@ -101,7 +101,7 @@ class TopicLog(Generic[AnyRows]):
     def __init__(
         self,
         node: Node,
-        topic: Topic[AnyRows],
+        topic: BatchTopic[AnyRows],
         quality: QoSProfile,
         skin: Skin,
     ) -> None:

@@ -26,7 +26,7 @@ from cube_tensor_driver.simulation.sample_log import SampleLog
 from cube_tensor_driver.simulation.simulator import FAULT_PIPE
 
 from ..checks.expected import load_tables
-from ..checks.record import NS_PER_S, Action, Record, Span
+from ..checks.record import NS_PER_S, NodeAction, Record, Span
 from .actions import MAX_START_S, Actions
 from .memory import MemoryMonitor
 from .mix import CUBES_PER_HUB, HUBS, RATE, schedule
@@ -152,7 +152,7 @@ def _describe(actions: Actions, log: SampleLog) -> dict[str, Any]:
     def seconds(time_ns: int) -> float:
         return round((time_ns - log.start_time_ns) / NS_PER_S, 3)
 
-    def span(action: Action) -> str:
+    def span(action: NodeAction) -> str:
         return f"{action.kind}: {seconds(action.begin_ns)} to {seconds(action.end_ns)} s"
 
     failed = [f"{action.kind}: {action.answer}" for action in actions.done if not action.succeeded]

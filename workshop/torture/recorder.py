@@ -20,9 +20,9 @@ from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.ros.messages import to_ns
 from cube_tensor_driver.ros.qos import batch_profile
 
-from ..checks.record import Action, Record, Span
+from ..checks.record import NodeAction, Record, Span
 from .memory import MemoryMonitor
-from .message_log import CubeTopicLog, Topic, TopicLog
+from .message_log import BatchTopic, CubeTopicLog, TopicLog
 from .mix import CUBES_PER_HUB, OPENING_CUBES, OPENING_HUB, RATE
 
 INSTANTS = 1000
@@ -42,7 +42,7 @@ LINK_COUNTERS = ("lost_on_the_way", "dropped_in_hub", "taken", "delivered", "dup
 """Counters of the driver for each link that are shown or checked."""
 
 
-class Recorder:
+class TortureRecorder:
     """Records what a skin publishes.
 
     Attributes:
@@ -60,8 +60,8 @@ class Recorder:
         self.observer, self._skin = observer, skin
         quality = batch_profile(RATE)
         quality.depth = QUEUE_DEPTH
-        frequencies = Topic("frequencies", SkinFrequencies, frequency_codec)
-        stress = Topic("stress", SkinStress, stress_codec)
+        frequencies = BatchTopic("frequencies", SkinFrequencies, frequency_codec)
+        stress = BatchTopic("stress", SkinStress, stress_codec)
         self._frequencies = TopicLog(node, frequencies, quality, skin)
         self.stress = TopicLog(node, stress, quality, skin)
         self._cube_topics = CubeTopicLog(node, skin, RECORDED_CUBE, quality)
@@ -108,7 +108,7 @@ class Recorder:
             counts[name] = sum(values)
         return counts
 
-    def finish(self, checked: Span, actions: list[Action]) -> Record:
+    def finish(self, checked: Span, actions: list[NodeAction]) -> Record:
         """Return everything that was recorded.
 
         Args:
@@ -155,7 +155,7 @@ def recording(
     children: Children,
     interrupted: Event,
     memory: MemoryMonitor,
-) -> Iterator[Recorder]:
+) -> Iterator[TortureRecorder]:
     """Make a recorder for the length of a block, and measure the memory while it spins."""
     steps: list[Callable[[], None]] = [memory.measure]
 
@@ -166,7 +166,7 @@ def recording(
     with observing("torture", children, interrupted=interrupted, on_step=on_step) as observer:
         node = rclpy.create_node("checker")
         try:
-            recorder = Recorder(observer, node, skin)
+            recorder = TortureRecorder(observer, node, skin)
             steps.append(recorder.take)
             yield recorder
         finally:

@@ -74,7 +74,7 @@ class _Limits(NamedTuple):
     open: Single
 
 
-class _Pattern(NamedTuple):
+class _HealthPattern(NamedTuple):
     """Quantities that depend only on the cube numbers of a message.
 
     Attributes:
@@ -245,7 +245,7 @@ class Health:
         self._rows = np.zeros_like(rows)
         return self._conditions.collect(), had_high_residual, rows
 
-    def _check(self, pattern: _Pattern, rows: FrequencyRows) -> tuple[PadMasks, StatusBits]:
+    def _check(self, pattern: _HealthPattern, rows: FrequencyRows) -> tuple[PadMasks, StatusBits]:
         """Check the rows of one or more scans of the same cubes, and add them to the statistics.
 
         `update` explains the result.
@@ -362,7 +362,7 @@ class Health:
         is_reported &= self._exists[cube]
         self._conditions.add(cube, is_reported * np.uint16(REPORTED))
 
-    def _make_pattern(self, cube: AnyArray) -> _Pattern:
+    def _make_pattern(self, cube: AnyArray) -> _HealthPattern:
         n_cubes, n_pads = self._exists.shape
         is_known = (cube >= 0) & (cube < n_cubes)
         if not is_known.all():
@@ -377,7 +377,7 @@ class Health:
             # the last is as long as the scan.
             if last - first + 1 == len(scan):
                 cubes = slice(first, last + 1)
-        return _Pattern(
+        return _HealthPattern(
             repeats=repeats,
             cube=scan,
             cubes=cubes,
