@@ -35,7 +35,11 @@ def find_influence(name: str) -> Path:
 
 
 def influence_problem(name: str) -> str:
-    """Return the error message of `find_influence` for a name, or "" if it finds a file."""
+    """Return an error message if there is no file of influence functions of this name; else "".
+
+    Args:
+        name: Name of such a file in the package, without its suffix, or a path.
+    """
     try:
         find_influence(name)
     except ConfigError as error:

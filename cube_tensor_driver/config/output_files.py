@@ -34,8 +34,8 @@ def atomic_write(path: Path) -> Iterator[Path]:
 def check_writable(path: Path) -> None:
     """Raise ConfigError if `atomic_write` could not write this file.
 
-    A temporary file is made beside it and removed. The permissions would not suffice: root passes
-    every check of permissions, also below /proc and on read-only file systems.
+    A temporary file is made beside it and removed. To read its permissions would not
+    suffice: root passes every check of permissions, even below /proc and on read-only file systems.
     """
     with _temporary_file(path) as temporary:
         temporary.touch()

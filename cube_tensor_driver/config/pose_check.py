@@ -36,7 +36,10 @@ MAX_NAMES = 4
 
 
 def pose_doubts(skin: Skin) -> Iterator[str]:
-    """Yield a warning (one line) for each pose of a cube that is most likely a typing error."""
+    """Yield a warning (one line) for each mistake that the cubes' poses most likely have.
+
+    Warnings are given for several cubes at one position, and for positions in mm instead of m.
+    """
     positions = np.array([cube.xyz for cube in skin.cubes])
     yield from _find_shared_positions(skin, positions)
     if _seems_in_millimetres(positions):

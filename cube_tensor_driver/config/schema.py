@@ -143,8 +143,8 @@ class Schema:
 def _is_finite_number(_: Any, value: Any) -> bool:
     """Return whether a value is a number in the range of a float.
 
-    NaN and infinity, which YAML writes as .nan and .inf, are not. jsonschema passes itself as the
-    first argument, which is not needed.
+    The result is false for NaN and infinity, which YAML writes as .nan and .inf. The library
+    jsonschema passes its checker of types as the first argument, which is not used.
     """
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
     # The comparison is false for NaN. math.isfinite would raise OverflowError for an integer above

@@ -230,7 +230,8 @@ def check_skin_data(data: Any, folder: Path) -> tuple[Skin | None, list[str]]:
     # Further checks go through the entries of both lists, so both must be lists.
     if not isinstance(data.get("links"), list) or not isinstance(data.get("cubes"), list):
         return None, mistakes
-    # The first two keys of a path identify the entry: ("cubes", 3) for any mistake in cubes[3].
+    # The path of a mistake is the keys that lead to the wrong value. The first two identify the
+    # entry: ("cubes", 3) for any mistake in cubes[3].
     malformed = {where[:2] for where, _ in schema_mistakes}
 
     links = tuple(
@@ -283,9 +284,11 @@ class _CubeReader:
         self._calibrations: dict[str, Calibration | None] = {}
 
     def read(self, number: int, item: dict[str, Any]) -> None:
-        """Read the entry `item`, which is `cubes[number]` of the file.
+        """Read the entry of one cube; add the cube to `cubes`, and its mistakes to `mistakes`.
 
-        The cube is added to `cubes`, and mistakes are added to `mistakes`.
+        Args:
+            number: Index of the cube in the skin file.
+            item: The entry: keys and values of the cube.
         """
         calibration = self._read_calibration(number, item["calibration"])
         if calibration is None:
@@ -305,10 +308,14 @@ class _CubeReader:
         self.cubes.append(cube)
 
     def _read_calibration(self, number: int, name: str) -> Calibration | None:
-        """Return the calibration of this name, or None if it cannot be read.
+        """Return the calibration that a cube names, or None if it cannot be read.
 
-        The error is added to `mistakes` only once, for the first cube (of index `number`) that
-        names the calibration.
+        If several cubes name a calibration that cannot be read, the error is added to `mistakes`
+        only once, for the first of these cubes.
+
+        Args:
+            number: Index of the cube in the skin file.
+            name: Name or path of the calibration, as the skin file states it.
         """
         if name not in self._calibrations:
             try:
@@ -382,7 +389,8 @@ def _find_cube_mistakes(cubes: tuple[SkinCube, ...]) -> Iterator[str]:
 def _find_pad_mistakes(links: tuple[SkinLink, ...], cubes: tuple[SkinCube, ...]) -> Iterator[str]:
     """Yield a mistake for each link whose cubes differ in their number of pads.
 
-    The protocol of the hubs requires this: a frame of data has the same number of pads per cube.
+    The cubes of a link must have equal numbers of pads, because a SAMPLE frame of the hubs'
+    protocol has the same number of pads for each cube.
     """
     for link in links:
         pads = {cube.calibration.layout.n_pads for cube in cubes if cube.link == link.name}

@@ -51,7 +51,7 @@ def write_tare(
     rest_frequency: NDArray[np.floating[Any]],
     created: datetime,
 ) -> None:
-    """Write the tare of a cube, completely or not at all.
+    """Write the tare file (frequencies without load) of a cube, completely or not at all.
 
     Args:
         folder: Folder of the tare files of all cubes. It is made if it does not exist.
@@ -81,7 +81,7 @@ def write_tare(
 
 
 def read_tare(folder: Path, uid: int, calibration: Calibration) -> StoredTare | None:
-    """Return the stored tare of a cube, or None if there is no file for it.
+    """Return the stored tare (frequencies without load) of a cube; None if there is no file for it.
 
     Args:
         folder: Folder of the tare files of all cubes.
@@ -99,7 +99,8 @@ def read_tare(folder: Path, uid: int, calibration: Calibration) -> StoredTare | 
     for _, mistake in _tare_schema(calibration.layout.n_pads).mistakes(data):
         raise ConfigError(f"{path}: {mistake}; tare again")
 
-    # The two differ if somebody has renamed the file or copied it for another cube.
+    # The uid in the file differs from that in its name if somebody has renamed the file or copied
+    # it for another cube.
     if int(data["uid"], 16) != uid:
         raise ConfigError(
             f"{path}: uid is {data['uid']!r}, the file's name says {uid:#x}; tare again"

@@ -159,10 +159,10 @@ class Decoded(Generic[AnyRows]):
         return len(self.stamp_ns)
 
     def select(self, chosen: slice) -> Decoded[AnyRows]:
-        """Return some successive messages.
+        """Return some successive messages of these M messages.
 
         Args:
-            chosen: Numbers of the first message and of the one after the last; no step.
+            chosen: Slice of the message numbers 0 to M - 1, without a step.
         """
         n_rows = len(self.rows) // len(self)
         begin, end, _ = chosen.indices(len(self))
@@ -399,6 +399,11 @@ class MessageCodec(Generic[AnyRows]):
     def _read_records(self, messages: Sequence[bytes]) -> tuple[_Layout, AnyArray]:
         """View serialised messages as an array (M,) of the structured dtype of their layout.
 
+        The layout states the byte offset and type of each field.
+
+        Args:
+            messages: M serialised messages whose lengths and `shape_bytes` are equal.
+
         Returns:
             The layout of the messages, and the array.
 
@@ -575,13 +580,14 @@ def _dimensions(width: int, shape: _Shape) -> tuple[int, ...]:
 
 
 def _read_stamps(record: AnyArray) -> tuple[Times, Times]:
-    """Return the time stamps of messages and of their rows, in ns since the Unix epoch.
+    """Return the time stamps of messages and of their rows (samples of cubes).
 
     Args:
         record: Messages (M,) as an array of the structured dtype of their layout.
 
     Returns:
-        Time stamps of the headers (M,), and those of the rows of all messages, one after the other.
+        Time stamps of the headers (M,), and those of the rows of all messages, one after the other;
+        both in ns since the Unix epoch.
     """
     seconds = record["sec"].astype(np.int64)
     stamp_ns: Times = seconds * SECOND + record["nanosec"]
@@ -605,7 +611,7 @@ def _read_column(record: AnyArray, name: str) -> AnyArray:
 
 
 def _align(offset: int) -> int:
-    """Round a byte offset up to a multiple of 4."""
+    """Round a byte offset up to a multiple of 4, at which CDR begins values of 4 bytes."""
     return -(-offset // 4) * 4
 
 

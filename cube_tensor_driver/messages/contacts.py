@@ -61,7 +61,7 @@ def contacts_message(
     """Make a SkinContacts message.
 
     Args:
-        make: Function that constructs a message.
+        make: Function that constructs a message from its type's name and its fields.
         stamp_ns: Time stamp of the header, in ns since the Unix epoch.
         frame_id: Coordinate frame of the positions, normals and forces.
         contacts: The contacts: all with a tracker (`TrackedContact`) or all without one.
@@ -88,10 +88,11 @@ def traction_message(
     """Make a PointCloud2 message of the traction (pressure and shear stress) on the surface.
 
     Args:
-        make: Function that constructs a message.
+        make: Function that constructs a message from its type's name and its fields.
         stamp_ns: Time stamp of the header, in ns since the Unix epoch.
         frame_id: Coordinate frame of the points, which is the parent frame of the skin.
-        cloud: Points (M, 6) with the columns of `CLOUD`.
+        cloud: Points (M, 6) with the columns of `CLOUD`: position in m, pressure, shear stress and
+            standard deviation of the pressure in Pa.
     """
     data = cloud.astype("<f4")
     fields = [

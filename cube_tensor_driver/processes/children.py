@@ -66,8 +66,11 @@ class Children:
     def start(self, process: Process) -> None:
         """Start a process in a session of its own.
 
-        The terminal sends SIGINT (Ctrl-C) only to the session of this process. So `end` decides in
-        which order the children end.
+        The terminal sends SIGINT (Ctrl-C) only to the session of this process, not to the child. So
+        the order in which `end` is called decides in which order the children end.
+
+        Args:
+            process: Executable, arguments and parameters of the process.
         """
         program = [process.program] if process.program else [sys.executable, "-m", process.module]
         # `end_with_parent` ends the command when this process is killed. Otherwise a driver would

@@ -56,8 +56,8 @@ def check_domain() -> None:
 def own_domain() -> Iterator[int]:
     """Set, for a `with` block, a DDS domain that no other process on this host uses.
 
-    It holds for this process and for those started in the block. Nodes are not visible to other
-    hosts.
+    The domain holds for this process and for those that it starts in the block. Their nodes are not
+    visible to other hosts. Afterwards the environment variables are as before.
 
     Yields:
         The number of the domain.
@@ -87,7 +87,7 @@ def _claim_domain() -> tuple[int, socket.socket]:
     """
     for domain in range(MAX_OWN_DOMAIN, 0, -1):
         claim = _bind(domain, FREE_OFFSET)
-        # The port is taken: another process of this package has reserved the domain.
+        # If the port is in use, another process of this package has reserved the domain.
         if claim is None:
             continue
         # Any node that runs in the domain has bound the port of the first participant.

@@ -108,7 +108,8 @@ def skin_processes(
         port: Port that replaces the one in the skin file, which must have a single link; empty:
             the ports of the file.
         rate: Sampling rate of each cube, in Hz; 0: the rate in the skin file.
-        publish_period: Time, in s, whose scans are sent in one message; 0: one message per scan.
+        publish_period: Time, in s, whose scans (samples of all cubes) are sent in one message; 0: a
+            message for each scan.
         composed: Whether driver and reconstruction run in one process.
         markers: Whether the node `markers` (picture for RViz) runs, too.
         contacts: Whether the node `contacts` (contacts on the skin) runs, too.

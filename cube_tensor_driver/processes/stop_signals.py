@@ -14,8 +14,8 @@ SIGHUP when the terminal is closed."""
 def on_stop_signal(stop: Callable[[], None]) -> None:
     """Register `stop` as handler of the signals that ask this process to end (`STOP_SIGNALS`).
 
-    The process then does not end by itself at such a signal. This function must be called in the
-    main thread, as Python requires for handlers of signals.
+    After that, such a signal only calls `stop`, and the process must end by itself. This function
+    must be called in the main thread, as Python requires for handlers of signals.
     """
     for number in STOP_SIGNALS:
         # A command started with nohup ignores SIGHUP; a handler here would undo that.
