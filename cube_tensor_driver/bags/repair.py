@@ -314,8 +314,8 @@ class _Salvaged:
         if chunk is None or len(index.records) != counts[index.channel_id]:
             raise ValueError("an index has another number of messages than its chunk")
         chunk.message_index_offsets[index.channel_id] = start
-        # Readers need the indexes of all channels, so the chunk is complete, and its messages
-        # count, only when the index of its last channel has been read.
+        # Readers need the index records of all channels (topics) of a chunk. So the chunk is
+        # complete, and its messages count, only when the last index record has been read.
         if chunk.message_index_offsets.keys() == counts.keys():
             self.end = start + RECORD_HEAD.size + len(content)
             chunk_end = chunk.chunk_start_offset + chunk.chunk_length

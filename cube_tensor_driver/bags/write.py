@@ -147,7 +147,8 @@ class BagWriter:
         return self
 
     def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
-        # After an error of writing the bag cannot be completed; `repair` makes it readable later.
+        # After an error of writing (BagError) the bag cannot be completed, so it is not closed
+        # here; `repair` makes it readable later.
         if error is None or not issubclass(error, BagError):
             self.close()
 
@@ -222,7 +223,7 @@ class BagWriter:
             self._attempt(self._part.file.flush)
 
     def close(self) -> None:
-        """Complete the bag; calling it again does nothing."""
+        """Complete the storage file and metadata.yaml; a second call does nothing."""
         if self._part is not None:
             self._attempt(self._finish_part)
 

@@ -181,8 +181,8 @@ def encode_raw(message: Any) -> EncodedImage:
     size = int(message.width), int(message.height)
     if not all(size):
         raise ValueError(f"an image of {size[0]} x {size[1]} pixels")
-    # `step` is the length of a line in bytes, which may be more than its pixels need. Pillow raises
-    # a ValueError if there are too few bytes.
+    # `message.step` is the length of a line of the image in bytes, which may be more than its
+    # pixels need. Pillow raises a ValueError if the message has too few bytes.
     image = Image.frombuffer(
         mode,
         size,

@@ -189,8 +189,8 @@ class Episode:
                 "which is longer than was recorded: a clock was set; leave it out with --marks"
             )
         if n_frames > len(self.counts):
-            # The number of frames is not known before the end, so the table grows by half each time
-            # it is full; growing by single frames would copy it too often.
+            # The number of frames is not known before the end, so the table of counts grows by half
+            # each time it is full. If it grew by single frames, it would be copied too often.
             room = 3 * n_frames // 2
             larger = np.zeros((room, n_cubes), np.uint32)
             larger[: len(self.counts)] = self.counts
@@ -248,7 +248,7 @@ def plan_bag(
             rate is above the sample rate, so that frames would have no sample.
     """
     with open_bag(path, choices.frequencies) as source:
-        # The number of messages is the total amount of the displayed progress.
+        # The progress that is displayed is the fraction of the messages that have been read.
         counts = {one.topic: one.msgcount for one in source.bag.connections}
         total = counts[source.topic]
         spans = [(MIN_NS, MAX_NS, choices.task)]

@@ -74,7 +74,8 @@ class Statistics:
         self._mean += difference * count / both
         self._count += count
 
-        # Unknown values are replaced by infinities, which never become the minimum or maximum.
+        # NaN and infinite values are replaced by the infinity that never becomes the minimum, or the
+        # maximum.
         for_min = np.where(known, values, np.inf)
         for_max = np.where(known, values, -np.inf)
         self._min = np.minimum(self._min, for_min.min(axis=0))

@@ -118,7 +118,7 @@ class TopicReader:
         for name, topic in topics.items():
             if topic.msgtype in IMAGE_TYPES:
                 # Images are read one by one when their frames are written, because a recording of
-                # images can be larger than the memory. Numbers are read at once.
+                # images can be larger than the memory. Topics of numbers are read completely here.
                 self._sources[name] = ImageStream(bag, name, topic.shape)
             else:
                 self._sources[name] = read_signal(bag, name, topic.msgtype)

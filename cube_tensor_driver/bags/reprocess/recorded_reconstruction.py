@@ -41,11 +41,11 @@ class RecordedReconstruction:
     def health_at(self, rows: FrequencyRows, reconstructor: Reconstructor) -> RecordedHealth:
         """Return the recorded health (which pads were left out, and why) for rows of one message.
 
-        The rest frequencies that were recorded for the time of these rows are set in the
-        reconstructor.
+        The rest frequencies (without load) that applied when these rows were recorded are also set
+        in the reconstructor.
 
         Args:
-            rows: Rows of one message of frequencies.
+            rows: Rows (samples of cubes) of one message of frequencies.
             reconstructor: The reconstructor that will process these rows.
 
         Returns:

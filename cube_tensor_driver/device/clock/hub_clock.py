@@ -359,7 +359,7 @@ class HubClock:
             before_ns = self._decision.before_ns
             since_ns = self._decision.since_ns
         if not step_us:
-            # This step has undone the one before, so there is nothing left to decide.
+            # This step of the hub's clock has undone the one before, so nothing is left to decide.
             self._decision = None
             return
         self._decision = StepDecision(

@@ -282,8 +282,8 @@ class ClockLine:
             next_low = max(low, trip.low_ns - drifted - tolerance)
             next_high = min(high, trip.high_ns - drifted + tolerance)
             if next_low > next_high:
-                # Bounds that do not overlap show that a clock was set between the round trips, so
-                # this one and all older ones are not used.
+                # Bounds of the offset that do not overlap show that a clock was set between two
+                # round trips, so the older round trips are not used.
                 break
             low, high = next_low, next_high
             self._trip_offset = (low + high) / 2

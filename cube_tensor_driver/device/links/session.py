@@ -229,8 +229,8 @@ class Session:
         if link.state is LinkState.SILENT or not self._has_hello:
             if now >= self._hello_at:
                 self._ask_hello(now)
-        # The hub's time is compared with the times of its samples, so the first request follows
-        # the first sample.
+        # The answer to TIME is compared with the device times of the hub's samples, so the first
+        # request TIME follows the first sample.
         elif self._knows_time and self._last_sample > self._opened_at and now >= self._ask_time_at:
             self._ask_time(now)
 

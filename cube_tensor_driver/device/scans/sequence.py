@@ -319,8 +319,8 @@ class SampleAccount:
             for name, value in part.as_dict().items():
                 total[name] += value
         missing = total.pop("missing")
-        # The hub reports dropped samples only in STATS. Until then they count as lost on the way;
-        # a sample that was lost on the way never counts as dropped.
+        # The hub reports the number of samples that it has dropped only in STATS frames. Until then
+        # they count as lost on the way; a sample that was lost on the way never counts as dropped.
         dropped = min(self._dropped, missing)
         return {
             "taken": total["delivered"] + missing,

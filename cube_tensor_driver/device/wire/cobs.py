@@ -27,8 +27,8 @@ def encode_in_python(data: bytes) -> bytes:
         code += block
 
     if data and data[-1] and not block:
-        # The data end with a block of 254 bytes, and the loop has added an empty block after it,
-        # which the encoding does not need.
+        # The data end with a block of 254 bytes, after which the loop has added an empty block. The
+        # encoding does not need it, so its length byte is removed.
         del code[-1]
     return bytes(code)
 
