@@ -416,6 +416,9 @@ def _connections(index: Summary) -> dict[int, Connection]:
 def _check_summary(stream: BinaryIO) -> None:
     """Check the checksum of an MCAP file's summary, which the library mcap does not check.
 
+    Args:
+        stream: The file, open for reading.
+
     Raises:
         McapError: The file is cut off, or its summary is damaged.
     """

@@ -285,7 +285,11 @@ def _time_span(start_ns: int, end_ns: int) -> dict[str, Any]:
 
 
 def _topic_information(connection: Connection) -> dict[str, Any]:
-    """Return the entry of a topic in metadata.yaml, with the keys that rosbag2 requires."""
+    """Return the entry of a topic in metadata.yaml, with the keys that rosbag2 requires.
+
+    Args:
+        connection: Topic with its message type, quality of service and number of messages.
+    """
     return {
         "topic_metadata": {
             "name": connection.topic,

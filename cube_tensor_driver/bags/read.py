@@ -303,7 +303,7 @@ class Bag:
         return infos
 
     def frequencies(self, topic: str) -> Iterator[tuple[Decoded[FrequencyRows], Times]]:
-        """Read frequencies in the order of recording.
+        """Read the frequencies on a topic in the order of recording.
 
         Successive messages with the same number of rows and the same frame id are decoded together.
 
@@ -317,7 +317,9 @@ class Bag:
         return self._decoded(topic, frequency_codec, frequency_codec.decode)
 
     def stress(self, topic: str) -> Iterator[tuple[Decoded[StressRows], Times]]:
-        """Read recorded stress in the order of recording.
+        """Read the recorded stress on a topic in the order of recording.
+
+        Successive messages with the same number of rows and the same frame id are decoded together.
 
         Yields:
             M messages, and an array (M,) of the times at which they were recorded, in ns since the

@@ -39,7 +39,7 @@ class _StressBatch(NamedTuple):
     """The columns of N recorded rows of stress that state the health of pads, read together.
 
     Attributes:
-        cube: (N,) index of the cube.
+        cube: (N,) index of the cube in the skin.
         sequence: (N,) sequence number of the sample.
         stamp_ns: (N,) stamp of the sample, in ns since the Unix epoch.
         left_out: (N,) bit p is set if pad p was not used.
@@ -142,7 +142,10 @@ class RecordedHealthReader:
                 yield batch
 
     def _read(self) -> Iterator[_StressBatch]:
-        """Yield the columns of the recorded stress that state the health, from the beginning."""
+        """Yield the recorded columns of stress that state the health of the pads, batch by batch.
+
+        The bag is read from its beginning.
+        """
         names = ("cube", "sequence", "left_out", "status")
         for columns in self._bag.stress_columns(self._topic, names):
             stamp_ns, cube, sequence, left_out, status = columns

@@ -111,7 +111,7 @@ class Recording:
         recording are fastest, because the bag is then read only once.
 
         Args:
-            rows: Rows of frequencies whose health is wanted.
+            rows: Rows of frequencies (samples of cubes) for whose pads the health is wanted.
         """
         return self._health.health_at(rows)
 

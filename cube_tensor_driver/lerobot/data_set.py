@@ -248,7 +248,10 @@ class DataSet:
         )
 
     def write_meta(self) -> None:
-        """Write episodes, tasks, features and statistics into meta/, after the last episode."""
+        """Write episodes, tasks, features and statistics into the folder meta/ of the data set.
+
+        It is called once, after the last episode.
+        """
         meta = self._folder / "meta"
         path = meta / "episodes" / FILE_NAME.format(chunk_index=0, file_index=0)
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -416,7 +419,13 @@ def _task_table(tasks: list[str]) -> pyarrow.Table:
         pandas_type: str,
         numpy_type: str,
     ) -> dict[str, Any]:
-        """Return pandas' description of a column: its name and types."""
+        """Return pandas' description of a column: its name and types.
+
+        Args:
+            name: Name of the column.
+            pandas_type: Type in pandas, such as "unicode".
+            numpy_type: Type in numpy, such as "object".
+        """
         kinds = {"pandas_type": pandas_type, "numpy_type": numpy_type}
         return {
             "name": name,

@@ -65,7 +65,7 @@ def export_lerobot(
     choices: Choices,
     report: Report,
 ) -> Exported:
-    """Write a data set. Its folder gets its final name only when it is complete.
+    """Write a data set for LeRobot. Its folder gets its final name only when it is complete.
 
     Args:
         bags: Folders or files of bags.

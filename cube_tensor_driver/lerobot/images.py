@@ -161,7 +161,11 @@ class ImageStream:
             self._fail(str(error))
 
     def _fail(self, reason: str) -> NoReturn:
-        """Raise a BagError that names the bag, the topic, the reason and the remedy."""
+        """Raise a BagError that names the bag, the topic, the reason and the remedy.
+
+        Args:
+            reason: Why an image cannot be used, such as the text of an error of Pillow.
+        """
         raise BagError(
             f"{self._bag.path}: {self._topic}: {reason}; leave the topic out by naming the others "
             "with --topics"
@@ -208,7 +212,7 @@ def keep_encoded(message: Any) -> EncodedImage:
 
 
 def _as_png(image: Image.Image) -> EncodedImage:
-    """Encode an image of Pillow as PNG."""
+    """Encode an image of the library Pillow as a PNG file in memory."""
     file = io.BytesIO()
     # Compression level 1 takes a fifth of the default's time and makes files a fifth larger.
     image.save(file, "PNG", compress_level=1)

@@ -149,7 +149,7 @@ class Episode:
         """Return the number of the frame (N,) to which the sample with each stamp (N,) belongs.
 
         Samples before `begin_ns` belong to frame 0: the samples of some hubs arrive later than the
-        first row but were taken a little earlier.
+        first counted sample, but were taken a little earlier.
         """
         return np.maximum(self.frame_of(stamp_ns), 0)
 

@@ -74,8 +74,8 @@ class Statistics:
         self._mean += difference * count / both
         self._count += count
 
-        # NaN and infinite values are replaced by the infinity that never becomes the minimum, or the
-        # maximum.
+        # Unknown values (NaN, infinite) are replaced by +infinity for the minimum and by -infinity
+        # for the maximum, so that they never become either.
         for_min = np.where(known, values, np.inf)
         for_max = np.where(known, values, -np.inf)
         self._min = np.minimum(self._min, for_min.min(axis=0))

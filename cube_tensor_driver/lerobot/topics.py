@@ -219,7 +219,7 @@ def _describe_topic(
         bag: Open bag that has the topic.
         name: Name of the topic.
         msgtype: Type of its messages in this bag.
-        found: Descriptions by the names of the topics; this one is added or extended.
+        found: Descriptions by the names of the topics; that of this topic is added or extended.
 
     Raises:
         BagError: The topic has another type in a bag that was read before.

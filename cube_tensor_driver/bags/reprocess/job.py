@@ -71,7 +71,7 @@ class Overrides:
 
     @property
     def any(self) -> bool:
-        """Whether anything replaces what was recorded."""
+        """Whether a calibration, a skin or a tare replaces what was recorded."""
         values = (self.calibration, self.skin, self.tare)
         return any(value is not None for value in values)
 

@@ -14,6 +14,9 @@ from ..source import open_bag
 class RecordedReconstruction:
     """The rest frequencies and the health of the pads that applied at each time of a recording.
 
+    A rest frequency is the frequency of a pad without load. The health states which pads were left
+    out as faulty.
+
     Attributes:
         skin: The skin (cubes, their poses and calibrations) as the bag describes it.
     """

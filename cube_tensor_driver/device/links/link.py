@@ -198,8 +198,8 @@ class Link:
             call again later.
 
         Raises:
-            LinkError: The serial port could not be opened, or no TCP connection was made. The kind
-                tells why (see the head of this file).
+            LinkError: The serial port could not be opened, or no TCP connection was made. Its kind
+                and text tell why, for example `no_port` or `no_permission`.
         """
         if self._tcp:
             self._open_tcp()

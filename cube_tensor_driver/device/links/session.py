@@ -251,6 +251,9 @@ class Session:
     def _handle_hello(self, frame: Hello) -> None:
         """Check the unique number and the sample period of a hub, and send its settings if needed.
 
+        Args:
+            frame: HELLO frame of the hub.
+
         Raises:
             LinkError: The hub is not the one that the skin file asks for, or sending failed.
         """

@@ -311,10 +311,10 @@ class ScanBuilder:
     def _align_by_order(self) -> None:
         """Put the first pending samples of all links into one scan, the second ones into the next.
 
-        It is called when one link is more than one scan ahead of another, because this process
-        cannot keep up with its input. If scans were then built in parts, there would be more
-        messages, which cost even more time. With this step the process keeps up with 1260 cubes at
-        1 kHz; without it, a third of their rows were lost.
+        This method is called when one link is more than one scan ahead of another, because this
+        process cannot keep up with its input. If scans were then built in parts, there would be
+        more messages, which cost even more time. With this step the process keeps up with 1260
+        cubes at 1 kHz; without it, a third of their rows were lost.
         """
         queues: dict[int, list[StampedSample]] = {}
         for scan in self._pending:

@@ -90,11 +90,11 @@ class SequenceTracker:
         self._set_back = 0  # number of the first sample after the clock was last set back
 
     def update(self, sequence: int, device_us: int) -> Arrival:
-        """Classify and count one sample in constant time.
+        """Classify one sample as new, late, duplicate or first after a restart, and count it.
 
         Args:
             sequence: Number of the sample, 32 bits, which wraps to 0.
-            device_us: Device time of the sample, in µs.
+            device_us: Device time (the hub's clock) of the sample, in µs.
         """
         # Almost every sample has the next number, so this case is handled first, for speed.
         if sequence == self._next % _WRAP and device_us >= self._newest_us:
@@ -228,8 +228,8 @@ class SequenceTracker:
         """Count a sample as delivered, and keep its number and time for later comparisons.
 
         Args:
-            number: Unwrapped number of the sample.
-            device_us: Device time of the sample, in µs.
+            number: Number of the sample, continued beyond 32 bits.
+            device_us: Device time (the hub's clock) of the sample, in µs.
             arrival: Class of the sample (new, late …), which is returned.
         """
         self.counters.delivered += 1
@@ -238,10 +238,10 @@ class SequenceTracker:
 
 
 def _is_in_order(number: int, device_us: int, seen: Sequence[tuple[int, int]]) -> bool:
-    """Return whether device times still grow with the numbers if this sample is added.
+    """Return whether device times (hub's clock) grow with the numbers if this sample is added.
 
     Args:
-        number: Unwrapped number of the sample.
+        number: Number of the sample, continued beyond 32 bits.
         device_us: Device time of the sample, in µs.
         seen: Numbers and device times of other samples.
     """

@@ -16,7 +16,7 @@ byte, 255, means that no zero follows the block."""
 
 
 def encode_in_python(data: bytes) -> bytes:
-    """Return the COBS encoding of any bytes, which contains no zero byte."""
+    """Return the COBS encoding (consistent overhead byte stuffing) of any bytes; it has no zero."""
     code = bytearray()
     block = b""
     for block in data.split(b"\0"):
