@@ -20,11 +20,15 @@ from ..core.modes import STRESS
 from .layer import FIELD
 
 Orders = NDArray[np.int64]
-"""Array of the orders m of circular components."""
+"""Array of the orders m of circular components: a rotation of the frame by an angle multiplies a
+component of order m by exp(-i m angle)."""
 
 
 def _define_components() -> tuple[Complex, Orders]:
     """Define the 14 circular components as combinations of the stresses and their gradients.
+
+    A rotation of the frame by an angle multiplies a circular component of order m by exp(-i m
+    angle).
 
     Returns:
         Matrix (14, 24) of the components as combinations of `FIELD`, and their orders (14,).
@@ -33,13 +37,13 @@ def _define_components() -> tuple[Complex, Orders]:
     unit = dict(zip(FIELD, np.eye(len(FIELD)), strict=True))
 
     def combine_stresses(suffix: str) -> list[tuple[int, Complex]]:
-        """Return the components of the six stresses, or of their derivatives along one axis.
+        """Return four circular components of the six stresses, or of their derivatives by one axis.
 
         Args:
             suffix: "" for the stresses, "_x", "_y" or "_z" for the derivatives.
 
         Returns:
-            Order m and row (24,) of the matrix for each component.
+            For each of the four components, its order m and its coefficients (24,) of `FIELD`.
         """
         s = {name: unit[name + suffix].astype(complex) for name in STRESS}
         return [

@@ -31,11 +31,12 @@ from ..core.errors import ElasticError
 
 _HERTZ_ORDER_PER_RADIUS = 5.5
 """Quadrature order (number of rings of point forces) that represents a Hertz contact accurately,
-divided by radius / depth of the contact. The value was found by numerical tests."""
+divided by the ratio of its radius to the depth at which the stress is computed. The value was found
+by numerical tests."""
 
 _MIN_HERTZ_ORDER = 6
-"""Smallest quadrature order (number of rings of point forces) of a Hertz contact. It suffices for
-radii that are small compared with the depth."""
+"""Smallest quadrature order (number of rings of point forces) that represents a Hertz contact. It
+suffices for contacts with radii that are small compared with the depth of the cubes."""
 
 _STRESS_AXES = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 """Indices of both axes (0: x, 1: y, 2: z) of the stress components xx, yy, zz, yz, zx, xy."""

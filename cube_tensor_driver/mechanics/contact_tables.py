@@ -45,28 +45,30 @@ to the nearest one; within the range, this changes them by at most 10 %."""
 
 GRID_STEP = 1 / 16
 """Step of the grid of the polygon tables, in asinh(d) and in asinh(t / sqrt(1 + d**2)). d is the
-distance of an edge's line from the cube and t the length along it, divided by the depth. The
+distance of the line through a polygon's edge from the point of the surface above the cube, t the
+length along this line from its nearest point, both divided by the depth of the cubes. The
 function asinh makes the grid fine near the cube and coarse far away."""
 
 MAX_LEG_RATIO = 50.0
-"""Largest tabulated t / sqrt(1 + d**2), where d is the distance of an edge's line from the cube and
-t the length along it, divided by the depth. Longer edges are cut off there, because traction
+"""Largest tabulated t / sqrt(1 + d**2). d is the distance of the line through a polygon's edge from
+the point of the surface above the cube, t the length along this line from its nearest point, both
+divided by the depth of the cubes. Longer edges are cut off there, because traction
 farther away hardly causes any stress at the cube."""
 
 _LAST_DISTANCE = REACH_DEPTHS * POINTS_PER_DEPTH
 """Index of the largest tabulated distance between a round contact and a cube."""
 
 _GRID_ROWS = int(np.ceil(np.arcsinh(REACH_DEPTHS) / GRID_STEP)) + 2
-"""Number of rows of the polygon tables, one for each value of the distance d of an edge's line from
-the cube."""
+"""Number of rows of the polygon tables, one for each value of d, the distance of the line through a
+polygon's edge from the point of the surface above the cube."""
 
 _CENTRE_COLUMN = int(np.ceil(np.arcsinh(MAX_LEG_RATIO) / GRID_STEP))
-"""Index of the column of the polygon tables for t = 0, where t is the length along an edge from the
-point that is nearest to the cube."""
+"""Index of the column of the polygon tables for t = 0, where t is the length along the line through
+a polygon's edge, from the point of this line that is nearest to the cube."""
 
 _GRID_COLUMNS = 2 * _CENTRE_COLUMN + 1
-"""Number of columns of the polygon tables, one for each value of the length t along an edge; t is
-negative on one side of the point that is nearest to the cube."""
+"""Number of columns of the polygon tables, one for each value of t, the length along the line
+through a polygon's edge. t is negative on one side of the point that is nearest to the cube."""
 
 _ORIGIN_TOLERANCE = 1e-12
 """Length of a polygon's edge, divided by the depth of the cubes, below which the edge counts as a

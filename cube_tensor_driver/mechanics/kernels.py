@@ -203,7 +203,7 @@ class Kernels:
 
         Args:
             components: Matrix (2 n, 15) as in `MeasurementModel`, for cubes of which only some pads
-                are used.
+                are used; gradients are in Pa/m.
 
         Returns:
             Index of the variant in `component_matrices`.
@@ -325,10 +325,10 @@ class Kernels:
         Args:
             place: Positions (N, 2) from the centre of the contact, in m.
             size: Radius of the contact in m.
-            force: Force (3,) on the skin in N.
+            force: Force (3,) on the skin in N, along x, y and z.
 
         Returns:
-            Pressure -σzz (N,) in Pa.
+            Pressure -σzz (N,) in Pa, positive in compression.
         """
         return -self.field(place, size)[:, _FIELD_ZZ] @ force
 

@@ -159,13 +159,15 @@ class Layer:
     def _airy(self, k: Array, zeta: Array) -> Array:
         """Return the function psi of the file head and its first three derivatives by zeta.
 
+        The Airy function psi / k^2 gives the stress of a wave; psi = -sigma_zz.
+
         Args:
             k: Wavenumbers (...) in 1/m.
             zeta: Height z (...) multiplied by the wavenumber; negative below the surface.
 
         Returns:
-            Array (4, ..., 2). The last axis is for the boundary conditions psi(0) = 1, psi'(0) = 0
-            and psi(0) = 0, psi'(0) = 1.
+            psi and its derivatives (4, ..., 2). The last axis is for two boundary conditions at the
+            surface: psi = 1, psi' = 0, then psi = 0, psi' = 1.
         """
         if np.isinf(self.thickness):
             return self._airy_half_space(zeta)
@@ -204,7 +206,10 @@ class Layer:
 
     @staticmethod
     def _airy_half_space(zeta: Array) -> Array:
-        """Return psi and its derivatives as `_airy`, for a half space, where C = D = 0."""
+        """Return psi and its derivatives as `_airy`, for a layer of infinite thickness.
+
+        The terms of psi that grow with the depth, those with the constants C and D, are then 0.
+        """
         decay = np.exp(zeta)[..., None]
         a = np.array([1.0, 0.0])
         b = np.array([-1.0, 1.0])  # psi'(0) = A + B
@@ -234,7 +239,7 @@ class Layer:
         }
 
     def _uniform(self) -> Array:
-        """Return the stress (6, 3) under uniform unit traction along x, y and z."""
+        """Return the stress (6, 3) in Pa under a uniform traction of 1 Pa along x, y and z."""
         # Ratio of lateral to normal stress: in a half space, the mean over all directions of k; in
         # a layer, the value without lateral strain.
         lateral = (1 + 2 * self.poisson) / 2

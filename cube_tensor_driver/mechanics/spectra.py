@@ -39,12 +39,12 @@ from .circular import CIRCULAR_FROM_FIELD, ORDERS, Orders
 from .layer import Layer
 
 BesselTable = Callable[[int], Array]
-"""Function that returns J_m(kr) (positions, waves) of one order m, at fixed positions and
-wavenumbers."""
+"""Function of the order m that returns the Bessel functions J_m(k r) (positions, waves) at fixed
+distances r (one for each position) and wavenumbers k (one for each wave)."""
 
 MAX_WAVENUMBER_TIMES_DEPTH = 25.0
-"""Upper limit of integrals over the wavenumber k, multiplied by the depth of the cubes. At this
-depth, a wave of this wavenumber has decayed by a factor of about exp(-25)."""
+"""Upper limit of integrals over the wavenumber k, multiplied by the depth of the cubes' centres. At
+this depth, the stress of a wave with this wavenumber has decayed by a factor of about exp(-25)."""
 
 N_WAVENUMBERS = 256
 """Number of Gauss points in integrals over the wavenumber k. They resolve the Bessel functions
@@ -120,7 +120,8 @@ class Spectra:
     ) -> tuple[Array, Array]:
         """Compute covariances of the components at two positions under a random traction.
 
-        The first position lies in the direction x from the other one.
+        The components n of these spectra are at the first position, which lies in the direction x
+        from the other one.
 
         Args:
             other: Spectra of the n' components at the other position.

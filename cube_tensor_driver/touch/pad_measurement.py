@@ -54,8 +54,8 @@ _N_DISTANCES = 400
 of the Bessel functions up to the largest distance (half the width of the finite element body)."""
 
 _LENGTH_TOLERANCE = 1e-6
-"""Difference below which two sides of cubes (relative difference) or two pad positions, normals or
-sizes (in units of half a side) count as equal."""
+"""Difference below which two lengths count as equal. It is relative for the sides of two cubes, and
+in units of half a side for the positions, normals and sizes of two pads (sensing elements)."""
 
 
 def model_pads(influence: Influence, calibrations: Sequence[Calibration]) -> MeasurementModel:

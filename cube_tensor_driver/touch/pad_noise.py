@@ -22,7 +22,7 @@ from ..core.modes import COMPONENTS
 from ..core.pipeline import Pipeline
 
 GAIN_ERROR = 0.01
-"""Relative standard deviation of a pad's true gain (sensitivity) from its calibrated value."""
+"""Standard deviation of the relative error of a pad's calibrated gain (sensitivity): 1 %."""
 
 
 def noise_by_pad(

@@ -60,8 +60,8 @@ class Contact(NamedTuple):
 
     Attributes:
         position: Position (3,) in m, where the line of action of the force meets the surface.
-        normal: Unit normal (3,) out of the skin.
-        force: Force (3,) in N on the skin.
+        normal: Unit normal (3,) of the surface, out of the skin.
+        force: Force (3,) in N that the touching body exerts on the skin.
         normal_force: Normal force in N, positive for a body that presses on the skin.
         shear_force: Length of the tangential force in N; NaN if no cube observes shear.
         area: Area in m^2 on which the pressure exceeds half of its maximum.

@@ -30,7 +30,8 @@ NEGLIGIBLE_RESIDUAL = 2.5e-4
 It is then left out of the estimate, which takes half the time."""
 
 _MIN_NORMAL_FORCE = 1e-12
-"""Smallest absolute value, in N, of a normal force in a denominator; it avoids a division by 0."""
+"""Smallest absolute value, in N, of a normal force by which moments are divided to get a position.
+It avoids a division by 0."""
 
 
 class ContactEstimate(NamedTuple):

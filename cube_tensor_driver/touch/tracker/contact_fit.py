@@ -68,8 +68,8 @@ SHAPE_SHIFT = 0.5
 contacts shifted along an axis minus contacts shifted across it."""
 
 SHAPE_WIDENING = 0.2
-"""Change of the natural logarithm of the radius of the contacts from which the flatness shape is
-made: the contact minus a mixture of a narrower and a wider one."""
+"""Change of the natural logarithm of the radius that gives the narrower and the wider contact of
+the flatness shape. This shape is a contact minus a mixture of a narrower and a wider one."""
 
 STEPS_NEW = 16
 """Largest number of Gauss-Newton steps in the fit of a contact that was not fitted before. The fit
@@ -97,9 +97,10 @@ FINE_STEPS = 6
 of the pads (`GAIN_ERROR`) instead of the larger `ROUGH_GAIN_ERROR`."""
 
 SETTLED_STEP = 0.02
-"""Threshold of the Gauss-Newton steps below which a contact has converged. It limits both the
-distance divided by the depth of the cubes, and the change of the logarithm of the radius. One more
-step follows, so that only an error of second order remains."""
+"""Size of a Gauss-Newton step below which a fit has converged. The size is the larger one of two
+numbers: the shift of a contact divided by the depth of the cubes' centres, and the change of the
+natural logarithm of its radius. This step is still made, so that only an error of second order
+remains."""
 
 _MAX_STEP_DEPTHS = 0.5
 """Largest distance that one Gauss-Newton step moves a contact along each axis, divided by the depth
@@ -526,9 +527,9 @@ class ContactResponse(NamedTuple):
     """Response of D values to a contact, and its derivatives by centre, radius and shapes.
 
     Attributes:
-        response: Values (D, 3) in Pa per N of force along x, y and z.
+        response: Values (D, 3) in Pa for a force of 1 N along x, y and z.
         slopes: Derivatives (3, D, 3) of the response by the centre c_x, c_y in m and by ln a, the
-            natural logarithm of the radius.
+            natural logarithm of the radius a.
         shapes: Changes (3, D, 3) of the response for one standard deviation of each shape
             (deviation from a circular Hertz contact).
     """
@@ -625,15 +626,16 @@ def _factorise(
     noise: Array,
     residual_scale: float,
 ) -> _Factor:
-    """Return the Cholesky factor of alpha^2 K + noise, with the residual scale alpha in Pa.
+    """Return the Cholesky factor of the covariance alpha^2 K + noise of D values.
 
-    SciPy's factor can be used for several products, which NumPy's solver cannot. For 240 values,
-    this takes 0.3 ms instead of 2.4 ms.
+    The factor of SciPy's `cho_factor` serves for several systems of equations, while NumPy's solver
+    would start anew for each. For 240 values, this takes 0.3 ms instead of 2.4 ms.
 
     Args:
-        observations: Values with their prior covariance K (D, D).
-        noise: Covariance (D, D) of noise and shapes, in Pa^2.
-        residual_scale: Standard deviation alpha of the pressure that the contacts do not explain.
+        observations: Values with their prior covariance K (D, D) for a pressure of variance 1 Pa^2.
+        noise: Covariance (D, D) in Pa^2 of noise and shapes (deviations from circular contacts).
+        residual_scale: Standard deviation alpha, in Pa, of the pressure that the contacts do not
+            explain.
     """
     # The covariance matrix is symmetric. Its transpose has the memory order that LAPACK expects
     # (columns one after the other), which avoids a copy.

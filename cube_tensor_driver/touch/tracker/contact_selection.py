@@ -13,12 +13,13 @@ from ...core.arrays import Array
 from .contact_model import ContactModel, HertzContact
 
 DETECTION_FRACTION = 0.2
-"""Pressure that the present contacts do not explain, divided by the largest total pressure on the
-skin, above which a new contact is detected. An absolute threshold applies in addition."""
+"""A new contact is detected only where the pressure that the present contacts do not explain is
+above this fraction of the largest total pressure on the skin. It must be above an absolute
+threshold, too."""
 
 PRUNING_FRACTION = 0.1
-"""Peak pressure of a contact, divided by the peak pressure of the strongest contact, below which
-the contact is removed. It is smaller than `DETECTION_FRACTION`, so that a contact near the
+"""A contact is removed if its peak pressure is below this fraction of the peak pressure of the
+strongest contact. The fraction is smaller than `DETECTION_FRACTION`, so that a contact near the
 threshold is not removed and detected again in turn."""
 
 MIN_DISTANCE_PITCHES = 1.0
@@ -48,7 +49,7 @@ _VALLEY_SAMPLES = 9
 included."""
 
 _MIN_PRESSURE = 1e-9
-"""Smallest pressure in Pa in a denominator; it avoids a division by 0."""
+"""Smallest pressure, in Pa, by which `valley_ratio` divides; it avoids a division by 0."""
 
 
 def detect_contact(

@@ -50,8 +50,9 @@ LARGE_RESIDUAL = 0.02
 `AMPLITUDE`, above which a fit counts as possibly wrong and is repeated from other starts."""
 
 WIDE_SIZE = 2.5
-"""Radius, divided by the depth of the cubes' centres, with which the fit of a contact is repeated
-if it leaves a large residual. The true contact may be wide, and the usual start radius is small."""
+"""Start radius, divided by the depth of the cubes' centres, with which the fit of a contact is
+repeated if it leaves a large residual. The true contact may be too wide to be found from the usual,
+smaller start radius (`USUAL_SIZE`)."""
 
 POSITION_TOLERANCE_PITCHES = 0.005
 """Standard deviation of the positions at which fits from different starts end, divided by the pitch
@@ -59,15 +60,16 @@ POSITION_TOLERANCE_PITCHES = 0.005
 other starts are tried again in the next scan."""
 
 RESTART_CUBES = 4
-"""Number of cubes around which fits of a new contact are started if its first fit leaves a large
-residual: those nearest to the result of this fit."""
+"""Number of cubes around which a new contact is fitted again if its first fit leaves a large
+residual (`LARGE_RESIDUAL`). The cubes nearest to the position found by this fit are chosen."""
 
 START_SCALE = 0.05 * AMPLITUDE
 """Start value, in Pa, of the residual scale (standard deviation of the pressure that the contacts
 do not explain) in the fit of a new contact."""
 
 _MIN_VALUES_PER_CONTACT = 6
-"""Smallest number of known values per contact for a fit: a contact has six parameters."""
+"""Smallest number of known values (of the cubes near the contacts) per contact for a fit. It is the
+number of a contact's parameters: force (3), centre (2) and radius."""
 
 _CORNERS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
 """Signs (4, 2) of x and y for the four mirror images of a position about the axes of a cube."""
@@ -539,6 +541,8 @@ class ContactTracker:
         angle: Array,
     ) -> Array:
         """Return the prior covariance of the values of some cubes, from memory if possible.
+
+        The flattened skin is the plane in which the skin is laid out for a fit.
 
         Args:
             cubes: Indices (n,) of the cubes.
