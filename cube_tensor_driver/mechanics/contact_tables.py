@@ -101,10 +101,11 @@ class _ContactTables:
         self._rows = table.reshape(-1, n_loads * len(ORDERS)).view(np.float32)
 
     def _compute(self) -> Arrays:
-        """Compute the table (grid points ..., unit loads, 14) of complex circular components.
+        """Compute the table of circular components under unit loads; subclasses implement it.
 
         Returns:
-            Dictionary with the single key `table`.
+            Dictionary with the single key `table`: 14 complex circular components (grid points ...,
+            unit loads, 14) for each grid point and each unit load.
         """
         raise NotImplementedError
 

@@ -399,7 +399,12 @@ class Kernels:
     ) -> Array:
         """Compute the prior covariance of measured components with the pressure below one point.
 
-        The pressure is taken at the depth of the cubes. Arguments as in `cross`.
+        The pressure is taken at the depth of the cubes, below one point of the surface.
+
+        Args:
+            place: Positions (N, 2) of the cubes from the point, in m.
+            angle: Rotations (N,) of the cubes about z, in rad.
+            variant: Index (N,) of each cube's variant in the measurement model.
 
         Returns:
             Covariance (N, 15) for a surface pressure of variance 1 Pa^2.
@@ -424,7 +429,8 @@ class Kernels:
                 load.
             place: Positions (N, 2) from the load, in m.
             angle: Rotations (N,) of the frames about z, in rad.
-            order: Orders (n,) of the circular components.
+            order: Orders m (n,) of the circular components: a rotation of the frame by an angle
+                multiplies a component by exp(-i m angle).
 
         Returns:
             Real parts and then imaginary parts (N, 3, 2 n), for loads along x, y and z.
@@ -471,7 +477,7 @@ class Kernels:
             variant: Index (N,) of each cube's variant in the measurement model.
 
         Returns:
-            Matrix (N, 15, n) for the real parts of the circular components, and for their
+            Two matrices (N, 15, n): for the real parts of the circular components, and for their
             imaginary parts.
         """
         phases = _phases(angle, self._order)[:, None]
@@ -514,14 +520,14 @@ class Kernels:
         return np.asarray(np.tensordot(weights, neighbours, axes=1))
 
     def _interpolate(self, table: Array, distance: Array) -> Array:
-        """Interpolate a table over the distance.
+        """Interpolate a table over the distance between load and cube, or between two cubes.
 
         Args:
             table: Values (distances, ...) at the tabulated distances.
             distance: Distances (N,) in m.
 
         Returns:
-            Values (N, ...); 0 beyond `REACH_DEPTHS`.
+            Values (N, ...); 0 at distances of more than `REACH_DEPTHS` depths of the cubes.
         """
         index = distance / self.step
         first, weights = _cubic_weights(np.minimum(index, self._last))

@@ -129,16 +129,16 @@ class Layer:
         return np.concatenate([stress, gradient], axis=-2)
 
     def _plane_strain(self, k: Array, depth: float) -> _WaveStress:
-        """Return the stress of the plane strain under a unit traction along z and along L.
+        """Return the stress under waves of traction with amplitude 1 Pa along z and along L.
 
-        L is the horizontal axis along the wave vector.
+        L is the horizontal axis along the wave vector; both tractions cause plane strain.
 
         Args:
             k: Wavenumbers (...) in 1/m, greater than 0.
             depth: Distance below the surface in m.
         """
-        # psi and its derivatives 1 to 3 by zeta; on the last axis for the boundary conditions
-        # psi(0) = 1 and psi'(0) = 1.
+        # The first axis of `psi` is for the function psi and its first three derivatives by zeta.
+        # The last axis is for two boundary conditions: psi(0) = 1 (other one 0), psi'(0) = 1.
         psi = self._airy(k, -k * depth)
         by_load = {"L": 1j * psi[..., 1], "z": -psi[..., 0]}
 
@@ -218,7 +218,9 @@ class Layer:
         return np.stack(derivatives)
 
     def _twist(self, k: Array, depth: float) -> _WaveStress:
-        """Return the shear stress under a unit traction along T, horizontally across the wave.
+        """Return the stress under a wave of traction with amplitude 1 Pa along the axis T.
+
+        T is the horizontal axis across the wave vector; such a traction causes shear stress only.
 
         Args:
             k: Wavenumbers (...) in 1/m, greater than 0.

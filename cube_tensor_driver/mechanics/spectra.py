@@ -163,8 +163,8 @@ class Spectra:
         """Integrate products of spectra, Bessel functions and the prior spectrum over k.
 
         Args:
-            spectrum: Products (waves, n, n') of two spectra.
-            order: Order (n, n') of the Bessel function for each pair.
+            spectrum: Products (waves, n, n') of the spectra of n and n' circular components.
+            order: Order (n, n') of the Bessel function for each pair of components.
             bessel: Bessel functions at the distances of the result.
             prior: Spectrum S (waves,) of the pressure.
 

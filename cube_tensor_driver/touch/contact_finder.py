@@ -73,17 +73,18 @@ class ContactSettings:
 
 
 class ContactFinder(Protocol):
-    """Finds the contacts of one skin."""
+    """Finds the contacts of one skin, by interpolation or by fits (`ContactSettings.method`)."""
 
     def update(self, values: Array, left_out: PadMasks) -> list[Contact] | list[TrackedContact]:
         """Find the contacts in the newest values.
 
         Args:
             values: Components (cubes, 15) in Pa and Pa/m, NaN where unknown.
-            left_out: Bit masks (cubes,), in which bit k is set if pad k was not used for `values`.
+            left_out: Bit masks (cubes,), in which bit k is set if pad k (sensing element) of a cube
+                was not used for `values`.
 
         Returns:
-            Contacts, strongest first.
+            Contacts, the one with the largest normal force first.
         """
 
     def cloud(self, values: Array) -> Array | None:

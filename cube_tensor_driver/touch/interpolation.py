@@ -46,7 +46,8 @@ class Interpolation:
 
         Args:
             poses: Poses of the cubes.
-            patches: Positions (cubes, points, 3) in m of the points, equally many for each cube.
+            patches: Positions (cubes, points, 3) in m of the points around each cube to which
+                values are interpolated, in the skin's parent frame.
             length: Length c of the radial basis function, in m.
         """
         self._poses = poses
@@ -231,7 +232,8 @@ def _nearest_cubes(poses: CubePoses) -> Index:
     distance = distance.reshape(n, -1)
     near = near.reshape(n, -1)
 
-    # Rounding errors of the distances must not decide the order.
+    # Distances are rounded, because otherwise their rounding errors would decide the order of
+    # equally distant cubes.
     rounded = (distance / poses.pitch).round(6)
     order = np.lexsort((near, rounded))[:, :count]
     return np.asarray(np.take_along_axis(near, order, axis=1))

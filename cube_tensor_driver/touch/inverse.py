@@ -42,7 +42,7 @@ class TractionField(NamedTuple):
 
     @property
     def pressure(self) -> Array:
-        """Pressure (M,) in Pa on the surface."""
+        """Pressure (M,) in Pa on the surface at the M points, positive where a body presses."""
         return -self.traction[:, 2]
 
 
@@ -97,7 +97,7 @@ class SurfaceInverse:
             depth: Distance from the centres of the cubes to the surface, in m.
             thickness: Thickness of the elastomer on rigid ground, in m; infinite for a half space.
             poisson: Poisson's ratio of the elastomer.
-            side: Number of points along a side of the patch of a cube.
+            side: Number of points along a side of the patch (square grid of points) of each cube.
             influence: Influence functions (stress of each pad under a force of 1 N, by the force's
                 position), whose depth, thickness and Poisson's ratio replace those given here.
                 None: cubes are modelled as points.
@@ -125,14 +125,14 @@ class SurfaceInverse:
         side: int = 2,
         model: MeasurementModel | None = None,
     ) -> SurfaceInverse:
-        """Create an inverse without a skin file.
+        """Create a `SurfaceInverse` from the cubes' poses and noise, without a skin file.
 
         Args:
             poses: Poses of the cubes.
             by_pad: Noise matrices (cubes, 15, P) as from `noise_of_all_pads`.
             layer: Elastic layer that contains the cubes.
             depth: Distance from the centres of the cubes to the surface, in m.
-            side: Number of points along a side of the patch of a cube.
+            side: Number of points along a side of the patch (square grid of points) of each cube.
             model: Measurement model of the cubes as from `model_pads`; None: they are modelled as
                 points.
         """

@@ -27,11 +27,12 @@ class _Prediction(NamedTuple):
     Attributes:
         cube: Index of the cube.
         columns: Columns (D,) of the missing values among the observed components.
-        near: Indices (inner,) of the cubes from whose values they are predicted.
+        near: Indices (inner,) of the cubes from whose values the missing ones are predicted.
         weights: Matrix (D, inner C) from the values of these cubes to the predictions.
         by_pad: Change (D, inner P) of the predictions in Pa for one standard deviation of the noise
-            of each pad.
-        rows: Indices (n,) of the windows (named by their centre cube) that contain the cube.
+            of each of the P pads of these cubes.
+        rows: Indices (n,) of the windows (a cube and its nearest neighbours) that contain the cube.
+            The index of a window is that of its centre cube.
         gain: Entries (n, D, points x 2) of the matrices G of these windows: change of the pressures
             on the surface and at the cubes' depth per Pa of each missing value.
     """
@@ -61,7 +62,7 @@ class MissingValuePrediction:
         observed: Mask,
         known: Mask,
     ) -> None:
-        """Prepare the predictions.
+        """Prepare the predictions of the values that are observed normally but not known now.
 
         Args:
             windows: Matrices of all windows (a cube and its nearest neighbours).

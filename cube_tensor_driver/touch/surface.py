@@ -153,14 +153,15 @@ class Surface:
         return self._interpolation.uncertainty(values, self._pressure_columns)
 
     def contacts(self, values: Array, threshold: float) -> list[Contact]:
-        """Find contacts: regions in which the pressure is above two thresholds.
+        """Find contacts: regions in which the pressure at the cubes' depth is above two thresholds.
 
         These are the absolute `threshold` and the fraction `RELATIVE_THRESHOLD` of the largest
         pressure on the skin.
 
-        The elastomer above the plane of the cubes is in equilibrium. So the integral of the
-        pressure in this plane is the normal force. The first moment of the pressure is the first
-        moment of the load plus depth × shear force; this product is subtracted again. For this
+        The elastomer above the plane of the cubes' centres is in equilibrium. So the integral of
+        the pressure in this plane is the normal force on the surface. The first moment of the
+        pressure in this plane is the first moment of the load on the surface plus depth × shear
+        force; this product is subtracted to get the position of the contact. For this
         moment, pressure and shear are interpolated by the same method, from values without
         gradients. Below a point force on an incompressible body, the vector (σzx, σyz, σzz) points
         away from the force, so that each single cube gives the correct position, and so does every

@@ -147,11 +147,13 @@ class ContactModel:
         return TractionField(traction, depth_pressure)
 
     def pressure_variance(self, contacts: list[HertzContact]) -> Array:
-        """Compute the variances of the pressure that the covariances of the contacts cause.
+        """Compute the variances of the pressure due to the uncertain parameters of the contacts.
+
+        The parameters and their covariance are those of `HertzContact.covariance`.
 
         Returns:
-            Variances (M, 2) in Pa^2 of the pressure on the surface, and of the pressure at the
-            cubes' depth.
+            Variances (M, 2) in Pa^2 at the M points of the surface: of the pressure on the surface,
+            and of the pressure at the depth of the cubes' centres.
         """
         total = np.zeros((len(self.inverse.points), 2))
         for contact in contacts:

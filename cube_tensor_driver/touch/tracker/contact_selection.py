@@ -156,8 +156,8 @@ def prune_contacts(
         for contact in contacts
     }
     strongest = max(peaks.values(), default=0.0)
-    # A contact ends at half of the pressure at which it begins, so that a contact near the
-    # threshold is not removed and detected again in turn.
+    # A contact is removed below half of `min_pressure`, the smallest pressure of a new contact.
+    # So a contact whose pressure is near one of both limits is not removed and detected in turn.
     threshold = max(min_pressure / 2, PRUNING_FRACTION * strongest)
 
     # Ids increase with time, so older contacts come first. They are kept, and younger contacts

@@ -263,7 +263,7 @@ class ContactTracker:
         while remaining:
             first = remaining.pop(0)
             group = [first, *self._neighbours(first, remaining)[: MAX_CONTACTS_PER_FIT - 1]]
-            # Contacts are compared by identity, because two contacts may have equal attributes.
+            # Contacts are compared by identity: `==` would compare all attributes, arrays included.
             members = {id(one) for one in group}
             remaining = [one for one in remaining if id(one) not in members]
             others = [one for one in self._contacts if id(one) not in members]
@@ -500,7 +500,7 @@ class ContactTracker:
         The flattened skin is the plane in which the skin was laid out for the fit.
 
         Args:
-            number: Id of the contact.
+            number: Number (id) of the contact.
             estimate: Force and position of the contact, with variances, on the flattened skin.
             cubes: Indices (n,) of the cubes whose values were fitted.
             place: Positions (n, 2) of these cubes on the flattened skin, in m.
