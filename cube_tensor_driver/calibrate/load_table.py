@@ -93,6 +93,17 @@ def _check_columns(
     layout: Layout,
     modes: Modes,
 ) -> None:
+    """Check the names of the columns of a table of loads.
+
+    Args:
+        path: Path of the table, for the error message.
+        header: Names of the columns.
+        layout: Layout of the cube's pads; each pad needs a column.
+        modes: Modes (linear stress fields) that a column may hold.
+
+    Raises:
+        FitError: A column is unknown, present twice or missing.
+    """
     allowed = {*layout.pads, *modes.names, *FORCE, TEMPERATURE}
     # One error message names all columns with the same mistake, so that a user can correct them at
     # once.

@@ -158,6 +158,7 @@ class Calibration:
             self._set("covariance", _read_array(self.covariance, square, "covariance"))
 
     def _check_temperature(self) -> None:
+        """Raise CalibrationError unless the temperature model has coefficients for every pad."""
         if self.temperature is None:
             return
         n_lists = len(self.temperature.coefficients)
@@ -168,6 +169,7 @@ class Calibration:
             )
 
     def _check_uid(self) -> None:
+        """Raise CalibrationError if the unique id is neither None nor a whole number of 8 bytes."""
         if self.uid is None:
             return
         # True and False are integers in Python, but never an id.
@@ -381,10 +383,20 @@ def _to_plain(value: Any, is_per_pad: bool) -> Any:
 
 
 def _read_number(value: Any, name: str) -> float:
+    """Return a value of a file as a float; `name` stands for it in the error message.
+
+    Raises:
+        CalibrationError: The value is no finite number.
+    """
     return float(_read_array(value, (), name))
 
 
 def _read_coefficients(value: Any) -> dict[str, float]:
+    """Return coefficients by name, as a file holds them, as numbers.
+
+    Raises:
+        CalibrationError: The value is no table, or an entry is no number.
+    """
     if not isinstance(value, Mapping):
         raise CalibrationError(
             f"coefficients is {value!r}; it must be a table of names and numbers"

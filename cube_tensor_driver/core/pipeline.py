@@ -643,6 +643,12 @@ class Pipeline:
         return np.where(is_stress, 1, 1 / self._groups[group].half_side)
 
     def _make_estimator(self, group: int, mask: int) -> Estimator:
+        """Construct the estimator (map from pad stresses to components) of a calibration.
+
+        Args:
+            group: Number of the calibration.
+            mask: Bit mask of the pads that are not used.
+        """
         calibration = self._groups[group]
         missing = np.flatnonzero(_unpack_bits(mask, calibration.layout.n_pads))
         return make_estimator(
@@ -654,6 +660,12 @@ class Pipeline:
         )
 
     def _make_table(self, group: int, mask: int) -> _Table:
+        """Construct the matrix and limits of a calibration without some pads.
+
+        Args:
+            group: Number of the calibration.
+            mask: Bit mask of the pads that are not used.
+        """
         estimator = self._estimator(group, mask)
         n_pads = self._groups[group].layout.n_pads
         matrix = np.zeros((N_COMPONENTS + self._n_residual, self.n_pads))

@@ -221,6 +221,7 @@ def _derive_structure(
     symmetry: str,
     modes: Modes,
 ) -> Structure:
+    """Derive the structure that `find_structure` returns; the arguments are the same."""
     elements = find_layout_group(layout, symmetry)
     pad_images = np.array([map_pads(layout, element) for element in elements])
     mode_images, mode_signs = _read_signed_permutations(

@@ -109,6 +109,15 @@ class _SetLoad:
         self._field = np.zeros((cubes, 6)), np.zeros((cubes, 6, 3))
 
     def set(self, stress: Array, gradient: Array) -> None:
+        """Replace stress and gradient.
+
+        Args:
+            stress: Stress (cubes, 6) in Pa, in the frames of the cubes.
+            gradient: Gradient (cubes, 6, 3) in Pa/m.
+
+        Raises:
+            ConfigError: Stress or gradient has another shape.
+        """
         cubes = len(self._field[0])
         if stress.shape != (cubes, 6) or gradient.shape != (cubes, 6, 3):
             raise ConfigError(

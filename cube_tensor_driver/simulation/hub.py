@@ -219,6 +219,15 @@ class SimulatedHub:
         celsius: int = TEMPERATURE_UNKNOWN,
         pad_fault: PadMasks | None = None,
     ) -> Sample:
+        """Return a sample as the protocol code encodes it.
+
+        Args:
+            sequence: Sequence number of the sample.
+            device_us: Time of the hub's clock in µs.
+            frequency: Frequencies (cubes, pads) in mHz.
+            celsius: Temperature of all cubes in 0.01 °C.
+            pad_fault: Bit masks (cubes,) of the pads reported as failed; None for no pads.
+        """
         n = len(frequency)
         if pad_fault is None:
             pad_fault = np.zeros(n, "<u4")

@@ -354,6 +354,7 @@ class Injector:
         at_us: int,
         fault: Fault,
     ) -> None:
+        """Add the begin or end of a fault at a simulated time in µs to a schedule."""
         self._number += 1
         heapq.heappush(schedule, (at_us, self._number, fault))
 

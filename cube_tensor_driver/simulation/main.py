@@ -49,6 +49,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line arguments."""
     parser = argparse.ArgumentParser(
         prog="simulator", description="Simulated hubs of a skin on pseudo-terminals."
     )

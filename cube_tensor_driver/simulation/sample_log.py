@@ -141,6 +141,7 @@ class SampleLog:
 
     @classmethod
     def _parse(cls, data: dict[str, Any]) -> SampleLog:
+        """Create a log from the dictionary that its JSON file contains."""
         links = tuple(
             LinkLog(
                 name=link["name"],

@@ -133,6 +133,7 @@ class Conditions:
         return found
 
     def _combine(self) -> None:
+        """Compute the present conditions and masks from those of the recent windows."""
         self.state: StatusBits = np.bitwise_or.reduce(self._recent, axis=0)
         self._since_collected |= self.state
         is_left_out = self.state & LEFT_OUT > 0
@@ -200,6 +201,12 @@ class PadDiagnosis:
         return valid
 
     def _find_noisy(self, window: Window, state: StatusBits) -> Mask:
+        """Find the pads whose noise is high (cubes, P), with hysteresis, and set the new `bound`.
+
+        Args:
+            window: Statistics of the window that has ended.
+            state: Conditions known before the window ended (cubes, P).
+        """
         # Vibration raises the noise of all pads of a cube. They must not be reported as noisy then,
         # so the median noise of the pads is the usual noise if it is above that of the calibration.
         usual = np.fmax(self.noise, _lower_median(window.noise))
@@ -213,6 +220,12 @@ class PadDiagnosis:
         return noisy
 
     def _find_stuck(self, span: Real, state: StatusBits) -> Mask:
+        """Find the pads that keep a single value while the other pads of the cube move (cubes, P).
+
+        Args:
+            span: Highest minus lowest frequency in the window (cubes, P), in Hz.
+            state: Conditions known before the window ended (cubes, P).
+        """
         others_moved = _lower_median(span / self.noise) > STUCK_MIN_SPAN
         # A pad with a loose wire may show a single frequency for a window. It is not stuck, and has
         # the condition open, short or range already.
@@ -227,6 +240,14 @@ class PadDiagnosis:
         has_enough_rows: Mask,
         state: StatusBits,
     ) -> None:
+        """Determine which cubes are still: no usable pad's frequency moved in the window.
+
+        Args:
+            window: Statistics of the window that has ended.
+            span: Highest minus lowest frequency in the window (cubes, P), in Hz.
+            has_enough_rows: Whether a cube has at least `MIN_ROWS` rows in the window.
+            state: Conditions of the pads (cubes, P).
+        """
         limit = STILL_MAX_SPAN * self.noise
         # A step of the frequency between two windows is not visible in the span of either of them.
         jumped = np.abs(window.mean - self._mean_before) > limit
@@ -237,6 +258,11 @@ class PadDiagnosis:
         self._mean_before = np.where(has_mean, window.mean, self._mean_before)
 
     def _find_drifting(self, window: Window) -> Mask:
+        """Find the pads of still cubes whose frequency shifts relative to the others (cubes, P).
+
+        Args:
+            window: Statistics of the window that has ended.
+        """
         moved = ~self.still & (window.rows > 0)
         self._mean_at_rest[moved] = np.nan
         has_come_to_rest = self.still[:, None] & np.isnan(self._mean_at_rest)
@@ -276,6 +302,11 @@ def has_high_residual(
 
 
 def _squared_bound(noise: Array) -> Array:
+    """Return the limit of squared second differences of the frequency, in Hz².
+
+    Args:
+        noise: Usual noise (standard deviation of the frequency) of each pad, in Hz.
+    """
     bound: Array = ((MAX_SECOND_DIFFERENCE * noise) ** 2).astype(np.float32)
     return bound
 

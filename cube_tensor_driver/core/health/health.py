@@ -316,6 +316,7 @@ class Health:
         self._over_limit[:] = 0
 
     def _close_window(self) -> None:
+        """Evaluate the statistics of the present window, and start the next window."""
         window = self.window()
         self.history.append(window)
         self.closed += 1
@@ -363,6 +364,11 @@ class Health:
         self._conditions.add(cube, is_reported * np.uint16(REPORTED))
 
     def _make_pattern(self, cube: AnyArray) -> _HealthPattern:
+        """Compute the quantities that depend only on the cube numbers (N,) of a message.
+
+        Raises:
+            LayoutError: The skin does not have one of the cubes.
+        """
         n_cubes, n_pads = self._exists.shape
         is_known = (cube >= 0) & (cube < n_cubes)
         if not is_known.all():
@@ -387,6 +393,12 @@ class Health:
         )
 
     def _misfit(self, cube: AnyArray, shape: tuple[int, ...]) -> LayoutError:
+        """Return the error for frequencies that do not fit the skin.
+
+        Args:
+            cube: Cube number of each row (N,).
+            shape: Shape of the frequencies.
+        """
         n_cubes, n_pads = self._exists.shape
         return LayoutError(
             f"frequencies of shape {shape} for cubes up to {max(cube, default=0)}; this skin has "

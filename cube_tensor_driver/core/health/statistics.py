@@ -210,6 +210,7 @@ class WindowStatistics:
             self._add_waiting()
 
     def _add_waiting(self) -> None:
+        """Add the scans that wait, if there are any, to the sums."""
         waiting, count = self._waiting, self._waiting.count
         if count:
             waiting.count = 0
@@ -222,6 +223,7 @@ class WindowStatistics:
         stamp_ns: Times,
         doubtful: Mask | None = None,
     ) -> None:
+        """Add B scans of the same N cubes to the sums; the arguments are those of `add`."""
         chosen = self._pads[:, cubes]
         last, difference, first_squares, second_squares, bounded_squares = chosen[:5]
         total, lowest, highest, base, bound = chosen[5:]

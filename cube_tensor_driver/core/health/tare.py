@@ -264,6 +264,15 @@ def _list_checks(
     rest: Array,
     means: _Means,
 ) -> list[_Check]:
+    """Return the checks that a tare must pass.
+
+    Args:
+        pipeline: Pipeline with the calibrations.
+        health: Health of the pads, with their noise.
+        chosen: Numbers of the cubes to tare.
+        rest: New rest frequencies (frequencies without load) of these cubes, in Hz.
+        means: Statistics of the frequencies of these cubes.
+    """
     calibrations = [pipeline.calibrations[cube] for cube in chosen.tolist()]
     frequencies = [calibration.rest_frequency for calibration in calibrations]
     calibrated = pad_table(frequencies, pipeline.n_pads, np.nan)
