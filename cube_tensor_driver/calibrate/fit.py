@@ -302,7 +302,11 @@ class _Model:
         self.gains: Array = np.array(columns).reshape(-1, n_pads).T
 
     def unpack(self, theta: Array) -> tuple[Array, Array]:
-        """Return all coefficients (K,) and gains (P,) that parameters theta stand for."""
+        """Return all coefficients (K,) and gains (P,) for some values of the parameters.
+
+        Args:
+            theta: Parameters: the coefficients that are not fixed, then coordinates of the gains.
+        """
         coefficients = self._fixed.copy()
         coefficients[self.free] = theta[: len(self.free)]
         coordinates = theta[len(self.free) :]

@@ -129,6 +129,12 @@ def _read_states(
 ) -> Array:
     """Return the amplitudes of the modes (N, M), in Pa, from the columns of modes or of forces.
 
+    Args:
+        path: Path of the table, for error messages.
+        columns: Numbers (N,) in each column by its name.
+        modes: The M modes (linear stress fields).
+        area: Area that a force acts on, in m²; None if it is not known.
+
     Raises:
         FitError: The table has both kinds of columns or none, not all forces, or forces without an
             area.

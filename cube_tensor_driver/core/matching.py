@@ -87,7 +87,10 @@ def match_rows(known: SampleRows, wanted: SampleRows) -> Index:
 
 
 def _keys(rows: SampleRows) -> AnyArray:
-    """Return one integer per row (N,) that combines its cube number and its sequence number."""
+    """Return keys (N,) of rows: integers that combine cube number and sequence number.
+
+    Two rows have the same key if they have the same cube and the same sequence number.
+    """
     cube = rows.cube.astype(np.int64) << _SEQUENCE_BITS
     keys: AnyArray = cube | rows.sequence.astype(np.int64)
     return keys

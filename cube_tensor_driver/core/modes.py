@@ -224,7 +224,7 @@ def _split_fields(flat: Array) -> tuple[Array, Array]:
 
 
 def _parse_terms(name: str) -> list[tuple[float, int]]:
-    """Return the terms of a mode's name, such as "zz", "zz_x" or "xy_y-zx_z" with two terms.
+    """Return the terms of the name of a mode (linear stress field): "xy_y-zx_z" has two terms.
 
     Returns:
         Sign of each term, and its index among the 36 entries of a field (9 of the stress, then 27

@@ -94,7 +94,13 @@ def stress_slope(
 ) -> Array:
     """Compute the derivative of a pad's stress v with respect to its frequency f, in Pa/Hz.
 
-    Without load it is E (1 + beta) / f0. The arguments are those of `pad_stress`.
+    Without load it is E (1 + beta) / f0.
+
+    Args:
+        frequency: Frequency f of a pad's oscillator, in Hz.
+        rest_frequency: Frequency f0 without load, in Hz.
+        beta: Ratio of the parasitic to the active capacitance without load.
+        modulus: Modulus E of the pad's foam, in Pa.
     """
     f, f0 = np.asarray(frequency), np.asarray(rest_frequency)
     with np.errstate(all="ignore"):

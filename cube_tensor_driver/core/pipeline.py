@@ -692,7 +692,15 @@ class Pipeline:
 
 
 def _unpack_bits(mask: AnyArray | int, count: int) -> Mask:
-    """Return bits 0 to count - 1 of bit masks (...) as an array (..., count)."""
+    """Convert bit masks to truth values.
+
+    Args:
+        mask: Bit masks (...).
+        count: Number of bits to convert, from bit 0 (the lowest) on.
+
+    Returns:
+        Whether each bit is set (..., count).
+    """
     masks = np.asarray(mask, dtype=np.int64)
     shifted = masks[..., None] >> np.arange(count)
     bits: Mask = shifted & 1 > 0
@@ -700,7 +708,7 @@ def _unpack_bits(mask: AnyArray | int, count: int) -> Mask:
 
 
 def _pack_bits(bits: Mask) -> Times:
-    """Return bit masks of bits (..., count), the inverse of `_unpack_bits`."""
+    """Convert truth values (..., count) to bit masks (...); value p becomes bit p of a mask."""
     weights = np.int64(1) << np.arange(bits.shape[-1])
     masks: Times = bits @ weights
     return masks

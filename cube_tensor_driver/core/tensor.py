@@ -71,7 +71,7 @@ def von_mises(stress: Real) -> Array:
 
 
 def _split(stress: Real) -> AnyArray:
-    """Return a stress (..., 6) with its components as the first axis (6, ...)."""
+    """Return a stress (..., 6) as an array (6, ...), from which the six components are unpacked."""
     return np.moveaxis(np.asarray(stress), -1, 0)
 
 
@@ -152,7 +152,10 @@ def quaternion_from_rpy(
 ) -> Array:
     """Return the rotation by roll, pitch and yaw as a quaternion x, y, z, w (4,) with w >= 0.
 
-    `rotation_from_rpy` explains the angles, which are in rad.
+    Args:
+        roll: First rotation, about the fixed x axis, in rad.
+        pitch: Second rotation, about the fixed y axis, in rad.
+        yaw: Third rotation, about the fixed z axis, in rad.
     """
     w, x, y, z = euler.euler2quat(roll, pitch, yaw, _FIXED_AXES)
     # q and -q are the same rotation; choosing one sign gives equal rotations equal numbers.
@@ -184,7 +187,7 @@ def rotation_from_quaternion(quaternion: ArrayLike) -> Array:
 
 
 def rpy_from_quaternion(quaternion: ArrayLike) -> Array:
-    """Return roll, pitch and yaw (3,), in rad, of a quaternion x, y, z, w.
+    """Return roll, pitch and yaw (3,), in rad, of the rotation by a quaternion x, y, z, w (4,).
 
     Raises:
         CubeError: The quaternion is zero or not finite.

@@ -201,9 +201,16 @@ def hub_cubes(
 def hub_members(skin: Skin, link: str) -> Index:
     """Return the indices in the skin of the cubes (hub cubes,) of the hub on a link.
 
-    A cube whose index on the hub is given in the skin file has this index. The others (with a uid
-    instead) take the free indices in the order of the skin; without a link, they are on the first
-    link. The value is `ABSENT` for indices that remain free.
+    A cube whose index on the hub is given in the skin file has this index. Cubes for which the skin
+    file gives a uid (unique number) instead take the free indices, in the order of the skin. Of
+    these, cubes without a link are on the first link of the skin.
+
+    Args:
+        skin: The skin.
+        link: Name of the link.
+
+    Returns:
+        Index in the skin for each index on the hub; `ABSENT` where no cube of the skin has it.
     """
     by_index = {
         cube.index: number

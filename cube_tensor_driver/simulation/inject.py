@@ -53,7 +53,11 @@ def inject(ports: Path | None, words: Sequence[str]) -> str:
 
 
 def fault_line(fault: dict[str, object]) -> str:
-    """Return a fault as one line for the pipe of a simulator."""
+    """Return a fault as one line of YAML, which a simulator reads from its pipe.
+
+    Args:
+        fault: Keys and values of the fault, as `Fault` lists them.
+    """
     return to_yaml(fault).replace("\n", " ").strip() + "\n"
 
 

@@ -140,7 +140,11 @@ class Injector:
             self.add(fault, round(1e6 * fault.at))
 
     def add(self, fault: Fault, at_us: int) -> None:
-        """Schedule a fault at a simulated time in µs.
+        """Schedule a fault.
+
+        Args:
+            fault: Fault; one without a link affects all links.
+            at_us: Simulated time in µs at which the fault begins.
 
         Raises:
             ConfigError: The fault names a link, cube or pad that does not exist.
@@ -241,7 +245,12 @@ class Injector:
         return self._alter_frame(kind, data) + held_back
 
     def _alter_frame(self, kind: str, data: bytes) -> bytes:
-        """Return the bytes of a frame after a fault of this kind; "" does not change them."""
+        """Return the bytes that are sent for a frame under a fault.
+
+        Args:
+            kind: One of `FRAME_FAULTS`. Any other text leaves the frame unchanged.
+            data: Bytes of the frame.
+        """
         random = self._random
         match kind:
             case "drop":
@@ -263,7 +272,12 @@ class Injector:
         return data
 
     def _begin(self, fault: Fault, now_us: int) -> None:
-        """Begin a fault, record it and schedule its end."""
+        """Begin a fault on its link, record it and schedule its end.
+
+        Args:
+            fault: Fault with the name of a single link.
+            now_us: Simulated time in µs.
+        """
         link = self._links[fault.link]
         state = self._states[fault.link]
         hub = link.hub
@@ -314,13 +328,24 @@ class Injector:
         now_us: int,
         sequence: int,
     ) -> None:
-        """Restart a hub, which then sends HELLO and numbers its samples from `sequence` on."""
+        """Restart a hub, which then describes itself by a HELLO frame.
+
+        Args:
+            link: Link of the hub.
+            now_us: Simulated time in µs.
+            sequence: Number of the next sample of the hub.
+        """
         self._states[link.name].held_back = b""
         link.hub.reset(now_us, sequence)
         link.line.send(link.hub.hello(), now_us)
 
     def _end(self, fault: Fault, now_us: int) -> None:
-        """End a fault."""
+        """End a fault on its link, and undo its effect on the hub, its pads or its line.
+
+        Args:
+            fault: Fault that has lasted for its duration.
+            now_us: Simulated time in µs.
+        """
         link = self._links[fault.link]
         state = self._states[fault.link]
         hub = link.hub
@@ -354,7 +379,13 @@ class Injector:
         at_us: int,
         fault: Fault,
     ) -> None:
-        """Add the begin or end of a fault at a simulated time in µs to a schedule."""
+        """Add the begin or the end of a fault to a schedule.
+
+        Args:
+            schedule: Schedule of all begins or of all ends, which is changed.
+            at_us: Simulated time in µs.
+            fault: Fault with the name of a single link.
+        """
         self._number += 1
         heapq.heappush(schedule, (at_us, self._number, fault))
 

@@ -226,7 +226,13 @@ class Load:
         action: Action,
         seconds: float,
     ) -> ContactLoad:
-        """Return the contact of an indenter at a time in s during one of its actions."""
+        """Return the contact of an indenter at a time during one of its actions.
+
+        Args:
+            indenter: The indenter.
+            action: Action of the indenter during which the time lies.
+            seconds: Time in s since the start of the script.
+        """
         duration = action.end - action.start
         progress = (seconds - action.start) / duration  # 0 to 1
         path = self._paths[id(action)]
@@ -251,7 +257,12 @@ class Load:
         return ContactLoad(indenter.shape, position, normal, shear - size * normal, radius)
 
     def _contact_radius(self, indenter: Indenter, force: float) -> float:
-        """Return the radius in m of a contact under a normal force in N."""
+        """Return the radius of a contact, in m.
+
+        Args:
+            indenter: Indenter, whose shape and size determine the radius.
+            force: Normal force in N.
+        """
         if indenter.shape == "disc":
             return indenter.radius
         # Hertz: a³ = 3 F R / (4 E*) for the contact radius a, with E* = E / (1 − ν²); Johnson 4.2

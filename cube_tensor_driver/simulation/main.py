@@ -131,7 +131,12 @@ def _create_simulator(options: argparse.Namespace) -> Simulator:
 
 
 def _read_load(skin: Skin, options: argparse.Namespace) -> AnyLoad:
-    """Read the MuJoCo scene or load script that the options name, or the default script."""
+    """Read the load on the skin: a MuJoCo scene or a load script.
+
+    Args:
+        skin: The skin.
+        options: Command line options; without a scene and a script, the default script is read.
+    """
     if options.mujoco:
         # MuJoCo is optional, and importing it takes long.
         from .mujoco.scene import MujocoLoad

@@ -153,7 +153,14 @@ class SkinPads:
         drift: float = 0.0,
         imperfections: Imperfections | None = None,
     ) -> None:
-        """Create the pads; arguments as in `SimulatedCubes`.
+        """Create the pads.
+
+        Args:
+            skin: Skin whose pads are simulated.
+            noise: Standard deviation of a frequency divided by the frequency; None: that of the
+                calibration of each cube.
+            drift: Relative change of every rest frequency (frequency without load) per second.
+            imperfections: Deviations of the pads from their calibrations; None: none.
 
         Raises:
             ConfigError: Cubes of one hub have different numbers of pads.

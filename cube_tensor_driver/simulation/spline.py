@@ -68,7 +68,8 @@ class CubicSpline:
         """Return the interval between two points in which a time from 0 to 1 lies.
 
         Returns:
-            Elapsed fraction of the interval, the points at its two ends, and the slopes there.
+            Elapsed fraction t of the interval, the points p and q (D,) at its start and end, and
+            the slopes m and n (D,) there.
         """
         scaled = time * (len(self._points) - 1)
         i = min(int(scaled), len(self._points) - 2)

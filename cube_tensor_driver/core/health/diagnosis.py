@@ -312,7 +312,13 @@ def _squared_bound(noise: Array) -> Array:
 
 
 def _lower_median(values: Real) -> Real:
-    """Return the lower median (cubes, 1) of the values (cubes, P) of each cube that are not NaN."""
+    """Return the median over the pads of each cube (cubes, 1), without NaN.
+
+    Of an even number of values, it is the lower one of the two in the middle.
+
+    Args:
+        values: Value of each pad (cubes, P); NaN where a cube has no such pad.
+    """
     ordered = np.sort(values, axis=1)  # NaN is sorted to the end
     n_unknown = np.isnan(ordered).sum(axis=1)
     n_known = values.shape[1] - n_unknown

@@ -248,7 +248,12 @@ class Health:
     def _check(self, pattern: _HealthPattern, rows: FrequencyRows) -> tuple[PadMasks, StatusBits]:
         """Check the rows of one or more scans of the same cubes, and add them to the statistics.
 
-        `update` explains the result.
+        Args:
+            pattern: Quantities that depend only on the cube numbers of the rows.
+            rows: N rows (samples of one cube).
+
+        Returns:
+            Bit masks of the pads to leave out of each row (N,), and conditions of its cube (N,).
         """
         scans = pattern.repeats, len(pattern.cube)
         frequency = rows.frequency.reshape(*scans, -1)

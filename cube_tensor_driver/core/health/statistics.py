@@ -411,9 +411,13 @@ def _differences(before: AnyArray, values: AnyArray) -> AnyArray:
 
 
 def _add_in_order(total: Single, terms: Single) -> None:
-    """Add terms (B, N, P) to a total (N, P) in place, one after the other.
+    """Add the terms of B scans to a total in place, one scan after the other.
 
-    The bits of the sum are then the same as if the scans were added in separate calls.
+    The sum is then the same, to the last bit, as if the scans were added in separate calls.
+
+    Args:
+        total: Sum for each cube and pad (N, P), which is changed.
+        terms: Terms of each scan (B, N, P).
     """
     for term in terms:
         total += term

@@ -145,7 +145,10 @@ def _area_moments(corners: Array) -> tuple[float, Array, float]:
 
 
 def _next_corners(corners: Array) -> Array:
-    """Return the next corner (K, 2) for each corner; np.roll would take five times as long."""
+    """Return, for each corner (K, 2) of a polygon, the corner that follows it.
+
+    np.roll would take five times as long.
+    """
     return np.concatenate([corners[1:], corners[:1]])
 
 
@@ -176,7 +179,9 @@ def _plane_basis(
     y: float,
     z: float,
 ) -> Array:
-    """Return two axes (3, 2) perpendicular to the normal (x, y, z); the three are right-handed.
+    """Return two unit axes, as columns (3, 2), that span the plane with the normal (x, y, z).
+
+    First axis, second axis and normal are a right-handed frame.
 
     The result is cached, because all contacts on a flat skin have the same normal.
     """

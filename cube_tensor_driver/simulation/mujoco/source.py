@@ -203,7 +203,10 @@ class MujocoSkin:
         return found
 
     def field(self, touches: list[Touch]) -> tuple[Array, Array]:
-        """Compute the fields at the cubes under contacts.
+        """Compute stress and gradient at the cubes under contacts.
+
+        Args:
+            touches: Contacts of the skin, as `touches` returns them.
 
         Returns:
             Stress (cubes, 6) in Pa and gradient (cubes, 6, 3) in Pa/m, order xx yy zz yz zx xy, in
@@ -277,8 +280,13 @@ class MujocoSkin:
     ) -> tuple[Array, Array, Array]:
         """Return the positions in m, forces in N and normals (each (n, 3)) of n contact points.
 
-        They are in the parent frame of the skin; the forces act on the skin, the normals point out
-        of it.
+        They are in the parent frame of the skin. The forces act on the skin, and the normals point
+        out of the skin.
+
+        Args:
+            part: Body of the skin and its cubes.
+            rows: Numbers (n,) of the contact points in MuJoCo's list.
+            sign: 1 if the body of the skin is the second of the two bodies, -1 if it is the first.
         """
         data = self.data
         frames = data.contact.frame[rows].reshape(-1, 3, 3)
@@ -454,10 +462,15 @@ def _field_of_polygons(
     loads: list[tuple[Polygon, Array]],
     tables: PolygonTables,
 ) -> tuple[Array, Array]:
-    """Compute stress and gradient at the cubes of a body under polygons with their normals.
+    """Compute stress and gradient at the cubes of a body under tractions on polygons.
 
-    A polygon is projected onto the plane of a cube, which reduces its area by the cosine with which
-    it faces the cube.
+    A polygon is projected onto the plane of a cube, which reduces its area by the cosine of the
+    angle between its normal and the normal of the plane.
+
+    Args:
+        part: The cubes on the body.
+        loads: Polygons with their unit normals (3,), in the parent frame of the skin.
+        tables: Stress under polygons, for the layer and the depth of the cubes.
     """
     position, rotation, _ = part.poses
     in_plane = rotation[..., :2]
