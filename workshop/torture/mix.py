@@ -197,7 +197,7 @@ class _Mix:
             elif kind == "step":
                 fault["value"] = round(random.uniform(-0.5, 5.0), 3)
             elif kind == "wrap":
-                # The numbers of the samples begin again at 0 after so many.
+                # The numbers of the samples begin again at 0 after this number of samples.
                 fault["count"] = int(random.integers(100, 3000))
             self._add_quietly(at, **fault)
             # A link that was cut delivers for a while before the next cut.

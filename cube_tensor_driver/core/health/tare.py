@@ -48,7 +48,7 @@ A larger difference shows that a load is on the cube, or that the calibration is
 
 JUMP_SPAN_RATIO = 10.0
 """Span (highest minus lowest frequency of a pad), as a multiple of the measured noise, above which
-the frequency is assumed to have jumped, because white noise does not span so much.
+the frequency is assumed to have jumped, because the span of white noise is smaller.
 
 A jump raises the measured noise as well. The error message of the refused tare then names the span
 as the reason, and not the noise.

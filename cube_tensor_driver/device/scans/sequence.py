@@ -195,8 +195,8 @@ class SequenceTracker:
         """Begin to count the samples anew with the first one after a restart of the hub.
 
         Earlier samples since power-up count as missing, because numbers begin at 0 with power-up.
-        If the number is above `MAX_GAP`, so many samples cannot have been lost, and nothing counts
-        as missing.
+        If the number is above `MAX_GAP`, it is not credible that all of them were lost, and nothing
+        counts as missing.
 
         Args:
             sequence: Number of the sample, 32 bits.
