@@ -9,9 +9,9 @@ from ..core.modes import COMPONENTS
 
 
 class History:
-    """The values (stress, gradients and residual) of all cubes in the last pictures of the page.
+    """Values (stress, gradients, residual) of all cubes at the last instants that the page showed.
 
-    They are stored in a ring buffer: a new picture overwrites the oldest one.
+    They are stored in a ring buffer: a new instant overwrites the oldest one.
     """
 
     COLUMNS = (*COMPONENTS, "residual")
@@ -23,7 +23,7 @@ class History:
 
         Args:
             cubes: Number of cubes.
-            length: Maximum number of pictures (instants) that are kept.
+            length: Maximum number of instants that are kept.
         """
         self._values = np.full((length, cubes, len(self.COLUMNS)), np.nan, np.float32)
         self._times = np.full(length, np.nan)
@@ -35,10 +35,10 @@ class History:
         values: Array,
         residual: Array,
     ) -> None:
-        """Add the values of one picture; the oldest picture is overwritten if the buffer is full.
+        """Add the values of one instant; the oldest is overwritten if the buffer is full.
 
         Args:
-            now: Time of the picture, in s, on any clock that all calls share.
+            now: Time of the instant, in s, on any clock that all calls share.
             values: Stress in Pa and gradients in Pa/m (cubes, 15); NaN where unknown.
             residual: Misfit between pads and tensor relative to the noise (cubes,); about 1 for
                 noise alone.
@@ -50,11 +50,11 @@ class History:
         self._count += 1
 
     def clear(self) -> None:
-        """Remove all pictures, for example because a replay has jumped to another time."""
+        """Remove all instants, for example because a replay has jumped to another time."""
         self._count = 0
 
     def of(self, cube: int, column: int) -> Array:
-        """Return one value of a cube in the M stored pictures (M,), in SI units, the oldest first.
+        """Return one value of a cube at the M stored instants (M,), in SI units, the oldest first.
 
         Args:
             cube: Index of the cube.
@@ -64,18 +64,18 @@ class History:
 
     @property
     def times(self) -> Array:
-        """Times (M,) of the M stored pictures minus that of the newest one, in s, so at most 0."""
+        """Times (M,) of the M stored instants minus that of the newest one, in s, so at most 0."""
         times = self._times[self._slots()]
-        # Plots end at zero, which is the time of the newest picture.
+        # Plots end at zero, which is the newest instant.
         return times - times[-1] if len(times) else times
 
     @property
     def observed(self) -> Mask:
-        """Whether each of `COLUMNS` is finite (16,) for any cube in any stored picture."""
+        """Whether each of `COLUMNS` is finite (16,) for any cube at any stored instant."""
         return np.asarray(np.isfinite(self._values[self._slots()]).any(axis=(0, 1)))
 
     def _slots(self) -> Index:
-        """Return the indices (M,) of the stored pictures in the ring buffer, the oldest first."""
+        """Return the indices (M,) of the stored instants in the ring buffer, the oldest first."""
         length = len(self._times)
         numbers = np.arange(max(0, self._count - length), self._count)
         return np.asarray(numbers % length)

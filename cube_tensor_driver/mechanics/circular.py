@@ -55,7 +55,8 @@ def _define_components() -> tuple[Complex, Orders]:
 
     components = combine_stresses("") + combine_stresses("_z")
 
-    # The derivative d/dx + i d/dy raises the order by one, d/dx - i d/dy lowers it by one.
+    # d/dx + i d/dy raises the angular order n of a component (its factor exp(i n phi)) by one,
+    # and d/dx - i d/dy lowers it by one.
     by_x = combine_stresses("_x")
     by_y = combine_stresses("_y")
     for (order, along_x), (_, along_y) in zip(by_x, by_y, strict=True):

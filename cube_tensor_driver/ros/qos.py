@@ -24,9 +24,9 @@ limits it.
 MAX_QUEUE_BYTES = 64_000_000
 """Maximum size, in bytes, of the queue of a batch topic (a topic whose messages hold all cubes).
 
-It keeps the memory of each process below 200 MB.
-
-On the largest skins a queue of this size holds less than `MAX_PAUSE_S` of messages.
+A full queue is the largest part of the memory of a process, which stays below 200 MB. On the
+largest skins this limit is reached before the queue holds `MAX_PAUSE_S` (longest pause of a
+subscriber without loss) of messages, so a shorter pause already loses messages there.
 """
 
 MIN_BATCH_DEPTH = 10

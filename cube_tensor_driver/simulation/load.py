@@ -320,8 +320,8 @@ def total(loads: Sequence[ContactLoad]) -> tuple[Array, Array, Array]:
     """Return the total force of some contacts, their centre of pressure and mean normal.
 
     Returns:
-        Force (3,) on the skin in N, centre of pressure (3,) in m and mean normal (3,). Without a
-        load, centre and normal are NaN.
+        Force (3,) on the skin in N, centre of pressure (3,) in m and mean normal (3,), which points
+        out of the skin; all in the skin's parent frame. Without a load, centre and normal are NaN.
     """
     if not loads:
         return np.zeros(3), np.full(3, np.nan), np.full(3, np.nan)

@@ -157,7 +157,7 @@ class PadDiagnosis:
         """Prepare the diagnosis of the pads of a skin.
 
         Args:
-            exists: Whether a cube has a pad with this number (cubes, P).
+            exists: Whether each cube has each pad (cubes, P), with P the largest number of pads.
         """
         self._exists = exists
         self.still: Mask = np.zeros(len(exists), bool)
@@ -285,9 +285,9 @@ def has_high_residual(
 ) -> Mask:
     """Decide, with hysteresis, which cubes have a high residual after a window of 0.5 s.
 
-    Noise alone exceeds the limit of the residual in one row of a thousand, so the fraction of the
-    window's rows above the limit decides: `RESIDUAL_ENTER` or `RESIDUAL_LEAVE`. Cubes without rows
-    keep their state.
+    Noise alone exceeds the limit of the residual (misfit of the pads) in one row of a thousand, so
+    the fraction of the window's rows above the limit decides. A residual becomes high at
+    `RESIDUAL_ENTER` and stays high down to `RESIDUAL_LEAVE`. Cubes without rows keep their state.
 
     Args:
         was_high: Whether the residual of a cube was high before the window (cubes,).

@@ -310,7 +310,9 @@ class WindowStatistics:
     ) -> tuple[Single, Single] | None:
         """Compute ratios and weights for second differences from the intervals between rows.
 
-        The formulas are those of r and w in the head of this file.
+        The ratio r of two successive intervals makes the second difference of a linear drift
+        vanish, and the weight w gives it the variance of the noise; the formulas are in the
+        docstring of this module.
 
         Args:
             cubes: Numbers of the N cubes.

@@ -53,8 +53,10 @@ MIN_BUCKETS_HIGH = 2
 the smallest delay by more than `MAX_RISE_NS` before the hub's or the host's clock counts as set.
 In a single bucket this may come from a pause of the host."""
 JITTER_POINTS = 64
-"""Number of reads over which the jitter (mean of the delay minus the smallest delay) is averaged,
-as the time constant of a low-pass filter."""
+"""Time constant, in reads of the link, of the low-pass filter that estimates the jitter.
+
+The jitter is the mean delay (time from sampling to arrival) minus the smallest delay.
+"""
 MAX_ROUND_TRIPS = 64
 """Number of newest round trips (questions for the hub's time and their answers) that are kept. With
 one per second they cover about one minute."""

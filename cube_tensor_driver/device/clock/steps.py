@@ -26,9 +26,12 @@ PERIOD_SAMPLES = 64
 """Time constant, in samples, of the low-pass filter that estimates the sample period of a hub from
 the device times (hub's clock) of its samples."""
 DECISION_NS = 200_000_000
-"""Time, in ns, after which the smallest delay of samples since a suspected step of the hub's clock
-decides whether the clock was set or the hub sampled late. Earlier it is decided only if the delay
-of a sample excludes one of the two."""
+"""Time, in ns after a suspected step of the hub's clock, at which the step is decided.
+
+A delay is the time from the sampling to the arrival of a sample. If the hub sampled late, the
+smallest delay since the step is as before; if its clock was set, it differs by the step. Before
+this time a step is decided only if one of the two would make a delay negative or improbably long.
+"""
 MAX_DECISION_NS = 1_000_000_000
 """Time limit, in ns after a suspected step of the hub's clock, for deciding whether the clock was
 set or the hub sampled late. Until then it is not decided while the smallest delay of samples lies

@@ -25,9 +25,12 @@ from ..prior import AMPLITUDE
 from .contact_fit import ContactFit, Observations
 
 NEGLIGIBLE_RESIDUAL = 2.5e-4
-"""Residual scale (standard deviation of the pressure that the contacts do not explain), divided by
-`AMPLITUDE`, below which the residual field adds less than a hundredth to any variance of a contact.
-It is then left out of the estimate, which takes half the time."""
+"""Residual scale below which the residual field is left out of the estimate of a contact.
+
+The residual field is the pressure that the contacts do not explain; its scale is its standard
+deviation divided by that of the prior (`AMPLITUDE`, in Pa). Below this scale it adds less than 1 %
+to the variances of force and position, and an estimate without it takes half the time.
+"""
 
 _MIN_NORMAL_FORCE = 1e-12
 """Smallest absolute value, in N, of a normal force by which moments are divided to get a position.
