@@ -26,8 +26,6 @@ autodoc_typehints = "description"
 autodoc_type_aliases = {"NDArray": "NDArray"}
 autodoc_typehints_description_target = "documented_params"
 napoleon_use_ivar = True
-# Docstrings that are not in Google style are shown as they are, although docutils warns of them.
-suppress_warnings = ["docutils"]
 default_role = "py:obj"
 exclude_patterns = ["_build"]
 

@@ -58,7 +58,7 @@ def invariants(stress: Real) -> Array:
 
 
 def von_mises(stress: Real) -> Array:
-    """Compute the von Mises stress sqrt(3/2 |deviator|^2) of each stress tensor (..., 6).
+    """Compute the von Mises stress ``sqrt(3/2 |deviator|^2)`` of each stress tensor (..., 6).
 
     The deviator is the tensor minus the mean of its normal stresses. The result has the unit of the
     stress.

@@ -3,7 +3,7 @@
 The skin is the half space z <= 0: z points out of the skin, its surface is z = 0 and a cube is at z
 = -depth. A force acts *on* the skin, so that a force that presses has a negative z component.
 
-A force F acts at a source on the surface. With d = point - source, R = |d|, Z = -d_z and the
+A force F acts at a source on the surface. With d = point - source, ``R = |d|``, Z = -d_z and the
 harmonic potential chi = Z ln(R + Z) - R, the solutions of Boussinesq (normal force) and Cerruti
 (tangential force) for the stress sigma at the point are one expression; nu is Poisson's ratio, and
 an index of chi and g is a derivative::

@@ -8,7 +8,7 @@ from cube_tensor_driver.core.matching import NO_MATCH, SampleKeys, match_rows
 
 
 def keys(*rows: tuple[int, int, int]) -> SampleKeys:
-    """Of rows (cube, sequence, stamp)."""
+    """Return the keys of rows that are given as (cube, sequence, stamp)."""
     cube, sequence, stamp_ns = np.array(rows, np.int64).reshape(-1, 3).T
     return SampleKeys(cube.astype(np.uint16), sequence.astype(np.uint32), stamp_ns)
 
