@@ -228,8 +228,11 @@ def test_the_page_shows_a_load_a_cube_and_a_tare(ros, tmp_path, page):
 
 
 def test_a_replay_is_controlled_from_the_page(ros, tmp_path, page):
-    """A bag of 3 s whose cubes swing with a period of 2 s."""
-    path = make_bag(tmp_path / "bag", CONFIG, 300)
+    """A bag of 30 s whose cubes swing with a period of 2 s.
+
+    It is so long that a slow browser sees it play before it holds at its end.
+    """
+    path = make_bag(tmp_path / "bag", CONFIG, 3000)
     heard = ros.listen(SkinStress, "stress")
     replay = subprocess.Popen(
         [
@@ -240,7 +243,7 @@ def test_a_replay_is_controlled_from_the_page(ros, tmp_path, page):
             str(path),
             "--view",
             "--start",
-            "2.5",
+            "29.5",
         ],
         cwd=ROOT,
         stdin=subprocess.DEVNULL,
@@ -256,7 +259,7 @@ def test_a_replay_is_controlled_from_the_page(ros, tmp_path, page):
             return 1e-9 * (to_ns(heard[-1].header.stamp) - START_NS)
 
         # It has come to the end, and holds there. Its cubes do not become stale.
-        ros.wait(lambda: heard and position() > 2.9 and GO_ON in buttons(page), 40)
+        ros.wait(lambda: heard and position() > 29.9 and GO_ON in buttons(page), 40)
         see(ros, page, lambda text: "paused" in text and f"{N} of {N} cubes" in text)
 
         def key(one: str, wanted: float) -> None:
@@ -283,16 +286,16 @@ def test_a_replay_is_controlled_from_the_page(ros, tmp_path, page):
         ros.wait(lambda: GO_ON in buttons(page), 40)
         key(Keys.HOME, 0.0)
         ros.wait(lambda: position() < 0.3, 40)
-        key(Keys.END, 3.0)
-        ros.wait(lambda: position() > 2.8, 40)
-        ros.wait(lambda: slider_value(page) > 2.8, 40)
+        key(Keys.END, 30.0)
+        ros.wait(lambda: position() > 29.8, 40)
+        ros.wait(lambda: slider_value(page) > 29.8, 40)
         assert f"{N} of {N} cubes" in text(page)
         refused = ros.call(
-            SteerReplay, "player/steer", SteerReplay.Request(position=3.5, paused=True)
+            SteerReplay, "player/steer", SteerReplay.Request(position=30.5, paused=True)
         )
         assert (
             not refused.success
-            and "3.5 s is not in the bag, which is 2.990 s long" in refused.message
+            and "30.5 s is not in the bag, which is 29.990 s long" in refused.message
         )
         replay.terminate()
         assert replay.wait(timeout=10) == 0
