@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_device_protocol import cobs_of
 from test_native_wire import pieces
+from test_protocol import cobs_of
 
 from conftest import ROOT
 from cube_tensor_driver.core.rows import FrequencyRows

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from test_device_protocol import BAD, FRAMES, cobs_of, crc_of, dump, wire
+from test_protocol import BAD, FRAMES, cobs_of, crc_of, dump, wire
 
 from conftest import ROOT
 from cube_tensor_driver.device.wire.decoder import MAX_RUN, Counters, PythonDecoder

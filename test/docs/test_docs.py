@@ -30,7 +30,7 @@ ELSEWHERE = {
         "test_end_to_end.test_demo_loses_nothing_and_is_right"
     ),
     "./cube demo --config first.yaml --headless --duration 3": (
-        "test_docs_python.test_subscriber_of_the_page_prints_pressures"
+        "test_python_page.test_subscriber_of_the_page_prints_pressures"
     ),
     "./cube bringup /dev/ttyACM0 -o hand.yaml": (
         "test_bringup.test_a_turned_cube_is_found_and_written"
@@ -42,11 +42,11 @@ ELSEWHERE = {
         "test_firmware.test_hubs_keep_every_rule_on_real_lines"
     ),
     "./cube fem cube_11mm --surface --meshes 2 -o mine.npz": (
-        "test_elastic_command.test_pads_under_loads_on_the_surface"
+        "test_fem_command.test_pads_under_loads_on_the_surface"
     ),
-    "./cube record -o run1": "test_bags_ros.test_recorded_is_published_and_reprocessed_is_live",
+    "./cube record -o run1": "test_recording.test_recorded_is_published_and_reprocessed_is_live",
     "./cube fit run1 --cube c05 --reference /force --area 1.44e-4 --layout planar -o c05.yaml": (
-        "test_bags_files.test_fit_from_a_bag"
+        "test_files.test_fit_from_a_bag"
     ),
     "./cube inject kind=unplug link=hub0 seconds=2": (
         "test_faults.test_inject_speaks_to_the_pipe_or_says_that_nobody_listens"
@@ -55,11 +55,10 @@ ELSEWHERE = {
         "test_faults.test_inject_speaks_to_the_pipe_or_says_that_nobody_listens"
     ),
     "./cube torture --duration 600 --seed 7 --json torture.json": (
-        "test_reliability_torture"
-        ".test_a_tortured_skin_loses_nothing_uncounted_and_says_nothing_wrong"
+        "test_torture.test_a_tortured_skin_loses_nothing_uncounted_and_says_nothing_wrong"
     ),
     "./cube torture --mutate all --seed 1 --json mutations.json": (
-        "test_reliability_torture.test_mutations_are_caught"
+        "test_torture.test_mutations_are_caught"
     ),
     "./cube demo --config config/examples/sole.yaml --load config/examples/gait.yaml "
     "--duration 3.3 --figure gait.png": (

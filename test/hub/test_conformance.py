@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 from hub_in_memory import HubInMemory, MemoryWire
-from test_device_protocol import wire
+from test_protocol import wire
 
 from conftest import ROOT
 from cube_tensor_driver.core.errors import CubeError, LinkError

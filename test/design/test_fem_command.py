@@ -436,7 +436,7 @@ def test_shipped_calibrations_are_what_their_commands_make(name, tmp_path, reque
 
 def test_study_says_where_to_trust(monkeypatch, tmp_path, capsys):
     """Errors of 50 % under 2 mm and 10 % under 10 mm; the quad layout does not see yy.
-    test_elastic_bench runs it."""
+    test_virtual_bench runs it."""
     error = {name: np.tile([[[0.5], [0.1]]], (2, 1, 15)) for name in LAYOUTS}
     error["quad"][..., 1] = np.nan
     error["cube"][1] = 0.3

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_device_clock import EPOCH_NS
+from test_clock import EPOCH_NS
 
 from cube_tensor_driver.device.clock.hub_clock import BAD_ANSWERS, HubClock
 from cube_tensor_driver.device.links.session import ASK_TIME_S

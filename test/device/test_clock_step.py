@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from test_device_clock import BASE_S, EPOCH_NS, random_delays, stalls, usb_bursts
+from test_clock import BASE_S, EPOCH_NS, random_delays, stalls, usb_bursts
 
 from cube_tensor_driver.core.status import STAMP
 from cube_tensor_driver.device.chain import LiveLinks

@@ -23,7 +23,7 @@ pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 from bag_maker import START_NS, make_bag
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
-from test_bags_files import all_differing_bits, differing_bits, stress
+from test_files import all_differing_bits, differing_bits, stress
 
 from conftest import ROOT, decoded
 from cube_tensor_driver.bags.read import Bag

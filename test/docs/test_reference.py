@@ -17,7 +17,7 @@ import pytest
 pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 pytest.importorskip("skfem", reason="needs skfem: pip install scikit-fem")
 
-from test_docs_python import blocks
+from test_python_page import blocks
 
 from conftest import ROOT
 from cube_tensor_design.studies.pads_example import planar_calibration
