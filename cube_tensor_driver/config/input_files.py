@@ -3,11 +3,33 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import stat
+import struct
+import zipfile
+import zlib
 from pathlib import Path
 
+import numpy as np
+
+from ..core.arrays import AnyArray
 from ..core.errors import ConfigError
+
+_ARCHIVE_ERRORS = (
+    zipfile.BadZipFile,
+    zlib.error,
+    struct.error,
+    RuntimeError,
+    EOFError,
+    ValueError,
+    OverflowError,
+    MemoryError,
+)
+"""Errors that zipfile and NumPy raise for a damaged file of arrays (.npz).
+
+`RuntimeError` is that for a member that seems to be encrypted or compressed by an unknown method.
+"""
 
 
 def check_regular(path: Path) -> None:
@@ -47,3 +69,34 @@ def read_bounded(path: Path, limit: int, purpose: str) -> bytes:
     if len(data) > limit:
         raise ConfigError(f"{path}: too large, the limit is {limit} bytes: this is no {purpose}")
     return data
+
+
+def read_arrays(path: Path, limit: int) -> dict[str, AnyArray]:
+    """Return the arrays of a file (.npz, a zip archive of NumPy arrays) by their names.
+
+    Args:
+        path: The file.
+        limit: Maximum size of the file and of its decompressed content, in bytes.
+
+    Raises:
+        ConfigError: The file is damaged, too large, or no file of arrays.
+        OSError: The file does not exist or cannot be read.
+    """
+    check_regular(path)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            # A small archive may decompress to any size, so the sizes are checked first.
+            size = sum(member.file_size for member in archive.infolist())
+            largest = max(size, path.stat().st_size)
+            if largest > limit:
+                raise ValueError(f"the content has {largest} bytes, the limit is {limit}")
+            # Each member is read as a whole before NumPy parses it, because zipfile compares its
+            # checksum only at its end. `np.load` would parse damaged bytes.
+            return {
+                name.removesuffix(".npy"): np.lib.format.read_array(
+                    io.BytesIO(archive.read(name)), allow_pickle=False
+                )
+                for name in archive.namelist()
+            }
+    except _ARCHIVE_ERRORS as error:
+        raise ConfigError(f"{path}: damaged, or no file of arrays ({error})") from None

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import atexit
 import json
+import os
 import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 from ..core.errors import ConfigError
 
@@ -21,13 +23,18 @@ YAML_SUFFIXES = (".yaml", ".yml")
 def atomic_write(path: Path) -> Iterator[Path]:
     """Yield the path of a temporary file, which replaces `path` when the `with` block ends.
 
-    If the block raises an error, the temporary file is removed and `path` stays as it was.
+    If the block raises an error, the temporary file is removed and `path` stays as it was. Several
+    processes may write the same file: each has its own temporary file, and the last one remains.
 
     Raises:
         ConfigError: The file cannot be written, or `path` is a folder or a device.
     """
     with _temporary_file(path) as temporary:
         yield temporary
+        # Without this call, a loss of power after the renaming can leave an empty file, because a
+        # file system may store the new name before the content.
+        with temporary.open("rb") as file:
+            os.fsync(file.fileno())
         temporary.replace(path)
 
 
@@ -37,8 +44,8 @@ def check_writable(path: Path) -> None:
     A temporary file is made beside it and removed. To read its permissions would not
     suffice: root passes every check of permissions, even below /proc and on read-only file systems.
     """
-    with _temporary_file(path) as temporary:
-        temporary.touch()
+    with _temporary_file(path):
+        pass
 
 
 def check_outputs(paths: dict[str, Path | None]) -> None:
@@ -126,16 +133,19 @@ def temporary_folder(prefix: str) -> Path:
 
 @contextmanager
 def _temporary_file(path: Path) -> Iterator[Path]:
-    """Yield the path of a file in the folder of `path`; it is removed when the block ends.
+    """Yield the path of a new file in the folder of `path`; it is removed when the block ends.
 
     Raises:
         ConfigError: An error of the operating system occurred in the block, or `path` is no file.
     """
-    # A rename is atomic only within one file system, so the file lies in the same folder.
-    temporary = path.parent / f"{path.name}.part"
+    # A rename is atomic only within one file system, so the file lies in the same folder. Its name
+    # is random, because several processes may write `path` at the same time.
+    temporary = path.parent / f".{uuid4().hex}.part"
     try:
         if path.exists() and not path.is_file():
             raise OSError(0, "is no file")
+        # The call fails if the name exists, so no link that somebody has put there is followed.
+        temporary.touch(exist_ok=False)
         yield temporary
     except OSError as error:
         reason = error.strerror or str(error)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ..core.arrays import Array
 from ..core.calibration import Calibration
 from ..core.errors import ConfigError
+from ..core.health.tare import MAX_REST_CHANGE
 from .schema import TEXT, JsonSchema, Schema, mapping
 from .yaml import read_yaml, write_yaml
 
@@ -89,8 +90,9 @@ def read_tare(folder: Path, uid: int, calibration: Calibration) -> StoredTare | 
         calibration: Calibration that the cube has now.
 
     Raises:
-        ConfigError: The file is damaged, belongs to another cube, or was measured under another
-            calibration. The message states which of these it is, and asks for a new tare.
+        ConfigError: The file is damaged, belongs to another cube, was measured under another
+            calibration, or has frequencies that the tare service would refuse. The message states
+            which of these it is, and asks for a new tare.
     """
     path = tare_path(folder, uid)
     if not path.exists():
@@ -113,6 +115,14 @@ def read_tare(folder: Path, uid: int, calibration: Calibration) -> StoredTare | 
             f"the cube now has {calibration.id!r}; tare again"
         )
     rest_frequency = np.array(data["rest_frequency"], float)
+    change = np.abs(rest_frequency / calibration.rest_frequency - 1)
+    pad = int(change.argmax())
+    if change[pad] > MAX_REST_CHANGE:
+        raise ConfigError(
+            f"{path}: pad {pad} has {rest_frequency[pad]:g} Hz, which is more than "
+            f"{MAX_REST_CHANGE:.0%} from the {calibration.rest_frequency[pad]:g} Hz of the "
+            "calibration; tare again"
+        )
     return StoredTare(rest_frequency, _parse_time(path, data["created"]))
 
 

@@ -9,23 +9,24 @@ from __future__ import annotations
 
 import hashlib
 import os
-import zipfile
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
-from tempfile import NamedTemporaryFile
 from typing import Any
 
 import numpy as np
 
+from ..config.input_files import read_arrays
+from ..config.output_files import atomic_write
 from ..core.arrays import AnyArray
+from ..core.errors import ConfigError
 
 MAX_CACHE_BYTES = 1 << 30
 """Maximum size of all cached files together, in bytes. Beyond it, the least recently used files are
 removed."""
 
-_READ_ERRORS = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
-"""Errors that NumPy and zipfile raise for a missing or damaged file."""
+_CONTENT = "content"
+"""Name of the array in each cached file that lists the other arrays with their types and shapes."""
 
 _CODE = (
     "mechanics/layer.py",
@@ -73,7 +74,7 @@ def load_or_compute(
         return arrays
 
     arrays = compute()
-    with suppress(OSError):  # if the folder cannot be written, nothing is stored
+    with suppress(OSError, ConfigError):  # if the folder cannot be written, nothing is stored
         _store(path, arrays)
     return arrays
 
@@ -106,14 +107,20 @@ def _load(path: Path) -> Arrays | None:
         Arrays by name; None if the file is missing or damaged, or cannot be marked.
     """
     try:
-        # NumPy checks the checksums of the zip file and raises an error for a damaged one.
-        with np.load(path, allow_pickle=False) as file:
-            arrays = dict(file)
+        # The factor leaves room for the headers of the file.
+        arrays = read_arrays(path, 2 * MAX_CACHE_BYTES)
         # The file's time becomes the time of its last use, by which `_make_room` sorts.
         os.utime(path)
-    except _READ_ERRORS:
+    except (OSError, ConfigError):
         return None
-    return arrays
+    # The checksums in the file cover each array, but not how many there are.
+    content = arrays.pop(_CONTENT, None)
+    return arrays if np.array_equal(content, _describe(arrays)) else None
+
+
+def _describe(arrays: Arrays) -> AnyArray:
+    """Return name, type and shape of each array, as texts."""
+    return np.array([f"{name} {one.dtype.str} {one.shape}" for name, one in arrays.items()])
 
 
 def _store(path: Path, arrays: Arrays) -> None:
@@ -122,21 +129,16 @@ def _store(path: Path, arrays: Arrays) -> None:
     Arrays of more than `MAX_CACHE_BYTES` are not stored.
 
     Raises:
-        OSError: The file cannot be written.
+        OSError, ConfigError: The file cannot be written.
     """
     size = sum(array.nbytes for array in arrays.values())
     if size > MAX_CACHE_BYTES:
         return
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    with NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:
-        try:
-            np.savez(file, allow_pickle=False, **arrays)
-            file.close()
-            Path(file.name).replace(path)
-        except OSError:
-            Path(file.name).unlink(missing_ok=True)
-            raise
+    with atomic_write(path) as partial, partial.open("wb") as file:
+        content = {_CONTENT: _describe(arrays)}
+        np.savez(file, allow_pickle=False, **content, **arrays)
     _make_room(path)
 
 

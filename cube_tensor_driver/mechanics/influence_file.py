@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import io
-import zipfile
 from pathlib import Path
 
 import numpy as np
 
-from ..config.input_files import read_bounded
+from ..config.input_files import read_arrays
 from ..config.output_files import atomic_write
 from ..core.errors import ConfigError, CubeError
 from ..core.layout import Layout
@@ -27,8 +25,11 @@ MAX_INTEGER = 30_000
 """Integer as which the largest absolute stress of a file is stored. Stresses are stored as 16-bit
 integers; their rounding error is a tenth of the error of the finite elements."""
 
-_READ_ERRORS = (OSError, ValueError, KeyError, EOFError, MemoryError, zipfile.BadZipFile)
-"""Errors that NumPy and zipfile raise for a damaged file."""
+_NUMBERS = ("pad_size", "side", "depth", "thickness", "poisson", "step")
+_TABLES = ("positions", "normals", "place", "pads")
+
+_PARSE_ERRORS = (OSError, KeyError, TypeError, ValueError)
+"""Errors for a file that cannot be read, lacks an array, or has one of another type or shape."""
 
 
 def write_influence(
@@ -79,38 +80,19 @@ def read_influence(path: Path) -> Influence:
         ConfigError: The file is missing, damaged or inconsistent.
     """
     try:
-        data = read_bounded(path, MAX_FILE_BYTES, "file of influence functions")
-        influence = _parse(_load_arrays(data))
+        influence = _parse(read_arrays(path, MAX_FILE_BYTES))
         _check(influence)
     except FileNotFoundError:
         raise ConfigError(
             f"{path}: no such file; make it with ./cube fem MODEL --surface"
         ) from None
-    except (CubeError, *_READ_ERRORS) as error:
+    except (CubeError, *_PARSE_ERRORS) as error:
         # A KeyError contains only the name of the missing array.
         reason = f"no {error}" if isinstance(error, KeyError) else error
         raise ConfigError(
             f"{path}: {reason}; make the file again with ./cube fem MODEL --surface -o FILE.npz"
         ) from None
     return influence
-
-
-def _load_arrays(data: bytes) -> Arrays:
-    """Decompress the arrays of a file of influence functions after a check of their size.
-
-    Args:
-        data: Content of the file (.npz, a zip file of NumPy arrays).
-
-    Raises:
-        ConfigError: The decompressed content is larger than `MAX_FILE_BYTES`.
-    """
-    # A small zip file may decompress to any size, so the total size is checked first.
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        size = sum(member.file_size for member in archive.infolist())
-    if size > MAX_FILE_BYTES:
-        raise ConfigError(f"the content has {size} bytes, the limit is {MAX_FILE_BYTES}")
-    with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-        return dict(arrays)
 
 
 def _parse(arrays: Arrays) -> Influence:
@@ -123,22 +105,27 @@ def _parse(arrays: Arrays) -> Influence:
         ConfigError: The file has another version of the format (`SCHEMA`).
         ElasticError: The layer's thickness or Poisson's ratio is out of range.
         KeyError: An array is missing.
+        TypeError, ValueError: An array has another type or shape.
     """
-    if int(arrays["schema"]) != SCHEMA:
-        raise ConfigError(f"schema is {arrays['schema']}, this package reads {SCHEMA}")
+    schema = arrays["schema"].item()
+    if schema != SCHEMA:
+        raise ConfigError(f"schema is {schema}, this package reads {SCHEMA}")
+    number = {name: float(arrays[name].item()) for name in _NUMBERS}
+    # Complex numbers and texts cannot be cast safely, so they are refused here.
+    table = {name: arrays[name].astype(float, casting="safe") for name in _TABLES}
     layout = Layout(
         str(arrays["layout"]),
-        arrays["positions"],
-        arrays["normals"],
-        float(arrays["pad_size"]),
+        table["positions"],
+        table["normals"],
+        number["pad_size"],
     )
     return Influence(
         layout=layout,
-        side=float(arrays["side"]),
-        layer=Layer(float(arrays["thickness"]), float(arrays["poisson"])),
-        depth=float(arrays["depth"]),
-        place=arrays["place"].astype(float),
-        pads=arrays["pads"] * float(arrays["step"]),
+        side=number["side"],
+        layer=Layer(number["thickness"], number["poisson"]),
+        depth=number["depth"],
+        place=table["place"],
+        pads=table["pads"] * number["step"],
     )
 
 

@@ -278,6 +278,20 @@ def test_file_round_trip_and_what_does_not_fit(tmp_path):
     assert read_tare(tmp_path / "deep", 8, CALIBRATION) is None
 
 
+@pytest.mark.parametrize("hertz", [5.0, 0.79 * 100e3, 1.21 * 100e3, 1e308])
+def test_a_file_is_held_to_the_limit_of_the_service(tmp_path, hertz):
+    rest = CALIBRATION.rest_frequency.copy()
+    np.testing.assert_allclose(rest, 100e3)
+    for pad, within in ((2, 0.81), (5, 1.19)):
+        rest[pad] *= within
+    write_tare(tmp_path, 7, CALIBRATION, rest, NOW)
+    assert read_tare(tmp_path, 7, CALIBRATION) is not None
+    rest[3] = hertz
+    write_tare(tmp_path, 7, CALIBRATION, rest, NOW)
+    with pytest.raises(ConfigError, match=r"0007\.yaml: pad 3 has .*20%.*tare again"):
+        read_tare(tmp_path, 7, CALIBRATION)
+
+
 @settings(max_examples=150, deadline=None)
 @given(data=st.data())
 def test_damaged_files_are_our_errors(tmp_path_factory, data):
@@ -297,5 +311,5 @@ def test_damaged_files_are_our_errors(tmp_path_factory, data):
         assert (
             stored is not None
             and stored.rest_frequency.shape == (8,)
-            and (stored.rest_frequency > 0).all()
+            and (np.abs(stored.rest_frequency / CALIBRATION.rest_frequency - 1) <= 0.2).all()
         )

@@ -44,7 +44,7 @@ def test_it_is_made_once_for_each_input(folder):
     assert len(list(folder.iterdir())) == 4
 
 
-@pytest.mark.parametrize("damage", ["cut", "flipped", "empty", "text"])
+@pytest.mark.parametrize("damage", ["cut", "flipped", "empty", "text", "method", "lost", "shape"])
 def test_a_damaged_file_is_made_again(folder, damage):
     make = Counted()
     cache.load_or_compute("kind", [1.0], make)
@@ -52,10 +52,19 @@ def test_a_damaged_file_is_made_again(folder, damage):
     data = bytearray(path.read_bytes())
     data[len(data) // 3] ^= 4
     damaged = {"cut": data[: len(data) // 2], "flipped": data, "empty": b"", "text": b"no zip"}
-    path.write_bytes(damaged[damage])
+    # The directory at the end of a zip file has the method of compression 10 bytes after "PK12".
+    method = bytearray(path.read_bytes())
+    method[method.index(b"PK\1\2") + 10] = 77
+    with np.load(path) as file:
+        arrays = dict(file)
+    path.write_bytes(damaged.get(damage, method))
+    if damage == "lost":
+        np.savez(path, **{name: array for name, array in arrays.items() if name != "other"})
+    if damage == "shape":
+        np.savez(path, **arrays | {"other": arrays["other"].T})
     found = cache.load_or_compute("kind", [1.0], make)
     np.testing.assert_array_equal(found["one"], np.arange(300.0))
-    assert make.times == 2
+    assert make.times == 2 and found["other"].shape == (2, 3)
     cache.load_or_compute("kind", [1.0], make)
     assert make.times == 2
 

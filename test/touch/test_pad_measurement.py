@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 from dataclasses import replace
 from pathlib import Path
@@ -199,6 +200,9 @@ def damaged(path: Path, **changes) -> bytes:
         ({"side": 0.012}, "below the surface"),
         ({"layout": np.array([{}])}, "allow_pickle"),
         ({"more": np.zeros(70 << 20, np.int8)}, "the limit is"),
+        ({"side": np.full(3, 4e-3)}, "size 1"),
+        ({"step": 1j}, "complex"),
+        ({"normals": np.array(["x"])}, "'safe'"),
     ],
 )
 def test_a_file_that_is_none(changes, words, tmp_path):
@@ -208,6 +212,20 @@ def test_a_file_that_is_none(changes, words, tmp_path):
     with pytest.raises(ConfigError, match=words) as error:
         read_influence(path)
     assert str(path) in str(error.value) and "--surface" in str(error.value)
+
+
+def test_each_damaged_byte_names_file_and_fix(tmp_path):
+    """zipfile raises many kinds of errors, as that for an unknown method of compression."""
+    whole = find_influence("cube_11mm").read_bytes()
+    path = tmp_path / "bad.npz"
+    directory = whole.rindex(b"PK\1\2")
+    for at in [*range(0, 60, 3), *range(4000, len(whole), 9000), *range(directory, directory + 30)]:
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ 0x15]) + whole[at + 1 :])
+        with contextlib.suppress(ConfigError):
+            read_influence(path)
+            continue
+        with pytest.raises(ConfigError, match=r"bad\.npz.*--surface"):
+            read_influence(path)
 
 
 def test_a_name_that_is_none():
