@@ -16,8 +16,7 @@ import pyarrow.parquet
 from ..config.skin import Skin
 from ..core.arrays import AnyArray
 from ..core.modes import COMPONENTS, STRESS
-from .images import IMAGE_TYPES, EncodedImage
-from .plan import BagPlan, Episode
+from .plan import Episode
 from .statistics import Statistics
 from .topics import Topic
 from .windows import TACTILE, WINDOW_COLUMNS
@@ -28,14 +27,16 @@ VERSION = "v3.0"
 MAX_FILES_PER_CHUNK = 1000
 """Largest number of Parquet files in one folder (which LeRobot calls chunk) of a data set."""
 
-MAX_FILE_MB = 100
-"""Size of a Parquet file, in MB (2**20 bytes), from which on the next episode begins a new file.
-
-An episode is never divided between files, so a file can become larger than this.
-"""
+FILE_MB = 100
+"""Size of a file, in MB (2**20 bytes), above which LeRobot begins a new one if it adds episodes to
+a data set. The files that are written here contain one bag each, whatever its size is."""
 
 FILE_NAME = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 """Pattern (for `str.format`) of a Parquet file's path, relative to data/ or meta/episodes/."""
+
+RESIDUAL = f"{TACTILE}.residual"
+"""Name of the feature with the residual: the part of the pads' measurements that no stress
+explains, divided by their noise."""
 
 COUNTER_FEATURES = {
     "timestamp": "float32",
@@ -62,9 +63,10 @@ class DataSet:
     Attributes:
         fps: Frames per second.
         depth: Number of samples of each cube that a frame has room for.
-        widths: Number of columns of each feature for which statistics are computed, by its name.
         frames: Number of frames written so far.
         episodes: Description of each complete episode: a row of the table in meta/episodes/.
+        calibrations: Ids of the cubes' calibrations: the first ones, and each change, with the bag
+            and the stamp (ns since the Unix epoch) from which on they were used.
     """
 
     def __init__(
@@ -75,7 +77,7 @@ class DataSet:
         *,
         fps: int,
         depth: int,
-        samples: int,
+        frames: int,
     ) -> None:
         """Create the folder of the data set.
 
@@ -85,86 +87,60 @@ class DataSet:
             topics: Topics other than stress that become features, such as images.
             fps: Frames per second.
             depth: Number of samples of each cube that a frame has room for.
-            samples: Total number of samples of cubes that will be written.
+            frames: Total number of frames that will be written.
         """
-        (folder / "meta").mkdir(parents=True)
+        (folder / "meta" / "episodes" / "chunk-000").mkdir(parents=True)
         self.fps, self.depth = fps, depth
         self.frames = 0
         self.episodes: list[dict[str, Any]] = []
-        # Integer columns beside the stress (stamps, status bits) have no statistics, because
-        # policies do not normalise them.
-        self.widths = {
-            TACTILE: len(COMPONENTS),
-            f"{TACTILE}.residual": 1,
-        }
-        for topic in topics:
-            bands = topic.shape[2]
-            self.widths[topic.key] = bands or len(topic.names)
-        self.widths |= dict.fromkeys(COUNTER_FEATURES, 1)
+        self.calibrations: list[dict[str, Any]] = []
         self._folder = folder
         self._skin = skin
         self._topics = topics
-        self._image_keys = {topic.key for topic in topics if topic.msgtype in IMAGE_TYPES}
-        self._statistics = {}
-        for key, width in self.widths.items():
-            self._statistics[key] = Statistics(width, samples)
         self._tasks: list[str] = []
-        self._calibrations: list[dict[str, Any]] = []
         self._writer: Any = None
-        # There is no file yet: each is created with its first frames, whose types its columns get.
-        self._path = folder
-        self._file_number = -1
+        self._file_number = 0
+        # Integer columns beside the stress (stamps, status bits) have no statistics, because
+        # policies do not normalise them. Statistics of the stress have one row per place for a
+        # sample of a cube, all others one per frame.
+        samples = frames * depth * len(skin.cubes)
+        self._statistic_rows = {TACTILE: samples, RESIDUAL: samples}
+        others = [topic.key for topic in topics]
+        for key in [*others, *COUNTER_FEATURES]:
+            self._statistic_rows[key] = frames
+        self._statistics = self.new_statistics()
 
     def __enter__(self) -> DataSet:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._close_file()
+        self.close_file()
 
-    def begin_episode(self, task: str) -> tuple[dict[str, int], int]:
-        """Choose the data file of the next episode.
+    def new_statistics(self) -> dict[str, Statistics]:
+        """Return empty statistics of an episode, by the names of the features that have some."""
+        statistics = {}
+        for key, rows in self._statistic_rows.items():
+            statistics[key] = Statistics(rows)
+        return statistics
 
-        Args:
-            task: Task of the episode, as a text.
-
-        Returns:
-            The numbers of the file and of its folder, as the table of episodes states them, and the
-            index of the task.
-        """
-        if task not in self._tasks:
-            self._tasks.append(task)
-        # The size on disk lags behind what has been written by one row group, so files can exceed
-        # the limit by as much.
-        is_new = self._writer is None
-        if is_new or self._path.stat().st_size >= MAX_FILE_MB << 20:
-            self._close_file()
-            self._file_number += 1
-        chunk, file = divmod(self._file_number, MAX_FILES_PER_CHUNK)
-        place = {"chunk_index": chunk, "file_index": file}
-        if self._writer is None:
-            self._path = self._folder / "data" / FILE_NAME.format(**place)
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-        described = {
-            "data/chunk_index": chunk,
-            "data/file_index": file,
-        }
-        return described, self._tasks.index(task)
-
-    def write(self, columns: dict[str, AnyArray | list[EncodedImage]]) -> None:
+    def write(self, columns: dict[str, AnyArray | list[bytes]]) -> None:
         """Write successive frames as one row group of the current Parquet file.
 
         Args:
             columns: By the names of the features (columns of the data set): arrays whose first
-                dimension is the frames, or a list of images with one per frame.
+                dimension is the frames, or a list of image files with one per frame.
         """
         arrays = {}
         for name, values in columns.items():
             arrays[name] = _column(values)
         table = pyarrow.table(arrays)
         if self._writer is None:
+            name = FILE_NAME.format(**self._place())
+            path = self._folder / "data" / name
+            path.parent.mkdir(parents=True, exist_ok=True)
             # Dictionary encoding saves space only if values repeat. Measured ones rarely do.
             self._writer = pyarrow.parquet.ParquetWriter(
-                self._path,
+                path,
                 table.schema,
                 compression="zstd",
                 use_dictionary=False,
@@ -172,80 +148,52 @@ class DataSet:
         self._writer.write_table(table)
         self.frames += len(table)
 
-    def count(
-        self,
-        key: str,
-        rows: AnyArray,
-        of_episode: dict[str, Statistics],
-    ) -> None:
-        """Add values of a feature (column) to the statistics of the data set and of an episode.
+    def close_file(self) -> None:
+        """Complete the current Parquet file, if there is one; the next frames begin a new one."""
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
+            self._file_number += 1
 
-        Args:
-            key: Name of the feature.
-            rows: (n, D) values of the feature's D columns.
-            of_episode: Statistics of the current episode, by the names of the features.
-        """
-        self._statistics[key].add(rows)
-        of_episode[key].add(rows)
+    def task_index(self, task: str) -> int:
+        """Return the index of a task, which is described by a text, in the table of tasks."""
+        if task not in self._tasks:
+            self._tasks.append(task)
+        return self._tasks.index(task)
 
     def end_episode(
         self,
-        plan: BagPlan,
         episode: Episode,
-        place: dict[str, int],
         statistics: dict[str, Statistics],
     ) -> None:
         """Add an episode, whose frames have all been written, to the table of episodes.
 
         Args:
-            plan: The bag of the episode.
             episode: The episode.
-            place: Numbers of its file and folder, as `begin_episode` returned them.
             statistics: Statistics of the episode, by the names of the features.
         """
         frames = len(episode.counts)
+        place = self._place()
         described = {
             "episode_index": len(self.episodes),
             "tasks": [episode.task],
             "length": frames,
-            **place,
+            "data/chunk_index": place["chunk_index"],
+            "data/file_index": place["file_index"],
             "dataset_from_index": self.frames - frames,
             "dataset_to_index": self.frames,
             # The descriptions of all episodes are in one file, because each takes only some kB.
             "meta/episodes/chunk_index": 0,
             "meta/episodes/file_index": 0,
-            "bag": plan.path.name,
+            "bag": episode.bag.name,
             "begin_ns": episode.begin_ns,
         }
         for key, one in statistics.items():
-            result = one.result(frames)
-            for name, values in self._as_lists(key, result).items():
+            lists = _as_lists(one, frames)
+            for name, values in lists.items():
                 described[f"stats/{key}/{name}"] = values
+            self._statistics[key].merge(one)
         self.episodes.append(described)
-
-    def note_calibrations(
-        self,
-        bag: str,
-        since_ns: int,
-        ids: list[str],
-    ) -> None:
-        """Note the calibrations with which the stress of a bag is computed.
-
-        Args:
-            bag: Name of the bag.
-            since_ns: Earliest stamp of the stress, in ns since the Unix epoch.
-            ids: Id of the calibration of each cube, by the cube's index.
-        """
-        # Only changes are noted, because most data sets have the same calibrations throughout.
-        if self._calibrations and self._calibrations[-1]["ids"] == ids:
-            return
-        self._calibrations.append(
-            {
-                "bag": bag,
-                "since_ns": since_ns,
-                "ids": ids,
-            }
-        )
 
     def write_meta(self) -> None:
         """Write episodes, tasks, features and statistics into the folder meta/ of the data set.
@@ -253,11 +201,10 @@ class DataSet:
         It is called once, after the last episode.
         """
         meta = self._folder / "meta"
-        path = meta / "episodes" / FILE_NAME.format(chunk_index=0, file_index=0)
-        path.parent.mkdir(parents=True, exist_ok=True)
         episodes = pyarrow.Table.from_pylist(self.episodes)
+        path = FILE_NAME.format(chunk_index=0, file_index=0)
+        pyarrow.parquet.write_table(episodes, meta / "episodes" / path)
         tasks = _task_table(self._tasks)
-        pyarrow.parquet.write_table(episodes, path)
         pyarrow.parquet.write_table(tasks, meta / "tasks.parquet")
         _write_json(
             meta / "info.json",
@@ -268,8 +215,8 @@ class DataSet:
                 "total_frames": self.frames,
                 "total_tasks": len(self._tasks),
                 "chunks_size": MAX_FILES_PER_CHUNK,
-                "data_files_size_in_mb": MAX_FILE_MB,
-                "video_files_size_in_mb": 2 * MAX_FILE_MB,
+                "data_files_size_in_mb": FILE_MB,
+                "video_files_size_in_mb": FILE_MB,
                 "fps": self.fps,
                 "splits": {"train": f"0:{len(self.episodes)}"},
                 "data_path": f"data/{FILE_NAME}",
@@ -277,35 +224,16 @@ class DataSet:
                 "features": self._features(),
             },
         )
-        statistics = {
-            key: self._as_lists(key, one.result(self.frames))
-            for key, one in self._statistics.items()
-        }
+        statistics = {}
+        for key, one in self._statistics.items():
+            statistics[key] = _as_lists(one, self.frames)
         _write_json(meta / "stats.json", statistics)
 
-    def _close_file(self) -> None:
-        """Complete the current Parquet file, if there is one."""
-        if self._writer is not None:
-            self._writer.close()
-            self._writer = None
-
-    def _as_lists(self, key: str, result: dict[str, AnyArray]) -> dict[str, Any]:
-        """Return the statistics of a feature as lists, which JSON and Parquet can contain.
-
-        Those of images get the shape (bands, 1, 1), where bands are colour channels.
-
-        Args:
-            key: Name of the feature.
-            result: Statistics of the feature, by their names such as ``mean``.
-        """
-        lists = {}
-        for name, values in result.items():
-            if key in self._image_keys and name != "count":
-                # LeRobot normalises images of the shape (bands, height, width), to which statistics
-                # of the shape (bands, 1, 1) are broadcast.
-                values = values[:, np.newaxis, np.newaxis]
-            lists[name] = values.tolist()
-        return lists
+    def _place(self) -> dict[str, int]:
+        """Return the numbers of the current Parquet file and of its folder, which LeRobot calls
+        chunk."""
+        chunk, file = divmod(self._file_number, MAX_FILES_PER_CHUNK)
+        return {"chunk_index": chunk, "file_index": file}
 
     def _features(self) -> dict[str, Any]:
         """Return the description of all features (columns of the data set) for info.json.
@@ -315,25 +243,23 @@ class DataSet:
         """
         cubes = len(self._skin.cubes)
         window = (self.depth, cubes)
-        about = describe_skin(self._skin) | {"calibrations": self._calibrations}
-        tactile = _feature(
-            "float32",
-            (*window, len(COMPONENTS)),
-            ["sample", "cube", "component"],
-        )
+        axes = ["sample", "cube", "component"]
+        about = describe_skin(self._skin) | {"calibrations": self.calibrations}
+        tactile = _feature("float32", (*window, len(COMPONENTS)), axes)
         features = {TACTILE: tactile | {"info": about}}
         for name, kind in WINDOW_COLUMNS.items():
             dtype = np.dtype(kind).name
-            features[f"{TACTILE}.{name}"] = _feature(dtype, window, ["sample", "cube"])
+            features[f"{TACTILE}.{name}"] = _feature(dtype, window, axes[:2])
         names = list(self._skin.names)
         features[f"{TACTILE}.count"] = _feature("int64", (cubes,), names)
         for topic in self._topics:
-            if topic.key in self._image_keys:
+            if topic.is_image:
                 axes = ["height", "width", "channels"]
-                features[topic.key] = _feature("image", topic.shape, axes)
+                described = _feature("image", topic.shape, axes)
             else:
                 width = len(topic.names)
-                features[topic.key] = _feature("float32", (width,), topic.names)
+                described = _feature("float32", (width,), topic.names)
+            features[topic.key] = described
         for key, dtype in COUNTER_FEATURES.items():
             features[key] = _feature(dtype, (1,), None)
         return features
@@ -383,16 +309,31 @@ def _feature(
     }
 
 
-def _column(values: AnyArray | list[EncodedImage]) -> pyarrow.Array:
+def _as_lists(statistics: Statistics, frames: int) -> dict[str, Any]:
+    """Return the statistics of a feature as lists, which JSON and Parquet can contain.
+
+    Args:
+        statistics: Statistics of the feature.
+        frames: Number of frames (time steps of the data set), which LeRobot uses as the weight of
+            the statistics when it merges data sets.
+    """
+    lists: dict[str, Any] = {"count": [frames]}
+    result = statistics.result()
+    for name, values in result.items():
+        lists[name] = values.tolist()
+    return lists
+
+
+def _column(values: AnyArray | list[bytes]) -> pyarrow.Array:
     """Convert the values of a feature in n frames to a column of a Parquet file.
 
     Args:
-        values: n images, or an array (n, …). An array (n, 1) becomes n numbers, one with more
-            dimensions becomes nested lists.
+        values: Contents of n image files, or an array (n, …). An array (n, 1) becomes n numbers,
+            one with more dimensions becomes nested lists.
     """
     if isinstance(values, list):
         # If the path is None, LeRobot reads the image from the bytes.
-        images = [{"bytes": image.data, "path": None} for image in values]
+        images = [{"bytes": image, "path": None} for image in values]
         return pyarrow.array(images, _IMAGE)
     flat = np.ascontiguousarray(values).reshape(-1)
     array = pyarrow.array(flat)
@@ -402,7 +343,8 @@ def _column(values: AnyArray | list[EncodedImage]) -> pyarrow.Array:
     # Lists are nested from the last dimension to the first: each step joins `size` successive
     # numbers or lists to one list.
     for size in reversed(shape):
-        offsets = np.arange(0, len(array) + 1, size, dtype=np.int32)
+        lists = len(array) // size
+        offsets = size * np.arange(lists + 1, dtype=np.int32)
         array = pyarrow.ListArray.from_arrays(offsets, array)
     return array
 
@@ -413,50 +355,23 @@ def _task_table(tasks: list[str]) -> pyarrow.Table:
     Args:
         tasks: Texts of the tasks, by their indices.
     """
-
-    def column(
-        name: str,
-        pandas_type: str,
-        numpy_type: str,
-    ) -> dict[str, Any]:
-        """Return pandas' description of a column: its name and types.
-
-        Args:
-            name: Name of the column.
-            pandas_type: Type in pandas, such as "unicode".
-            numpy_type: Type in numpy, such as "object".
-        """
-        kinds = {"pandas_type": pandas_type, "numpy_type": numpy_type}
-        return {
-            "name": name,
-            "field_name": name,
-            **kinds,
-            "metadata": None,
-        }
-
     # Format of this metadata: https://pandas.pydata.org/docs/development/developer.html
-    described = {
-        "index_columns": ["task"],
-        "column_indexes": [],
-        "columns": [
-            column("task_index", "int64", "int64"),
-            column("task", "unicode", "object"),
-        ],
-        "pandas_version": "2.0.0",
+    label = {
+        "name": "task",
+        "field_name": "task",
+        "pandas_type": "unicode",
+        "numpy_type": "object",
     }
-    numbers = range(len(tasks))
-    table = pyarrow.table({"task_index": numbers, "task": tasks})
+    described = {"index_columns": ["task"], "columns": [label]}
+    columns = {
+        "task_index": range(len(tasks)),
+        "task": tasks,
+    }
+    table = pyarrow.table(columns)
     return table.replace_schema_metadata({"pandas": json.dumps(described)})
 
 
 def _write_json(path: Path, value: Any) -> None:
     """Write a value to a JSON file as LeRobot does: indented, in UTF-8."""
-    path.write_text(
-        json.dumps(
-            value,
-            indent=4,
-            ensure_ascii=False,
-        )
-        + "\n",
-        encoding="utf-8",
-    )
+    text = json.dumps(value, indent=4, ensure_ascii=False)
+    path.write_text(text + "\n", encoding="utf-8")

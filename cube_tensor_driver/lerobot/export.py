@@ -17,11 +17,12 @@ from ..bags.source import open_bag
 from ..config.skin import Skin
 from ..core.arrays import AnyArray
 from ..core.errors import BagError
+from ..core.modes import COMPONENTS
 from ..core.rows import StressRows
-from .data_set import DataSet
+from .data_set import RESIDUAL, DataSet
+from .images import ImageStream, image_pixels
 from .plan import BagPlan, Choices, Episode, Report, plan_bag
-from .statistics import Statistics
-from .topics import Topic, TopicReader, find_topics
+from .topics import Signal, Topic, find_topics
 from .windows import TACTILE, Windows
 
 MAX_SAMPLED_IMAGES = 20
@@ -80,13 +81,12 @@ def export_lerobot(
     check_empty(folder)
     plans = [plan_bag(path, choices, report) for path in bags]
     skin = _check_same_skin(plans)
-    episodes = [episode for plan in plans for episode in plan.episodes]
-    if not episodes:
+    counts = [episode.counts for plan in plans for episode in plan.episodes]
+    if not counts:
         raise BagError(f"{bags[0]}: no sample lies between the marks; nothing to export")
     topics = find_topics(bags, choices)
-    depths = [int(episode.counts.max()) for episode in episodes]
-    depth = max(depths)
-    samples = sum(episode.rows for episode in episodes)
+    frames = sum(len(each) for each in counts)
+    depth = max(int(each.max()) for each in counts)
     # The incomplete data set lies beside the final folder (same file system) to be renamed.
     partial = folder.absolute()
     partial = partial.with_name(f"{partial.name}.partial")
@@ -97,10 +97,10 @@ def export_lerobot(
         data_set = DataSet(
             partial,
             skin,
-            list(topics.values()),
+            topics,
             fps=choices.fps,
             depth=depth,
-            samples=samples,
+            frames=frames,
         )
         with data_set:
             for plan in plans:
@@ -115,12 +115,12 @@ def export_lerobot(
         shutil.rmtree(partial, ignore_errors=True)
     rate = max(plan.rate for plan in plans)
     return Exported(
-        episodes=len(episodes),
+        episodes=len(counts),
         frames=data_set.frames,
-        rows=samples,
-        depth=depth,
+        rows=sum(int(each.sum()) for each in counts),
+        depth=data_set.depth,
         usual=math.ceil(rate / choices.fps),
-        features=[topic.key for topic in topics.values()],
+        features=[topic.key for topic in topics],
         outside=sum(plan.outside for plan in plans),
         unknown=sum(plan.unknown for plan in plans),
         empty=sum(plan.empty for plan in plans),
@@ -143,31 +143,22 @@ class EpisodeWriter:
     def __init__(
         self,
         data_set: DataSet,
-        plan: BagPlan,
         episode: Episode,
-        topics: TopicReader,
+        topics: dict[str, Signal | ImageStream],
     ) -> None:
         """Prepare to write an episode.
 
         Args:
             data_set: The data set to write into.
-            plan: The bag of the episode.
             episode: The episode, with its numbers of samples.
-            topics: Reader of the topics other than stress.
+            topics: Numbers and images on the topics other than stress, by the names of their
+                features.
         """
         self._data_set = data_set
-        self._plan = plan
         self._episode = episode
         self._topics = topics
         self._windows = Windows(episode.counts, data_set.depth)
-        self._place: dict[str, int] = {}
-        self._task = 0
-        self._statistics = {}
-        for key, width in data_set.widths.items():
-            # Statistics of the stress have one row per sample of a cube, all others one per frame.
-            is_stress = key.startswith(TACTILE)
-            rows = episode.rows if is_stress else len(episode.counts)
-            self._statistics[key] = Statistics(width, rows)
+        self._statistics = data_set.new_statistics()
 
     def add(self, rows: StressRows) -> int:
         """Add those rows of stress (one sample of one cube each) whose stamps lie in the episode.
@@ -178,16 +169,12 @@ class EpisodeWriter:
         Returns:
             The number of rows that lie in the episode.
         """
-        inside = self._episode.contains(rows.stamp_ns)
-        if not inside.any():
-            return 0
-        rows = rows.select(inside)
-        frame = self._episode.sample_frame_of(rows.stamp_ns)
-        self._windows.add(frame, rows)
-        components = np.hstack([rows.stress, rows.gradient])
-        self._count(TACTILE, components)
-        self._count(f"{TACTILE}.residual", rows.residual[:, np.newaxis])
-        return len(rows)
+        is_inside = self._episode.contains(rows.stamp_ns)
+        inside = rows.select(is_inside)
+        if len(inside):
+            frame = self._episode.sample_frame_of(inside.stamp_ns)
+            self._windows.add(frame, inside)
+        return len(inside)
 
     def write(self) -> bool:
         """Write the frames (time steps of the data set) of which all rows of stress were added.
@@ -199,18 +186,10 @@ class EpisodeWriter:
             Whether all frames of the episode have been written.
         """
         for windows in self._windows.complete():
-            if not self._place:
-                task = self._episode.task
-                self._place, self._task = self._data_set.begin_episode(task)
             self._write_frames(windows)
         is_complete = self._windows.done == len(self._episode.counts)
         if is_complete:
-            self._data_set.end_episode(
-                self._plan,
-                self._episode,
-                self._place,
-                self._statistics,
-            )
+            self._data_set.end_episode(self._episode, self._statistics)
         return is_complete
 
     def _write_frames(self, windows: dict[str, AnyArray]) -> None:
@@ -222,41 +201,44 @@ class EpisodeWriter:
         data_set, last = self._data_set, self._windows.done
         frames = len(windows[TACTILE])
         first = last - frames
+        columns: dict[str, Any] = {}
+        for key, source in self._topics.items():
+            columns[key] = source.at(self._episode, first, last)
+
         frame = np.arange(first, last)
-        counted: dict[str, Any] = {
+        task = data_set.task_index(self._episode.task)
+        counted: dict[str, AnyArray] = {
             "timestamp": (frame / data_set.fps).astype(np.float32),
             "frame_index": frame,
             "episode_index": np.full(frames, len(data_set.episodes)),
             "index": data_set.frames + np.arange(frames),
-            "task_index": np.full(frames, self._task),
+            "task_index": np.full(frames, task),
         }
-        columns = self._topics.at(self._episode, first, last)
-        for key, values in counted.items():
-            columns[key] = values[:, np.newaxis]
+        for key, numbers in counted.items():
+            columns[key] = numbers[:, np.newaxis]
         data_set.write(windows | columns)
 
+        # Places of a window without a sample are NaN, which the statistics leave out.
+        components = windows[TACTILE].reshape(-1, len(COMPONENTS))
+        residual = windows[RESIDUAL].reshape(-1, 1)
+        self._statistics[TACTILE].add(components)
+        self._statistics[RESIDUAL].add(residual)
         # A few pixels of a few images suffice for the statistics of colours. Decoding every image
         # would be slow.
         stride = -(-len(self._episode.counts) // MAX_SAMPLED_IMAGES)
         for key, values in columns.items():
             if isinstance(values, np.ndarray):
-                self._count(key, values)
+                self._statistics[key].add(values)
                 continue
             # Every stride-th frame of the episode is chosen. This block begins at frame `first`, so
             # its first chosen frame has the index -first % stride in the block.
             for image in values[-first % stride :: stride]:
-                pixels = image.pixels()[::PIXEL_STRIDE, ::PIXEL_STRIDE]
+                pixels = image_pixels(image)[::PIXEL_STRIDE, ::PIXEL_STRIDE]
+                # LeRobot normalises images of the shape (bands, height, width), to which statistics
+                # of the shape (bands, 1, 1) are broadcast.
                 bands = pixels.shape[2]
-                self._count(key, pixels.reshape(-1, bands))
-
-    def _count(self, key: str, rows: AnyArray) -> None:
-        """Add values of a feature (column) to the statistics of the episode and the data set.
-
-        Args:
-            key: Name of the feature.
-            rows: (n, D) values of the feature's D numbers.
-        """
-        self._data_set.count(key, rows, self._statistics)
+                colours = pixels.reshape(-1, bands, 1, 1)
+                self._statistics[key].add(colours)
 
 
 def _check_same_skin(plans: list[BagPlan]) -> Skin:
@@ -291,7 +273,7 @@ def _check_same_skin(plans: list[BagPlan]) -> Skin:
 def _write_bag(
     data_set: DataSet,
     plan: BagPlan,
-    topics: dict[str, Topic],
+    topics: list[Topic],
     choices: Choices,
     report: Report,
 ) -> None:
@@ -300,15 +282,15 @@ def _write_bag(
     Args:
         data_set: The data set to write into.
         plan: The bag and its episodes.
-        topics: Topics other than stress, by their names.
+        topics: Topics other than stress.
         choices: Frame rate, tasks, topics and overrides that the user chose.
         report: Function that displays progress.
     """
     with Bag(plan.path) as bag:
-        reader = TopicReader(bag, topics)
+        sources = {topic.key: topic.open(bag) for topic in topics}
         waiting = []
         for episode in plan.episodes:
-            writer = EpisodeWriter(data_set, plan, episode, reader)
+            writer = EpisodeWriter(data_set, episode, sources)
             waiting.append(writer)
         total = sum(episode.rows for episode in plan.episodes)
         done = 0
@@ -320,6 +302,7 @@ def _write_bag(
             while waiting and waiting[0].write():
                 waiting.pop(0)
             report(done, total, f"exporting {plan.path}")
+    data_set.close_file()
 
 
 def _stress_rows(
@@ -334,17 +317,22 @@ def _stress_rows(
         plan: The bag.
         choices: Topic of the frequencies, and overrides of calibrations and tare.
     """
+    noted = data_set.calibrations
     with open_bag(plan.path, choices.frequencies) as source:
         settings = settings_with(source, choices.overrides)
         for segment, rows in reconstruct(source, choices.overrides):
             is_known = rows.cube < len(source.skin.cubes)
-            rows = rows.select(is_known)
-            if len(rows):
-                calibrations = settings[segment.number].calibrations
-                since_ns = int(rows.stamp_ns.min())
-                data_set.note_calibrations(
-                    plan.path.name,
-                    since_ns,
-                    [one.id for one in calibrations],
-                )
-                yield rows
+            known = rows.select(is_known)
+            if not len(known):
+                continue
+            ids = [one.id for one in settings[segment.number].calibrations]
+            # Only changes are noted, because most data sets have the same calibrations throughout.
+            if not noted or noted[-1]["ids"] != ids:
+                since_ns = int(known.stamp_ns.min())
+                change = {
+                    "bag": plan.path.name,
+                    "since_ns": since_ns,
+                    "ids": ids,
+                }
+                noted.append(change)
+            yield known

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any, NoReturn
 
 import numpy as np
@@ -28,40 +27,17 @@ PILLOW_MODES = {
     "mono8": ("L", "L"),
     "8UC1": ("L", "L"),
 }
-"""Mode of the image in Pillow, and order of the bands (colour channels) in the message, for each
-value of `encoding` in a sensor_msgs/Image that can be exported."""
-
-MODE_OF_BANDS = {1: "L", 3: "RGB", 4: "RGBA"}
-"""Mode (pixel format) of an image in the library Pillow for each number of bands (colour channels):
-grey, colour, and colour with opacity."""
+"""Mode (pixel format) of an image in the library Pillow, and order of the bands (colour channels)
+in the message, for each value of `encoding` in a sensor_msgs/Image that can be exported."""
 
 Shape = tuple[int, int, int]
 """Height and width of an image in pixels, and its number of bands (colour channels)."""
 
 
-@dataclass(frozen=True)
-class EncodedImage:
-    """An image in a file format such as PNG or JPEG.
-
-    Attributes:
-        data: Content of the image file.
-        shape: Height and width of the image in pixels, and its number of bands (colour channels).
-    """
-
-    data: bytes
-    shape: Shape
-
-    def pixels(self) -> Single:
-        """Decode the image and return its pixels (height, width, bands), scaled to 0 to 1."""
-        with Image.open(io.BytesIO(self.data)) as image:
-            pixels: Single = np.asarray(image, np.float32) / np.float32(255)
-        return pixels.reshape(self.shape)
-
-
 class ImageStream:
     """The images on one topic of a bag, read in the order of recording.
 
-    If the bag does not have the topic, every frame gets a black image.
+    If the bag does not have the topic, every frame (time step of the data set) gets a black image.
 
     Attributes:
         shape: Height, width and number of bands (colour channels) of every image.
@@ -91,21 +67,25 @@ class ImageStream:
         if shape is None:
             shape = (1, 1, 1)
             if self._next:
-                shape = self._encode(self._next[1]).shape
+                _, shape = self._encode(self._next[1])
         self.shape = shape
         # Frames (time steps of the data set) that end before the first image of the topic get a
-        # black image.
-        height, width, bands = shape
-        black = Image.new(MODE_OF_BANDS[bands], (width, height))
-        self._latest = _as_png(black)
+        # black image. Pillow takes grey images as arrays without the axis of the bands.
+        black = np.zeros(shape, np.uint8)
+        if shape[2] == 1:
+            black = black[..., 0]
+        self._latest = _as_png(Image.fromarray(black))
 
     def at(
         self,
         episode: Episode,
         first: int,
         last: int,
-    ) -> list[EncodedImage]:
-        """Return one image for each of several successive frames: the newest before the frame ends.
+    ) -> list[bytes]:
+        """Return the file of one image for each of several successive frames.
+
+        It is the newest image that is stamped before the end of the frame (time step of the data
+        set); a black image if there is none.
 
         Args:
             episode: Episode of the frames.
@@ -118,8 +98,8 @@ class ImageStream:
         frames = range(first, last)
         return [self._newest_in(episode, frame) for frame in frames]
 
-    def _newest_in(self, episode: Episode, frame: int) -> EncodedImage:
-        """Return the newest image that is stamped before the end of a frame.
+    def _newest_in(self, episode: Episode, frame: int) -> bytes:
+        """Return the file of the newest image that is stamped before the end of a frame.
 
         The bag is read as far as the first image after the frame. If there is no image before the
         end of the frame, the result is a black image.
@@ -137,10 +117,10 @@ class ImageStream:
             message = self._next[1]
             self._next = next(self._unread, None)
         if message is not None:
+            self._latest, shape = self._encode(message)
             # LeRobot requires that all images of a feature have the same shape.
-            self._latest = self._encode(message)
-            if self._latest.shape != self.shape:
-                self._fail(f"an image of {self._latest.shape} after ones of {self.shape}")
+            if shape != self.shape:
+                self._fail(f"an image of {shape} after ones of {self.shape}")
         return self._latest
 
     def _read(self) -> Iterator[tuple[int, Any]]:
@@ -149,14 +129,23 @@ class ImageStream:
             message = self._bag.decode(entry)
             yield stamp_ns(message), message
 
-    def _encode(self, message: Any) -> EncodedImage:
-        """Convert an Image or CompressedImage message to an image in a file format.
+    def _encode(self, message: Any) -> tuple[bytes, Shape]:
+        """Convert an Image or CompressedImage message to an image file, such as PNG or JPEG.
+
+        Returns:
+            Content of the file, and the height, width and number of bands of the image.
 
         Raises:
             BagError: The image is damaged, or its format is not known.
         """
         try:
-            return encode_raw(message) if hasattr(message, "encoding") else keep_encoded(message)
+            # Only uncompressed images state an encoding; compressed ones are image files already.
+            is_raw = hasattr(message, "encoding")
+            file = encode_raw(message) if is_raw else bytes(message.data)
+            # This reads only the header of the file, and decodes no pixels.
+            with Image.open(io.BytesIO(file)) as image:
+                bands = len(image.getbands())
+                return file, (image.height, image.width, bands)
         except (UnidentifiedImageError, OSError, ValueError) as error:
             self._fail(str(error))
 
@@ -172,7 +161,7 @@ class ImageStream:
         ) from None
 
 
-def encode_raw(message: Any) -> EncodedImage:
+def encode_raw(message: Any) -> bytes:
     """Encode a sensor_msgs/Image (uncompressed pixels) as PNG.
 
     Raises:
@@ -199,26 +188,17 @@ def encode_raw(message: Any) -> EncodedImage:
     return _as_png(image)
 
 
-def keep_encoded(message: Any) -> EncodedImage:
-    """Return the image file in a sensor_msgs/CompressedImage unchanged.
-
-    Raises:
-        OSError: Pillow does not recognise the file format.
-    """
-    data = bytes(message.data)
-    # Image.open reads only the header of the file, which states the size, and decodes no pixels.
-    with Image.open(io.BytesIO(data)) as image:
-        return EncodedImage(data, _shape(image))
+def image_pixels(file: bytes) -> Single:
+    """Decode an image file and return its pixels (height, width, bands), scaled to 0 to 1."""
+    with Image.open(io.BytesIO(file)) as image:
+        values = np.asarray(image, np.float32)
+    pixels: Single = values / np.float32(255)
+    return np.atleast_3d(pixels)
 
 
-def _as_png(image: Image.Image) -> EncodedImage:
+def _as_png(image: Image.Image) -> bytes:
     """Encode an image of the library Pillow as a PNG file in memory."""
     file = io.BytesIO()
     # Compression level 1 takes a fifth of the default's time and makes files a fifth larger.
     image.save(file, "PNG", compress_level=1)
-    return EncodedImage(file.getvalue(), _shape(image))
-
-
-def _shape(image: Image.Image) -> Shape:
-    """Return height and width of an image in pixels, and its number of bands (colour channels)."""
-    return image.height, image.width, len(image.getbands())
+    return file.getvalue()

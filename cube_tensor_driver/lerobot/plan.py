@@ -36,12 +36,6 @@ MIN_NS = -(1 << 63)
 MAX_NS = (1 << 63) - 1
 """Largest time in 64 bits, in ns: the end of the last episode of a bag."""
 
-MAX_NS_TIMES_FPS = 1 << 62
-"""Largest product of a time in ns and the frame rate in Hz, chosen so that it fits 64 bits.
-
-Times whose product would be larger, which come from clocks that were never set, are reduced.
-"""
-
 MAX_STAMP_RATIO = 10
 """Largest allowed ratio of the time between the first and the last stamp of an episode to the
 duration of the recording. A larger ratio means that a clock was set, and is an error.
@@ -98,6 +92,7 @@ class Episode:
     """An episode of a bag (one execution of a task), and its numbers of samples.
 
     Attributes:
+        bag: Folder or file of the bag.
         task: Text of the task, such as "pick up the cup".
         begin_ns: Time at which frame 0 begins, in ns since the Unix epoch: the earliest stamp among
             the first samples that are counted.
@@ -107,25 +102,28 @@ class Episode:
 
     def __init__(
         self,
-        since_ns: int,
-        until_ns: int,
-        task: str,
+        bag: Path,
+        span: tuple[int, int, str],
+        *,
         fps: int,
+        n_cubes: int,
+        max_frames: float,
     ) -> None:
         """Make an episode without samples.
 
         Args:
-            since_ns: Smallest stamp that belongs to the episode, in ns since the Unix epoch.
-            until_ns: Stamp, in ns, from which on nothing belongs to the episode.
-            task: Text of the task.
+            bag: Folder or file of the bag.
+            span: Smallest stamp that belongs to the episode, the stamp from which on nothing
+                belongs to it (both in ns since the Unix epoch), and the text of its task.
             fps: Frames per second.
+            n_cubes: Number of cubes of the skin.
+            max_frames: Largest plausible number of frames for the duration of the recording.
         """
-        self.task = task
+        self.bag = bag
+        self._since_ns, self._until_ns, self.task = span
+        self._fps, self._max_frames = fps, max_frames
         self.begin_ns = self.rows = 0
-        self.counts: AnyArray = np.zeros((0, 1), np.uint32)
-        self._since_ns = since_ns
-        self._until_ns = until_ns
-        self._fps = fps
+        self.counts: AnyArray = np.zeros((0, n_cubes), np.uint32)
 
     def contains(self, stamp_ns: Times) -> Mask:
         """Return whether each stamp (N,), in ns since the Unix epoch, lies in the episode."""
@@ -140,9 +138,10 @@ class Episode:
         Returns:
             (N,) numbers of frames; they are negative for stamps before `begin_ns`.
         """
-        limit = MAX_NS_TIMES_FPS // self._fps
-        since_ns = np.clip(stamp_ns - self.begin_ns, -limit, limit)
-        frames: Index = since_ns * self._fps // SECOND
+        # Whole seconds are multiplied separately, because the product of a time in ns and the frame
+        # rate may exceed 64 bits if a clock was never set.
+        seconds, rest_ns = np.divmod(stamp_ns - self.begin_ns, SECOND)
+        frames: Index = seconds * self._fps + rest_ns * self._fps // SECOND
         return frames
 
     def sample_frame_of(self, stamp_ns: Times) -> Index:
@@ -153,23 +152,16 @@ class Episode:
         """
         return np.maximum(self.frame_of(stamp_ns), 0)
 
-    def count(
-        self,
-        cube: Index,
-        stamp_ns: Times,
-        n_cubes: int,
-        max_frames: float,
-    ) -> None:
+    def count(self, cube: Index, stamp_ns: Times) -> None:
         """Count those samples whose stamps lie in the episode.
 
         Args:
             cube: (N,) index of the cube of each sample.
             stamp_ns: (N,) stamps, in ns since the Unix epoch.
-            n_cubes: Number of cubes of the skin.
-            max_frames: Largest plausible number of frames for the duration of the recording.
 
         Raises:
-            BagError: A stamp is so late that the episode would have more frames than `max_frames`.
+            BagError: A stamp is so late that the episode would have more frames than is plausible
+                for the duration of the recording.
         """
         inside = self.contains(stamp_ns)
         cube = cube[inside]
@@ -182,19 +174,18 @@ class Episode:
             self.begin_ns = int(stamp_ns.min())
         frame = self.sample_frame_of(stamp_ns)
         n_frames = int(frame.max()) + 1
-        if n_frames > max_frames:
+        if n_frames > self._max_frames:
             late_s = (int(stamp_ns.max()) - self.begin_ns) / SECOND
             raise BagError(
-                f"a sample is stamped {late_s:.0f} s after the first of its episode, "
+                f"{self.bag}: a sample is stamped {late_s:.0f} s after the first of its episode, "
                 "which is longer than was recorded: a clock was set; leave it out with --marks"
             )
         if n_frames > len(self.counts):
             # The number of frames is not known before the end, so the table of counts grows by half
             # each time it is full. If it grew by single frames, it would be copied too often.
             room = 3 * n_frames // 2
-            larger = np.zeros((room, n_cubes), np.uint32)
-            larger[: len(self.counts)] = self.counts
-            self.counts = larger
+            n_cubes = self.counts.shape[1]
+            self.counts.resize((room, n_cubes), refcheck=False)
         self.rows += len(cube)
         np.add.at(self.counts, (frame, cube), 1)
 
@@ -254,10 +245,19 @@ def plan_bag(
         spans = [(MIN_NS, MAX_NS, choices.task)]
         if choices.marks is not None:
             spans = _marked_spans(source.bag, choices.marks)
-        episodes = [Episode(*span, choices.fps) for span in spans]
         n_cubes = len(source.skin.cubes)
         recorded_s = (source.bag.end_ns - source.bag.start_ns) / SECOND
         max_frames = MAX_STAMP_RATIO * recorded_s * choices.fps + ALWAYS_ALLOWED_COUNT
+        episodes = [
+            Episode(
+                path,
+                span,
+                fps=choices.fps,
+                n_cubes=n_cubes,
+                max_frames=max_frames,
+            )
+            for span in spans
+        ]
 
         samples = np.zeros(n_cubes, np.int64)
         first_ns, last_ns = MAX_NS, MIN_NS
@@ -270,19 +270,11 @@ def plan_bag(
                 first_ns = min(first_ns, int(stamp_ns.min()))
                 last_ns = max(last_ns, int(stamp_ns.max()))
                 for episode in episodes:
-                    try:
-                        episode.count(cube, stamp_ns, n_cubes, max_frames)
-                    except BagError as error:
-                        raise BagError(f"{path}: {error}") from None
+                    episode.count(cube, stamp_ns)
             report(source.messages, total, f"counting {path}")
 
     covered_s = (last_ns - first_ns) / SECOND
-    rate = _check_rate(
-        source,
-        samples,
-        covered_s,
-        choices.fps,
-    )
+    rate = _check_rate(source, samples, covered_s, choices.fps)
     # Episodes without samples are left out; often one begins just before the recording ends.
     used = [episode for episode in episodes if episode.rows]
     for episode in used:
@@ -334,11 +326,6 @@ def _check_rate(
     # the frame rate is higher than the sample rate by the factor 1 + 1/n.
     fewest = int(several.min())
     max_fps = math.floor(rate * (1 + 1 / fewest))
-    if max_fps < 1:
-        raise BagError(
-            f"{path}: the cubes were sampled {rate:.2g} times per second; LeRobot counts "
-            "whole frames per second, and needed is at least one sample in each"
-        )
     if fps > max_fps:
         raise BagError(
             f"{path}: --fps {fps}: the cubes were sampled {rate:.4g} times per second, so that "

@@ -1,4 +1,4 @@
-"""Statistics of a feature (column of a data set), with which policies normalise its values.
+"""Statistics of a feature (column of a LeRobot data set), with which policies normalise its values.
 
 NaN, which stands for an unknown value, is left out of all statistics.
 """
@@ -19,98 +19,87 @@ QUANTILES = {
 """Quantiles of each feature that LeRobot expects: the name of each in LeRobot, and the fraction of
 the values that lie below it."""
 
-MAX_SAMPLE_ROWS = 10_000
-"""Approximate number of rows of a feature from which its quantiles are computed.
-
-Quantiles, unlike means, require all values in memory, so they are computed from a random sample of
-the rows.
+MAX_SAMPLE_ROWS = 20_000
+"""Approximate number of rows of a feature from which its quantiles in the whole data set are
+computed. Quantiles, unlike means, require all values in memory, so the rows are chosen at random.
 """
 
 
 class Statistics:
-    """Minimum, maximum, mean, standard deviation and quantiles of the D columns of a feature.
+    """Minimum, maximum, mean, standard deviation and quantiles of the D numbers of a feature.
 
-    The rows are added in parts, so that they need not be in memory together. A column without any
-    known value has mean 0 and standard deviation 1, which leave values unchanged on normalisation.
+    The rows (one value of each number) are added in parts, so that they need not be in memory
+    together. A number without any known value has mean 0 and standard deviation 1, which leave
+    values unchanged on normalisation.
     """
 
-    def __init__(self, width: int, rows: int) -> None:
-        """Prepare for the rows (values of D numbers) of a feature (column of a data set).
+    def __init__(self, rows: int) -> None:
+        """Prepare for the rows of a feature.
 
         Args:
-            width: Number of columns D of the feature.
-            rows: Approximate number of rows that will be added, which determines the fraction of
+            rows: Approximate number of rows in the whole data set, which determines the fraction of
                 them that is kept for the quantiles.
         """
-        self._count = np.zeros(width)
-        self._mean = np.zeros(width)
-        self._squares = np.zeros(width)  # sum of squared differences from the mean
-        self._min = np.full(width, np.inf)
-        self._max = np.full(width, -np.inf)
-        self._share = min(1.0, MAX_SAMPLE_ROWS / max(1, rows))
+        self._share = MAX_SAMPLE_ROWS / max(1, rows)
         self._random = np.random.default_rng(0)
+        # For each part, an array (5, …): count, mean, variance, minimum and maximum.
+        self._parts: list[Array] = []
         self._sample: list[Array] = []
 
     def add(self, rows: AnyArray) -> None:
-        """Add n rows of the feature's D columns to the statistics.
+        """Add n rows of the feature to the statistics.
 
         Args:
-            rows: (n, D) values, n at least 1. NaN and infinite values are left out.
+            rows: (n, …) values, n at least 1. NaN and infinite values are left out. All calls must
+                have the same shape after n, such as (D,).
         """
-        values = rows.astype(np.float64)
-        known = np.isfinite(values)
-        count = known.sum(axis=0)
-        total = np.where(known, values, 0).sum(axis=0)
-        mean = total / np.maximum(count, 1)
-        deviation = np.where(known, values - mean, 0)
-        squares = (deviation**2).sum(axis=0)
-
-        # Means and sums of squared deviations of two parts are combined as in Chan, Golub and
-        # LeVeque (1983). The simpler difference of sums of squares would lose small deviations of
-        # large numbers in rounding.
-        both = np.maximum(self._count + count, 1)
-        difference = mean - self._mean
-        self._squares += squares + difference**2 * self._count * count / both
-        self._mean += difference * count / both
-        self._count += count
-
-        # Unknown values (NaN, infinite) are replaced by +infinity for the minimum and by -infinity
-        # for the maximum, so that they never become either.
-        for_min = np.where(known, values, np.inf)
-        for_max = np.where(known, values, -np.inf)
-        self._min = np.minimum(self._min, for_min.min(axis=0))
-        self._max = np.maximum(self._max, for_max.max(axis=0))
+        values = np.ma.masked_invalid(rows.astype(np.float64))
+        part = [
+            values.count(axis=0),
+            values.mean(axis=0).filled(0),
+            values.var(axis=0).filled(0),
+            values.min(axis=0).filled(np.inf),
+            values.max(axis=0).filled(-np.inf),
+        ]
+        self._parts.append(np.array(part))
         is_chosen = self._random.random(len(rows)) < self._share
-        self._sample.append(values[is_chosen])
+        self._sample.append(values[is_chosen].filled(np.nan))
 
-    def result(self, frames: int) -> dict[str, AnyArray]:
+    def merge(self, other: Statistics) -> None:
+        """Add all rows that were added to another object, such as the statistics of an episode."""
+        self._parts += other._parts
+        self._sample += other._sample
+
+    def result(self) -> dict[str, Array]:
         """Return the statistics of all rows added so far.
 
-        Args:
-            frames: Number of frames, which LeRobot uses as the weight when it merges data sets.
-
         Returns:
-            An array (D,) for each statistic, by its name in LeRobot, and ``count`` (1,).
+            An array of the shape of a row for each statistic, by its name in LeRobot.
         """
-        is_empty = self._count == 0
-        variance = self._squares / np.maximum(self._count, 1)
-        deviation = np.sqrt(variance)
-        result = {
-            "min": np.where(is_empty, 0, self._min),
-            "max": np.where(is_empty, 0, self._max),
-            "mean": self._mean,
+        count, means, variances, lowest, highest = np.stack(self._parts, axis=1)
+        total = count.sum(axis=0)
+        is_empty = total == 0
+        weight = count / np.maximum(total, 1)
+        mean = (weight * means).sum(axis=0)
+        # Law of total variance: the variances within the parts, plus that of the means of the parts
+        within = (weight * variances).sum(axis=0)
+        between = (weight * (means - mean) ** 2).sum(axis=0)
+        deviation = np.sqrt(within + between)
+        low = lowest.min(axis=0)
+        high = highest.max(axis=0)
+
+        drawn = np.concatenate(self._sample)
+        # Of a number with few known values, the random rows may contain none by chance. Then the
+        # mean stands for all of its quantiles.
+        is_drawn = np.isfinite(drawn).any(axis=0)
+        substitute = np.where(is_drawn, np.nan, mean)
+        sample = np.concatenate([drawn, substitute[np.newaxis]])
+        shares = list(QUANTILES.values())
+        quantiles = np.nanquantile(sample, shares, axis=0)
+        return {
+            "min": np.where(is_empty, 0, low),
+            "max": np.where(is_empty, 0, high),
+            "mean": mean,
             "std": np.where(is_empty, 1, deviation),
-            "count": np.array([frames]),
+            **dict(zip(QUANTILES, quantiles, strict=True)),
         }
-        sample = np.concatenate(self._sample)
-        # The random sample may be empty by chance; then the mean is used for all quantiles.
-        if not len(sample):
-            sample = self._mean[np.newaxis]
-        columns = [column[np.isfinite(column)] for column in sample.T]
-        for name, share in QUANTILES.items():
-            quantiles = np.zeros(len(columns))
-            for number, column in enumerate(columns):
-                if len(column):
-                    quantiles[number] = np.quantile(column, share)
-            result[name] = quantiles
-        return result

@@ -38,10 +38,10 @@ all these frames are in memory at the same time."""
 class Windows:
     """The windows (samples of all cubes in one frame, a time step of the data set) of one episode.
 
-    Rows may be added in any order of frames; the windows are made in the order of the frames.
-    Within a window the samples of a cube are in the order of recording, the newest at the end. If a
-    frame has fewer samples than a window has room for, the first entries are NaN (0 in columns of
-    integers).
+    Rows of stress (one sample of one cube each) may be added in any order of frames; the windows
+    are made in the order of the frames. Within a window the samples of a cube are in the order of
+    recording, the newest at the end. If a frame has fewer samples than a window has room for, the
+    first entries are NaN (0 in columns of integers).
 
     Attributes:
         done: Number of frames whose windows have been made.
@@ -63,7 +63,7 @@ class Windows:
         self._waiting: list[tuple[Index, StressRows]] = []
 
     def add(self, frame: Index, rows: StressRows) -> None:
-        """Add N rows of stress.
+        """Add N rows of stress (one sample of one cube each).
 
         Args:
             frame: (N,) number of the frame in the episode to which each row belongs.
@@ -113,7 +113,7 @@ class Windows:
         Args:
             counts: (n, cubes) number of samples of each cube in each frame.
             frame: (N,) index of each row's frame, 0 for the first of the n frames.
-            rows: The N rows.
+            rows: The N rows (one sample of one cube each).
 
         Returns:
             Arrays (n, depth, cubes, …) by the names of the features, where depth is the number of
@@ -125,19 +125,16 @@ class Windows:
         cell = frame * n_cubes + rows.cube
         order = np.argsort(cell, kind="stable")
         cell = cell[order]
-        # After sorting, the rows of a cell are adjacent, so the rank of a row in its cell is its
-        # distance from the first row of the cell.
-        first_of_cell = np.searchsorted(cell, cell)
-        rank = np.arange(len(cell)) - first_of_cell
-        # Samples are aligned to the end of the window, so that the newest is always the last entry.
-        in_cell = counts.reshape(-1).astype(np.intp)[cell]
-        slot = self._depth - in_cell + rank
+        # The last row of each cell gets the last entry of the window, so that the newest sample is
+        # always there; the rows before it get the entries before.
+        end_of_cell = np.cumsum(counts, dtype=np.intp)[cell]
+        slot = self._depth - end_of_cell + np.arange(len(cell))
         place = cell // n_cubes, slot, cell % n_cubes
 
         shape = (n_frames, self._depth, n_cubes)
         components = np.hstack([rows.stress, rows.gradient])
-        tactile = np.empty((*shape, len(COMPONENTS)), np.float32)
-        tactile[:] = np.nan
+        tactile_shape = (*shape, len(COMPONENTS))
+        tactile = np.full(tactile_shape, np.nan, np.float32)
         tactile[place] = components[order]
         windows: dict[str, AnyArray] = {TACTILE: tactile}
         for name, kind in WINDOW_COLUMNS.items():

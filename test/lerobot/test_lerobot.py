@@ -93,13 +93,13 @@ def others() -> list[tuple[str, int, object]]:
     return found
 
 
-def with_others(plain: Path, folder: Path) -> Path:
-    """A copy of a bag, with more topics in it."""
+def with_others(plain: Path, folder: Path, added: list[tuple[str, int, object]]) -> Path:
+    """A copy of a bag, with more messages in it: topic, time of recording, message."""
     store = typestore()
     with Bag(plain) as bag:
         entries = list(bag.entries())
     entries = [(one.topic, one.msgtype, one.time_ns, one.data) for one in entries]
-    for topic, time_ns, one in others():
+    for topic, time_ns, one in added:
         data = bytes(store.serialize_cdr(one, one.__msgtype__))
         entries.append((topic, one.__msgtype__, time_ns, data))
     with BagWriter(folder) as writer:
@@ -116,7 +116,7 @@ def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("lerobot")
     stuck = lambda k: np.where(np.arange(16) == 3, (1 << 2) * (k >= 80), 0)  # noqa: E731
     plain = make_bag(folder / "plain", SKIN, left_out=stuck)
-    bag = with_others(plain, folder / "bag")
+    bag = with_others(plain, folder / "bag", others())
     reprocess(ReprocessJob(bag, folder / "bag.parquet", "parquet"))
     table = pyarrow.parquet.read_table(folder / "bag.parquet")
     command = ["export", "lerobot", str(bag), "-o", str(folder / "set"), "--fps", str(FPS)]
@@ -131,8 +131,8 @@ def frames(made):
 
 def read_frames(folder: Path) -> dict[str, np.ndarray]:
     """Every column of the data, as arrays of the shapes that info.json promises."""
-    (path,) = (folder / "data").rglob("*.parquet")
-    table = pyarrow.parquet.read_table(path)
+    paths = sorted((folder / "data").rglob("*.parquet"))
+    table = pyarrow.concat_tables(map(pyarrow.parquet.read_table, paths))
     features = json.loads((folder / "meta" / "info.json").read_text())["features"]
     assert table.column_names == list(features)
     found = {}
@@ -269,6 +269,7 @@ def test_marks_divide_a_bag_into_episodes(made, tmp_path):
     assert [one["tasks"] for one in episodes] == [["press"], ["slide"]] * 2
     assert [one["length"] for one in episodes] == [21, 45] * 2  # 0.7 s and 1.5 s
     assert [one["dataset_to_index"] for one in episodes] == [21, 66, 87, 132]
+    assert [one["data/file_index"] for one in episodes] == [0, 0, 1, 1]  # a file for each bag
     np.testing.assert_array_equal(frames["index"][:, 0], np.arange(132))
     np.testing.assert_array_equal(
         frames["task_index"][:, 0], np.repeat([0, 1, 0, 1], [21, 45, 21, 45])
@@ -323,13 +324,29 @@ def test_windows_take_samples_in_any_order():
 def test_statistics_of_parts_are_those_of_the_whole():
     values = np.random.default_rng(2).normal(1e6, 3, (5000, 2))
     values[::7, 0] = np.nan
-    statistics = Statistics(2, 5000)
+    statistics = Statistics(5000)
     for part in np.split(values, 10):
         statistics.add(part)
-    result = statistics.result(40)
+    result = statistics.result()
     np.testing.assert_allclose(result["mean"], np.nanmean(values, axis=0), rtol=1e-12)
     np.testing.assert_allclose(result["std"], np.nanstd(values, axis=0), rtol=1e-6)
     np.testing.assert_array_equal(result["q90"], np.nanquantile(values, 0.9, axis=0))
+
+
+def test_an_image_of_grey_and_opacity_is_exported(made, tmp_path):
+    """A frame before the first image is black in the same mode (pixel format)."""
+    file = io.BytesIO()
+    Image.new("LA", (4, 2), (200, 100)).save(file, "PNG")
+    data = np.frombuffer(file.getvalue(), np.uint8)
+    kind = "sensor_msgs/msg/CompressedImage"
+    at_ns = START_NS + 10**9
+    shown = message(kind, header=header(at_ns), format="png", data=data)
+    bag = with_others(made[0].with_name("plain"), tmp_path / "bag", [(JPEG, at_ns, shown)])
+    command = ["export", "lerobot", str(bag), "-o", str(tmp_path / "set")]
+    assert main([*command, "--fps", "30"]) == 0
+    images = read_frames(tmp_path / "set")["observation.images.camera.image.compressed"]
+    first, last = (Image.open(io.BytesIO(images[k])) for k in (0, -1))
+    assert first.mode == "LA" and not first.getbbox() and last.getpixel((0, 0)) == (200, 100)
 
 
 @pytest.mark.parametrize(
