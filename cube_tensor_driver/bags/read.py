@@ -1,12 +1,15 @@
 """Bags (a rosbag2 folder, or one .mcap or .db3 file) read without ROS.
 
-Whatever is wrong with a bag is reported as a `BagError` of one line.
+Whatever is wrong with a file of a bag is reported as a `BagError` of one line. A message that
+cannot be read is left out, counted and logged: one bad message never makes a bag unreadable.
 """
 
 from __future__ import annotations
 
+import logging
 import sqlite3
 import struct
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
@@ -73,6 +76,8 @@ READ_ERRORS = (
 `KeyError` from a topic or message type that is used but not defined in the file.
 """
 
+_log = logging.getLogger(__name__)
+
 
 def is_bag(path: Path) -> bool:
     """Return whether a path is a folder or ends in .mcap or .db3; the content is not checked."""
@@ -91,13 +96,19 @@ def report_damage(path: Path) -> Iterator[None]:
     except OSError as error:
         raise BagError(f"{path}: {error.strerror or error}; name a bag that can be read") from None
     except READ_ERRORS as error:
-        # Texts of the libraries can have several lines or quote many damaged bytes, so they are
-        # joined to one line and shortened.
-        text = " ".join(str(error).split()) or type(error).__name__
         raise BagError(
-            f"{path}: damaged, or no bag ({text[:200]}); "
+            f"{path}: damaged, or no bag ({_one_line(error)}); "
             f"./cube bag repair {path} may help if it was cut off"
         ) from None
+
+
+def _one_line(error: Exception) -> str:
+    """Return the text of a library's error, joined to one line of at most 200 characters.
+
+    Such texts can have several lines or quote many damaged bytes.
+    """
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text[:200]
 
 
 def open_storage(path: Path) -> McapReader | SqliteReader:
@@ -163,6 +174,8 @@ class Bag:
             until `open`.
         end_ns: Time at which the latest message was recorded, in ns since the Unix epoch; 0 until
             `open`.
+        skipped: Topic -> number of its messages that were left out because they are damaged. A
+            message counts each time that it is read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -177,6 +190,7 @@ class Bag:
         self.path = path
         self.connections: list[Connection] = []
         self.start_ns = self.end_ns = 0
+        self.skipped: Counter[str] = Counter()
         # A single storage file is also a bag. Without metadata.yaml it counts as not compressed.
         self._bag_files = BagFiles([path], "")
         if path.is_dir():
@@ -266,14 +280,48 @@ class Bag:
         for connection, time_ns, data in self._messages(topics, start_ns, stop_ns):
             yield Entry(connection.topic, connection.msgtype, time_ns, data)
 
-    def decode(self, entry: Entry) -> Any:
-        """Return the message object that the bytes of an entry stand for.
+    def decoded(self, topics: set[str]) -> Iterator[tuple[int, Any]]:
+        """Read messages as objects, in the order of recording; damaged ones are left out.
+
+        Yields:
+            The time of recording, in ns since the Unix epoch, and the message.
 
         Raises:
-            BagError: The bytes do not fit the message type.
+            BagError: A file of the bag is damaged.
         """
-        with report_damage(self.path):
-            return typestore().deserialize_cdr(entry.data, entry.msgtype)
+        for entry in self.entries(topics):
+            try:
+                message = typestore().deserialize_cdr(entry.data, entry.msgtype)
+            except READ_ERRORS as error:
+                self.skip(entry.topic, entry.time_ns, error)
+            else:
+                yield entry.time_ns, message
+
+    def skip(
+        self,
+        topic: str,
+        time_ns: int,
+        error: Exception,
+        count: int = 1,
+    ) -> None:
+        """Count messages that are left out, and log the first ones of each topic.
+
+        Args:
+            topic: Topic of the messages.
+            time_ns: Time at which the first of them was recorded, in ns since the Unix epoch.
+            error: Why they cannot be used.
+            count: Number of messages.
+        """
+        if topic not in self.skipped:
+            seconds = (time_ns - self.start_ns) * 1e-9
+            _log.warning(
+                "%s: %s: a message at %.3f s is left out (%s)",
+                self.path,
+                topic,
+                seconds,
+                _one_line(error),
+            )
+        self.skipped[topic] += count
 
     def fields(self, msgtype: str) -> list[tuple[str, Any]]:
         """Return name and kind of each field of a message type, as the library rosbags states them.
@@ -286,21 +334,25 @@ class Bag:
     def infos(self, topic: str) -> list[Any]:
         """Return the SkinInfo messages (cubes, calibrations, rest frequencies) of a topic.
 
+        Messages that are damaged are left out.
+
         Raises:
-            BagError: The topic has no message, or a message has another version than `VERSION`.
+            BagError: No message can be read, or all have another version than `VERSION`.
         """
-        infos = list(map(self.decode, self.entries({topic})))
-        if not infos:
+        read = list(self.decoded({topic}))
+        if not read:
             raise BagError(
-                f"{self.path}: no message on {topic}: the bag does not say what its frequencies "
-                f"mean; record {topic} too"
+                f"{self.path}: no message on {topic} that can be read: the bag does not say what "
+                f"its frequencies mean; record {topic} too"
             )
-        for info in infos:
-            # Comparing definitions is not enough: the version also changes when a field gets
-            # another meaning but keeps its type.
-            if info.version != VERSION:
-                self._refuse_version(f"{topic} has version {info.version}")
-        return infos
+        # Comparing definitions is not enough: the version also changes when a field gets another
+        # meaning but keeps its type.
+        others = {time_ns: info.version for time_ns, info in read if info.version != VERSION}
+        if len(others) == len(read):
+            self._refuse_version(f"{topic} has version {read[0][1].version}")
+        for time_ns, version in others.items():
+            self.skip(topic, time_ns, MessageError(f"version {version}, not {VERSION}"))
+        return [info for _, info in read if info.version == VERSION]
 
     def frequencies(self, topic: str) -> Iterator[tuple[Decoded[FrequencyRows], Times]]:
         """Read the frequencies on a topic in the order of recording.
@@ -312,7 +364,7 @@ class Bag:
             Unix epoch.
 
         Raises:
-            BagError: The bag is damaged, or the lengths stated in a message are inconsistent.
+            BagError: A file of the bag is damaged.
         """
         return self._decoded(topic, frequency_codec, frequency_codec.decode)
 
@@ -374,7 +426,13 @@ class Bag:
             for file in self._files:
                 for connection, time_ns, data in file.messages(wanted, begin_ns, end_ns):
                     count += 1
-                    yield connection, time_ns, _decompress(data) if is_packed else data
+                    if is_packed:
+                        try:
+                            data = _decompress(data)
+                        except READ_ERRORS as error:
+                            self.skip(connection.topic, time_ns, error)
+                            continue
+                    yield connection, time_ns, data
 
         # If the name of a topic or the number of a channel is damaged, no library raises an error:
         # messages are only missing. Therefore their number is compared with the one stated.
@@ -407,24 +465,33 @@ class Bag:
         times_ns: list[int] = []
         size = limit = 0
         shape = b""
-        try:
-            for _, time_ns, data in self._messages({topic}):
-                has_same_shape = len(data) == size and data.startswith(shape, SHAPE_AT)
-                if len(waiting) >= limit or not has_same_shape:
-                    if waiting:
-                        yield decode(*waiting), np.array(times_ns)
-                    waiting, times_ns = [], []
-                    size, shape = len(data), codec.shape_bytes(data)
-                    # The last 4 bytes of the shape are the number of rows in the message.
-                    rows = int.from_bytes(shape[-4:], "little")
-                    fitting = MAX_BATCH_ROWS // max(1, rows)
-                    limit = max(1, min(MAX_BATCH_MESSAGES, fitting))
-                waiting.append(data)
-                times_ns.append(time_ns)
-            if waiting:
+
+        def decode_waiting() -> Iterator[tuple[Any, Times]]:
+            try:
                 yield decode(*waiting), np.array(times_ns)
-        except MessageError as error:
-            raise BagError(f"{self.path}: {topic}: {error}") from None
+            except MessageError:
+                # The others of these messages are in order, so each is decoded alone.
+                for time_ns, data in zip(times_ns, waiting, strict=True):
+                    try:
+                        yield decode(data), np.array([time_ns])
+                    except MessageError as error:
+                        self.skip(topic, time_ns, error)
+
+        for _, time_ns, data in self._messages({topic}):
+            has_same_shape = len(data) == size and data.startswith(shape, SHAPE_AT)
+            if len(waiting) >= limit or not has_same_shape:
+                if waiting:
+                    yield from decode_waiting()
+                waiting, times_ns = [], []
+                size, shape = len(data), codec.shape_bytes(data)
+                # The last 4 bytes of the shape are the number of rows in the message.
+                rows = int.from_bytes(shape[-4:], "little")
+                fitting = MAX_BATCH_ROWS // max(1, rows)
+                limit = max(1, min(MAX_BATCH_MESSAGES, fitting))
+            waiting.append(data)
+            times_ns.append(time_ns)
+        if waiting:
+            yield from decode_waiting()
 
     def _unpacked_paths(self) -> Sequence[Path]:
         """Return the paths of the storage files.

@@ -58,11 +58,19 @@ class Recording:
             BagError: The bag has no SkinInfo message for the topic, or one that is invalid.
         """
         self._bag = bag
-        self.infos = sorted(skin_infos(bag, topic), key=stamp_ns)
-        try:
-            self.settings = [settings_of(info) for info in self.infos]
-        except MessageError as error:
-            raise BagError(f"{bag.path}: {error}") from None
+        self.infos: list[Any] = []
+        self.settings: list[Settings] = []
+        for info in sorted(skin_infos(bag, topic), key=stamp_ns):
+            try:
+                settings = settings_of(info)
+            except MessageError as error:
+                reason = error
+                bag.skip(topic.replace("frequencies", "info"), stamp_ns(info), error)
+            else:
+                self.infos.append(info)
+                self.settings.append(settings)
+        if not self.infos:
+            raise BagError(f"{bag.path}: {reason}") from None
         stamps = [stamp_ns(info) for info in self.infos]
         self._since_ns = np.array(stamps)
         # The recorded stress, which states the health, is read only when `health_at` is called.
@@ -147,8 +155,12 @@ def skin_infos(bag: Bag, topic: str) -> list[Any]:
     skin = topic.removesuffix("frequencies")
     own, of_driver = f"{skin}info", f"{skin}driver/info"
     recorded = {one.topic for one in bag.connections if one.msgcount}
-    is_only_driver = of_driver in recorded and own not in recorded
-    infos = bag.infos(of_driver if is_only_driver else own)
+    try:
+        infos = bag.infos(own)
+    except BagError:
+        if of_driver not in recorded:
+            raise
+        infos = bag.infos(of_driver)
     reconstructed = [info for info in infos if info.sender == "reconstruction"]
     return reconstructed or infos
 
@@ -163,8 +175,8 @@ def settings_of(info: Any) -> Settings:
     """Return the calibrations and rest frequencies in a SkinInfo message.
 
     Raises:
-        MessageError: The message has no cubes, an invalid calibration, or a number of rest
-            frequencies that is not the number of the cube's pads.
+        MessageError: The message has no cubes, an invalid calibration, a number of rest frequencies
+            that is not the number of the cube's pads, or one that is not above 0.
     """
     calibrations = cube_calibrations(info)
     # A skin without cubes cannot be reconstructed; the table of rest frequencies would be empty.
@@ -178,7 +190,13 @@ def settings_of(info: Any) -> Settings:
                 f"info of the skin {info.name}: cube {cube.name} has {len(cube.rest_frequency)} "
                 f"rest frequencies, its layout {layout.name} has {layout.n_pads} pads"
             )
-        rest.append(np.asarray(cube.rest_frequency, float))
+        frequency = np.asarray(cube.rest_frequency, float)
+        if not (np.isfinite(frequency) & (frequency > 0)).all():
+            raise MessageError(
+                f"info of the skin {info.name}: cube {cube.name} has the rest frequencies "
+                f"{frequency.tolist()}; they must be finite and above 0"
+            )
+        rest.append(frequency)
     widest = max(map(len, rest))
     return Settings(calibrations, pad_table(rest, widest, np.nan))
 

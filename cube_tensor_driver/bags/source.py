@@ -88,8 +88,16 @@ class BagSource:
             yield segment.messages.rows
 
     def statistics(self) -> dict[str, object]:
-        """Return the numbers of messages and rows delivered so far."""
-        return {"messages": self.messages, "rows": self.rows}
+        """Return the numbers of messages and rows delivered so far, and of damaged messages."""
+        skipped = self.bag.skipped[self.topic]
+        return {"messages": self.messages, "rows": self.rows, "skipped": skipped}
+
+    def skip(self, segment: Segment, error: Exception) -> None:
+        """Count the messages of a segment as left out, because they cannot be reconstructed."""
+        count = len(segment.messages)
+        self.messages -= count
+        self.rows -= len(segment.messages.rows)
+        self.bag.skip(self.topic, int(segment.recorded_ns[0]), error, count)
 
     def segments(self) -> Iterator[Segment]:
         """Yield all messages in the order of recording, with their rows (samples of cubes).

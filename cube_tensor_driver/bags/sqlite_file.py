@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sqlite3
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
@@ -40,6 +41,12 @@ INSERT INTO schema(schema_version, ros_distro) VALUES (4, 'rosbags');
 """
 """SQL that creates the tables of a .db3 file as rosbag2 of ROS 2 Jazzy does (schema version 4)."""
 
+_IS_SOUND = "typeof(timestamp) = 'integer' AND typeof(data) = 'blob'"
+"""SQL condition for a message to be readable. SQLite stores a type with every value, not per
+column, so damage can change the type of a single value."""
+
+_log = logging.getLogger(__name__)
+
 
 class SqliteReader:
     """An SQLite file open for reading.
@@ -64,19 +71,25 @@ class SqliteReader:
         )
         try:
             self._connections = self._read_connections()
-            (span,) = self._database.execute("SELECT min(timestamp), max(timestamp) FROM messages")
+            (found,) = self._database.execute(
+                "SELECT min(timestamp), max(timestamp), (SELECT count(*) FROM messages)"
+                " FROM messages WHERE typeof(timestamp) = 'integer'"
+            )
         except BaseException:
             self._database.close()
             raise
         connections = list(self._connections.values())
         # SQL's min and max are NULL (None) if the file has no message.
-        start_ns, end_ns = span
+        start_ns, end_ns, total = found
         self.summary = FileSummary(
             path.name,
             connections,
             start_ns or 0,
             end_ns or 0,
         )
+        damaged = total - self.summary.msgcount
+        if damaged:
+            _log.warning("%s: %d damaged messages are left out", path, damaged)
 
     def close(self) -> None:
         """Close the file."""
@@ -102,13 +115,10 @@ class SqliteReader:
         places = ",".join("?" * len(numbers))
         rows = self._database.execute(
             f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({places})"
-            " AND timestamp >= ? AND timestamp < ? ORDER BY timestamp, id",
+            f" AND {_IS_SOUND} AND timestamp >= ? AND timestamp < ? ORDER BY timestamp, id",
             [*numbers, start_ns, stop_ns],
         )
         for number, time_ns, data in rows:
-            # SQLite stores a type with every value, not per column, so damage can change a type.
-            if not isinstance(time_ns, int) or not isinstance(data, bytes):
-                raise sqlite3.DatabaseError("a message has values of other types")
             yield self._connections[number], time_ns, data
 
     def _read_connections(self) -> dict[int, Connection]:
@@ -127,7 +137,9 @@ class SqliteReader:
         # No table states the number of messages per topic, so they are counted here. This is fast
         # compared with reading them.
         counts = dict(
-            self._database.execute("SELECT topic_id, count(*) FROM messages GROUP BY topic_id")
+            self._database.execute(
+                f"SELECT topic_id, count(*) FROM messages WHERE {_IS_SOUND} GROUP BY topic_id"
+            )
         )
         qos_column = "offered_qos_profiles" if has_qos else "''"
         topics = self._database.execute(f"SELECT id, name, type, {qos_column} FROM topics")

@@ -75,8 +75,8 @@ def last_diagnostics(bag: Bag) -> list[Any]:
     # Entries come in the order of recording, so a later status replaces an earlier one.
     last = {}
     topics = set(bag.topics(DIAGNOSTICS_TYPE))
-    for entry in bag.entries(topics) if topics else ():
-        for status in bag.decode(entry).status:
+    for _, message in bag.decoded(topics) if topics else ():
+        for status in message.status:
             last[status.name] = status
     return [last[name] for name in sorted(last)]
 

@@ -189,7 +189,7 @@ def _read_reference(
     if msgtype == BATCH_TYPE:
         stamp_ns, values = _read_batches(bag, topic, number)
     elif msgtype in (WRENCH_TYPE, TENSOR_TYPE):
-        messages = [bag.decode(entry) for entry in bag.entries({topic})]
+        messages = [message for _, message in bag.decoded({topic})]
         stamps = [message.header.stamp for message in messages]
         read = _read_force if msgtype == WRENCH_TYPE else _read_components
         times = [stamp.sec * SECOND + stamp.nanosec for stamp in stamps]

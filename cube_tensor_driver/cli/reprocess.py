@@ -142,7 +142,10 @@ def result_line(output: Path, result: ReprocessResult) -> str:
         output: Path of the result, which the line contains.
         result: Numbers of messages and rows (one cube at one sampling time), and the duration.
     """
-    return f"{output}: {result.messages} messages, {result.rows} rows, {result.seconds:.1f} s"
+    skipped = f", {result.skipped} damaged ones left out" if result.skipped else ""
+    return (
+        f"{output}: {result.messages} messages{skipped}, {result.rows} rows, {result.seconds:.1f} s"
+    )
 
 
 def overrides_of(options: argparse.Namespace) -> Overrides:

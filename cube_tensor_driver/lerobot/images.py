@@ -125,8 +125,7 @@ class ImageStream:
 
     def _read(self) -> Iterator[tuple[int, Any]]:
         """Yield the stamp, in ns since the Unix epoch, and the message of each image."""
-        for entry in self._bag.entries({self._topic}):
-            message = self._bag.decode(entry)
+        for _, message in self._bag.decoded({self._topic}):
             yield stamp_ns(message), message
 
     def _encode(self, message: Any) -> tuple[bytes, Shape]:

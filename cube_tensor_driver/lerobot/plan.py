@@ -385,9 +385,8 @@ def _marked_spans(bag: Bag, topic: str) -> list[tuple[int, int, str]]:
             f"{bag.path}: no marks ({MARK_TYPE}) on {topic}; topics of that type: {names}"
         )
     marks = []
-    for entry in bag.entries({topic}):
-        text = bag.decode(entry).data.strip()
-        marks.append((entry.time_ns, text))
+    for time_ns, mark in bag.decoded({topic}):
+        marks.append((time_ns, mark.data.strip()))
     marks.append((MAX_NS, ""))
     spans = []
     for (since_ns, task), (until_ns, _) in pairwise(marks):

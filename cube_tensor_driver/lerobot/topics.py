@@ -208,8 +208,7 @@ def _read_numbers(
         BagError: The bag is damaged, or a JointState has more or fewer values than joint names.
     """
     paths = _number_paths(bag, topic.msgtype)
-    for entry in bag.entries({topic.name}):
-        message = bag.decode(entry)
+    for _, message in bag.decoded({topic.name}):
         if topic.msgtype == JOINT_STATE_TYPE:
             numbers = _joint_numbers(message, f"{bag.path}: {topic.name}")
         else:

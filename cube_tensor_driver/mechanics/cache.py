@@ -114,7 +114,7 @@ def _load(path: Path) -> Arrays | None:
     except (OSError, ConfigError):
         return None
     # The checksums in the file cover each array, but not how many there are.
-    content = arrays.pop(_CONTENT, None)
+    content = arrays.pop(_CONTENT, np.empty(0))
     return arrays if np.array_equal(content, _describe(arrays)) else None
 
 

@@ -62,7 +62,7 @@ def test_a_bag_is_a_source_of_its_rows(bag):
         assert [cube.name for cube in source.skin.cubes] == [f"c{k:02}" for k in range(16)]
         assert source.skin.parent_frame == "skin_base"
         parts = list(source)
-        assert source.statistics() == {"messages": MESSAGES, "rows": 16 * MESSAGES}
+        assert source.statistics() == {"messages": MESSAGES, "rows": 16 * MESSAGES, "skipped": 0}
     cube, sequence, stamp_ns, frequency, *_ = columns(parts)
     assert len(parts) < 10  # many messages at a time
     assert cube.tolist() == list(range(16)) * MESSAGES

@@ -107,7 +107,6 @@ def a_device(folder: Path) -> Path:
     ("make", "words"),
     [
         (a_large_chunk, "the limit is 268435456"),
-        (a_large_message, "more than 67108864 bytes"),
         (a_pipe, "no regular file"),
         (a_pipe_as_database, "no regular file"),
         (a_pipe_as_metadata, "no metadata.yaml"),
@@ -121,6 +120,11 @@ def test_beyond_the_bounds_is_one_line(
     with pytest.raises(BagError, match=words) as caught:
         read_all(path)
     assert "\n" not in str(caught.value)
+
+
+def test_a_message_beyond_the_bounds_is_left_out(tmp_path: Path, caplog) -> None:
+    assert read_all(a_large_message(tmp_path)) == 0
+    assert "more than 67108864 bytes" in caplog.text
 
 
 @pytest.mark.parametrize("name", ["zstd", "lz4"])

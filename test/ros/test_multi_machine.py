@@ -146,7 +146,7 @@ def rows(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Cube, sequence and time of arrival (ns) of all rows of `stress`."""
     with Bag(path) as bag:
         (topic,) = bag.topics(STRESS)
-        messages = [(bag.decode(entry), entry.time_ns) for entry in bag.entries({topic})]
+        messages = [(message, time_ns) for time_ns, message in bag.decoded({topic})]
     cube, sequence = (
         np.concatenate([getattr(one, name) for one, _ in messages]) for name in ("cube", "sequence")
     )
@@ -159,7 +159,7 @@ def rows(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def lost_on_the_way(path: Path) -> int:
     """What the reconstruction said last of messages lost."""
     with Bag(path) as bag:
-        arrays = [bag.decode(entry) for entry in bag.entries({"/diagnostics"})]
+        arrays = [message for _, message in bag.decoded({"/diagnostics"})]
     said = [
         int(pair.value)
         for array in arrays

@@ -108,11 +108,13 @@ class ReprocessResult(NamedTuple):
         messages: Number of messages of stress that were computed.
         rows: Number of rows of stress (samples of cubes).
         seconds: Duration of the recording, in s.
+        skipped: Number of recorded messages that were left out because they are damaged.
     """
 
     messages: int
     rows: int
     seconds: float
+    skipped: int = 0
 
 
 def reprocess(job: ReprocessJob) -> ReprocessResult:
@@ -242,6 +244,7 @@ def _reprocess(
         messages=sum(source.messages for source in sources),
         rows=sum(source.rows for source in sources),
         seconds=(bag.end_ns - bag.start_ns) * 1e-9,
+        skipped=bag.skipped.total(),
     )
 
 
@@ -301,18 +304,19 @@ def _reconstruct(
     """
     number = -1
     ids: list[str] = []
+    refused: CubeError | None = None
     for segment in source.segments():
         rows = segment.messages.rows
         health = source.recording.health_at(rows) if use_health else None
+        if segment.number != number:
+            number = segment.number
+            current = settings[number]
+            # A new reconstructor forgets the health of the pads. A tare changes only rest
+            # frequencies, so the health continues; other calibrations require a new start.
+            if ids != (ids := [one.id for one in current.calibrations]):
+                reconstructor = Reconstructor(current.calibrations)
+            reconstructor.rest_frequency = current.rest_frequency
         try:
-            if segment.number != number:
-                number = segment.number
-                current = settings[number]
-                # A new reconstructor forgets the health of the pads. A tare changes only rest
-                # frequencies, so the health continues; other calibrations require a new start.
-                if ids != (ids := [one.id for one in current.calibrations]):
-                    reconstructor = Reconstructor(current.calibrations)
-                reconstructor.rest_frequency = current.rest_frequency
             # If the recording states the health of every row, it is not determined again, which
             # saves two fifths of the time.
             if health is not None and health.known.all():
@@ -320,8 +324,13 @@ def _reconstruct(
             else:
                 stress = reconstructor.process(rows, health)
         except CubeError as error:
-            raise BagError(f"{source.bag.path}: {source.topic}: {error}") from None
+            # The node refused these messages, too, as those with another number of pads.
+            refused = error
+            source.skip(segment, error)
+            continue
         yield segment, stress
+    if refused is not None and not source.messages:
+        raise BagError(f"{source.bag.path}: {source.topic}: {refused}")
 
 
 def _recalibrate(
