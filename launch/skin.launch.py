@@ -24,6 +24,7 @@ from cube_tensor_driver.ros.launching import (
     declare_text,
     record_skin,
     rviz_file,
+    stay_ended,
 )
 
 PACKAGE = "cube_tensor_driver"
@@ -48,6 +49,16 @@ ARGUMENTS = (
         "publish_period",
         "Time, in s, whose scans are sent in one message. If it is empty, the parameter "
         "publish_period is not set.",
+    ),
+    declare_text(
+        "frame_prefix",
+        "Text in front of the frame ids of the skin and its cubes, such as left_. Two skins with "
+        "the same skin file need different ones.",
+    ),
+    declare_switch(
+        "forces",
+        "Publish one force per cube on `forces`. If it is empty, the parameter forces is not set.",
+        "",
     ),
     declare_switch("simulate", "Simulate the hubs of the skin instead of opening its ports."),
     declare_text(
@@ -82,19 +93,23 @@ ARGUMENTS = (
 
 def generate_launch_description() -> LaunchDescription:
     autostart = ParameterFile(GivenParameters("autostart"))
-    reconstruction = ParameterFile(GivenParameters("autostart", "config", "publish_period"))
-    driver = ParameterFile(
-        GivenParameters("autostart", "config", "publish_period", "port", "rate", "port_directory")
+    skin = ParameterFile(
+        GivenParameters(
+            *("autostart", "config", "port", "rate", "publish_period", "frame_prefix", "forces"),
+            "port_directory",
+        )
     )
     is_composed = LaunchConfiguration("composed")
     return LaunchDescription(
         [
             *ARGUMENTS,
-            OpaqueFunction(function=check_arguments),
+            OpaqueFunction(
+                function=check_arguments, args=[[argument.name for argument in ARGUMENTS]]
+            ),
             make_simulator(),
-            make_node("reconstruction", reconstruction, UnlessCondition(is_composed)),
-            make_node("driver", driver, UnlessCondition(is_composed)),
-            make_node("composed", driver, IfCondition(is_composed)),
+            make_node("reconstruction", skin, UnlessCondition(is_composed)),
+            make_node("driver", skin, UnlessCondition(is_composed)),
+            make_node("composed", skin, IfCondition(is_composed)),
             make_node("contacts", autostart, if_any("contacts")),
             make_node("markers", autostart, if_any("markers", "rviz")),
             OpaqueFunction(function=record_skin, condition=if_any("record")),
@@ -142,15 +157,22 @@ def make_node(executable: str, parameters: Any, condition: Any) -> Node:
         emulate_tty=True,
         respawn=LaunchConfiguration("respawn"),
         respawn_delay=RESPAWN_DELAY_S,
+        on_exit=stay_ended,
     )
 
 
 def make_state_publisher() -> Node:
-    """Return the action that starts robot_state_publisher, which publishes the cubes' frames."""
+    """Return the action that starts robot_state_publisher, which publishes the cubes' frames.
+
+    The names of its node and topic differ from those of the robot's own robot_state_publisher,
+    which may run in the same namespace.
+    """
     urdf = ParameterValue(FromSkin(skin_urdf), value_type=str)
     return Node(
         package="robot_state_publisher",
         executable="robot_state_publisher",
+        name="skin_state_publisher",
+        remappings=[("robot_description", "skin_description")],
         namespace=LaunchConfiguration("namespace"),
         parameters=[{"robot_description": urdf}],
         output="screen",

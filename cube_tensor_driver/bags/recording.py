@@ -231,4 +231,6 @@ def recorded_skin(info: Any, calibrations: tuple[Calibration, ...]) -> Skin:
                 calibration=calibration,
             )
         )
-    return Skin(info.name, info.header.frame_id, None, links, tuple(cubes))
+    # A frame id is the prefix of the launch file, and the names of skin and cube.
+    frame_prefix = info.cubes[0].frame_id.removesuffix(f"{info.name}_{cubes[0].name}")
+    return Skin(info.name, info.header.frame_id, None, links, tuple(cubes), frame_prefix)

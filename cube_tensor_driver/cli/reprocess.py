@@ -7,7 +7,6 @@ It needs no ROS. From the same frequencies and calibrations, it computes exactly
 from __future__ import annotations
 
 import argparse
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -205,17 +204,10 @@ def contacts_of(options: argparse.Namespace) -> ContactsOverTime | None:
         name, _, value = text.partition(":=")
         if name not in known:
             raise ConfigError(f"--contacts {text}: use NAME:=VALUE with one of {', '.join(known)}")
-        if name == "influence":
-            values[name] = value
-            continue
-        low, high = known[name].span or (0.0, 0.0)
-        try:
-            values[name] = float(value)
-        except ValueError:
-            values[name] = math.nan
-        # A text that is no number became NaN, which fails this comparison, too.
-        if not low <= values[name] <= high:
-            raise ConfigError(f"--contacts {text}: needed is a number from {low:g} to {high:g}")
+        values[name] = known[name].parse(value)
+        refusal = known[name].refusal(values[name])
+        if refusal:
+            raise ConfigError(f"--contacts {text}: {refusal}")
     rate = values.pop("rate")
     settings = ContactSettings(method, **values)
     settings.check()

@@ -10,11 +10,17 @@ from .parser import Parser
 
 def arguments(parser: Parser) -> None:
     parser.add_argument("file", type=Path, metavar="FILE", help="skin file")
+    parser.add_argument(
+        "--frame-prefix",
+        default="",
+        metavar="TEXT",
+        help="text in front of all frame ids, as in the launch file's frame_prefix:=left_",
+    )
 
 
 def run(options: argparse.Namespace) -> int:
     from ..config.skin import read_skin
     from ..config.urdf import skin_urdf
 
-    print(skin_urdf(read_skin(options.file)), end="")
+    print(skin_urdf(read_skin(options.file, options.frame_prefix)), end="")
     return 0

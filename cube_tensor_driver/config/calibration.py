@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,7 +29,8 @@ def find_calibration(name: str, folder: Path) -> Path:
     """
     shipped = package_data() / "config" / "calibration"
     for path in (shipped / f"{name}.yaml", folder / name):
-        if path.is_file():
+        # os.path.isfile, unlike Path.is_file, is false for a name that is too long.
+        if os.path.isfile(path):  # noqa: PTH113
             return path
     names = ", ".join(sorted(path.stem for path in shipped.glob("*.yaml")))
     raise ConfigError(

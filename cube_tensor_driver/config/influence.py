@@ -6,6 +6,7 @@ they are tables computed with finite elements.
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from ..core.errors import ConfigError
@@ -25,7 +26,8 @@ def find_influence(name: str) -> Path:
     # The package is searched before the file system, as for calibrations.
     shipped = package_data() / "config" / "influence"
     for path in (shipped / f"{name}.npz", Path(name)):
-        if path.is_file():
+        # os.path.isfile, unlike Path.is_file, is false for a name that is too long.
+        if os.path.isfile(path):  # noqa: PTH113
             return path
     names = ", ".join(sorted(path.stem for path in shipped.glob("*.npz")))
     raise ConfigError(

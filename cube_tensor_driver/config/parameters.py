@@ -6,6 +6,7 @@ and docs/parameters.md lists them.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -42,6 +43,41 @@ class Parameter(NamedTuple):
     minimum: float | None = None
     problem: Callable[[str], str] | None = None
 
+    def parse(self, text: str) -> Any:
+        """Return the value that a text states: a truth value, a number, or the text itself.
+
+        The result for a text that is no number is NaN, which `refusal` refuses.
+        """
+        if isinstance(self.default, bool):
+            return text.lower() == "true"
+        if not isinstance(self.default, float):
+            return text
+        try:
+            return float(text)
+        except ValueError:
+            return math.nan
+
+    def refusal(self, value: Any) -> str:
+        """Return an error message if the parameter cannot have a value; "" if it can.
+
+        Args:
+            value: The value, which has the type of the parameter.
+        """
+        found = f"parameter {self.name} is {value!r}"
+        if self.choices and value not in self.choices.split(", "):
+            return f"{found}, allowed: {self.choices}"
+        if self.span is not None:
+            low, high = self.span
+            is_zero = self.minimum is not None and value == 0
+            # NaN fails this comparison, too.
+            if not (is_zero or (self.minimum or low) <= value <= high):
+                allowed = f"{low:g} to {high:g}"
+                if self.minimum:
+                    allowed = f"0, or {self.minimum:g} to {high:g}"
+                return f"{found}, allowed: {allowed}"
+        problem = self.problem(value) if self.problem is not None and value else ""
+        return f"parameter {self.name}: {problem}" if problem else ""
+
 
 AUTOSTART = Parameter(
     "autostart",
@@ -59,9 +95,18 @@ RELIABILITY = Parameter(
 )
 """Parameter of the nodes `driver` and `reconstruction`."""
 
+FRAME_PREFIX = Parameter(
+    "frame_prefix",
+    "",
+    "Text in front of the frame ids of the skin and its cubes, such as left_ for one of two skins "
+    "with the same skin file.",
+)
+"""Parameter of the nodes `driver` and `reconstruction`."""
+
 DRIVER = (
     AUTOSTART,
     Parameter("config", "", "Path of the skin file (YAML). It is required."),
+    FRAME_PREFIX,
     Parameter(
         "port",
         "",
@@ -104,6 +149,7 @@ RECONSTRUCTION = (
         "tares and the drift of the recording, so that replayed frequencies give the recorded "
         "stress. It is required.",
     ),
+    FRAME_PREFIX,
     Parameter(
         "wrench_side",
         0.0,

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from glob import has_magic
 from pathlib import Path
 from typing import Any
@@ -132,6 +132,7 @@ class Skin:
             choose the rate.
         links: The links, in the order of the file.
         cubes: The cubes, in the order of the file. Index 0 in rows and messages is the first one.
+        frame_prefix: Text in front of the frame ids of the cubes. `parent_frame` contains it.
     """
 
     name: str
@@ -139,6 +140,7 @@ class Skin:
     rate: float | None
     links: tuple[SkinLink, ...]
     cubes: tuple[SkinCube, ...]
+    frame_prefix: str = ""
 
     def __repr__(self) -> str:
         layouts = ", ".join(sorted({one.layout.name for one in self.calibrations}))
@@ -172,11 +174,12 @@ class Skin:
         return max(calibration.layout.n_pads for calibration in self.calibrations)
 
     def frame(self, cube: SkinCube) -> str:
-        """Return the frame id of a cube: the names of skin and cube, joined by an underscore."""
-        return f"{self.name}_{cube.name}"
+        """Return the frame id of a cube: the frame prefix, and the names of skin and cube, joined
+        by an underscore."""
+        return f"{self.frame_prefix}{self.name}_{cube.name}"
 
 
-def read_skin(path: str | Path) -> Skin:
+def read_skin(path: str | Path, frame_prefix: str = "") -> Skin:
     """Read a skin file (YAML) with the calibrations that it names, and check both.
 
     docs/config.md describes the keys. No port is opened.
@@ -184,6 +187,8 @@ def read_skin(path: str | Path) -> Skin:
     Args:
         path: The skin file. A calibration that it names is searched among those of the package
             first, then as a file relative to the folder of the skin file.
+        frame_prefix: Text in front of all frame ids, such as "left_", by which the frames of two
+            skins with the same file differ.
 
     Returns:
         The links and cubes in the order of the file.
@@ -191,12 +196,15 @@ def read_skin(path: str | Path) -> Skin:
     Raises:
         ConfigError: The file cannot be read or has mistakes. The message names the file, the key of
             the first mistake, the value found there, the allowed values, and the number of further
-            mistakes. `check_skin` returns all of them.
+            mistakes. `check_skin` returns all of them. Or a frame id cannot begin with the prefix.
     """
     path = Path(path)
     skin, mistakes = check_skin(path)
     if skin is not None:
-        return skin
+        parent_frame = frame_prefix + skin.parent_frame
+        for _, mistake in Schema(_FRAME).mistakes(parent_frame):
+            raise ConfigError(f"frame_prefix {frame_prefix!r}: {mistake.partition(': ')[2]}")
+        return replace(skin, parent_frame=parent_frame, frame_prefix=frame_prefix)
     others = len(mistakes) - 1
     more = f" (and {others} more: ./cube config check {path})" if others else ""
     raise ConfigError(f"{path}: {mistakes[0]}{more}")

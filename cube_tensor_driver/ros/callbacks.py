@@ -11,7 +11,12 @@ from collections.abc import Callable
 from functools import wraps
 from typing import Any
 
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
+
+MAX_CHARACTERS = 1000
+"""Maximum number of characters of a text in a response that quotes the request, so that a request
+of megabytes is not answered and logged with megabytes."""
 
 LOG_PERIOD_S = 5.0
 """Minimum time, in seconds, between two log messages about errors that occur repeatedly."""
@@ -48,7 +53,8 @@ class CallbackErrors:
     def catch_in_service(self, callback: Callable[..., Any]) -> Callable[..., Any]:
         """Wrap the callback of a service so that its exceptions are caught.
 
-        After an exception the response is sent with the values that it has by then.
+        After an exception the response is sent with the values that it has by then, and with the
+        exception as the reason of a failure.
         """
 
         @wraps(callback)
@@ -57,7 +63,7 @@ class CallbackErrors:
                 return callback(request, response)
             except Exception as error:  # noqa: BLE001  (see the head of this file)
                 self._note(error)
-                return response
+                return explain_failure(request, response, repr(error))
 
         return call
 
@@ -67,6 +73,33 @@ class CallbackErrors:
             f"a callback failed, the node goes on ({self.count} so far): {error!r}",
             throttle_duration_sec=LOG_PERIOD_S,
         )
+
+
+def explain_failure(request: Any, response: Any, reason: str) -> Any:
+    """Write into the response of a service why it failed, if its type has a field for that.
+
+    Args:
+        request: The request.
+        response: The response, which is changed.
+        reason: The reason.
+
+    Returns:
+        The response.
+    """
+    if hasattr(response, "message"):
+        response.message = reason
+    if hasattr(response, "results"):  # of SetParameters: one result for each parameter
+        done: list[Any] = list(response.results)
+        missing = len(request.parameters) - len(done)
+        response.results = done + [SetParametersResult(reason=reason)] * missing
+    return response
+
+
+def shorten(text: str) -> str:
+    """Return a text for a response or a log; of a text above `MAX_CHARACTERS` its beginning."""
+    if len(text) <= MAX_CHARACTERS:
+        return text
+    return f"{text[:MAX_CHARACTERS]}… ({len(text)} characters)"
 
 
 def refuse_on_error(callback: Callable[..., Any], errors: type[Exception]) -> Callable[..., Any]:

@@ -7,7 +7,8 @@ wheels of ROS 2. So only the launch files import it.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterable
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -16,21 +17,24 @@ from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 from launch import Action, LaunchContext, Substitution
 from launch.actions import (
     DeclareLaunchArgument,
+    EmitEvent,
     ExecuteProcess,
     SetLaunchConfiguration,
 )
+from launch.events import matches_action
+from launch.events.process import ProcessExited, ShutdownProcess
 from launch.substitutions import LaunchConfiguration
 from launch_ros.utilities.namespace_utils import make_namespace_absolute, prefix_namespace
 
 from ..config.load_script import read_script
 from ..config.output_files import temporary_folder
 from ..config.package_data import package_data
-from ..config.parameters import DRIVER
-from ..config.port import port_problem
+from ..config.parameters import DRIVER, RECONSTRUCTION
 from ..config.rviz import rviz_view
 from ..config.skin import Skin, read_skin
 from ..config.yaml import read_yaml, write_yaml
 from ..core.errors import ConfigError
+from ..device.live import link_configs
 
 _CONFIG = package_data() / "config"
 
@@ -48,6 +52,9 @@ SKIN_LAUNCH = package_data() / "launch" / "skin.launch.py"
 
 RECORD_QOS = _CONFIG / "record_qos.yaml"
 """Path of the file that lists the recorded topics and the quality of service (QoS) of each."""
+
+PARAMETERS = {parameter.name: parameter for parameter in (*RECONSTRUCTION, *DRIVER)}
+"""Name of a parameter of the nodes `driver` and `reconstruction` -> the parameter."""
 
 NEEDED_PACKAGES = {
     "rviz": ("rviz2", "robot_state_publisher"),
@@ -89,9 +96,13 @@ def declare_switch(
         default: "true" or "false". An empty text allows an empty value, too, which leaves the
             decision to the parameter of the same name.
     """
-    choices = ["true", "false"] if default else ["", "true", "false"]
+    # Launch files in Python pass the texts "True" and "False".
+    choices = ["true", "false", "True", "False"]
     return DeclareLaunchArgument(
-        name, default_value=default, choices=choices, description=description
+        name,
+        default_value=default,
+        choices=choices if default else ["", *choices],
+        description=description,
     )
 
 
@@ -124,19 +135,15 @@ class GivenParameters(Substitution):  # type: ignore[misc]
 
     def __init__(self, *names: str) -> None:
         super().__init__()
-        self._parameters = [parameter for parameter in DRIVER if parameter.name in names]
+        self._parameters = [PARAMETERS[name] for name in names]
 
     def describe(self) -> str:
         return f"parameters {', '.join(parameter.name for parameter in self._parameters)}"
 
     def perform(self, context: LaunchContext) -> str:
-        """Write the parameter file and return its path.
-
-        Raises:
-            ConfigError: The text of an argument is no number although its parameter is one.
-        """
+        """Write the parameter file and return its path."""
         given = {
-            parameter.name: _convert(parameter.name, text, type(parameter.default))
+            parameter.name: parameter.parse(text)
             for parameter in self._parameters
             if (text := _argument(context, parameter.name))
         }
@@ -209,8 +216,26 @@ def _recorded_topics(surroundings: dict[str, Any], namespace: str) -> dict[str, 
     return qualities
 
 
-def check_arguments(context: LaunchContext) -> list[Action]:
+def stay_ended(event: ProcessExited, context: LaunchContext) -> Action | None:
+    """Return the action that prevents a new start of a node that ended with `EX_CONFIG`.
+
+    The exit code says that a parameter or a file cannot be used, so that the node would end again.
+
+    Args:
+        event: The end of the process of the node.
+        context: Not used; launch passes it to every handler of an event.
+    """
+    if event.returncode != os.EX_CONFIG:
+        return None
+    return EmitEvent(event=ShutdownProcess(process_matcher=matches_action(event.action)))
+
+
+def check_arguments(context: LaunchContext, declared: Iterable[str]) -> list[Action]:
     """Check all launch arguments. It is the first action of a launch file, before nodes start.
+
+    Args:
+        context: Holds the launch arguments.
+        declared: Names of the arguments of the launch file.
 
     Returns:
         Actions that set the launch configuration `config` to the absolute path of the skin file,
@@ -220,23 +245,25 @@ def check_arguments(context: LaunchContext) -> list[Action]:
         ConfigError: An argument, the skin file or the load script has a mistake, or a ROS package
             that an argument needs is not installed. The error ends the launch.
     """
-    is_simulated = _argument(context, "simulate") == "true"
+    _check_names(context, declared)
+    is_simulated = _is_true(context, "simulate")
     config = _argument(context, "config") or (str(DEMO_SKIN) if is_simulated else "")
     if not config:
         raise ConfigError(
             "config is missing: name a skin file, config:=skin.yaml, or try simulate:=true"
         )
     path = Path(config).expanduser().resolve()
-    read_skin(path)
+    skin = read_skin(path, _argument(context, "frame_prefix"))
     read_script(Path(_argument(context, "load")).expanduser())
 
-    problem = _argument(context, "port") and port_problem(_argument(context, "port"))
-    if problem:
-        raise ConfigError(f"port: {problem}")
-    for name in ("rate", "publish_period"):
-        _convert(name, _argument(context, name) or "0", float)
+    for name in PARAMETERS.keys() & declared:
+        text = _argument(context, name)
+        refusal = PARAMETERS[name].refusal(PARAMETERS[name].parse(text)) if text else ""
+        if refusal:
+            raise ConfigError(f"{name}:={text}: {refusal}")
+    link_configs(skin, _argument(context, "port"))  # refuses one port for several links
     for name, packages in NEEDED_PACKAGES.items():
-        if _argument(context, name) == "true":
+        if _is_true(context, name):
             _check_installed(name, packages)
 
     # The folder is a new one for each launch, so that two simulated skins on one host do not make
@@ -248,31 +275,32 @@ def check_arguments(context: LaunchContext) -> list[Action]:
     ]
 
 
+def _check_names(context: LaunchContext, declared: Iterable[str]) -> None:
+    """Raise ConfigError if the command line of `ros2 launch` has an argument that is not declared.
+
+    Launch itself ignores such arguments. They are checked only if the command line names a launch
+    file of this package, because another one that includes it has arguments of its own.
+    """
+    if not {Path(word).name for word in sys.argv} & {SKIN_LAUNCH.name, "cube.launch.py"}:
+        return
+    for name in (word.partition(":=")[0] for word in context.argv):
+        if name not in declared:
+            raise ConfigError(
+                f"no launch argument {name}, there are: {', '.join(declared)}. Parameters of nodes "
+                "are set in a launch file that includes this one, see docs/robot.md"
+            )
+
+
 def _argument(context: LaunchContext, name: str) -> str:
     return str(LaunchConfiguration(name).perform(context))
 
 
+def _is_true(context: LaunchContext, name: str) -> bool:
+    return _argument(context, name).lower() == "true"
+
+
 def _read_skin(context: LaunchContext) -> Skin:
-    return read_skin(Path(_argument(context, "config")))
-
-
-def _convert(name: str, text: str, kind: type) -> Any:
-    """Convert the text of a launch argument to the type of the parameter that it sets.
-
-    Args:
-        name: Name of the launch argument, for the error message.
-        text: The text that the user gave.
-        kind: Type of the parameter, such as float or bool.
-
-    Raises:
-        ConfigError: The type is float, and the text is no number.
-    """
-    if kind is bool:
-        return text == "true"
-    try:
-        return kind(text)
-    except ValueError:
-        raise ConfigError(f"{name}:={text}: must be a number") from None
+    return read_skin(Path(_argument(context, "config")), _argument(context, "frame_prefix"))
 
 
 def _check_installed(name: str, packages: tuple[str, ...]) -> None:

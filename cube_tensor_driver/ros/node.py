@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import math
+import os
 import sys
 import threading
 import time
@@ -29,6 +29,7 @@ from rclpy.lifecycle import (
     TransitionCallbackReturn,
 )
 from rclpy.node import Node
+from rclpy.parameter import Parameter as RclpyParameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.service import Service
@@ -36,9 +37,10 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
 from ..config.parameters import Parameter
+from ..config.skin import Skin, read_skin
 from ..core.errors import ConfigError, CubeError
 from ..processes.stop_signals import stop_event
-from .callbacks import CallbackErrors, refuse_on_error
+from .callbacks import CallbackErrors, refuse_on_error, shorten
 from .compat import after_parameters_are_set, make_executor
 from .qos import SERVICES, batch_profile, scans_per_message
 from .session import spin_until, start_ros
@@ -80,6 +82,8 @@ class CubeNode(LifecycleNode):
         callback_errors: Catches and counts the exceptions of callbacks.
         is_configured: Whether the lifecycle state is inactive or active.
         is_active: Whether the lifecycle state is active.
+        is_misconfigured: Whether a transition was refused because of a parameter or a file, so that
+            a restart of the process would not help.
     """
 
     def __init__(self, name: str, parameters: Sequence[Parameter]) -> None:
@@ -90,11 +94,12 @@ class CubeNode(LifecycleNode):
             parameters: The parameters, with defaults, limits and whether they may change later.
         """
         self.callback_errors = CallbackErrors(self)
+        self._parameters_by_name = {parameter.name: parameter for parameter in parameters}
         super().__init__(name)
         self.is_configured = False
         self.is_active = False
+        self.is_misconfigured = False
         self._resources = contextlib.ExitStack()
-        self._parameters_by_name = {parameter.name: parameter for parameter in parameters}
         self._protect_lifecycle_services()
         after_parameters_are_set(self, self._apply_parameters)
         self.add_on_set_parameters_callback(self._check_parameters)
@@ -170,6 +175,14 @@ class CubeNode(LifecycleNode):
     def value(self, name: str) -> Any:
         """Return the present value of a parameter of the node."""
         return self.get_parameter(name).value
+
+    def read_skin(self) -> Skin:
+        """Read the skin file, with the frame ids that the parameter `frame_prefix` asks for.
+
+        Raises:
+            ConfigError: The parameter `config` is empty, or the file has a mistake.
+        """
+        return read_skin(self.config(), self.value("frame_prefix"))
 
     def config(self) -> Path:
         """Return the path in the parameter `config`.
@@ -256,13 +269,33 @@ class CubeNode(LifecycleNode):
                 step=0.0,
             )
             descriptor.floating_point_range = [bounds]
+        # Values of the command line, which rclpy keeps until the parameter is declared.
+        given = self._parameter_overrides
+        if parameter.name in given:
+            given[parameter.name] = self._as_declared(given[parameter.name])
         self.declare_parameter(parameter.name, parameter.default, descriptor)
+
+    def set_parameters_atomically(self, parameter_list: list[Any]) -> SetParametersResult:
+        return super().set_parameters_atomically(list(map(self._as_declared, parameter_list)))
+
+    def _as_declared(self, parameter: Any) -> Any:
+        """Return a parameter in the type of its declaration if it is an integer for a real number.
+
+        rclpy refuses `rate: 250` for a parameter whose type is double.
+
+        Args:
+            parameter: Name and value (rclpy.parameter.Parameter).
+        """
+        known = self._parameters_by_name.get(parameter.name)
+        if known and isinstance(known.default, float) and type(parameter.value) is int:
+            return RclpyParameter(parameter.name, value=float(parameter.value))
+        return parameter
 
     def _check_parameters(self, parameters: list[Any]) -> SetParametersResult:
         for parameter in parameters:
             reason = self._refusal(parameter.name, parameter.value)
             if reason:
-                return SetParametersResult(successful=False, reason=reason)
+                return SetParametersResult(successful=False, reason=shorten(reason))
         return SetParametersResult(successful=True)
 
     def _refusal(self, name: str, value: Any) -> str:
@@ -272,31 +305,17 @@ class CubeNode(LifecycleNode):
             name: Name of the parameter.
             value: The requested value.
         """
+        known = self._parameters_by_name.get(name)
         # rclpy also calls this for its own parameters, such as use_sim_time, which have no entry.
-        known = self._parameters_by_name.get(
-            name,
-            Parameter(
-                name,
-                None,
-                "",
-                live=True,
-            ),
-        )
-        if known.choices and value not in known.choices.split(", "):
-            return f"parameter {name} is {value!r}, allowed: {known.choices}"
-        if isinstance(value, float) and not math.isfinite(value):
-            return f"parameter {name} is {value}, allowed: a finite number"
-        if known.minimum is not None and 0 < value < known.minimum:
-            return f"parameter {name} is {value}, allowed: 0, or at least {known.minimum:g}"
-        problem = known.problem(value) if known.problem is not None and value else ""
-        if problem:
-            return f"parameter {name}: {problem}"
-        if self.is_configured and not known.live:
+        if known is None:
+            return ""
+        refusal = known.refusal(value)
+        if not refusal and self.is_configured and not known.live:
             return (
                 f"parameter {name} cannot change while the node is configured: "
                 "clean it up first (lifecycle)"
             )
-        return ""
+        return refusal
 
     def _apply_parameters(self, parameters: list[Any]) -> None:
         for parameter in parameters:
@@ -351,6 +370,7 @@ class CubeNode(LifecycleNode):
         try:
             work()
         except CubeError as error:
+            self.is_misconfigured = True
             self.get_logger().error(str(error))
             return TransitionCallbackReturn.FAILURE
         except Exception as error:  # noqa: BLE001  (rclpy would swallow it silently)
@@ -388,8 +408,9 @@ class NodeClock:
 def run(make: Callable[[], Sequence[CubeNode]]) -> None:
     """Run nodes until a signal asks the process to end, and exit.
 
-    The nodes start in their order and end in the reverse order. The exit code is 1 if a node cannot
-    start or reports a `failure` later, else 0.
+    The nodes start in their order and end in the reverse order. The exit code is `EX_CONFIG` (78)
+    if a parameter or a file cannot be used, 1 after another error at the start or after a
+    `failure`, else 0.
 
     Args:
         make: Returns the nodes. It is called after rclpy has started.
@@ -401,16 +422,16 @@ def run(make: Callable[[], Sequence[CubeNode]]) -> None:
     sys.setswitchinterval(THREAD_SWITCH_S)
     try:
         start_ros()
-        is_good = _run_nodes(make(), stopping)
+        code = _run_nodes(make(), stopping)
     except (ParameterException, CubeError) as error:
         print(f"cube_tensor_driver: {error}", file=sys.stderr)
-        is_good = False
+        code = os.EX_CONFIG
     finally:
         rclpy.try_shutdown()
-    raise SystemExit(0 if is_good else 1)
+    raise SystemExit(code)
 
 
-def _run_nodes(nodes: Sequence[CubeNode], stopping: threading.Event) -> bool:
+def _run_nodes(nodes: Sequence[CubeNode], stopping: threading.Event) -> int:
     """Start nodes, spin them until a signal asks the process to end or a node fails, and end them.
 
     Args:
@@ -419,16 +440,15 @@ def _run_nodes(nodes: Sequence[CubeNode], stopping: threading.Event) -> bool:
             failure.
 
     Returns:
-        Whether all nodes could start and none has reported a `failure`.
+        The exit code, see `run`.
     """
     executor = make_executor()
-    is_good = True
+    code = 0
     for node in nodes:
         executor.add_node(node)
-        if not stopping.is_set() and node.value("autostart"):
-            is_good = _start(node)
-            if not is_good:
-                stopping.set()
+        if not stopping.is_set() and node.value("autostart") and not _start(node):
+            code = os.EX_CONFIG if node.is_misconfigured else 1
+            stopping.set()
 
     # The objects that exist now live until the end of the process. Frozen, they are not visited by
     # the garbage collector, which saves 20 ms per collection.
@@ -437,11 +457,11 @@ def _run_nodes(nodes: Sequence[CubeNode], stopping: threading.Event) -> bool:
     gc.set_threshold(*GC_THRESHOLDS)
 
     def check_failures() -> None:
-        nonlocal is_good
+        nonlocal code
         for node in nodes:
             if node.failure is not None:
                 node.get_logger().fatal(f"cannot go on: {node.failure!r}: please report it")
-                is_good = False
+                code = 1
                 stopping.set()
 
     with contextlib.suppress(ExternalShutdownException):
@@ -455,7 +475,7 @@ def _run_nodes(nodes: Sequence[CubeNode], stopping: threading.Event) -> bool:
         node.end()
         executor.remove_node(node)
         node.destroy_node()
-    return is_good
+    return code
 
 
 def _start(node: CubeNode) -> bool:

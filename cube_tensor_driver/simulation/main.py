@@ -36,6 +36,7 @@ def main(arguments: list[str] | None = None) -> int:
     # the simulator properly.
     try:
         simulator = _create_simulator(options)
+        stop.is_needed = simulator.is_started
         try:
             simulator.run(stop)
         finally:

@@ -6,12 +6,13 @@ The hubs are connected to the host by pseudo-terminals or TCP.
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import selectors
 import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -45,6 +46,10 @@ MAX_DELAY_US = 500_000
 """Maximum delay, in µs, of a simulated sample behind the time at which it is due. Beyond it, the
 hub leaves samples out. Otherwise, the delay of a simulator that is too slow would grow without
 limit."""
+
+MAX_WAIT_S = 1.0
+"""Maximum time, in seconds, from SIGINT until the simulator ends. It ends earlier if all drivers
+have asked the hubs to send no more samples (STOP)."""
 
 SECOND_US = 1_000_000
 """Period, in µs, at which a hub sends the HELLO frame (its description) and the STATS frame (its
@@ -184,7 +189,7 @@ class Simulator:
         # SelectSelector is used, because epoll rounds waiting times to milliseconds.
         with selectors.SelectSelector() as selector:
             watched: dict[str, int] = {}
-            selector.register(stop.fd, selectors.EVENT_READ, None)
+            selector.register(stop.fd, selectors.EVENT_READ, partial(os.read, stop.fd, 64))
             selector.register(self._fault_pipe, selectors.EVENT_READ, self._read_faults)
             report_us = SECOND_US
             while not stop.requested:
@@ -192,8 +197,7 @@ class Simulator:
                     self._watch(selector, watched, link)
                 wait_s = max(0.0, (self._due_us(report_us) - self.now_us()) * 1e-6)
                 for key, _ in selector.select(wait_s):
-                    if key.data is not None:
-                        key.data()
+                    key.data()
 
                 now = self.now_us()
                 self._skip_late(now)
@@ -214,6 +218,10 @@ class Simulator:
         for link in self._links:
             if link.line.plugged:
                 link.line.send(link.hub.hello() + link.hub.stats(now_us), now_us)
+
+    def is_started(self) -> bool:
+        """Return whether a driver has asked one of the hubs for samples and not stopped it."""
+        return any(link.hub.started for link in self._links)
 
     def log(self) -> SampleLog:
         """Return the log of all samples and faults so far."""
@@ -359,10 +367,19 @@ class Stop(Protocol):
 
 
 class StopSignal:
-    """A `Stop` that the signals SIGINT and SIGTERM request; it installs the signal handlers."""
+    """A `Stop` that the signals SIGINT and SIGTERM request; it installs the signal handlers.
+
+    Ctrl-C sends SIGINT to the simulator and to the driver at the same time. A driver would report
+    links that end before it has closed them as lost, so after SIGINT the simulator waits for it.
+
+    Attributes:
+        is_needed: Returns whether to go on for up to `MAX_WAIT_S` after SIGINT.
+    """
 
     def __init__(self) -> None:
-        self.requested = False
+        self.is_needed: Callable[[], bool] = bool
+        # Monotonic time, in s, at which the simulator ends, needed or not.
+        self._until_s = math.inf
         self.fd, write = os.pipe()
         os.set_blocking(write, False)  # `set_wakeup_fd` requires it
         # Python writes a byte into the pipe for each signal, which ends a selector's waiting.
@@ -370,8 +387,15 @@ class StopSignal:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._request)
 
-    def _request(self, *_: object) -> None:
-        self.requested = True
+    @property
+    def requested(self) -> bool:
+        if self._until_s == math.inf:
+            return False
+        return not self.is_needed() or time.monotonic() >= self._until_s
+
+    def _request(self, number: int, _: object) -> None:
+        wait_s = MAX_WAIT_S if number == signal.SIGINT else 0.0
+        self._until_s = min(self._until_s, time.monotonic() + wait_s)
 
 
 def _connect(

@@ -242,7 +242,7 @@ def test_rviz_shows_our_topics_as_they_are_offered():
     }
     assert topic_of(displays["MarkerArray"])["Value"] == "markers"
     model = topic_of(displays["RobotModel"])
-    assert model["Value"] == "robot_description" and model["Durability Policy"] == "Transient Local"
+    assert model["Value"] == "skin_description" and model["Durability Policy"] == "Transient Local"
     wrench = displays["Wrench"]
     assert (
         wrench["Topic"]["Value"] == "cubes/c05/wrench"

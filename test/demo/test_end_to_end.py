@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -323,7 +324,7 @@ def test_a_node_that_cannot_start_says_why_and_ends(domain, executable, paramete
         *ros_arguments(parameters),
     ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
-    assert done.returncode == 1
+    assert done.returncode == os.EX_CONFIG
     text = done.stdout + done.stderr
     assert "Traceback" not in text
     for word in words:

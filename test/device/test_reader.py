@@ -421,6 +421,7 @@ def test_silence_is_noticed_and_healed(start: Start, hub: PtyHub) -> None:
         (Result.DONE, 3000, "every 3000 µs, asked for were 2500 µs: set a rate that it can do"),
         (Result.REFUSED, 10_000, "every 10000 µs, asked for were 2500 µs, which it refused"),
         (Result.UNKNOWN, 10_000, "every 10000 µs, asked for were 2500 µs, and it cannot change"),
+        (Result.UNKNOWN, 2500, ""),
     ],
 )
 def test_a_hub_with_another_period_is_asked_once_and_named(
@@ -428,8 +429,10 @@ def test_a_hub_with_another_period_is_asked_once_and_named(
 ) -> None:
     """It may round, and it may refuse: each HELLO says so again, and is not answered."""
     watch = start(LinkConfig("a", hub.port), period_us=2500)
-    hub.greet()
-    hub.send(encode(Ack(Command.SET_PERIOD, result, period_us)))
+    hub.greet(period_us=period_us)
+    # Of a request that is not known the argument is 0 (rule R2), or that of the request.
+    argument = 0 if result == Result.UNKNOWN else period_us
+    hub.send(encode(Ack(Command.SET_PERIOD, result, argument)))
     for _ in range(3):
         hub.hello(period_us=period_us)
     hub.sample(1)

@@ -95,10 +95,11 @@ def points_of(cloud: object) -> np.ndarray:
     [
         (["guess"], "the methods are interpolation, inverse"),
         (["inverse", "depth=4"], "use NAME:=VALUE with one of rate, depth"),
-        (["inverse", "depth:=deep"], "needed is a number from 1e-05 to 1"),
-        (["inverse", "poisson:=0.6"], "needed is a number from 0 to 0.5"),
+        (["inverse", "depth:=deep"], "allowed: 1e-05 to 1"),
+        (["inverse", "poisson:=0.6"], "allowed: 0 to 0.5"),
         (["inverse", "thickness:=0.003"], "between 0 and the thickness"),
         (["inverse", "influence:=none"], "one of the shipped: cube_11mm"),
+        (["inverse", f"influence:={5000 * 'x'}"], "one of the shipped: cube_11mm"),
         (["inverse", "--format", "csv"], "only a bag holds contacts"),
     ],
 )

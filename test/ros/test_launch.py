@@ -205,6 +205,7 @@ def test_the_recording_follows_namespace_and_remaps():
     context.launch_configurations.update(
         {
             "config": str(SKIN),
+            "frame_prefix": "",
             "namespace": "hand",
             "ros_namespace": "/robot1",
             "ros_remaps": [("stress", "touch")],
@@ -280,19 +281,19 @@ def test_the_launch_file_starts_what_the_demo_starts():
 
 
 def arguments_refused(**given: str) -> str:
-    """Why skin.launch.py starts nothing with these arguments."""
+    """Why skin.launch.py starts nothing with these arguments of the command line."""
     from launch import LaunchContext
 
     from cube_tensor_driver.core.errors import ConfigError
     from cube_tensor_driver.ros.launching import check_arguments
 
-    context = LaunchContext()
+    context = LaunchContext(argv=[f"{name}:={text}" for name, text in given.items()])
     for argument in declared("skin.launch.py").values():
         context.launch_configurations[argument.name] = given.get(
             argument.name, argument.default_value[0].text
         )
     with pytest.raises(ConfigError) as refused:
-        check_arguments(context)
+        check_arguments(context, declared("skin.launch.py"))
     return str(refused.value)
 
 
@@ -302,46 +303,104 @@ def test_arguments_that_cannot_work_are_refused_before_anything_starts():
     assert "gone.yaml" in arguments_refused(config="gone.yaml")
     assert "gone.yaml" in arguments_refused(simulate="true", load="gone.yaml")
     assert "rate:=fast" in arguments_refused(simulate="true", rate="fast")
-    assert "port: " in arguments_refused(config=str(SKIN), port="socket://::::")
+    assert "allowed: 0, or 0.1 to 10000" in arguments_refused(simulate="True", rate="-5")
+    assert "allowed: 0 to 1" in arguments_refused(simulate="true", publish_period="5")
+    assert "parameter port: " in arguments_refused(config=str(SKIN), port="socket://::::")
+    assert "has 2 links" in arguments_refused(config=str(SKIN), port="/dev/ttyACM0")
+    assert "a letter first" in arguments_refused(simulate="true", frame_prefix="/left")
+
+
+@needs_launch
+def test_an_argument_that_no_launch_file_has_is_refused(monkeypatch):
+    """Unless another launch file includes this one: then it may be an argument of that one."""
+    monkeypatch.setattr(sys, "argv", ["ros2", "launch", "cube_tensor_driver", "skin.launch.py"])
+    assert "no launch argument drift_time" in arguments_refused(simulate="true", drift_time="9")
+    monkeypatch.setattr(sys, "argv", ["ros2", "launch", "robot.launch.xml"])
+    assert "config is missing" in arguments_refused(drift_time="9")
+
+
+@needs_launch
+@pytest.mark.parametrize(("code", "starts"), [(1, 3), (os.EX_CONFIG, 1)])
+def test_a_node_that_ends_with_a_configuration_error_stays_ended(code, starts):
+    from launch import LaunchDescription, LaunchService
+    from launch.actions import ExecuteProcess
+
+    from cube_tensor_driver.ros.launching import stay_ended
+
+    ended = []
+
+    def on_exit(event, context):
+        ended.append(event.returncode)
+        return stay_ended(event, context)
+
+    node = ExecuteProcess(
+        cmd=[sys.executable, "-c", f"raise SystemExit({code})"],
+        respawn=True,
+        respawn_delay=0.1,
+        respawn_max_retries=2,
+        on_exit=on_exit,
+    )
+    service = LaunchService(noninteractive=True)
+    service.include_launch_description(LaunchDescription([node]))
+    assert service.run() == 0
+    assert ended == [code] * starts
 
 
 ROBOT = """
 <launch>
   <group>
     <push_ros_namespace namespace="robot1"/>
-    <set_parameter name="drift_time" value="33.0"/>
+    <set_parameter name="drift_time" value="33"/>
     <set_parameter name="publish_period" value="0.05"/>
     <set_parameter name="rate" value="50.0"/>
     <set_remap from="stress" to="touch"/>
     <include file="$(find-pkg-share cube_tensor_driver)/launch/skin.launch.py">
-      <arg name="simulate" value="true"/>
+      <arg name="simulate" value="True"/>
+      <arg name="frame_prefix" value="robot1_"/>
+      <arg name="state_publisher" value="true"/>
       <arg name="namespace" value="hand"/>
       <arg name="record" value="true"/>
-      <arg name="rate" value="80.0"/>
+      <arg name="rate" value="80"/>
     </include>
   </group>
 </launch>
 """
 
 
+def make_package(prefix: Path, name: str, command: str) -> Path:
+    """A ROS package in its own install space whose executable is a command of the shell."""
+    index = prefix / "share" / "ament_index" / "resource_index" / "packages"
+    index.mkdir(parents=True)
+    (index / name).touch()
+    program = prefix / "lib" / name / name
+    program.parent.mkdir(parents=True)
+    program.write_text(f"#!/bin/sh\n{command}\n")
+    program.chmod(0o755)
+    return prefix
+
+
 @needs_launch
 @needs_ros2
 def test_a_robot_includes_a_simulated_skin(ros, tmp_path):
     """Its namespace, remaps and parameters reach the nodes and the recorder; an argument of the
-    launch file beats a parameter that was set around it. A driver that dies starts again; one
-    Ctrl-C ends all and leaves a whole bag."""
+    launch file beats a parameter that was set around it. Its frames have the prefix, and its
+    state publisher is none of the robot. A driver that dies starts again; one Ctrl-C ends all
+    without a warning and leaves a whole bag."""
     from rcl_interfaces.srv import GetParameters
 
     from cube_tensor_driver.bags.read import Bag
+    from cube_tensor_driver.bags.source import open_bag
     from cube_tensor_driver.msg import SkinStress
 
+    prefixes = os.environ["AMENT_PREFIX_PATH"]
     (tmp_path / "robot.launch.xml").write_text(ROBOT)
     temporary = tmp_path / "temporary"
     temporary.mkdir()
+    packages = make_package(tmp_path / "packages", "robot_state_publisher", "echo publisher: $*")
     process = subprocess.Popen(
         ["ros2", "launch", str(tmp_path / "robot.launch.xml")],
         cwd=tmp_path,
-        env=os.environ | {"TMPDIR": str(temporary)},
+        env=os.environ | {"TMPDIR": str(temporary), "AMENT_PREFIX_PATH": f"{packages}:{prefixes}"},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -364,6 +423,7 @@ def test_a_robot_includes_a_simulated_skin(ros, tmp_path):
         wait_for("link hub1: hub 0x2 with 8 cubes of 8 pads")
         heard = ros.listen(SkinStress, "/robot1/hand/touch", 100)
         ros.wait(lambda: len(heard) > 20)
+        assert heard[-1].header.frame_id == "robot1_skin_base"
         os.kill(driver, signal.SIGKILL)
         wait_for("link hub1: hub 0x2 with 8 cubes of 8 pads")
         asked = GetParameters.Request(names=["rate", "publish_period", "config"])
@@ -385,9 +445,15 @@ def test_a_robot_includes_a_simulated_skin(ros, tmp_path):
             os.killpg(process.pid, signal.SIGKILL)
     output = "".join(lines) + output
     assert process.returncode == 0, output
-    assert output.count("process has finished cleanly") == 4
+    assert output.count("process has finished cleanly") == 5
     assert "No such file" not in output
+    assert not re.search(r"WARN\]|lost", output.partition("ctrl-c")[2]), output
+    publisher = re.search("publisher: (.*)", output)[1]
+    assert "__node:=skin_state_publisher" in publisher
+    assert "robot_description:=skin_description" in publisher
     (folder,) = tmp_path.glob("robot1_hand_skin_*")
+    with open_bag(folder) as source:
+        assert source.skin.frame(source.skin.cubes[0]) == "robot1_skin_c00"
     with Bag(folder) as bag:
         recorded = {connection.topic for connection in bag.connections}
     assert recorded == {

@@ -26,7 +26,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from played_hub import SINGLE, PlayedHub
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import Trigger
@@ -243,7 +243,7 @@ def test_parameters_live(stage):
     stage.start()
 
     def change(node, name, value):
-        kinds = {float: ("double_value", ParameterType.PARAMETER_DOUBLE), str: ("string_value", 4)}
+        kinds = {float: ("double_value", 3), int: ("integer_value", 2), str: ("string_value", 4)}
         field, number = kinds[type(value)]
         parameter = Parameter(name=name, value=ParameterValue(type=number, **{field: value}))
         answer = stage.call(
@@ -264,7 +264,15 @@ def test_parameters_live(stage):
     ):
         result = change(node, name, value)
         assert not result.successful and words in result.reason, (name, result)
-    assert change("reconstruction", "drift_time", 600.0).successful
+    assert change("reconstruction", "drift_time", 600).successful
+    long = change("driver", "qos_reliability", "x" * 1_000_000)
+    assert not long.successful and len(long.reason) < 2000
+    # A type that does not exist, and a name that is too long for a file.
+    request = SetParameters.Request(
+        parameters=[Parameter(name="rate", value=ParameterValue(type=99))]
+    )
+    for one in stage.call(SetParameters, "/driver/set_parameters", request).results:
+        assert not one.successful and "99" in one.reason
     stage.children.check()
 
 

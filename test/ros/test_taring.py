@@ -20,6 +20,7 @@ from cube_tensor_driver.config.tare import read_tare, write_tare
 from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.msg import CubeInfo, SkinInfo
+from cube_tensor_driver.ros.nodes import taring
 from cube_tensor_driver.ros.nodes.taring import Taring
 from cube_tensor_driver.srv import Tare
 
@@ -56,7 +57,7 @@ def skin(tmp_path):
     not know."""
     write_tare(tmp_path, UID, CALIBRATION, KEPT, datetime.now(timezone.utc))
     node, reconstructor = Node(), Reconstructor(SKIN)
-    taring = Taring(node, SKIN, reconstructor, tmp_path, contextlib.nullcontext(), lambda: None)
+    tares = Taring(node, SKIN, reconstructor, tmp_path, contextlib.nullcontext(), lambda: None)
     for row in range(3 * RATE):
         node.now_ns = row * 1_000_000_000 // RATE
         frequency = 1.002 * CALIBRATION.rest_frequency[None].astype(np.float32)
@@ -64,7 +65,7 @@ def skin(tmp_path):
     return SimpleNamespace(
         services=node.services,
         rest=lambda: reconstructor.rest_frequency[0],
-        learn_uid=lambda: taring.on_info(SkinInfo(name=SKIN.name, cubes=[CubeInfo(uid=UID)])),
+        learn_uid=lambda: tares.on_info(SkinInfo(name=SKIN.name, cubes=[CubeInfo(uid=UID)])),
         on_disk=lambda: read_tare(tmp_path, UID, CALIBRATION),
     )
 
@@ -72,6 +73,20 @@ def skin(tmp_path):
 def test_the_tare_of_a_cube_is_restored_when_its_uid_is_known(skin):
     skin.learn_uid()
     np.testing.assert_allclose(skin.rest(), KEPT)
+
+
+def test_a_tare_writes_one_file_per_cube_and_its_answer_is_short(skin, monkeypatch):
+    """However often the request names the cube, and however long the name of another."""
+    skin.learn_uid()
+    written = []
+    monkeypatch.setattr(taring, "write_tare", lambda *_: written.append(1))
+    request = Tare.Request(duration=1.0, cubes=[SKIN.names[0]] * 5000)
+    answer = skin.services["~/tare"](request, Tare.Response())
+    assert answer.success and answer.message.startswith("1 cubes") and len(written) == 1
+    request = Tare.Request(cubes=["x" * 1_000_000, *map(str, range(5000))])
+    answer = skin.services["~/tare"](request, Tare.Response())
+    assert not answer.success and answer.message.startswith("no cube 'xxx")
+    assert len(answer.message) < 2000
 
 
 def test_a_tare_that_was_cleared_before_the_uid_was_known_does_not_come_back(skin):

@@ -190,8 +190,12 @@ class Session:
         if isinstance(frame, Hello):
             self._handle_hello(frame)
         elif isinstance(frame, Ack) and frame.request == Command.SET_PERIOD:
-            self.actual_us = self._answered_us = frame.argument
-            link.period_problem = _period_problem(self._period_us, frame)
+            # Only HELLO states the sample period of a hub that does not know SET_PERIOD (rule R2).
+            actual_us = frame.argument
+            if frame.result == Result.UNKNOWN and link.hello is not None:
+                actual_us = link.hello.period_us
+            self.actual_us = self._answered_us = actual_us
+            link.period_problem = _period_problem(self._period_us, actual_us, frame.result)
         elif isinstance(frame, Ack) and frame.request == Command.TIME:
             self._knows_time = False
         elif isinstance(frame, Time):
@@ -337,20 +341,19 @@ class Session:
         self.link.write(request)
 
 
-def _period_problem(asked_us: int | None, answer: Ack) -> str:
+def _period_problem(asked_us: int | None, actual_us: int, result: int) -> str:
     """Return a text with the fix if the hub's sample period is not the requested one; else empty.
 
     Args:
         asked_us: Requested sample period, in µs; None if none was requested.
-        answer: Answer of the hub to SET_PERIOD, with the period in force as its argument.
+        actual_us: Sample period in force, in µs.
+        result: Result of the request SET_PERIOD, as the hub's ACK states it.
     """
-    if asked_us is None:
+    if asked_us is None or abs(actual_us - asked_us) <= PERIOD_TOLERANCE * asked_us:
         return ""
-    in_force = f"the hub samples every {answer.argument} µs, asked for were {asked_us} µs"
-    if answer.result == Result.REFUSED:
+    in_force = f"the hub samples every {actual_us} µs, asked for were {asked_us} µs"
+    if result == Result.REFUSED:
         return f"{in_force}, which it refused: set a rate that it can do"
-    if answer.result != Result.DONE:
+    if result != Result.DONE:
         return f"{in_force}, and it cannot change that: leave the rate to it"
-    if abs(answer.argument - asked_us) > PERIOD_TOLERANCE * asked_us:
-        return f"{in_force}: set a rate that it can do"
-    return ""
+    return f"{in_force}: set a rate that it can do"

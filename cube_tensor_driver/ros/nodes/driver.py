@@ -9,7 +9,6 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.qos import QoSProfile
 
 from ...config.parameters import DRIVER
-from ...config.skin import read_skin
 from ...core.pipeline import Pipeline
 from ...core.rows import FrequencyRows
 from ...device.chain import LiveLinks
@@ -62,7 +61,7 @@ class Driver(CubeNode):
         return None if self._links is None else self._links.failure
 
     def configure(self) -> None:
-        skin = self._skin = read_skin(self.config())
+        skin = self._skin = self.read_skin()
         self._pipeline = Pipeline([cube.calibration for cube in skin.cubes])
         rate_hz = self._rate()
         self._frequencies = FrequenciesPublisher(

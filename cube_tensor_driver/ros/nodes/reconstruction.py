@@ -9,7 +9,6 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from ...config.parameters import RECONSTRUCTION
-from ...config.skin import read_skin
 from ...core.errors import BagError, CubeError, MessageError
 from ...core.reconstructor import Reconstructor
 from ...core.rows import FrequencyRows
@@ -67,7 +66,7 @@ class Reconstruction(CubeNode):
 
     def configure(self) -> None:
         self._recorded = self._open_recording()
-        skin = self._skin = self._recorded.skin if self._recorded else read_skin(self.config())
+        skin = self._skin = self._recorded.skin if self._recorded else self.read_skin()
         self._reconstructor = Reconstructor(skin)
         self._reconstructor.drift_time = float(self.value("drift_time"))
         # The driver may put one scan more into a message than the publish period holds. The factor

@@ -23,6 +23,7 @@ from ...core.errors import ConfigError, CubeError, TareError
 from ...core.reconstructor import Reconstructor
 from ...msg import SkinInfo
 from ...srv import Tare
+from ..callbacks import shorten
 from ..node import CubeNode
 
 MAX_DATA_AGE_S = 1.0
@@ -235,7 +236,7 @@ class Taring:
             response.message = self._tare(request.cubes, request.duration)
             response.success = True
         except CubeError as error:
-            response.success, response.message = False, str(error)
+            response.success, response.message = False, shorten(str(error))
         self._node.get_logger().info(f"tare: {response.message}")
         return response
 
@@ -317,7 +318,8 @@ class Taring:
                 f"no cube {', '.join(map(repr, unknown))} in the skin; "
                 f"its cubes: {', '.join(self._skin.names)}"
             )
-        return [index[name] for name in names] if names else list(index.values())
+        # A name that is repeated counts once, as each cube means writing a file.
+        return list({index[name]: None for name in names or index})
 
     def _keep_tares(self, cubes: list[int], rest: Array) -> str:
         """Store the tares of cubes, and return a text for the response that states the result.
