@@ -10,12 +10,13 @@ import itertools
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 import skfem
 
-from cube_tensor_driver.core.arrays import Array, Index
+from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.calibration import Calibration
 from cube_tensor_driver.core.defaults import (
     BETA,
@@ -42,6 +43,9 @@ Progress = Callable[[float, float, str], None]
 
 MAX_MESHES = 3
 """Number of meshes from the coarsest to the finest."""
+NO_FORCE = 1e-12
+"""Largest nodal force of a load, relative to the largest of all loads, that counts as rounding: the
+load has no part of this parity."""
 STIFF_CUBE_RATIO = 1e6
 """Ratio of the Young's moduli of cube and body that stands for a rigid cube, where the cube cannot
 be held because it moves with the body."""
@@ -292,21 +296,10 @@ def linear_response(
     stress = modes.stress[np.ix_(numbers, axes, axes)]
     gradient = modes.gradient[np.ix_(numbers, axes, axes, axes)]
 
-    def forces(parity: Parity) -> Array:
-        columns = []
-        parts = zip(
-            _parity_part(stress, parity),
-            _parity_part(gradient, parity),
-            strict=True,
-        )
-        for stress_part, gradient_part in parts:
-            if stress_part.any() or gradient_part.any():
-                columns.append(solid.linear_forces(stress_part, gradient_part))
-            else:
-                columns.append(np.zeros(solid.basis.N))
-        return np.stack(columns, axis=1)
+    def field(x: Array) -> Array:
+        return stress + np.einsum("mijk,qk->qmij", gradient, x)
 
-    return pad_stresses(solid, layout, forces, report)
+    return pad_stresses(solid, layout, partial(solid.outer_forces, field=field), report)
 
 
 def pad_stresses(
@@ -328,13 +321,11 @@ def pad_stresses(
         load = forces(parity)
         part = np.zeros((layout.n_pads, load.shape[1]))
         # Most loads have no part of this parity and need no solve.
-        used = np.flatnonzero(np.any(load != 0, axis=0))
-        pads = [pad for pad in range(layout.n_pads) if has_stress(layout, pad, parity)]
-        if pads and len(used):
-            reactions = solid.reactions(solid.solve(parity, load[:, used]))
-            for pad in pads:
-                dofs, weights = pad_weights(solid, parity, layout, pad)
-                part[pad, used] = weights @ reactions[dofs]
+        used = np.flatnonzero(np.abs(load).max(axis=0) > NO_FORCE * np.abs(load).max())
+        weights = solid.pad_weights(layout, parity)
+        if len(used) and weights.any():
+            reactions = solid.body @ solid.solve(parity, load[:, used])
+            part[:, used] = weights @ reactions
         stresses = stresses + part
     return np.asarray(stresses)
 
@@ -348,55 +339,3 @@ def each_parity(solid: Solid, report: Callable[[str], None]) -> Iterator[Parity]
     for parity in sorted(solid.parities, key=shared, reverse=True):
         report("parity " + "".join("-0+"[sign + 1] for sign in parity))
         yield parity
-
-
-def _parity_part(field: Array, parity: Parity) -> Array:
-    """Return the components of one parity of tensors (modes, dim, ..., dim).
-
-    A component is odd along an axis if an odd number of its indices is that axis.
-    """
-    signs = np.array(parity)
-    indices = np.indices(field.shape[1:])
-    counts = [np.sum(indices == k, axis=0) for k in range(len(parity))]
-    is_odd = np.stack(counts, axis=-1) % 2 == 1
-    # Along an axis without a mirror every component belongs to the only parity.
-    matches = (is_odd == (signs < 0)) | (signs == 0)
-    return np.asarray(field * np.all(matches, axis=-1))
-
-
-def has_stress(
-    layout: Layout,
-    pad: int,
-    parity: Parity,
-) -> bool:
-    """Return False where a pad's mean stress is zero, because the field is odd about its centre."""
-    axes = list(field_axes(layout))
-    centre = layout.positions[pad, axes]
-    normal = layout.normals[pad, axes]
-    is_off_mirror = (np.abs(centre) > 1e-9) | (normal != 0)
-    return bool(np.all((np.array(parity) >= 0) | is_off_mirror))
-
-
-def pad_weights(
-    solid: Solid,
-    parity: Parity,
-    layout: Layout,
-    pad: int,
-) -> tuple[Index, Array]:
-    """Return the unknowns (m,) and weights (m,) of a pad's mean normal stress.
-
-    It is weights @ reactions[dofs], with the reactions of `Solid.reactions`.
-    """
-    axes = list(field_axes(layout))
-    half = layout.pad_size / 2
-    centre = layout.positions[pad, axes]
-    normal = layout.normals[pad, axes]
-    axis = int(np.argmax(np.abs(normal)))
-    intervals = []
-    for k, position in enumerate(centre):
-        if k != axis:
-            # Rounding may put the edge of a pad beyond that of the face.
-            start = max(position - half, -1.0)
-            stop = min(position + half, 1.0)
-            intervals.append((start, stop))
-    return solid.pad_weights(parity, axis, float(np.sign(normal[axis])), intervals)

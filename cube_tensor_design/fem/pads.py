@@ -18,9 +18,71 @@ of the corner is ours.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from cube_tensor_driver.core.arrays import Array
+from cube_tensor_driver.core.layout import Layout
+
+from .body import field_axes
+
+SAME_COORDINATE = 1e-13
+"""Distance below which two coordinates of nodes are equal, in d0. They are known to rounding, and
+the smallest element has 1e-10."""
+SAME_PLACE = 1e-9
+"""Distance below which a pad's centre counts as on the centre line of its face, in d0."""
+
+
+def pad_weights(
+    positions: Array,
+    order: int,
+    layout: Layout,
+    parity: Sequence[int],
+    rotation: Array | None = None,
+) -> Array:
+    """Return weights (P, dofs) from nodal forces on the cube to the mean normal stress of pads.
+
+    Args:
+        positions: (dim, dofs) position of each unknown, in d0; the components of one node are
+            neighbours among the unknowns. Elements end where pads end.
+        order: Order of the elements.
+        layout: Pads of the cube.
+        parity: Parity of the field along each axis; 0 where there is no mirror.
+        rotation: Rotation (dim, dim) of the cube in the finite strain of the body; None for none.
+    """
+    axes = list(field_axes(layout))
+    dim = len(axes)
+    half = layout.pad_size / 2
+    component = np.arange(positions.shape[1]) % dim
+    weights = np.zeros((layout.n_pads, positions.shape[1]))
+    pads = zip(layout.positions[:, axes], layout.normals[:, axes], strict=True)
+    for pad, (centre, normal) in enumerate(pads):
+        axis = int(np.argmax(np.abs(normal)))
+        others = [k for k in range(dim) if k != axis]
+        # A field that is odd about the pad's centre has no mean.
+        if any(parity[k] < 0 and abs(centre[k]) < SAME_PLACE for k in others):
+            continue
+        # A pad on the other side of a mirror is read on this side.
+        face = normal[axis] if parity[axis] == 0 else 1.0
+        direction = normal if face == normal[axis] else -parity[axis] * normal
+        if rotation is not None:
+            direction = rotation @ direction
+        on_face = np.abs(positions[axis] - face) < SAME_COORDINATE
+        on_face &= np.all(np.abs(positions[others]) < 1.0 + SAME_COORDINATE, axis=0)
+        for along in np.flatnonzero(direction):
+            dofs = np.flatnonzero(on_face & (component == along))
+            product = np.full(len(dofs), direction[along])
+            for k in others:
+                # Rounding may put the edge of a pad beyond that of the face.
+                start = max(centre[k] - half, -1.0)
+                stop = min(centre[k] + half, 1.0)
+                rounded = np.round(positions[k, dofs], 14)
+                nodes, index = np.unique(rounded, return_inverse=True)
+                integral = interval_weights(nodes, order, parity[k], start, stop)
+                product *= integral[index] / (stop - start)
+            weights[pad, dofs] = product
+    return weights
 
 
 def interval_weights(
@@ -33,13 +95,22 @@ def interval_weights(
     """Return the weights w (n,) with w . r = integral of the traction from start to stop.
 
     Args:
-        nodes: (n,) positions on half a face, from its centre 0 to its corner 1. Each element has
-            `order` equal steps.
+        nodes: (n,) positions on half a face, from its centre 0 to its corner 1, or on a whole face
+            from -1 to 1, symmetric about the centre. Each element has `order` equal steps.
         order: Order of the elements.
-        parity: +1 when the traction is even about the centre, -1 when it is odd.
+        parity: +1 when the traction is even about the centre, -1 when it is odd, 0 on a whole face.
         start: Begin of the interval, -1 <= start < stop; the end of an element.
         stop: End of the interval, at most 1; the end of an element.
     """
+    if parity == 0:
+        half = len(nodes) // 2
+        # The forces are split into an even and an odd part about the centre.
+        even, odd = (interval_weights(nodes[half:], order, sign, start, stop) for sign in (1, -1))
+        weights = np.zeros(len(nodes))
+        weights[half:] = (even + odd) / 2
+        weights[half::-1] += (even - odd) / 2
+        weights[half] = even[0] / 2  # the node in the centre belongs to both halves
+        return weights
 
     def from_centre(end: float) -> Array:
         # An interval on the other half is the mirror image of one on this half.
@@ -47,32 +118,6 @@ def interval_weights(
         return sign * _weights_from_centre(nodes, order, parity, abs(end))
 
     return from_centre(stop) - from_centre(start)
-
-
-def face_weights(
-    nodes: Array,
-    order: int,
-    start: float,
-    stop: float,
-) -> Array:
-    """Return the weights as `interval_weights` does, for nodes on a whole face.
-
-    Args:
-        nodes: (n,) positions from corner to corner, -1 to 1, symmetric about the centre.
-        order: Order of the elements.
-        start: Begin of the interval.
-        stop: End of the interval.
-    """
-    half = len(nodes) // 2
-    # The forces are split into an even and an odd part about the centre.
-    upper = nodes[half:]
-    even = interval_weights(upper, order, 1, start, stop)
-    odd = interval_weights(upper, order, -1, start, stop)
-    weights = np.zeros(len(nodes))
-    weights[half:] = (even + odd) / 2
-    weights[half::-1] += (even - odd) / 2
-    weights[half] = even[0] / 2  # the node in the centre belongs to both halves
-    return weights
 
 
 def _weights_from_centre(

@@ -26,7 +26,7 @@ from cube_tensor_driver.mechanics.influence import Influence
 from cube_tensor_driver.mechanics.layer import Layer
 
 from .body import Body, check_pads, make_mesh
-from .fem import each_parity, has_stress, make_solid, pad_weights
+from .fem import each_parity, make_solid
 from .memory import check_memory
 from .solid import Solid
 
@@ -92,11 +92,7 @@ def _surface_influence(
     total = np.zeros((len(mirrors), layout.n_pads, len(nodes), dim))
     for parity in each_parity(solid, report):
         # The weights of the pads are the right-hand sides, all of one parity in one solve.
-        gaps = np.zeros((solid.basis.N, layout.n_pads))
-        for pad in range(layout.n_pads):
-            if has_stress(layout, pad, parity):
-                dofs, weights = pad_weights(solid, parity, layout, pad)
-                gaps[dofs, pad] = weights
+        gaps = solid.pad_weights(layout, parity).T
         displacement = solid.solve(parity, solid.body @ gaps)
         components = [displacement[dofs].T for dofs in surface_dofs]
         on_surface = np.stack(components, axis=-1)

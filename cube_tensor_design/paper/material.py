@@ -1,6 +1,6 @@
 """Elastomer in plane strain or stress, for small and for finite strain.
 
-F (..., 2, 2) is the gradient of the deformation, W the energy per volume of the undeformed body:
+F (2, 2, ...) is the gradient of the deformation, W the energy per volume of the undeformed body:
 
     linear    W = λ/2 (tr e)² + μ e : e            with e = (F + Fᵀ)/2 - 1
     finite    W = μ/2 (F : F - 2 - 2 ln J) + λ/2 (ln J)²   with J = det F > 0
@@ -16,19 +16,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from skfem.helpers import ddot, det, inv, mul, trace, transpose
 
 from cube_tensor_driver.core.arrays import Array
 
-_ONE = np.eye(2)
+_ONE = np.eye(2)[:, :, None, None]
 
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """A linear or a neo-Hookean material.
+    """A linear or a neo-Hookean material; E elements have Q quadrature points each.
 
     Attributes:
-        lam: Lamé's constant λ in Pa, of a shape that broadcasts against F without its last axes.
-        mu: Lamé's constant μ, the same.
+        lam: (E, 1) Lamé's constant λ, in Pa.
+        mu: (E, 1) Lamé's constant μ, in Pa.
         finite: Whether the material is neo-Hookean.
     """
 
@@ -37,76 +38,48 @@ class Material:
     finite: bool
 
     def energy(self, f: Array) -> Array:
-        """Return W (...), in Pa."""
+        """Return W (E, Q), in Pa, where the deformation is F (2, 2, E, Q)."""
         if not self.finite:
             strain = _strain(f)
-            squares = np.sum(strain * strain, axis=(-2, -1))
-            dilation = _trace(strain)
-            volume_part = self.lam / 2 * dilation**2
-            return np.asarray(volume_part + self.mu * squares)
-        log = np.log(np.linalg.det(f))
-        squares = np.sum(f * f, axis=(-2, -1))
-        distortion = self.mu / 2 * (squares - 2 - 2 * log)
+            volume_part = self.lam / 2 * trace(strain) ** 2
+            return np.asarray(volume_part + self.mu * ddot(strain, strain))
+        log = np.log(det(f))
+        distortion = self.mu / 2 * (ddot(f, f) - 2 - 2 * log)
         return np.asarray(distortion + self.lam / 2 * log**2)
 
     def stress(self, f: Array) -> Array:
-        """Return the first Piola-Kirchhoff stress P = dW/dF (..., 2, 2), in Pa.
+        """Return the first Piola-Kirchhoff stress P = dW/dF (2, 2, E, Q), in Pa.
 
         It is the force over the undeformed area.
         """
-        # Two more axes for the components i and j.
-        two_axes = (..., None, None)
-        lam = self.lam[two_axes]
-        mu = self.mu[two_axes]
         if not self.finite:
             strain = _strain(f)
-            dilation = _trace(strain)[two_axes]
-            return lam * dilation * _ONE + 2 * mu * strain
-        inverse = _inverse_transposed(f)
-        log = np.log(np.linalg.det(f))[two_axes]
-        return np.asarray(mu * (f - inverse) + lam * log * inverse)
+            return np.asarray(self.lam * trace(strain) * _ONE + 2 * self.mu * strain)
+        inverse = transpose(inv(f))
+        pressure_part = self.lam * np.log(det(f)) * inverse
+        return np.asarray(self.mu * (f - inverse) + pressure_part)
 
     def cauchy(self, f: Array) -> Array:
-        """Return the true stress P Fᵀ / J (..., 2, 2), in Pa: the force over the deformed area.
+        """Return the true stress P Fᵀ / J (2, 2, E, Q), in Pa: the force over the deformed area.
 
         A linear material does not distinguish it from P.
         """
         p = self.stress(f)
-        if not self.finite:
-            return p
-        transposed = np.swapaxes(f, -2, -1)
-        volume_ratio = np.linalg.det(f)[..., None, None]
-        return np.asarray(p @ transposed / volume_ratio)
+        return np.asarray(mul(p, transpose(f)) / det(f)) if self.finite else p
 
     def moduli(self, f: Array) -> Array:
-        """Return dP_ij/dF_kl (..., 2, 2, 2, 2), in Pa."""
-        four_axes = (..., None, None, None, None)
-        lam = self.lam[four_axes]
-        mu = self.mu[four_axes]
-        identity = np.einsum("ik,jl->ijkl", _ONE, _ONE)
-        if not self.finite:
-            outer = np.einsum("ij,kl->ijkl", _ONE, _ONE)
-            crossed = np.einsum("il,jk->ijkl", _ONE, _ONE)
-            return np.asarray(lam * outer + mu * (identity + crossed))
-        inverse = _inverse_transposed(f)
-        log = np.log(np.linalg.det(f))[four_axes]
+        """Return dP_ij/dF_kl (2, 2, 2, 2, E, Q), in Pa; Q is 1 for a linear material."""
+        inverse, log = _ONE, 0.0
+        if self.finite:
+            inverse, log = transpose(inv(f)), np.log(det(f))
+        identity = np.einsum("ik...,jl...->ijkl...", _ONE, _ONE)
         # With g = F^-T, these are g_ij g_kl and g_il g_kj.
-        outer = np.einsum("...ij,...kl->...ijkl", inverse, inverse)
-        crossed = np.swapaxes(outer, -3, -1)
+        outer = np.einsum("ij...,kl...->ijkl...", inverse, inverse)
+        crossed = np.swapaxes(outer, 1, 3)
         # The derivative of F^-T by F is -crossed.
-        shear_part = mu * identity + (mu - lam * log) * crossed
-        return np.asarray(shear_part + lam * outer)
-
-
-def _inverse_transposed(f: Array) -> Array:
-    inverse = np.linalg.inv(f)
-    return np.swapaxes(inverse, -2, -1)
+        shear_part = self.mu * identity + (self.mu - self.lam * log) * crossed
+        return np.asarray(shear_part + self.lam * outer)
 
 
 def _strain(f: Array) -> Array:
-    transposed = np.swapaxes(f, -2, -1)
-    return (f + transposed) / 2 - _ONE
-
-
-def _trace(e: Array) -> Array:
-    return e[..., 0, 0] + e[..., 1, 1]
+    return np.asarray((f + transpose(f)) / 2 - _ONE)

@@ -19,11 +19,12 @@ import skfem
 from cube_tensor_driver.core.arrays import Array, Index, Mask
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.layout import LAYOUTS, Layout
+from cube_tensor_driver.core.tensor import rotation_from_rpy
 
 from ..fem.body import Body
 from ..fem.memory import check_memory
 from ..fem.mesh import mesh_quarter, mirror_quarter
-from ..fem.pads import face_weights
+from ..fem.pads import pad_weights
 from ..fem.solid import lame
 from .material import Material
 from .newton import Balance, Constraints, factors, find_balance
@@ -230,31 +231,9 @@ class VirtualBench:
             layout: Pads that end where elements of this bench's mesh end.
             angle: Rotation of the cube, in rad.
         """
-        cos = np.cos(angle)
-        sin = np.sin(angle)
-        axes = np.array([[cos, sin], [-sin, cos]])
-        x = self.section.basis.doflocs
-        component = self.section.component
-        half = layout.pad_size / 2
-        weights = np.zeros((layout.n_pads, self.section.basis.N))
-        positions = layout.positions[:, [0, 2]]
-        normals = layout.normals[:, [0, 2]]
-        for pad, (position, normal) in enumerate(zip(positions, normals, strict=True)):
-            axis = 0 if normal[0] else 1
-            other = 1 - axis
-            start = position[other] - half
-            stop = position[other] + half
-            on_face = np.abs(x[axis] - normal[axis]) < SURFACE_TOLERANCE
-            on_face &= np.abs(x[other]) < 1 + SURFACE_TOLERANCE
-            # Once the cube has turned, forces along both axes act along a pad's normal.
-            for along in (0, 1):
-                face = np.flatnonzero(on_face & (component == along))
-                face = face[np.argsort(x[other, face])]
-                integral = face_weights(x[other, face], 2, start, stop)
-                mean = integral / (2 * half)
-                share = axes[axis, along] * normal[axis]
-                weights[pad, face] = share * mean
-        return weights
+        rotation = rotation_from_rpy(0, -angle, 0)[::2, ::2]
+        positions = self.section.basis.doflocs
+        return pad_weights(positions, 2, layout, (0, 0), rotation)
 
     def without_cube(self) -> VirtualBench:
         """Return a linear bench of the same mesh, with elastomer in the cube's place."""
@@ -288,7 +267,7 @@ class VirtualBench:
         """
         section = self.section
         mesh = self.section.mesh
-        field = stress + np.einsum("ijk,epk->epij", gradient, section.points)
+        field = stress[:, :, None, None] + np.einsum("ijk,kep->ijep", gradient, section.points)
         force = section.forces(field)
         # Three unknowns stop the rigid motions; the loads balance, so they bear no force.
         centre = section.node(0.0, 0.0)
@@ -306,7 +285,7 @@ class VirtualBench:
             half_side=self._half_side,
             height=self.body.height,
             displacement=self._half_side * u[nodal_dofs],
-            stress_zz=result[..., 1, 1].mean(axis=1),
+            stress_zz=result[1, 1].mean(axis=1),
         )
 
     def _horizontal_facets(self, z: float) -> skfem.FacetBasis:
@@ -415,14 +394,12 @@ class VirtualBench:
 
     def _state(self, u: Array) -> Array:
         """Fit the seven plane modes to the Cauchy stress within d0/2 of the centre."""
-        points = self.section.points
         section = self.section
-        is_near = np.all(np.abs(points) < 0.5, axis=-1)
-        stress = section.material.cauchy(section.deformation(u))[is_near]
-        x = points[is_near]
-        ones = np.ones(len(x))
-        design = np.column_stack([ones, x])
-        columns = stress[:, [0, 1, 0], [0, 1, 1]]  # xx, zz, zx
+        is_near = np.all(np.abs(section.points) < 0.5, axis=0)
+        stress = section.material.cauchy(section.deformation(u))[:, :, is_near]
+        x = section.points[:, is_near]
+        design = np.vstack([np.ones(x.shape[1]), x]).T
+        columns = stress[[0, 1, 0], [0, 1, 1]].T  # xx, zz, zx
         # Of each component its value, its slope along x and its slope along z.
         fit = np.linalg.lstsq(design, columns, rcond=None)[0]
         xx, zz, zx = fit.T

@@ -14,6 +14,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -229,7 +230,7 @@ def _solve_box(
     # All parities are solved for the modes and for the passages.
     report = count_steps(progress, 2 * len(solid.parities))
     matrix = linear_response(solid, layout, report)
-    pads = pad_stresses(solid, layout, lambda parity: solid.outer_forces(parity, field), report)
+    pads = pad_stresses(solid, layout, partial(solid.outer_forces, field=field), report)
     report("done")
     return matrix, pads
 
