@@ -22,6 +22,9 @@ AMBER = "#e67700"
 RED = "#c92a2a"
 BLUE = "#1864ab"
 
+LEVEL_COLOURS = ("inherit", AMBER, RED, RED)
+"""Colour of the text about a link for each level of its diagnostics: OK, WARN, ERROR and STALE."""
+
 NoteColour = Literal["blue", "green", "red"]
 """Names of the colours that a note to the user can have, as viser calls them."""
 
@@ -63,14 +66,15 @@ class PageStatus:
     """What the page shows besides measured values: links, recording, result of the last action.
 
     Attributes:
-        links: One line of text per link (connection to a hub): its name and state.
+        links: For each link (connection to a hub), one line of text with its name and state, and
+            the level of its diagnostics (0 OK, 1 WARN, 2 ERROR, 3 STALE).
         action: Text about the result of the user's last action, such as a tare.
         title: Title of the note with this text.
         colour: Colour of this note.
         recording: Whether a bag is being recorded.
     """
 
-    links: list[str] = field(default_factory=list)
+    links: list[tuple[str, int]] = field(default_factory=list)
     action: str = ""
     title: str = ""
     colour: NoteColour = "blue"
@@ -303,21 +307,23 @@ def _state(status: int, health: int) -> str:
     return ", ".join(words) or HEALTH_WORDS[health]
 
 
-def conditions(names: list[str], health: AnyArray, links: list[str]) -> str:
+def conditions(names: list[str], health: AnyArray, links: list[tuple[str, int]]) -> str:
     """Return HTML about the health of a skin: links, number of cubes per state, cubes with a fault.
 
     Args:
         names: Names of the N cubes.
         health: (N,) health of the cubes (fine, doubtful, faulty or stale), coded as in
             core/latest_stress.py.
-        links: One line of text per link (connection to a hub).
+        links: Line of text and level of the diagnostics of each link (connection to a hub).
     """
     counts = ", ".join(
         f"{np.count_nonzero(health == state)} {word}" for state, word in enumerate(HEALTH_WORDS)
     )
     with_fault = np.flatnonzero(health)[:MAX_LISTED_CUBES].tolist()
     rows = [(names[cube], HEALTH_WORDS[health[cube]], "") for cube in with_fault]
-    lines = "".join(f"<div>{escape(line)}</div>" for line in [*links, counts])
+    lines = "".join(
+        _div(f"color:{LEVEL_COLOURS[level]}", escape(line)) for line, level in [*links, (counts, 0)]
+    )
     return box(lines + _table(rows))
 
 

@@ -105,7 +105,7 @@ class Viewer:
         self._replay = ReplayClient(self._node, self._services, self._status.say)
         self._contacts = ContactsClient(self._node, self._callback_errors)
         self._recorder = BagRecorder(recordings)
-        self._links: dict[str, str] = {}
+        self._links: dict[str, tuple[str, int]] = {}
         self._actions: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._followed: FollowedSkin | None = None
         self._shown: ShownSkin | None = None
@@ -278,7 +278,7 @@ class Viewer:
             # The driver names the diagnostics of a link (connection to a hub) "NODE: link NAME".
             if ": link " in status.name:
                 name = status.name.rpartition(": ")[2]
-                self._links[status.name] = f"{name}: {status.message}"
+                self._links[status.name] = f"{name}: {status.message}", status.level[0]
 
 
 def _domain() -> str:

@@ -27,7 +27,7 @@ from .scans.row_account import RowAccount, RowCounts
 from .scans.scan import MakeRows, ScanBuilder, empty_rows
 from .scans.sequence import Arrival, SampleAccount
 from .wire.native import NOT_COMPILED, wire
-from .wire.protocol import VERSION, Command, Frame, Hello, Request, Sample, Stats, Time
+from .wire.protocol import VERSION, Ack, Command, Frame, Hello, Request, Sample, Stats, Time
 
 MAX_SCANS = 4
 """Largest number of scans (one sample of every cube) whose rows one callback receives. If the
@@ -36,6 +36,9 @@ process many scans wait; the limit keeps the memory of one callback small."""
 MAX_EVENTS = 100
 """Number of changes of state (open, silent, closed …) of one link that are kept for the next
 `LiveLinks.report`. If there are more, the oldest are discarded."""
+MIN_LAG_S = 0.05
+"""Shortest time, in s, by which reading was behind (data of links waited) at which lost samples are
+put down to this host. The buffers of a serial port hold about that much."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +78,7 @@ class _LinkRecord:
         hub_changes: Number of HELLO frames that reported other cubes than the one before; the first
             HELLO counts, too.
         was_open: Whether the link has ever been open.
+        reported: Counters of the samples at the last report.
     """
 
     account: SampleAccount = field(default_factory=SampleAccount)
@@ -85,6 +89,7 @@ class _LinkRecord:
     logged_version: int | None = None
     hub_changes: int = 0
     was_open: bool = False
+    reported: dict[str, int] = field(default_factory=dict)
 
 
 class LiveLinks:
@@ -217,8 +222,9 @@ class LiveLinks:
         if self._reader is None:
             return []
         links = zip(self._reader.links, self._records, self._loggers, strict=True)
+        lag_s = self._reader.take_lag_s()
         with self._lock:
-            return [self._report(link, record, logger) for link, record, logger in links]
+            return [self._report(link, record, logger, lag_s) for link, record, logger in links]
 
     def receive(self, received: Sequence[LinkFrames]) -> None:
         """Handle frames of the links, and call `on_rows` with the rows of the scans they complete.
@@ -229,7 +235,7 @@ class LiveLinks:
         """
         with self._lock:
             now_ns, step_ns = self._check_host_clock()
-            for link, arrival_ns, frames, asked_ns in received:
+            for link, arrival_ns, frames, asked_ns, is_late in received:
                 if step_ns:
                     # The arrival of bytes that were read just before the host's clock was set is a
                     # time of the old clock, and is moved by the step of the clock.
@@ -244,7 +250,8 @@ class LiveLinks:
                 try:
                     # If the host's clock was set between a question for the hub's time and its
                     # answer, the round trip says nothing about the hub's clock (0: not used).
-                    self._handle_frames(link, arrival_ns, frames, 0 if step_ns else asked_ns)
+                    asked_ns = 0 if step_ns else asked_ns
+                    self._handle_frames(link, arrival_ns, frames, asked_ns, is_late)
                 except Exception as error:  # noqa: BLE001  (other links must still be handled)
                     self._count_error(error)
         self._deliver()
@@ -275,6 +282,7 @@ class LiveLinks:
         arrival_ns: int,
         frames: Sequence[Frame],
         asked_ns: int,
+        is_late: bool,
     ) -> None:
         """Count the frames of a link and add their samples to the scans.
 
@@ -284,6 +292,7 @@ class LiveLinks:
             frames: The frames, in order.
             asked_ns: Host time, in ns, of the question that a TIME frame among them answers; 0 if
                 the answer must not be used.
+            is_late: Whether this host is behind with reading.
         """
         record = self._records[link]
         samples: list[Sample] = []
@@ -291,7 +300,7 @@ class LiveLinks:
             if isinstance(frame, Sample):
                 arrival = record.account.sample(frame)
                 if arrival is Arrival.RESET:
-                    self._add_samples(link, arrival_ns, samples)
+                    self._add_samples(link, arrival_ns, samples, is_late)
                     samples = []
                     record.clock.reset()
                 if arrival is Arrival.DUPLICATE:
@@ -299,6 +308,7 @@ class LiveLinks:
                 else:
                     samples.append(frame)
             elif isinstance(frame, Hello):
+                record.account.announce(frame.n_cubes)
                 self._learn_cubes(link, frame)
             elif isinstance(frame, Time):
                 if asked_ns:
@@ -306,9 +316,17 @@ class LiveLinks:
             elif isinstance(frame, Stats):
                 record.account.stats(frame)
                 record.account_errors = record.account.contradictions()
-        self._add_samples(link, arrival_ns, samples)
+            elif isinstance(frame, Ack) and frame.request == Command.START:
+                record.account.start()
+        self._add_samples(link, arrival_ns, samples, is_late)
 
-    def _add_samples(self, link: int, arrival_ns: int, samples: Sequence[Sample]) -> None:
+    def _add_samples(
+        self,
+        link: int,
+        arrival_ns: int,
+        samples: Sequence[Sample],
+        is_late: bool,
+    ) -> None:
         """Convert the times of samples from the hub's to the host's clock, and add them to scans.
 
         A scan is one sample of every cube.
@@ -317,13 +335,14 @@ class LiveLinks:
             link: Index of the link.
             arrival_ns: Host time at which all of these samples arrived, in ns.
             samples: The samples, in order.
+            is_late: Whether this host is behind with reading.
         """
         if not samples:
             return
         clock = self._records[link].clock
         device_us = [sample.device_us for sample in samples]
         numbers = [sample.sequence for sample in samples]
-        stamps_ns = clock.update(device_us, arrival_ns, numbers)
+        stamps_ns = clock.update(device_us, arrival_ns, numbers, is_late)
         status = STAMP if clock.in_doubt else 0
         self._scans.add(link, samples, stamps_ns, status)
 
@@ -400,15 +419,25 @@ class LiveLinks:
         """
         return self._configs[link].is_simulated and not self._records[link].was_open
 
-    def _report(self, link: Link, record: _LinkRecord, logger: LinkLogger) -> LinkReport:
+    def _report(
+        self,
+        link: Link,
+        record: _LinkRecord,
+        logger: LinkLogger,
+        lag_s: float,
+    ) -> LinkReport:
         """Return the report of one link, and clear its problems and past states.
 
         Args:
             link: The link.
             record: Data that is kept for the link.
             logger: Logger of the link, which counts the lines that it left out.
+            lag_s: Longest time by which reading was behind since the last report, in s.
         """
-        notes = [*record.problems, *record.account_errors]
+        counters = record.account.counters()
+        notes = [*_loss_notes(record.reported, counters, lag_s)]
+        record.reported = counters
+        notes += [*record.problems, *record.account_errors]
         if link.error is not None:
             notes.insert(0, str(link.error))
         if link.period_problem:
@@ -441,7 +470,7 @@ class LiveLinks:
             state=link.state,
             past_states=tuple(past_states),
             notes=tuple(notes),
-            values=_report_values(link, record, logger),
+            values=_report_values(link, record, logger, counters),
         )
 
 
@@ -450,10 +479,38 @@ def _period_us(rate: float | None) -> int | None:
     return None if rate is None else round(1e6 / rate)
 
 
+def _loss_notes(before: dict[str, int], now: dict[str, int], lag_s: float) -> list[str]:
+    """Return a text about the samples lost since the last report; none if none were lost.
+
+    The text names the place of the loss: this host, the hub, or the line between them.
+
+    Args:
+        before: Counters of the samples at the last report; empty at the first.
+        now: The counters now.
+        lag_s: Longest time by which reading was behind since the last report, in s.
+    """
+    taken, lost, dropped = (
+        now[name] - before.get(name, 0) for name in ("taken", "lost_on_the_way", "dropped_in_hub")
+    )
+    if lost + dropped <= 0:
+        if dropped <= 0:
+            return []
+        # STATS (counters of the hub) came after the report of the loss.
+        return [f"{dropped} of the samples lost before were dropped in the hub"]
+    if lag_s > MIN_LAG_S:
+        place = f"the host is too slow: it was {lag_s:.1f} s behind: lower the rate"
+    elif dropped > 0:
+        place = "in the hub, which could not send them: lower the rate or raise baud"
+    else:
+        place = "on the line: check the cable and baud"
+    return [f"{lost + dropped} of {taken} samples lost or dropped since the last report: {place}"]
+
+
 def _report_values(
     link: Link,
     record: _LinkRecord,
     logger: LinkLogger,
+    counters: dict[str, int],
 ) -> dict[str, object]:
     """Return the counters of one link and its hub, and the values of its clock, by name.
 
@@ -468,7 +525,7 @@ def _report_values(
         error_us = round(1e-3 * bound_ns, 1)
     values: dict[str, object] = {
         **link.counters,
-        **record.account.counters(),
+        **counters,
         "clock offset s": round(1e-9 * clock.offset_ns, 6),
         "clock drift ppm": round(clock.drift_ppm, 2),
         "clock jitter us": round(1e-3 * clock.jitter_ns, 1),

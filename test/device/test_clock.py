@@ -322,6 +322,22 @@ SEQUENCES = {
         [N, N, B, R],
         (4, 1 + 6, 0, 0, 2),
     ),
+    "gap of twenty minutes": ([(5, 50), (1_200_006, 1_200_051)], [N, N], (2, 1_200_000, 0, 0, 0)),
+    "repeated a hundred samples late": (
+        [*((number, 10 * number) for number in range(200)), (99, 990), (200, 2000)],
+        [N] * 200 + [D, N],
+        (201, 0, 1, 0, 0),
+    ),
+    "restart from before the first": (
+        [*((number, 10 * number) for number in range(300, 400)), (100, 1000)],
+        [N] * 100 + [R],
+        (101, 100, 0, 0, 1),
+    ),
+    "a number that goes back while time goes on is a restart": (
+        [*((number, 10 * number) for number in range(200)), (99, 2000)],
+        [N] * 200 + [R],
+        (201, 99, 0, 0, 1),
+    ),
     "far ahead is a restart": ([(TOP // 4, 50_000), (TOP // 2, 1)], [N, R], (2, 0, 0, 0, 1)),
 }
 

@@ -146,7 +146,7 @@ class Watch:
         self.batches.append(
             [
                 (link, arrival_ns, frame)
-                for link, arrival_ns, frames, _ in received
+                for link, arrival_ns, frames, *_ in received
                 for frame in frames
             ]
         )
@@ -284,8 +284,8 @@ def test_what_follows_a_loss_is_not_looked_at(hub: PtyHub) -> None:
     lost = LinkError("gone", "lost")
     reads = [(5, [hello, sample]), (6, lost), (7, lost), (8, [sample])]
     read = [LinkRead(0, at, result) for at, result in reads]
-    received, failed = reader._handle_reads(read)
-    assert [(at, frames) for _, at, frames, _ in received] == [(5, [hello, sample])]
+    received, failed = reader._handle_reads(read, False)
+    assert [(at, frames) for _, at, frames, *_ in received] == [(5, [hello, sample])]
     assert failed == {0: lost}
     # Closed after the frames are delivered: a link that delivers is waited for.
     assert link.is_open
@@ -721,7 +721,7 @@ def test_failing_callback_does_not_end_the_reader(start: Start, hub: PtyHub, cap
     seen: queue.Queue[int] = queue.Queue()
 
     def on_frames(received: list[LinkFrames]) -> None:
-        for frame in (frame for _, _, frames, _ in received for frame in frames):
+        for frame in (frame for _, _, frames, *_ in received for frame in frames):
             if isinstance(frame, Sample):
                 seen.put(frame.sequence)
                 raise RuntimeError("bug of the caller")

@@ -16,11 +16,16 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import UInt32
 
+from cube_tensor_driver.browser import markup
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import FrequencyRows
+from cube_tensor_driver.device.chain import LinkReport
+from cube_tensor_driver.device.links.link import LinkState
+from cube_tensor_driver.device.scans.row_account import RowCounts
 from cube_tensor_driver.ros.compat import make_executor, with_number
+from cube_tensor_driver.ros.diagnostics.links import LinkDiagnostics
 from cube_tensor_driver.ros.diagnostics.reconstruction import (
     LostMessages,
     ReconstructionDiagnostics,
@@ -113,3 +118,23 @@ def test_an_inactive_node_says_so_and_blames_no_cube():
     # No rows in the second of the activation are no fault either.
     assert texts(True) == [""]
     assert texts(True, 5) == [""]
+
+
+@pytest.mark.parametrize(
+    ("state", "notes", "level"),
+    [
+        (LinkState.OPEN, (), b"\0"),
+        (LinkState.OPEN, ("5 of 10 samples lost or dropped since the last report",), b"\1"),
+        (LinkState.WAITING, ("5 of 10 samples lost", "no port"), b"\2"),
+        (LinkState.SILENT, (), b"\3"),
+    ],
+)
+def test_losses_of_a_link_are_a_warning_and_coloured_on_the_page(state, notes, level):
+    report = LinkReport("hub0", 7, state, (), notes, {"lost_on_the_way": 5})
+    links = SimpleNamespace(row_counts=RowCounts, report=lambda: [report])
+    rows, link = LinkDiagnostics("skin").statuses(links, with_links=True)
+    assert (rows.level, link.level) == (b"\0", level)
+    assert link.message == "; ".join(notes) or state.value
+    html = markup.conditions(["c"], np.zeros(1, int), [(link.message, link.level[0])])
+    colour = {b"\0": "inherit", b"\1": markup.AMBER}.get(level, markup.RED)
+    assert f"color:{colour}'>{link.message}<" in html

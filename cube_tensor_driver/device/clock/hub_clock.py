@@ -17,6 +17,11 @@ from .steps import SampleTiming, StepDecision
 MAX_DELAY_NS = 60_000_000_000
 """Longest credible delay, in ns, between the sampling of a sample and its arrival. If the estimated
 time of sampling is further before the arrival, the arrival time is the stamp of the sample."""
+MAX_PAUSE_NS = 60_000_000_000
+"""Longest time, in ns by both the host's and the hub's clock, between two reads of a hub's samples
+after which the clock line (host time over device time) is still used. In a longer time the error of
+the drift (up to 100 ppm in the first seconds, so 6 ms per minute) would look like a step of the
+hub's clock, so the line is begun anew and only its drift is kept."""
 RESTART_US = 1_000_000
 """Smallest step back of the device time (the hub's clock), in µs, that is taken for a restart of
 the hub. If the device time of a sample is earlier by less, the sample has only come out of
@@ -70,6 +75,7 @@ class HubClock:
         self.problems: set[str] = set()
         self._line = ClockLine()
         self._timing = SampleTiming()
+        self._is_late = False  # whether the samples of the last update were read late
         self._last_us = -1  # newest device time, in µs, in the last read
         self._moved_ns = 0  # arrival time at which _last_us changed last
         self._n_still = 0  # number of reads since _last_us changed
@@ -173,6 +179,7 @@ class HubClock:
         device_us: Sequence[int],
         arrival_ns: int,
         numbers: Sequence[int] = (),
+        is_late: bool = False,
     ) -> list[int]:
         """Convert the device times of samples that arrived together to host times (stamps).
 
@@ -185,11 +192,14 @@ class HubClock:
             arrival_ns: Host time at which the samples arrived, in ns.
             numbers: Numbers of the samples. Without numbers, a step of the hub's clock is found
                 later, and small steps back are not found.
+            is_late: Whether this host reads the samples late, because it is too slow. Then their
+                delays show no step of a clock.
 
         Returns:
             Stamp (host time) of each sample, in ns.
         """
         self.in_doubt = False
+        self._is_late = is_late
         stamps: list[int] = []
         start = 0
         for k, number in enumerate(numbers):
@@ -276,18 +286,24 @@ class HubClock:
             Whether device times of this hub can be converted now.
         """
         goes_back = arrival_ns < self._last_arrival
+        pause_ns = min(
+            arrival_ns - self._last_arrival,
+            1000 * (newest_us - self._first_us) - self._newest,
+        )
         self._last_arrival = arrival_ns
         if goes_back:
             # The arrival time went back although no step of the host's clock was reported: either
             # the step was missed, or the host time is a simulated time that was restarted.
             self._last_stamp = _NEVER
             self.reset()
+        elif pause_ns > MAX_PAUSE_NS and not self._is_fresh:
+            self._restart()
 
         problem = self._find_problem(newest_us, arrival_ns)
         if problem:
             self.problems.add(problem)
             self._decision = None
-        elif self._decision is not None and not self._n_still:
+        elif self._decision is not None and not self._n_still and not self._is_late:
             self._decide(self._decision, newest_us, arrival_ns)
 
         device_ns = 1000 * (newest_us - self._first_us)
@@ -300,7 +316,7 @@ class HubClock:
         # Until it is decided whether the hub's clock was set, the delay of a sample is unknown, so
         # the line is not fitted to it.
         arrival = arrival_ns - self._first_ns
-        if self._decision is None and self._line.add(device_ns, arrival):
+        if self._decision is None and self._line.add(device_ns, arrival, self._is_late):
             self.problems.add(CLOCK_SET)
             self._count_reset()
         if problem or self._decision is not None:

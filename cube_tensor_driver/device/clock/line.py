@@ -112,6 +112,7 @@ class ClockLine:
         self._bucket_end = BUCKET_NS
         self._bucket_height = self._previous_height = math.inf
         self._earliest = (0.0, 0.0)
+        self._is_earliest_late = False
         self._points: deque[tuple[float, float]] = deque(maxlen=MAX_BUCKETS)
         self._round_trips: deque[ClockRoundTrip] = deque(maxlen=MAX_ROUND_TRIPS)
         self._trip_offset = math.inf
@@ -143,7 +144,7 @@ class ClockLine:
         """
         return arrival_ns - device_ns - self.offset - self.drift * device_ns
 
-    def add(self, device_ns: float, arrival_ns: int) -> bool:
+    def add(self, device_ns: float, arrival_ns: int, is_late: bool = False) -> bool:
         """Add the point (device time, arrival time) of a sample to the clock line.
 
         The line states host time over device time for the smallest delay. A point below the line
@@ -152,6 +153,8 @@ class ClockLine:
         Args:
             device_ns: Device time of the sample, in ns since the first point.
             arrival_ns: Host time at which it arrived, in ns since the first point.
+            is_late: Whether the host has read the sample late, because it is too slow. Then its
+                delay shows nothing about the clocks, but still limits the line from above.
 
         Returns:
             Whether the points show that the hub's or the host's clock was set.
@@ -165,6 +168,7 @@ class ClockLine:
         if height < self._bucket_height:
             self._bucket_height = height
             self._earliest = (device_ns, arrival_ns - device_ns)
+            self._is_earliest_late = is_late
         if arrival_ns >= self._bucket_end:
             was_set = self._fit(arrival_ns) or was_set
         return was_set
@@ -209,7 +213,8 @@ class ClockLine:
         # is known. Such a fall is not added to _fall, because it does not show that a clock was
         # set.
         self._fall -= height if self._points else 0.0
-        was_set = self._fall > MAX_FALL_NS or -height > MAX_RISE_NS
+        is_known = bool(self._points) or not self._is_earliest_late
+        was_set = self._fall > MAX_FALL_NS or (-height > MAX_RISE_NS and is_known)
         if was_set:
             self._fall = 0.0
             self._points.clear()
@@ -225,6 +230,21 @@ class ClockLine:
 
         Args:
             arrival_ns: Host time, in ns since the first point, at which this bucket ends.
+
+        Returns:
+            Whether the last `MIN_BUCKETS_HIGH` buckets show that a clock was set before them.
+        """
+        was_set = False
+        if not self._is_earliest_late:
+            was_set = self._add_point()
+        self._bucket_end = arrival_ns + BUCKET_NS
+        self._fall = 0.0
+        self._previous_height, self._bucket_height = self._bucket_height, math.inf
+        self._intersect_bounds()
+        return was_set
+
+    def _add_point(self) -> bool:
+        """Fit the line to the kept points and the earliest sample of the bucket that ends now.
 
         Returns:
             Whether the last `MIN_BUCKETS_HIGH` buckets show that a clock was set before them.
@@ -245,10 +265,6 @@ class ClockLine:
         # The line must not lie above any point, because no delay is negative. With a limited slope
         # it need not touch two points, so the offset is computed from all of them.
         self.offset = min(delay - self.drift * device_ns for device_ns, delay in points)
-        self._bucket_end = arrival_ns + BUCKET_NS
-        self._fall = 0.0
-        self._previous_height, self._bucket_height = self._bucket_height, math.inf
-        self._intersect_bounds()
         return was_set
 
     def _drift_error(self) -> float:

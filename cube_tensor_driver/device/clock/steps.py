@@ -13,8 +13,6 @@ import math
 import time
 from collections.abc import Callable
 
-from ..scans.sequence import MAX_DISORDER, MAX_GAP
-
 MIN_STEP_US = 4000.0
 """Smallest deviation, in µs, of the device time (hub's clock) of a sample from the time expected
 from its number and the sample period, at which a step of the hub's clock is suspected. Steps of 5
@@ -53,7 +51,6 @@ MAX_READS = 3
 """Number of attempts to read the host's clock and the monotonic clock within `MAX_READ_NS`. If all
 fail, no step of the host's clock is reported; the next comparison finds it."""
 _WRAP = 1 << 32
-_NO_NUMBER = -2  # not -1, because sample number 0 would then seem to follow it
 
 
 class HostClockWatch:
@@ -107,7 +104,8 @@ class SampleTiming:
 
     def restart(self) -> None:
         """Discard the sample period and the last sample, because the hub restarted."""
-        self._number = self._reference = _NO_NUMBER
+        self._number: int | None = None
+        self._reference = 0
         self._reference_us = 0
         self._period_us = 0.0
 
@@ -126,7 +124,13 @@ class SampleTiming:
             Device time minus expected device time, in µs, if the difference is large enough for a
             step of the hub's clock; else 0.
         """
-        if number != self._number + 1 and not self._is_ahead(number, device_us):
+        if self._number is None:
+            self._number = self._reference = number
+            self._reference_us = device_us
+            return 0
+        # A number that is not ahead belongs to a late sample or to a further frame of one sample.
+        advance = (number - self._number) % _WRAP
+        if not 0 < advance < _WRAP // 2:
             return 0
         self._number = number
         # The expected time is counted from a reference: the newest earlier sample whose device time
@@ -154,29 +158,6 @@ class SampleTiming:
         if interval or is_step or period <= 0.0:
             self._reference, self._reference_us = number, device_us
         return round(error) if is_step else 0
-
-    def _is_ahead(self, number: int, device_us: int) -> bool:
-        """Return whether a sample's number is ahead of the newest one, by at most `MAX_GAP`.
-
-        A number that is neither ahead nor that of a late sample comes from a hub that restarted.
-        Then all earlier samples are discarded and this sample becomes the first.
-
-        Args:
-            number: Number of the sample, 32 bits, which wraps to 0.
-            device_us: Device time of the sample, in µs.
-        """
-        advance = (number - self._number + _WRAP // 2) % _WRAP - _WRAP // 2
-        is_known = self._number != _NO_NUMBER
-        if is_known and 0 < advance <= MAX_GAP:
-            return True
-        # A number equal to the newest one (advance 0) belongs to a further frame of that sample,
-        # because a hub with many cubes needs several frames for a sample.
-        is_late = is_known and -MAX_DISORDER <= advance <= 0
-        if not is_late:
-            self.restart()
-            self._number = self._reference = number
-            self._reference_us = device_us
-        return False
 
 
 class StepDecision:

@@ -35,9 +35,6 @@ delivered a sample; `MAX_WAIT_PERIODS` is the limit at high sample rates."""
 WAIT_STEP_S = 2e-4
 """Period, in s, at which the reader checks for data while it waits for the other hubs. Waking up
 for each hub would take more processor time. Arrival times may be late by up to this period."""
-MIN_SELECT_S = 5e-5
-"""Shortest wait for data, in s, after which the reader also waits for the other hubs. If the wait
-was shorter, data had arrived before it, so the thread is behind and must not wait longer."""
 DRAIN_S = 0.05
 """Longest time, in s, that closing the links waits until the STOP requests (send no more samples)
 have left the serial ports."""
@@ -72,12 +69,15 @@ class LinkFrames(NamedTuple):
         frames: The frames, in order.
         asked_ns: Host time, in ns, at which the hub was asked for its time, if the answer (a TIME
             frame) may be among the frames; 0 if no answer is expected.
+        is_late: Whether this host is behind: further bytes of links had come before these were
+            handled.
     """
 
     link: int
     arrival_ns: int
     frames: list[Frame]
     asked_ns: int = 0
+    is_late: bool = False
 
 
 OnFrames = Callable[[list[LinkFrames]], None]
@@ -134,6 +134,7 @@ class Reader:
         self._clock_ns = clock_ns
         self._requests: deque[tuple[int, Request]] = deque()
         self._stopping = False
+        self._lag_s = 0.0
         self._thread: threading.Thread | None = None
         self._wake_lock = threading.Lock()
         self._wake_write = -1
@@ -177,6 +178,14 @@ class Reader:
             )
         self._requests.append((link, request))
         self._wake()
+
+    def take_lag_s(self) -> float:
+        """Return the longest time, in s, by which reading was behind since the last call.
+
+        Reading is behind from the time at which no link had data until it has caught up again.
+        """
+        lag_s, self._lag_s = self._lag_s, 0.0
+        return lag_s
 
     def forget_questions(self) -> None:
         """Ignore the answers to all TIME requests (for the hub's time) that were sent until now.
@@ -235,16 +244,26 @@ class Reader:
             wake_read: File descriptor of the pipe by which other threads wake up this one.
         """
         tick_at = 0.0
+        in_time_at = time.monotonic()
         while not self._stopping:
             now = time.monotonic()
-            ready = self._selector.select(max(0.0, tick_at - now))
+            # Data that are there without waiting came while the last ones were handled.
+            ready = self._selector.select(0)
+            is_late = bool(ready)
+            if not is_late:
+                ready = self._selector.select(max(0.0, tick_at - now))
             awake_at = time.monotonic()
             reads = self._read_ready(ready, wake_read)
-            if reads and awake_at - now > MIN_SELECT_S:
-                while time.monotonic() - awake_at < self._waiting_time(reads):
+            if is_late:
+                self._lag_s = max(self._lag_s, awake_at - in_time_at)
+            else:
+                # A wait ends within a tick, unless this thread or machine stood still.
+                self._lag_s = max(self._lag_s, awake_at - now - TICK_S)
+                in_time_at = awake_at
+                while reads and time.monotonic() - awake_at < self._waiting_time(reads):
                     time.sleep(WAIT_STEP_S)
                     reads += self._read_ready(self._selector.select(0), wake_read)
-            received, failed = self._handle_reads(reads)
+            received, failed = self._handle_reads(reads, is_late)
             if received:
                 self._call(self._on_frames, received)
             # Failed links are closed only after the callback, which marks every link whose frames
@@ -296,11 +315,16 @@ class Reader:
     def _handle_reads(
         self,
         reads: list[LinkRead],
+        is_late: bool,
     ) -> tuple[list[LinkFrames], dict[int, LinkError]]:
         """Pass the frames of several reads to the sessions of their links.
 
         All reads since the last callback are handled together. One by one they would take longer,
         because after each wait Python's code and data have left the caches of the processor.
+
+        Args:
+            reads: Results of reading since the last callback.
+            is_late: Whether this host is behind with reading.
 
         Returns:
             The frames to deliver; and, by index, the links that must be closed with their errors.
@@ -327,7 +351,7 @@ class Reader:
             except LinkError as error:
                 failed[i] = error
             if frames:
-                received.append(LinkFrames(i, arrival_ns, frames, asked_ns))
+                received.append(LinkFrames(i, arrival_ns, frames, asked_ns, is_late))
         return received, failed
 
     def _waiting_time(self, reads: list[LinkRead]) -> float:

@@ -10,17 +10,25 @@ from enum import Enum
 from ..wire.protocol import Sample, Stats
 
 MAX_DISORDER = 64
-"""Number of newest samples of a hub whose sequence numbers are kept, to recognise late and
-duplicate ones. A sample whose number is smaller than that of the newest one by more than this is
-taken for the first one after a restart of the hub."""
+"""Number of newest samples of a hub whose numbers and device times are kept, to recognise late and
+repeated ones. A sample that is older than these and lies in the past of the hub's run (the samples
+since its last restart) is taken for a repeated one."""
 MAX_GAP = 1 << 20
-"""Largest gap in the numbers of successive samples (17 minutes at 1 kHz) that is counted as lost
-samples. A larger gap is taken for a restart of the hub."""
+"""Largest gap in the numbers of successive samples of a hub (17 minutes at 1 kHz) that counts as
+lost samples without a look at the device times. A larger gap counts only if the device time has
+advanced by at least `MIN_PERIOD_US` for each number; otherwise the hub has restarted."""
+MIN_PERIOD_US = 100
+"""Shortest sample period of a hub, in µs: `MAX_RATE` of live.py, the highest rate that can be
+requested, is 10 kHz."""
 RESTART_US = 1_000_000
 """Largest difference of device time (the hub's clock), in µs, between the newest sample of a hub
 and a sample whose number is below that of the first counted one. With a smaller difference the
 sample is only late; with a larger one it is taken for the first sample after a restart of the
 hub."""
+MAX_REPEAT_US = 60_000_000
+"""Longest time, in µs of device time (the hub's clock), by which a repeated sample may be older
+than the newest one. No line holds samples for longer, so an older sample shows that the hub has
+restarted and its device time has begun again near zero."""
 _WRAP = 1 << 32
 
 
@@ -69,12 +77,18 @@ class SequenceCounters:
         """Return the counters by name."""
         return {name: getattr(self, name) for name in self.__slots__}
 
+    def add(self, other: SequenceCounters) -> None:
+        """Add the counters of another part of the samples to these."""
+        for name in self.__slots__:
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+
 
 class SequenceTracker:
     """Classifies samples of one hub as new, late or duplicate by their numbers, and counts them.
 
     Attributes:
         counters: Numbers of delivered, missing and duplicate samples.
+        n_cubes: Number of cubes in the frames of this part of the samples.
     """
 
     # The 32-bit numbers of samples wrap to 0. In the attributes below they are unwrapped, so that
@@ -82,12 +96,15 @@ class SequenceTracker:
 
     def __init__(self) -> None:
         self.counters = SequenceCounters()
+        self.n_cubes = -1
         # Each entry is the number and the device time, in µs, of one of the newest samples.
         self._seen: deque[tuple[int, int]] = deque(maxlen=MAX_DISORDER)
         self._first = 0
+        self._first_us = 0
         self._next = 0
         self._newest_us = 0
         self._set_back = 0  # number of the first sample after the clock was last set back
+        self._started_at = -1  # value of _next when the hub was last started
 
     def update(self, sequence: int, device_us: int) -> Arrival:
         """Classify one sample as new, late, duplicate or first after a restart, and count it.
@@ -108,33 +125,36 @@ class SequenceTracker:
 
         ahead = self._ahead(sequence)
         number = self._next + ahead
-        if 0 <= ahead <= MAX_GAP:
-            self.counters.missing += ahead
-            arrival = Arrival.NEW
-            if device_us < self._newest_us:
-                arrival, self._set_back = Arrival.SET_BACK, number
-                self.counters.resets += 1
-            self._next = number + 1
-            self._newest_us = device_us
-            return self._deliver(number, device_us, arrival)
+        if ahead >= 0:
+            if ahead > MAX_GAP and device_us - self._newest_us < MIN_PERIOD_US * ahead:
+                return self._restart(sequence, device_us)
+            return self._skip(number, device_us)
 
-        if ahead < -MAX_DISORDER or ahead > MAX_GAP:
+        # The number lies behind. A hub that has been started since its newest sample begins anew.
+        if self._started_at == self._next and device_us < self._newest_us:
             return self._restart(sequence, device_us)
-        if (number, device_us) in self._seen:
+        if (number, device_us) in self._seen or self._is_old_repeat(number, device_us):
             self.counters.duplicate += 1
             return Arrival.DUPLICATE
-        if not self._fits_run(number, device_us):
+        if ahead < -MAX_DISORDER or not self._fits_run(number, device_us):
             return self._restart(sequence, device_us)
 
         if number < self._first:
             # This late sample is older than the first one that was counted. It becomes the first,
             # and the samples between the two count as missing.
             self.counters.missing += self._first - number - 1
-            self._first = number
+            self._first, self._first_us = number, device_us
         else:
             self.counters.missing -= 1
         self.counters.out_of_order += 1
         return self._deliver(number, device_us, Arrival.LATE)
+
+    def note_start(self) -> None:
+        """Take a next sample in the past for the first after a restart, not for a repeated one.
+
+        It is called when the hub was started, because after power-up it does not sample before.
+        """
+        self._started_at = self._next
 
     def count_missing(self, taken: int) -> None:
         """Count samples as missing that the hub has taken but that have not arrived.
@@ -161,6 +181,36 @@ class SequenceTracker:
         half = _WRAP // 2
         distance = (sequence - self._next) % _WRAP
         return distance if distance < half else distance - _WRAP
+
+    def _skip(self, number: int, device_us: int) -> Arrival:
+        """Deliver a sample after a gap in the numbers, or whose device time was set back.
+
+        Args:
+            number: Unwrapped number of the sample.
+            device_us: Device time of the sample, in µs.
+        """
+        self.counters.missing += number - self._next
+        arrival = Arrival.NEW
+        if device_us < self._newest_us:
+            arrival, self._set_back = Arrival.SET_BACK, number
+            self.counters.resets += 1
+        self._next = number + 1
+        self._newest_us = device_us
+        return self._deliver(number, device_us, arrival)
+
+    def _is_old_repeat(self, number: int, device_us: int) -> bool:
+        """Return whether a sample older than the kept ones lies in the past of the hub's run.
+
+        The run is all samples since the last restart of the hub, or since the first one received.
+
+        Args:
+            number: Unwrapped number of the sample.
+            device_us: Device time of the sample, in µs.
+        """
+        if not self._first <= number < self._next - MAX_DISORDER:
+            return False
+        age_us = self._newest_us - device_us
+        return self._first_us <= device_us and 0 < age_us <= MAX_REPEAT_US
 
     def _fits_run(self, number: int, device_us: int) -> bool:
         """Return whether a late sample was taken since the last restart of the hub.
@@ -220,6 +270,7 @@ class SequenceTracker:
             arrival: Class of the sample (new or reset), which is returned.
         """
         self._first = self._set_back = sequence
+        self._first_us = device_us
         self._next = sequence + 1
         self._newest_us = device_us
         return self._deliver(sequence, device_us, arrival)
@@ -266,18 +317,36 @@ class SampleAccount:
     def __init__(self) -> None:
         self.received = 0
         self.stats_frame: Stats | None = None
-        # One tracker for each part of a sample, by the index of the first cube in its frame.
+        # One tracker for each part of a sample, by the index of the first cube in its frame; and
+        # the sums of the parts that the hub no longer sends.
         self._trackers: dict[int, SequenceTracker] = {}
+        self._ended = SequenceCounters()
+        self._n_cubes = 1 << 16  # number of cubes in HELLO; indices have 16 bits
         self._dropped = 0
         self._dropped_before = 0
 
     def sample(self, frame: Sample) -> Arrival:
         """Classify one SAMPLE frame by its number (new, late, duplicate …), and count it."""
-        tracker = self._trackers.get(frame.first_cube)
-        if tracker is None:
-            tracker = self._trackers[frame.first_cube] = SequenceTracker()
         self.received += 1
+        tracker = self._trackers.get(frame.first_cube)
+        if tracker is None or tracker.n_cubes != frame.n_cubes:
+            if frame.first_cube >= self._n_cubes:
+                # The hub has no such cubes. Their rows are left out and counted elsewhere.
+                self._ended.delivered += 1
+                return Arrival.NEW
+            tracker = self._begin_part(frame)
         return tracker.update(frame.sequence, frame.device_us)
+
+    def announce(self, n_cubes: int) -> None:
+        """Take over the number of cubes of the hub from HELLO, and end the parts beyond them."""
+        if n_cubes != self._n_cubes:
+            self._n_cubes = n_cubes
+            self._end_parts(n_cubes, 1 << 16)
+
+    def start(self) -> None:
+        """Note that the hub was started: the next sample may be the first after a restart."""
+        for tracker in self._trackers.values():
+            tracker.note_start()
 
     def stats(self, frame: Stats) -> None:
         """Take over how many samples the hub has taken and dropped, from its STATS frame.
@@ -294,6 +363,7 @@ class SampleAccount:
             # The hub has restarted. Its sample counter began again at 0 and must not be compared
             # with the last sample, which may be from before the restart.
             self._dropped_before = 0
+            self.start()
             return
         dropped = (frame.dropped - self._dropped_before) % _WRAP
         self._dropped += dropped * len(self._trackers)
@@ -301,10 +371,26 @@ class SampleAccount:
         for tracker in self._trackers.values():
             tracker.count_missing(frame.taken)
 
+    def _begin_part(self, frame: Sample) -> SequenceTracker:
+        """Return the tracker of a part of the samples that is new or now has other cubes.
+
+        Parts whose cubes are now in this one are ended, so that they do not count as missing.
+        """
+        first = frame.first_cube
+        self._end_parts(first + 1, first + frame.n_cubes)
+        tracker = self._trackers.setdefault(first, SequenceTracker())
+        tracker.n_cubes = frame.n_cubes
+        return tracker
+
+    def _end_parts(self, begin: int, end: int) -> None:
+        """End the parts of samples whose first cube has an index from `begin` to `end` - 1."""
+        for first in [first for first in self._trackers if begin <= first < end]:
+            self._ended.add(self._trackers.pop(first).counters)
+
     @property
     def resets(self) -> int:
         """Number of restarts of the hub plus number of times its clock was set back."""
-        return sum(tracker.counters.resets for tracker in self._trackers.values())
+        return self._total().resets
 
     def counters(self) -> dict[str, int]:
         """Return the numbers of samples by name.
@@ -312,12 +398,7 @@ class SampleAccount:
         Two sums hold: taken = delivered + dropped_in_hub + lost_on_the_way, and received =
         delivered + duplicate.
         """
-        # The list is a copy, because the reader's thread may add a tracker during the loop.
-        parts = [tracker.counters for tracker in list(self._trackers.values())]
-        total = SequenceCounters().as_dict()
-        for part in parts:
-            for name, value in part.as_dict().items():
-                total[name] += value
+        total = self._total().as_dict()
         missing = total.pop("missing")
         # The hub reports the number of samples that it has dropped only in STATS frames. Until then
         # they count as lost on the way; a sample that was lost on the way never counts as dropped.
@@ -328,6 +409,14 @@ class SampleAccount:
             "lost_on_the_way": missing - dropped,
             **total,
         }
+
+    def _total(self) -> SequenceCounters:
+        """Return the sums of the counters of all parts of the samples, also of ended ones."""
+        total = SequenceCounters()
+        total.add(self._ended)
+        for tracker in self._trackers.values():
+            total.add(tracker.counters)
+        return total
 
     def contradictions(self) -> list[str]:
         """Return one text if received differs from delivered + duplicate.

@@ -1,0 +1,229 @@
+"""Whatever is lost shows in the report of its link, and device time decides between a gap, a repeat
+and a restart."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_clock import EPOCH_NS
+
+from cube_tensor_driver.core.status import STAMP
+from cube_tensor_driver.device.chain import LiveLinks
+from cube_tensor_driver.device.clock.hub_clock import HubClock
+from cube_tensor_driver.device.links.link import LinkConfig
+from cube_tensor_driver.device.links.reader import LinkFrames
+from cube_tensor_driver.device.scans.cube_table import CubeAddress
+from cube_tensor_driver.device.scans.sequence import Arrival, SampleAccount
+from cube_tensor_driver.device.wire.protocol import Ack, Command, Hello, Sample, Stats
+
+PERIOD_US = 1000
+
+
+def sample(number: int, device_us: int | None = None, first: int = 0, n_cubes: int = 1) -> Sample:
+    return Sample(
+        number,
+        first,
+        PERIOD_US * number if device_us is None else device_us,
+        np.ones((n_cubes, 2), "<u4"),
+        np.zeros(n_cubes, "<u4"),
+        np.zeros(n_cubes, "<i2"),
+    )
+
+
+def hello(n_cubes: int) -> Hello:
+    return Hello(1, 1, 2, PERIOD_US, np.arange(1, n_cubes + 1, dtype="<u8"))
+
+
+class OneLink:
+    """The chain behind one link, given frames by hand; `report` needs a reader, so it is started
+    on a port that does not exist."""
+
+    def __init__(self, n_cubes: int = 1) -> None:
+        self.rows: list[tuple[int, int]] = []
+        cubes = [CubeAddress(f"c{index}", 0, index, None, 2) for index in range(n_cubes)]
+        self.live = LiveLinks([LinkConfig("a", "/dev/none")], cubes, self._keep)
+        self.live.start()
+        self.lag_s = 0.0  # not that of this machine, which may be busy
+        self.live._reader.take_lag_s = lambda: self.lag_s
+        self.arrival_ns = EPOCH_NS
+        self.give(hello(n_cubes))
+
+    def _keep(self, rows) -> None:
+        self.rows += zip(rows.sequence.tolist(), rows.status.tolist(), strict=True)
+
+    def give(self, *frames, after_us: int = PERIOD_US, is_late: bool = False) -> None:
+        self.arrival_ns += 1000 * after_us
+        self.live.receive([LinkFrames(0, self.arrival_ns, list(frames), 0, is_late)])
+
+    def report(self):
+        (report,) = self.live.report()
+        losses = [note for note in report.notes if "samples lost" in note]
+        return report.values, losses
+
+    def clock_problems(self) -> set[str]:
+        return self.live._records[0].clock.problems
+
+    def close(self) -> None:
+        self.live.close()
+
+
+@pytest.fixture
+def link():
+    made = OneLink()
+    yield made
+    made.close()
+
+
+def test_a_link_that_loses_half_of_its_samples_says_how_many_and_where(link) -> None:
+    """On the line, then in the hub, as its STATS tell; and nothing once it is over."""
+    for number in range(0, 1000, 2):
+        link.give(sample(number), after_us=2 * PERIOD_US)
+    link.give(Stats(1000, 1000, 0))
+    (note,) = link.report()[1]
+    assert note.startswith("500 of 1000 samples lost or dropped since the last report: on the line")
+    for number in range(1000, 1200, 2):
+        link.give(sample(number), after_us=2 * PERIOD_US)
+    link.give(Stats(1200, 1200, 100))
+    values, (note,) = link.report()
+    assert note.startswith("100 of 200 samples lost or dropped since the last report: in the hub")
+    assert (values["taken"], values["lost_on_the_way"], values["dropped_in_hub"]) == (
+        1200,
+        500,
+        100,
+    )
+    for number in range(1200, 1300):
+        link.give(sample(number))
+    link.give(Stats(1300, 1300, 100))
+    assert link.report()[1] == []
+
+
+def test_losses_that_turn_out_to_be_in_the_hub_are_told_when_its_stats_come(link) -> None:
+    link.give(sample(0), sample(10))
+    assert "on the line" in link.report()[1][0]
+    link.give(Stats(11, 11, 9))
+    values, (note,) = link.report()
+    assert note == "9 of the samples lost before were dropped in the hub"
+    assert (values["lost_on_the_way"], values["dropped_in_hub"]) == (0, 9)
+
+
+def test_a_host_that_is_too_slow_is_named(link) -> None:
+    link.give(sample(0), sample(10))
+    link.lag_s = 1.5
+    assert "the host is too slow: it was 1.5 s behind" in link.report()[1][0]
+
+
+def test_a_cable_unplugged_for_twenty_minutes_is_a_gap(link) -> None:
+    """More than 2**20 samples at 1 kHz, with the hub powered. Its crystal is 50 ppm off."""
+    for number in range(3000):
+        link.give(sample(number))
+    gap = 20 * 60 * 1000
+    link.give(sample(3000 + gap), after_us=round(1000 * gap * (1 - 5e-5)))
+    for number in range(3001 + gap, 6000 + gap):
+        link.give(sample(number))
+    assert not link.clock_problems()
+    values, (note,) = link.report()
+    assert (values["lost_on_the_way"], values["resets"], values["clock resets"]) == (gap, 0, 0)
+    assert note.startswith(f"{gap} of {6000 + gap} samples")
+    assert not any(status for _, status in link.rows)
+
+
+def test_samples_repeated_late_are_repeats_and_nothing_else(link) -> None:
+    """64 samples late or later, as a bridge does that sends its buffer again."""
+    repeats = range(100, 4000, 105)
+    for number in range(4000):
+        link.give(sample(number))
+        if number in repeats:
+            link.give(sample(number - 100), after_us=0)
+    values, losses = link.report()
+    assert values["duplicate"] == len(repeats) == live_duplicates(link)
+    assert (values["delivered"], values["resets"], values["clock resets"]) == (4000, 0, 0)
+    assert losses == [] and values["lost_on_the_way"] == 0
+    assert link.rows == [(number, 0) for number in range(4000)]
+
+
+def live_duplicates(link: OneLink) -> int:
+    return link.live.row_counts().duplicate
+
+
+@pytest.mark.parametrize("told_by", [Ack(Command.START), Stats(1, 0, 0)])
+def test_a_restart_that_repeats_numbers_and_times_is_a_restart(told_by) -> None:
+    """Soon after power-up the samples of the next run have the numbers and times of the last one.
+    A hub samples after START only, and its uptime begins again."""
+    account = SampleAccount()
+    account.stats(Stats(5, 0, 0))
+    for number in range(200):
+        account.sample(sample(number))
+    if isinstance(told_by, Stats):
+        account.stats(told_by)
+    else:
+        account.start()
+    arrivals = [account.sample(sample(number)) for number in range(3)]
+    assert arrivals == [Arrival.RESET, Arrival.NEW, Arrival.NEW]
+    assert account.resets == 1 and account.counters()["duplicate"] == 0
+
+
+def test_a_hub_that_announces_fewer_cubes_is_counted_right() -> None:
+    """80 cubes take two frames, 50 take one: nothing is missing where the second was."""
+    link = OneLink(80)
+    try:
+        for number in range(10):
+            link.give(sample(number, first=0, n_cubes=40), sample(number, first=40, n_cubes=40))
+        link.give(Stats(10, 10, 0), hello(50))
+        for number in range(10, 20):
+            link.give(sample(number, n_cubes=50))
+        link.give(Stats(20, 20, 0))
+        values, losses = link.report()
+        assert losses == [] and values["lost_on_the_way"] == values["resets"] == 0
+        assert values["taken"] == values["delivered"] == 2 * 10 + 10
+        for number in range(20, 30):
+            link.give(sample(number, first=0, n_cubes=40), sample(number, first=40, n_cubes=10))
+        link.give(Stats(30, 30, 0), hello(40))
+        link.give(sample(30, n_cubes=40), Stats(31, 31, 0))
+        values, losses = link.report()
+        assert losses == [] and values["taken"] == values["delivered"] == 30 + 2 * 10 + 1
+        assert link.live.row_counts().unaccounted == 0
+    finally:
+        link.close()
+
+
+def test_frames_of_cubes_that_the_hub_does_not_have_are_not_remembered() -> None:
+    account = SampleAccount()
+    account.announce(8)
+    for first in range(20_000):
+        account.sample(sample(0, first=first))
+    account.stats(Stats(10, 1, 0))
+    assert len(account._trackers) == 8
+    counters = account.counters()
+    assert (counters["delivered"], counters["lost_on_the_way"]) == (20_000, 0)
+    assert account.contradictions() == []
+
+
+def test_a_host_that_falls_behind_does_not_blame_the_hubs_clock() -> None:
+    """A backlog of 80 ms from the start on for 4 s, then one that comes and goes."""
+    random = np.random.default_rng(3)
+    number = np.arange(30_000)
+    behind_ms = np.where(number > 4000, np.maximum(0, 80 * np.sin(number / 1200)), 80)
+    late_ms = behind_ms + random.exponential(0.2, len(number))
+    arrival_ns = np.maximum.accumulate(1_000_000 * (number + late_ms))
+    is_late = arrival_ns > 1_000_000 * (number + 2)
+    clock = HubClock()
+    for k, arrived_ns, late in zip(number.tolist(), arrival_ns, is_late.tolist(), strict=True):
+        (stamp_ns,) = clock.update([PERIOD_US * k], EPOCH_NS + int(arrived_ns), [k], late)
+        assert k < 5000 or abs(stamp_ns - EPOCH_NS - 1_000_000 * k) < 500_000
+    assert clock.problems == set() and clock.resets == 0
+
+
+def test_the_doubt_after_a_step_waits_for_reads_in_time(link) -> None:
+    """A hub samples 30 ms late once, while the host falls behind by as much."""
+    number = np.arange(1500)
+    device_us = PERIOD_US * number + np.where(number >= 1000, 30_000, 0)
+    late_us = np.where((number >= 990) & (number < 1300), 30_000, 0)
+    arrival_us = np.maximum.accumulate(device_us + late_us)
+    after_us = np.diff(arrival_us, prepend=0)
+    for k in number.tolist():
+        is_late = bool(arrival_us[k] > device_us[k])
+        link.give(sample(k, int(device_us[k])), after_us=int(after_us[k]), is_late=is_late)
+    values, _ = link.report()
+    assert values["clock resets"] == 0
+    assert {status for number, status in link.rows if number < 1000 or number > 1400} == {0}
+    assert {status for _, status in link.rows} <= {0, STAMP}
