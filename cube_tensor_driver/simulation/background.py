@@ -12,7 +12,6 @@ hubs in the same way as real ones::
 
 from __future__ import annotations
 
-import os
 import threading
 from pathlib import Path
 
@@ -22,7 +21,7 @@ from numpy.typing import ArrayLike
 from ..config.skin import Skin
 from ..core.arrays import Array
 from ..core.errors import ConfigError
-from .simulator import Simulator
+from .simulator import Simulator, StopRequest
 
 
 class BackgroundHubs:
@@ -62,7 +61,7 @@ class BackgroundHubs:
             noise=noise,
             drift=drift,
         )
-        self._stop = _StopRequest()
+        self._stop = StopRequest()
         self._thread = threading.Thread(
             target=self._simulator.run,
             args=(self._stop,),
@@ -130,19 +129,3 @@ class _SetLoad:
 
     def at(self, seconds: float) -> tuple[Array, Array]:
         return self._field
-
-
-class _StopRequest:
-    """A request to end the simulator (`simulator.Stop`) that another thread makes."""
-
-    def __init__(self) -> None:
-        self.requested = False
-        self.fd, self._write = os.pipe()
-
-    def request(self) -> None:
-        self.requested = True
-        os.write(self._write, b"\0")  # wakes the selector of the simulator
-
-    def close(self) -> None:
-        os.close(self.fd)
-        os.close(self._write)

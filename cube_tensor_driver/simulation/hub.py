@@ -26,7 +26,6 @@ from ..device.wire.protocol import (
     encode,
 )
 from .cubes import Millihertz
-from .prepared_frames import PreparedFrame
 from .sample_log import SampleRun
 
 FIRMWARE = 0x00010000
@@ -91,7 +90,6 @@ class SimulatedHub:
     _run: SampleRun | None = None  # the newest run, as it began; `_last` is its last sample
     _last: int = 0
     _expected: tuple[int, int, int] | None = None  # time, period and boot of its next sample
-    _prepared: dict[int, tuple[Millihertz, PreparedFrame]] = field(default_factory=dict)
 
     def hello(self) -> bytes:
         """Return the HELLO frame, the description of the hub and its cubes."""
@@ -138,10 +136,6 @@ class SimulatedHub:
         self.drift_ppm = self.drift_ppm if drift_ppm is None else drift_ppm
         self._drift_since_us = now_us
 
-    def off(self) -> None:
-        """Switch the power off."""
-        self.started = False
-
     def reset(self, now_us: int, sequence: int) -> None:
         """Restart the hub: it stops sampling, and its clock starts again at 0.
 
@@ -149,7 +143,7 @@ class SimulatedHub:
             now_us: Simulated time in µs.
             sequence: Number of the next sample.
         """
-        self.off()
+        self.started = False
         self.boots += 1
         self.boot_us = -now_us
         self._drift_since_us = now_us
@@ -171,16 +165,6 @@ class SimulatedHub:
         requests = [frame for frame in frames if isinstance(frame, Request)]
         return b"".join(self._answer(request, now_us) for request in requests)
 
-    def prepare(self, frequency: Millihertz) -> None:
-        """Encode a SAMPLE frame in advance, except for number, time and checksum.
-
-        Args:
-            frequency: Frequencies (cubes, pads) in mHz. `sample` uses the prepared frame if it is
-                called with the same array object.
-        """
-        sample = self._build_sample(0, 0, frequency)
-        self._prepared[id(frequency)] = frequency, PreparedFrame(sample)
-
     def sample(self, frequency: Millihertz) -> bytes:
         """Take the sample that is due at `next_us`, log it and schedule the next one.
 
@@ -196,43 +180,18 @@ class SimulatedHub:
         self.sequence += 1
         self.next_us += self.period_us
 
-        _, prepared = self._prepared.get(id(frequency), (None, None))
-        # A prepared frame has an unknown temperature and no reported pad faults, and so cannot be
-        # used while a fault sets one of these.
-        is_plain = self.celsius == TEMPERATURE_UNKNOWN and self.pad_fault is None
-        if prepared is not None and is_plain and self.version == VERSION:
-            return prepared.encode(sequence, device_us)
-        sample = self._build_sample(
+        n = len(frequency)
+        pad_fault = np.zeros(n, "<u4") if self.pad_fault is None else self.pad_fault
+        temperature = np.full(n, self.celsius, "<i2")
+        sample = Sample(
             sequence,
+            0,
             device_us,
             frequency,
-            self.celsius,
-            self.pad_fault,
+            pad_fault,
+            temperature,
         )
         return encode(sample, self.version)
-
-    @staticmethod
-    def _build_sample(
-        sequence: int,
-        device_us: int,
-        frequency: Millihertz,
-        celsius: int = TEMPERATURE_UNKNOWN,
-        pad_fault: PadMasks | None = None,
-    ) -> Sample:
-        """Return a sample as the protocol code encodes it.
-
-        Args:
-            sequence: Sequence number of the sample.
-            device_us: Time of the hub's clock in µs.
-            frequency: Frequencies (cubes, pads) in mHz.
-            celsius: Temperature of all cubes in 0.01 °C.
-            pad_fault: Bit masks (cubes,) of the pads reported as failed; None for no pads.
-        """
-        n = len(frequency)
-        if pad_fault is None:
-            pad_fault = np.zeros(n, "<u4")
-        temperature = np.full(n, celsius, "<i2")
-        return Sample(sequence, 0, device_us, frequency, pad_fault, temperature)
 
     @property
     def runs(self) -> list[SampleRun]:

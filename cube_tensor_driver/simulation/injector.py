@@ -188,11 +188,6 @@ class Injector:
         """
         state = self._states[link.name]
         hub = link.hub
-        if not state.pads and state.warming is None and not hub.extra_pads:
-            # The array is returned itself and not copied, because the hub recognises the array for
-            # which it encoded a frame in advance by its identity.
-            return frequency
-
         # The array is copied, because it may be used again for a later sample.
         frequency = frequency.copy()
         if state.warming is not None:
@@ -296,7 +291,7 @@ class Injector:
                 line.burst_until_us = end_us
             case "unplug" | "rename":
                 state.held_back = b""
-                hub.off()  # a hub is powered by its port
+                hub.started = False  # a hub is powered by its port
                 line.unplug()
             case "reset":
                 self._restart(link, now_us, 0)

@@ -8,6 +8,7 @@ which a check compares the samples that arrived.
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from ..core.errors import CubeError
 from .faults import parse_faults
 from .imperfections import read_imperfections
 from .load import AnyLoad, Load, default_script
-from .simulator import Simulator, StopSignal
+from .simulator import Simulator, StopRequest
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -31,12 +32,13 @@ def main(arguments: list[str] | None = None) -> int:
         Exit code: 0, or 1 if an input file cannot be used.
     """
     options = _parser().parse_args(arguments)
-    stop = StopSignal()
+    stop = StopRequest()
     # The signal handlers exist before the files are read, so that a signal in this time also ends
     # the simulator properly.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, stop.request)
     try:
         simulator = _create_simulator(options)
-        stop.is_needed = simulator.is_started
         try:
             simulator.run(stop)
         finally:

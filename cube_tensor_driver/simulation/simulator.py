@@ -12,11 +12,10 @@ import selectors
 import signal
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Protocol
 
 from ..config.skin import Skin
 from ..config.yaml import parse_yaml, write_yaml
@@ -164,7 +163,7 @@ class Simulator:
             link.line.send(link.hub.hello(), 0)
 
     def _prepare(self, load: Fields, instants: int) -> None:
-        """Compute the frequencies and encode the frames of all hubs in advance.
+        """Compute the frequencies of all hubs in advance.
 
         Args:
             load: Stress and gradient at the cubes over time.
@@ -175,13 +174,12 @@ class Simulator:
             for link in self._links:
                 frequency = link.carried.frequency(stress, gradient, 0.0)
                 link.prepared.append(frequency)
-                link.hub.prepare(frequency)
 
     def now_us(self) -> int:
         """Return the simulated time in µs since the creation of the simulator."""
         return (time.monotonic_ns() - self._start_ns) // 1000
 
-    def run(self, stop: Stop) -> None:
+    def run(self, stop: StopRequest) -> None:
         """Simulate the hubs until a stop is requested.
 
         They send HELLO and STATS at 1 Hz, and samples after the host has requested them (START).
@@ -192,7 +190,7 @@ class Simulator:
             selector.register(stop.fd, selectors.EVENT_READ, partial(os.read, stop.fd, 64))
             selector.register(self._fault_pipe, selectors.EVENT_READ, self._read_faults)
             report_us = SECOND_US
-            while not stop.requested:
+            while not stop.is_due(self._is_needed()):
                 for link in self._links:
                     self._watch(selector, watched, link)
                 wait_s = max(0.0, (self._due_us(report_us) - self.now_us()) * 1e-6)
@@ -219,7 +217,7 @@ class Simulator:
             if link.line.plugged:
                 link.line.send(link.hub.hello() + link.hub.stats(now_us), now_us)
 
-    def is_started(self) -> bool:
+    def _is_needed(self) -> bool:
         """Return whether a driver has asked one of the hubs for samples and not stopped it."""
         return any(link.hub.started for link in self._links)
 
@@ -273,13 +271,13 @@ class Simulator:
             if link.computes_load and now_us - link.hub.next_us > MAX_DELAY_US:
                 link.hub.skip(now_us)
 
-    def _take_samples(self, now_us: int, stop: Stop) -> None:
+    def _take_samples(self, now_us: int, stop: StopRequest) -> None:
         """Take all samples that are due at simulated time `now_us`, unless a stop is requested.
 
         The hubs take one sample in turn. So if the simulator is late, all hubs are equally late.
         """
         is_behind = True
-        while is_behind and not stop.requested:
+        while is_behind and not stop.is_due(self._is_needed()):
             is_behind = False
             for link in self._links:
                 if link.hub.started and link.hub.next_us <= now_us:
@@ -354,48 +352,46 @@ class Simulator:
                 print(f"simulator: {error}", file=sys.stderr, flush=True)
 
 
-class Stop(Protocol):
-    """Request to end the simulator."""
-
-    @property
-    def requested(self) -> bool:
-        """Whether to end now."""
-
-    @property
-    def fd(self) -> int:
-        """File descriptor that becomes readable when the stop is requested."""
-
-
-class StopSignal:
-    """A `Stop` that the signals SIGINT and SIGTERM request; it installs the signal handlers.
-
-    Ctrl-C sends SIGINT to the simulator and to the driver at the same time. A driver would report
-    links that end before it has closed them as lost, so after SIGINT the simulator waits for it.
+class StopRequest:
+    """Request to end the simulator, which another thread or a signal makes.
 
     Attributes:
-        is_needed: Returns whether to go on for up to `MAX_WAIT_S` after SIGINT.
+        fd: File descriptor that becomes readable when the stop is requested, which ends the waiting
+            of a selector.
     """
 
     def __init__(self) -> None:
-        self.is_needed: Callable[[], bool] = bool
-        # Monotonic time, in s, at which the simulator ends, needed or not.
+        # Monotonic time, in s, at which the simulator ends at the latest.
         self._until_s = math.inf
-        self.fd, write = os.pipe()
-        os.set_blocking(write, False)  # `set_wakeup_fd` requires it
-        # Python writes a byte into the pipe for each signal, which ends a selector's waiting.
-        signal.set_wakeup_fd(write)
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._request)
+        self.fd, self._write = os.pipe()
 
-    @property
-    def requested(self) -> bool:
-        if self._until_s == math.inf:
-            return False
-        return not self.is_needed() or time.monotonic() >= self._until_s
+    def request(self, number: int = signal.SIGTERM, _: object = None) -> None:
+        """Request the stop; this method is also the handler of SIGINT and SIGTERM.
 
-    def _request(self, number: int, _: object) -> None:
+        Ctrl-C sends SIGINT to the simulator and to the driver at the same time. A driver would
+        report links that end before it has closed them as lost. So after SIGINT, the simulator
+        waits up to `MAX_WAIT_S` for the driver.
+
+        Args:
+            number: Number of the signal.
+        """
         wait_s = MAX_WAIT_S if number == signal.SIGINT else 0.0
         self._until_s = min(self._until_s, time.monotonic() + wait_s)
+        os.write(self._write, b"\0")
+
+    def is_due(self, is_needed: bool) -> bool:
+        """Return whether to end now.
+
+        Args:
+            is_needed: Whether a driver still reads samples of the hubs.
+        """
+        if self._until_s == math.inf:
+            return False
+        return not is_needed or time.monotonic() >= self._until_s
+
+    def close(self) -> None:
+        os.close(self.fd)
+        os.close(self._write)
 
 
 def _connect(

@@ -12,7 +12,6 @@ import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -33,7 +32,7 @@ from cube_tensor_driver.core.layout import Layout
 from cube_tensor_driver.core.modes import to_matrix, to_voigt
 from cube_tensor_driver.core.tensor import rotate_gradient, rotate_stress, rotation_from_rpy
 from cube_tensor_driver.mechanics import contact
-from cube_tensor_driver.simulation.simulator import FIRST_UID, Simulator
+from cube_tensor_driver.simulation.simulator import FIRST_UID, Simulator, StopRequest
 
 TURNS = cube_rotations()
 OTHER_DEPTH = {"depth": 3.5e-3, "distances": [1.3]}
@@ -151,16 +150,17 @@ class Person:
 @contextlib.contextmanager
 def played(folder: Path, calibrations: list[Calibration], person: Person) -> Iterator[None]:
     """A hub with these cubes under the person's finger, on a pseudo-terminal."""
-    stop = SimpleNamespace(requested=False, fd=os.pipe()[0])
+    stop = StopRequest()
     simulator = Simulator(row(calibrations), person, folder / "ports", noise=None)
     thread = threading.Thread(target=simulator.run, args=(stop,))
     thread.start()
     try:
         yield
     finally:
-        stop.requested = True
+        stop.request()
         thread.join()
         simulator.close()
+        stop.close()
 
 
 def row(calibrations: list[Calibration]) -> Skin:
