@@ -12,12 +12,15 @@ record follows only from the length that stands in front of each record.
 
 from __future__ import annotations
 
+import errno
+import fcntl
+import os
 import shutil
 import sqlite3
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -61,6 +64,10 @@ REST_SUFFIX = ".rest"
 storage file."""
 
 
+METADATA_ROOM = 1 << 16
+"""Space, in bytes, that a repair leaves free on the disk for metadata.yaml."""
+
+
 class Repaired(NamedTuple):
     """Result of the repair of a bag.
 
@@ -84,7 +91,8 @@ def repair(path: Path, keep_rest: bool = True) -> Repaired:
             whose name ends in `REST_SUFFIX`.
 
     Raises:
-        BagError: There is no bag, it has no complete message, or it cannot be written.
+        BagError: There is no bag, it has no complete message, it is still being recorded, or it
+            cannot be written.
     """
     if path.is_dir():
         return _repair_folder(path, keep_rest)
@@ -149,6 +157,7 @@ def _repair_file(path: Path, keep_rest: bool) -> tuple[int, int]:
         Number of bytes that were cut off, and number of damaged chunks that were left out.
     """
     with report_damage(path):
+        _check_not_recorded(path)
         if path.suffix == SUFFIXES["mcap"]:
             return _repair_mcap(path, keep_rest)
         # SQLite undoes an unfinished transaction by itself when a database is read that was opened
@@ -173,24 +182,59 @@ def _repair_mcap(path: Path, keep_rest: bool) -> tuple[int, int]:
     """
     size = path.stat().st_size
     is_complete = _has_summary(path)
-    with path.open("r+b") as stream:
-        # An intact summary does not prove that the chunks are intact, so all of them are read.
-        salvaged = _Salvaged(stream)
-        if is_complete and not salvaged.damaged:
-            return 0, 0
-        if keep_rest and not is_complete and size > salvaged.end:
-            # The rest is copied before the file is cut, so that a full disk cannot lose it.
+    # An intact summary does not prove that the chunks are intact, so all of them are read.
+    salvaged = _Salvaged(path)
+    if is_complete and not salvaged.damaged:
+        return 0, 0
+    if keep_rest and not is_complete and size > salvaged.end:
+        # The rest is copied before the file is cut, so that a full disk cannot lose it.
+        rest_path = path.with_name(path.name + REST_SUFFIX)
+        with path.open("rb") as stream, rest_path.open("wb") as rest:
             stream.seek(salvaged.end)
-            rest_path = path.with_name(path.name + REST_SUFFIX)
-            with rest_path.open("wb") as rest:
-                shutil.copyfileobj(stream, rest)
-        if salvaged.index.chunk_indexes:
-            stream.seek(salvaged.end)
-            stream.truncate()
-            _write_summary(stream, path.name, salvaged)
+            shutil.copyfileobj(stream, rest)
+    while salvaged.index.chunk_indexes and (missing := _complete(path, salvaged)):
+        if keep_rest:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        # The last messages are given up to make room for the summary, without which none is read.
+        os.truncate(path, max(len(MCAP_MAGIC), salvaged.end - missing))
+        salvaged = _Salvaged(path)
     if not salvaged.index.chunk_indexes:
         path.unlink()
     return 0 if is_complete else size - salvaged.end, salvaged.damaged
+
+
+def _complete(path: Path, salvaged: _Salvaged) -> int:
+    """Replace everything in a file after its last complete chunk (block of messages) by a summary.
+
+    Returns:
+        0, or the space in bytes that a disk without room must get first.
+    """
+    # Without a buffer, a write that fails leaves nothing behind that would be written later.
+    with path.open("r+b", buffering=0) as stream:
+        stream.truncate(salvaged.end)
+        stream.seek(salvaged.end)
+        summary = _summary_bytes(salvaged, path.name)
+        needed = len(summary) + METADATA_ROOM
+        with suppress(OSError):
+            if stream.write(summary + bytes(METADATA_ROOM)) == needed:
+                needed = 0
+        stream.truncate(salvaged.end + (0 if needed else len(summary)))
+    return needed
+
+
+def _check_not_recorded(path: Path) -> None:
+    """Raise BagError if a process has a file open for writing: its recording would be spoilt."""
+    with path.open("rb") as stream:
+        # The kernel grants a read lease (fcntl(2)) only if nobody has the file open for writing.
+        try:
+            fcntl.fcntl(stream, fcntl.F_SETLEASE, fcntl.F_RDLCK)
+        except BlockingIOError:
+            raise BagError(
+                f"{path}: is being recorded by another process; end that first"
+            ) from None
+        except OSError:
+            return  # this file system, or the owner of the file, does not allow leases
+        fcntl.fcntl(stream, fcntl.F_SETLEASE, fcntl.F_UNLCK)
 
 
 def _has_summary(path: Path) -> bool:
@@ -214,11 +258,8 @@ class _Salvaged:
         damaged: Number of records that were left out because they are damaged.
     """
 
-    def __init__(self, stream: BinaryIO) -> None:
-        """Read all records of a file.
-
-        Args:
-            stream: The MCAP file, open for reading.
+    def __init__(self, path: Path) -> None:
+        """Read all records of an MCAP file.
 
         Raises:
             BagError: The file does not begin with the bytes of an MCAP file.
@@ -228,23 +269,21 @@ class _Salvaged:
         self.end = self.damaged = 0
         self._open_chunk: ChunkIndex | None = None
         self._open_counts: Counter[int] = Counter()
-        stream.seek(0)
-        if stream.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
-            raise BagError(
-                f"{stream.name}: does not begin as an MCAP file does; nothing can be read"
-            )
-        for opcode, start, content in _records(stream):
-            if opcode == Opcode.HEADER:
-                self.end = stream.tell()
-            elif opcode in (Opcode.DATA_END, Opcode.FOOTER):
-                break
-            # A damaged record is left out. The records after it are still used, because their
-            # offsets do not depend on its content.
-            try:
-                self._read_record(opcode, start, content)
-            except READ_ERRORS:
-                self._open_chunk = None
-                self.damaged += 1
+        with path.open("rb") as stream:
+            if stream.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
+                raise BagError(f"{path}: does not begin as an MCAP file does; nothing can be read")
+            for opcode, start, content in _records(stream):
+                if opcode == Opcode.HEADER:
+                    self.end = stream.tell()
+                elif opcode in (Opcode.DATA_END, Opcode.FOOTER):
+                    break
+                # A damaged record is left out. The records after it are still used, because their
+                # offsets do not depend on its content.
+                try:
+                    self._read_record(opcode, start, content)
+                except READ_ERRORS:
+                    self._open_chunk = None
+                    self.damaged += 1
 
     def _read_record(
         self,
@@ -341,17 +380,12 @@ class _Salvaged:
             self.index.channels.setdefault(channel.id, channel)
 
 
-def _write_summary(
-    stream: BinaryIO,
-    name: str,
-    salvaged: _Salvaged,
-) -> None:
-    """Write the records that follow the chunks of a complete MCAP file, up to its end.
+def _summary_bytes(salvaged: _Salvaged, name: str) -> bytes:
+    """Return the records that follow the chunks of a complete MCAP file, up to its end.
 
     Args:
-        stream: The file; writing begins at its current position, after the last complete chunk.
+        salvaged: The complete chunks (blocks of messages) of the file.
         name: Name of the file in the bag's folder.
-        salvaged: The complete chunks of the file.
     """
     index, chunks = salvaged.index, salvaged.index.chunk_indexes
     index.statistics = statistics = Statistics(
@@ -370,10 +404,10 @@ def _write_summary(
     about = rosbag2_metadata(summarise(name, index))
     metadata = Metadata(ROSBAG2_RECORD, about)
     metadata_length = len(_bytes_of([metadata]))
-    metadata_index = MetadataIndex(stream.tell(), metadata_length, ROSBAG2_RECORD)
-    stream.write(_bytes_of([metadata, DataEnd(0)]))
+    metadata_index = MetadataIndex(salvaged.end, metadata_length, ROSBAG2_RECORD)
+    data_end = _bytes_of([metadata, DataEnd(0)])
 
-    summary_start = stream.tell()
+    summary_start = salvaged.end + len(data_end)
     groups: list[tuple[Opcode, Sequence[McapRecord]]] = [
         (Opcode.SCHEMA, list(index.schemas.values())),
         (Opcode.CHANNEL, list(index.channels.values())),
@@ -396,7 +430,7 @@ def _write_summary(
     footer = _bytes_of([Footer(summary_start, offsets_start, 0)])
     footer = footer[:-CHECKSUM_BYTES]
     checksum = struct.pack("<I", crc32(summary + footer))
-    stream.write(summary + footer + checksum + MCAP_MAGIC)
+    return data_end + summary + footer + checksum + MCAP_MAGIC
 
 
 def _records(stream: BinaryIO) -> Iterator[tuple[int, int, bytes]]:

@@ -120,6 +120,10 @@ class RecordingStatus:
         self._console.print(f"{self._path}: {sum(counts.values()) - dropped} messages")
         for topic, count in sorted(counts.items()):
             self._console.print(f"  {count:8} {topic}")
+        for topic, seconds in recorder.late.items():
+            self._console.print(
+                f"{topic} came {seconds:.1f} s later than the other topics", style="yellow"
+            )
         for topic in recorder.missing:
             self._console.print(f"         0 {topic}: nobody offers it", style="yellow")
         if dropped:

@@ -694,6 +694,7 @@ import resource, signal, sys
 from pathlib import Path
 
 from cube_tensor_driver.bags.read import Bag
+from cube_tensor_driver.bags.repair import repair
 from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.core.errors import BagError
 
@@ -708,6 +709,7 @@ try:
             writer.flush()
 except BagError as error:
     print(error)
+    print(repair(Path(sys.argv[2]), keep_rest=False).messages)
     sys.exit(3)
 """
 
@@ -744,16 +746,29 @@ def test_a_killed_writer_leaves_what_was_flushed(tmp_path, storage):
 
 
 def test_disk_full_leaves_what_was_written(bag, tmp_path):
-    """The file system takes 300 kB, then no more."""
+    """The file system takes 300 kB, then no more: the last messages make room for the summary."""
     command = [sys.executable, "-c", FILL_THE_DISK, str(bag), str(tmp_path / "full")]
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
     assert (
         done.returncode == 3 and "File too large" in done.stdout and "with room" in done.stdout
     ), done.stderr
-    kept = repair(tmp_path / "full", keep_rest=False)
-    assert kept.messages > 100
-    with Bag(tmp_path / "full") as read:
-        assert sum(1 for _ in read.entries()) == kept.messages
+    kept = int(done.stdout.split()[-1])
+    assert kept > 80
+    with Bag(tmp_path / "full") as read, Bag(bag) as source:
+        whole = [entry.data for entry in source.entries()]
+        assert [entry.data for entry in read.entries()] == whole[:kept]
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_a_running_recording_is_not_repaired(tmp_path, storage):
+    with BagWriter(tmp_path / "bag", storage) as writer:
+        writer.add_topic("/text", "std_msgs/msg/String")
+        for time in range(10):
+            writer.write("/text", time, b"")
+            writer.flush()
+            with pytest.raises(BagError, match="is being recorded by another process"):
+                repair(tmp_path / "bag")
+    assert repair(tmp_path / "bag").messages == 10
 
 
 def test_unwritable_and_existing_folders_are_refused(tmp_path):

@@ -29,10 +29,11 @@ from conftest import ROOT, decoded
 from cube_tensor_driver.bags.read import Bag
 from cube_tensor_driver.bags.repair import repair
 from cube_tensor_driver.bags.reprocess.job import ReprocessJob, reprocess
+from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.cli.main import main
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.core.errors import BagError
-from cube_tensor_driver.messages.types import FREQUENCIES
+from cube_tensor_driver.messages.types import FREQUENCIES, INFO, STRESS
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, skin_processes
@@ -244,7 +245,7 @@ def test_the_duration_of_a_recording_begins_with_its_first_message(tmp_path, mon
     from cube_tensor_driver.ros.commands import record
 
     now = [100.0]
-    recorder = SimpleNamespace(error=None, counts={"/stress": 0})
+    recorder = SimpleNamespace(error=None, counts={"/stress": 0}, has_begun=True)
     recorder.find_topics = recorder.close = lambda: None
 
     def spin_once(timeout_sec: float) -> None:
@@ -259,6 +260,105 @@ def test_the_duration_of_a_recording_begins_with_its_first_message(tmp_path, mon
     stop, show = threading.Event(), lambda *_: None
     record.fill(bag, None, executor, [], stop=stop, duration=5.0, show=show)
     assert now[0] == pytest.approx(108.0, abs=2 * session.STEP_S)
+
+
+class Publishers:
+    """A node that meets one publisher of each topic, connected when the test says so."""
+
+    def __init__(self) -> None:
+        self.connected: dict[str, bool] = {}
+        self.receive: dict[str, object] = {}
+        self.now_ns = START_NS
+
+    def get_clock(self) -> object:
+        return SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=self.now_ns))
+
+    def get_publishers_info_by_topic(self, topic: str) -> list[object]:
+        if topic not in self.connected:
+            return []
+        kinds = {"/stress": STRESS, "/frequencies": FREQUENCIES, "/info": INFO}
+        profile = LATCHED if topic == "/info" else QoSProfile(depth=10)
+        return [SimpleNamespace(topic_type=kinds[topic], qos_profile=profile)]
+
+    def create_subscription(self, kind, topic, receive, profile, raw) -> object:
+        self.receive[topic] = receive
+        return SimpleNamespace(get_publisher_count=lambda: int(self.connected[topic]))
+
+    def destroy_subscription(self, subscription: object) -> None:
+        pass
+
+
+def recorded(path: Path) -> list[tuple[str, bytes]]:
+    with Bag(path) as bag:
+        return [(entry.topic, entry.data) for entry in bag.entries()]
+
+
+def test_recording_begins_when_all_topics_are_connected(tmp_path, monkeypatch):
+    """Stress without its frequencies could not be computed again."""
+    from cube_tensor_driver.ros.commands import record
+
+    now = [50.0]
+    monkeypatch.setattr(record, "time", SimpleNamespace(monotonic=lambda: now[0]), raising=True)
+    node = Publishers()
+    bag = BagWriter(tmp_path / "bag")
+    recorder = record.Recorder(node, ["/stress", "/frequencies", "/info"], bag)
+    node.connected = {"/stress": True, "/info": True, "/frequencies": False}
+    for step in range(4):
+        recorder.find_topics()
+        now[0] += 0.5
+        assert not recorder.has_begun
+        node.receive["/stress"](b"early %d" % step)
+        if step == 1:
+            node.receive["/info"](b"latched")
+    node.connected["/frequencies"] = True
+    recorder.find_topics()
+    assert recorder.has_begun and recorder.counts == {"/stress": 0, "/frequencies": 0, "/info": 1}
+    node.receive["/frequencies"](b"one")
+    node.receive["/stress"](b"two")
+    assert recorder.received == 3 and not recorder.late
+    recorder.close()
+    assert recorded(tmp_path / "bag") == [
+        ("/info", b"latched"),
+        ("/frequencies", b"one"),
+        ("/stress", b"two"),
+    ]
+
+
+def test_a_topic_that_comes_late_is_named(tmp_path, monkeypatch, capsys):
+    from cube_tensor_driver.cli.record import RecordingStatus
+    from cube_tensor_driver.ros.commands import record
+
+    now = [50.0]
+    monkeypatch.setattr(record, "time", SimpleNamespace(monotonic=lambda: now[0]), raising=True)
+    node = Publishers()
+    recorder = record.Recorder(node, ["/stress", "/frequencies"], BagWriter(tmp_path / "bag"))
+    node.connected = {"/frequencies": True}
+    while not recorder.has_begun:
+        recorder.find_topics()
+        node.receive["/frequencies"](b"early")
+        now[0] += 0.25
+    assert now[0] - 50 == pytest.approx(record.MAX_CONNECT_S, abs=0.5)
+    node.receive["/frequencies"](b"kept")
+    now[0] += 2.0
+    node.connected["/stress"] = True
+    recorder.find_topics()
+    assert recorder.late == {"/stress": pytest.approx(2.25)}
+    recorder.close()
+    assert recorded(tmp_path / "bag") == [("/frequencies", b"early"), ("/frequencies", b"kept")]
+    RecordingStatus(tmp_path / "bag").print_summary(recorder)
+    assert "/stress came 2.2 s later than the other topics" in capsys.readouterr().err
+
+
+def test_a_recording_that_ends_early_keeps_what_came(tmp_path):
+    from cube_tensor_driver.ros.commands import record
+
+    node = Publishers()
+    recorder = record.Recorder(node, ["/stress", "/frequencies"], BagWriter(tmp_path / "bag"))
+    node.connected = {"/stress": True}
+    recorder.find_topics()
+    node.receive["/stress"](b"early")
+    recorder.close()
+    assert recorded(tmp_path / "bag") == [("/stress", b"early")]
 
 
 def test_record_says_what_is_wrong(domain, tmp_path):

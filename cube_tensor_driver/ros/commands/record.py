@@ -8,7 +8,7 @@ from __future__ import annotations
 import shutil
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -51,16 +51,27 @@ dropped and counted."""
 FIND_PERIOD_S = 0.2
 """Time, in seconds, between two searches for publishers of the topics to record."""
 
+MAX_CONNECT_S = 3.0
+"""Longest time, in seconds, from the connection to the first publisher until messages are kept.
+
+Recording begins as soon as every topic is connected to a publisher, so that the stress of all
+recorded frequencies is recorded, too. Topics without a publisher are not waited for any longer.
+"""
+
 SHOW_PERIOD_S = 1.0
 """Time, in seconds, between two calls of the function `show`, which reports the progress."""
 
 
 class Recorder:
-    """Records topics into a bag, from its construction until `close`.
+    """Records topics into a bag, until `close`.
 
     The caller calls `find_topics` regularly, which subscribes to topics that are published by now.
+    Messages are kept from the time on at which all topics are connected (see `MAX_CONNECT_S`),
+    those of latched topics from their connection on.
 
     Attributes:
+        has_begun: Whether messages are kept by now.
+        late: Topic that was connected after that time -> how much later, in seconds.
         received: Number of messages that have arrived.
         dropped: Number of messages that were not recorded, because the disk is too slow or writing
             has failed.
@@ -82,6 +93,8 @@ class Recorder:
             topics: Full names of the topics.
             bag: The bag, which is empty.
         """
+        self.has_begun = False
+        self.late: dict[str, float] = {}
         self.received = self.dropped = 0
         self.counts: dict[str, int] = {}
         self.refused: dict[str, str] = {}
@@ -89,6 +102,9 @@ class Recorder:
         self._node, self._bag = node, bag
         self._wanted = list(topics)
         self._subscriptions: list[Any] = []
+        self._unconnected: dict[str, Any] = {}
+        self._latched: set[str] = set()
+        self._connected_s = self._begin_s = 0.0
         self._waiting: deque[tuple[str, int, bytes]] = deque()
         # The receiving thread changes only the first of these counts and the writing thread only
         # the second, so they need no lock.
@@ -113,6 +129,33 @@ class Recorder:
                     self._subscribe(topic, offers)
                 except BagError as error:
                     self.refused[topic] = str(error)
+        now = time.monotonic()
+        for topic, subscription in list(self._unconnected.items()):
+            if subscription.get_publisher_count():
+                del self._unconnected[topic]
+                self._connected_s = self._connected_s or now
+                if self.has_begun:
+                    self.late[topic] = now - self._begin_s
+        is_complete = not (self.missing or self._unconnected)
+        has_waited = self._connected_s and now - self._connected_s > MAX_CONNECT_S
+        if not self.has_begun and (is_complete or has_waited):
+            self._begin(now)
+
+    def _begin(self, now: float) -> None:
+        """Drop what came before all topics were connected, and write from now on.
+
+        Args:
+            now: Time of the monotonic clock, in seconds.
+        """
+        early = Counter(topic for topic, _, _ in self._waiting if topic not in self._latched)
+        with self._lock:
+            kept = [one for one in self._waiting if one[0] in self._latched]
+            self._received_bytes = sum(len(data) for _, _, data in kept)
+            self._waiting = deque(kept)
+            self.has_begun, self._begin_s = True, now
+        for topic, count in early.items():
+            self.counts[topic] -= count
+        self.received -= early.total()
 
     def close(self) -> None:
         """Write the messages that wait, and close the bag.
@@ -140,6 +183,8 @@ class Recorder:
             self._bag.add_topic(topic, type_name, [recorded_profile])
         clock = self._node.get_clock()
         self.counts[topic] = 0
+        if profile.durability == DurabilityPolicy.TRANSIENT_LOCAL:
+            self._latched.add(topic)
 
         def receive(data: bytes) -> None:
             self.received += 1
@@ -153,15 +198,15 @@ class Recorder:
             self._waiting.append((topic, clock.now().nanoseconds, data))
 
         kind = message_class(topic, type_name)
-        self._subscriptions.append(
-            self._node.create_subscription(
-                kind,
-                topic,
-                receive,
-                profile,
-                raw=True,
-            )
+        subscription = self._node.create_subscription(
+            kind,
+            topic,
+            receive,
+            profile,
+            raw=True,
         )
+        self._subscriptions.append(subscription)
+        self._unconnected[topic] = subscription
 
     def _write(self) -> None:
         try:
@@ -170,7 +215,9 @@ class Recorder:
             while not is_last:
                 is_last = self._closing.wait(WRITE_PERIOD_S)
                 with self._lock:
-                    self._write_waiting()
+                    # Without a beginning, all that has come is better than nothing.
+                    if self.has_begun or is_last:
+                        self._write_waiting()
                     if time.monotonic() - flushed >= FLUSH_PERIOD_S:
                         self._bag.flush()
                         flushed = time.monotonic()
@@ -259,7 +306,7 @@ def fill(
     def is_done() -> bool:
         nonlocal has_come, until
         now = time.monotonic()
-        if not has_come and any(recorder.counts.values()):
+        if not has_come and recorder.has_begun and any(recorder.counts.values()):
             # The duration counts from the first message on, because finding the topics may take
             # seconds on a busy machine.
             has_come, until = True, until + now - begin
