@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cube_tensor_design.figures.experiments import draw_prototype
 from cube_tensor_design.figures.field import (
@@ -42,6 +43,7 @@ from cube_tensor_driver.processes.skin_processes import (
     skin_processes,
 )
 from cube_tensor_driver.simulation.mujoco.scene import MujocoLoad, scene_skin
+from cube_tensor_driver.simulation.mujoco.source import load_mujoco
 from cube_tensor_driver.views.figures.style import save
 
 from ..bench.skin import Bench, bench_scale
@@ -72,6 +74,8 @@ ERROR_LEVELS = (0.1, 0.2, 0.3, 0.5)
 """Relative errors of the pressure for which field.json tells how many cubes gradients save."""
 SHAKEN_S = 2.62
 """Time at which the acceleration of the gripper's box is largest, in s."""
+CAMERA_TARGET = (0.0, 0.0, 0.1)
+"""Position, in m in the world of the gripper's scene, at the centre of its picture."""
 PHOTOGRAPH_S = 120.0
 """Longest time for the browser to make its picture, in s."""
 COUNTS = [1, 4, 16, 64, 256, 1024, 4096]
@@ -150,14 +154,38 @@ def _draw_gripper(path: Path) -> None:
     scene = package_data() / "config" / "mujoco" / "gripper.xml"
     skin = read_skin(scene_skin(scene))
     load = MujocoLoad(scene, skin, noise=None)
-    load.play(SHAKEN_S)
-    pixels = load.picture(760, 900, lookat=np.array([0.0, 0.0, 0.1]), distance=0.25, azimuth=150.0)
+    load.at(SHAKEN_S)  # computes the scene up to this time
+    pixels = _render(load)
     links = np.array([cube.link for cube in skin.cubes])
     fingers = {name: np.flatnonzero(links == name) for name in ("left", "right")}
     save(
         draw_fingers(pixels, load.poses, load.touch.read(), fingers, load.depth),
         path,
     )
+
+
+def _render(load: MujocoLoad) -> NDArray[np.uint8]:
+    """Render the scene of a load as it is now; return its pixels (height, width, 3).
+
+    Raises:
+        ConfigError: OpenGL cannot draw here.
+    """
+    mujoco = load_mujoco()
+    camera = mujoco.MjvCamera()
+    camera.lookat[:] = CAMERA_TARGET
+    camera.distance = 0.25  # m
+    camera.azimuth = 150.0  # degrees
+    camera.elevation = -12.0  # degrees; a negative value means that it looks down
+    try:
+        with mujoco.Renderer(load.touch.model, 760, 900) as renderer:
+            renderer.update_scene(load.touch.data, camera)
+            pixels: NDArray[np.uint8] = renderer.render()
+    except (ImportError, AttributeError, RuntimeError, OSError, mujoco.FatalError) as error:
+        raise ConfigError(
+            f"MuJoCo cannot draw without a display ({error}): apt-get install libegl1 "
+            "libegl-mesa0, and set MUJOCO_GL=egl"
+        ) from None
+    return pixels
 
 
 @contextmanager

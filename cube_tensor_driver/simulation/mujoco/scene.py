@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...config.skin import Skin
 from ...core.arrays import Array
@@ -31,10 +30,6 @@ of a skin need the contacts at slightly different times, and a scene is only com
 
 UNBOUNDED_PERIOD_S = 10.0
 """Value, in s, of the attribute `period` of a scene that never repeats."""
-
-CAMERA_ELEVATION = -12.0
-"""Elevation of the camera's viewing direction in degrees; a negative value means that it looks
-down."""
 
 
 def read_scene(path: Path) -> MjModel:
@@ -136,53 +131,6 @@ class MujocoLoad:
     def total(self, seconds: float) -> tuple[Array, Array, Array]:
         """Return force, centre and normal of all contacts at a time in s, as `AnyLoad.total`."""
         return total([touch.press for touch in self._touches_at(seconds)])
-
-    def play(self, seconds: float) -> None:
-        """Compute the scene from its start, so that `touch.data` is its state at a time in s."""
-        self._restart()
-        while self._step < self._step_number(seconds):
-            self._advance()
-
-    def picture(
-        self,
-        width: int,
-        height: int,
-        *,
-        lookat: Array,
-        distance: float,
-        azimuth: float,
-    ) -> NDArray[np.uint8]:
-        """Render the scene as it is now, without a display.
-
-        Args:
-            width: Width in pixels.
-            height: Height in pixels.
-            lookat: Position (3,) in m at the centre of the picture.
-            distance: Distance of the camera from it, in m.
-            azimuth: Direction of the camera in degrees.
-
-        Returns:
-            Pixels (height, width, 3).
-
-        Raises:
-            ConfigError: OpenGL cannot draw here.
-        """
-        mujoco = self._mujoco
-        camera = mujoco.MjvCamera()
-        camera.lookat[:] = lookat
-        camera.distance = distance
-        camera.azimuth = azimuth
-        camera.elevation = CAMERA_ELEVATION
-        try:
-            with mujoco.Renderer(self.touch.model, height, width) as renderer:
-                renderer.update_scene(self.touch.data, camera)
-                pixels: NDArray[np.uint8] = renderer.render()
-        except (ImportError, AttributeError, RuntimeError, OSError, mujoco.FatalError) as error:
-            raise ConfigError(
-                f"MuJoCo cannot draw without a display ({error}): apt-get install libegl1 "
-                "libegl-mesa0, and set MUJOCO_GL=egl"
-            ) from None
-        return pixels
 
     def _touches_at(self, seconds: float) -> list[Touch]:
         """Return the contacts at a time in s; the scene is computed up to it if necessary."""
