@@ -152,14 +152,30 @@ def true_components(
     Returns:
         `COMPONENTS` (N, 15), stresses in Pa and gradients in Pa/m.
     """
-    # The contact model has its origin on the surface.
-    depth = np.full(len(points), -SURFACE_DEPTH)
-    below = np.column_stack([points[:, :2], depth])
     order = contact.hertz_order(width / 2, SURFACE_DEPTH)
-    sources, forces = contact.hertz(width / 2, force, centre, order)
-    stress, gradient = contact.field(below, sources, forces, POISSONS_RATIO)
-    slopes = gradient[:, :3].reshape(len(points), 9)
-    return np.concatenate([stress, slopes], axis=1)
+    load = contact.hertz(width / 2, force, centre, order)
+    # Of the gradients, those of the normal stresses come first.
+    return field_below(points, SURFACE_DEPTH, load, POISSONS_RATIO)[:, : len(COMPONENTS)]
+
+
+def field_below(
+    points: Array,
+    depth: float,
+    load: tuple[Array, Array],
+    poisson: float,
+) -> Array:
+    """Return stress and gradient (N, 6 + 18), in Pa and Pa/m, in a half space.
+
+    Args:
+        points: (N, 2 or more) positions along x and y, in m.
+        depth: Depth of the points below the surface, in m.
+        load: Positions (S, 3) in m and forces (S, 3) in N of point forces on the surface.
+        poisson: Poisson's ratio.
+    """
+    # The contact model has its origin on the surface.
+    below = np.column_stack([points[:, :2], np.full(len(points), -depth)])
+    stress, gradient = contact.field(below, *load, poisson)
+    return np.concatenate([stress, gradient.reshape(len(points), 18)], axis=1)
 
 
 def field_example(pitch: float = 0.010, width: float = 0.012) -> FieldExample:

@@ -16,8 +16,11 @@ from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.calibration import Calibration
 from cube_tensor_driver.core.defaults import POISSONS_RATIO, SURFACE_DEPTH
 from cube_tensor_driver.core.estimator import make_estimator
-from cube_tensor_driver.core.modes import COMPONENTS, STRESS
+from cube_tensor_driver.core.modes import COMPONENTS
 from cube_tensor_driver.mechanics import contact
+from cube_tensor_driver.simulation.cubes import true_state
+
+from .field_study import field_below
 
 LOAD = -10e3
 """Stress of each simple load, in Pa."""
@@ -86,19 +89,11 @@ def sweep(points: int = 129) -> Sweep:
     """
     calibration = planar_calibration()
     place = np.linspace(-REACH, REACH, points)
-    profile = _stress_and_slope(place - BALL_X)[0]["zz"]
-    at_sensor, slope_at_sensor = _stress_and_slope(np.array([-BALL_X]))
-
-    stress, slope = _stress_and_slope(-place)
-    # The state of the planar modes at the sensor, gradients times d0.
-    state = []
-    for name in calibration.modes.names:
-        component, _, axis = name.partition("_")
-        if axis:
-            state.append(calibration.half_side * slope[component][:, "xyz".index(axis)])
-        else:
-            state.append(stress[component])
-    pads = np.stack(state, axis=1) @ calibration.response.T
+    zz, zx, zz_x = (COMPONENTS.index(name) for name in ("zz", "zx", "zz_x"))
+    at_sensor = _beside_ball(np.array([-BALL_X]))[0]
+    passing = _beside_ball(-place)
+    gradient = passing[:, 6:].reshape(points, 6, 3)
+    pads = true_state(calibration, passing[:, :6], gradient) @ calibration.response.T
 
     estimator = make_estimator(calibration.response, calibration.noise, calibration.modes)
     left, right = (calibration.layout.index(name) for name in PAIR)
@@ -107,22 +102,16 @@ def sweep(points: int = 129) -> Sweep:
     pair_gain = to_shear[left] - to_shear[right]
     return Sweep(
         place=place,
-        profile=profile,
-        value=float(at_sensor["zz"][0]),
-        slope=float(slope_at_sensor["zz"][0, 0]),
-        truth=stress["zx"],
-        cube=pads @ estimator.matrix[COMPONENTS.index("zx")],
+        profile=_beside_ball(place - BALL_X)[:, zz],
+        value=float(at_sensor[zz]),
+        slope=float(at_sensor[zz_x]),
+        truth=passing[:, zx],
+        cube=pads @ estimator.matrix[zx],
         pair=(pads[:, left] - pads[:, right]) / pair_gain,
     )
 
 
-def _stress_and_slope(x: Array) -> tuple[dict[str, Array], dict[str, Array]]:
-    """Return stress (N,) and gradient (N, 3) by component, at x (N,) from the ball's centre."""
-    depth = np.full(len(x), -SURFACE_DEPTH)
-    points = np.stack([x, 0 * x, depth], axis=1)
-    ball = contact.hertz(BALL_RADIUS, BALL_FORCE, np.zeros(2))
-    stress, gradient = contact.field(points, *ball, POISSONS_RATIO)
-    numbers = list(enumerate(STRESS))
-    return {name: stress[:, k] for k, name in numbers}, {
-        name: gradient[:, k] for k, name in numbers
-    }
+def _beside_ball(x: Array) -> Array:
+    """Return stress and gradient (N, 24) at x (N,) from the ball's centre, by `field_below`."""
+    ball = contact.hertz(BALL_RADIUS, BALL_FORCE)
+    return field_below(np.stack([x, 0 * x], axis=1), SURFACE_DEPTH, ball, POISSONS_RATIO)

@@ -7,22 +7,21 @@ components nor its Hankel transforms are in it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from cube_tensor_driver.config.influence import find_influence
 from cube_tensor_driver.core.arrays import Array
-from cube_tensor_driver.core.defaults import CONTACT_PRESSURE
 from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.mechanics.influence import Influence
 from cube_tensor_driver.mechanics.influence_file import read_influence
-from cube_tensor_driver.touch.tracker.contact_tracker import ContactTracker
 
 from ..fem.body import Body
 from ..fem.reciprocity import compute_influence
-from .field_study import FORCE, FRICTION, FieldExample
-from .traction_study import CUBES, Errors, Setting, TractionBench
+from .field_study import FieldExample
+from .traction_study import CUBES, METHODS, Errors, Setting, TractionBench
 
 FORMS = ("points", "pads")
 """Models of a cube that the inverse assumes: a point, or pads with influence functions."""
@@ -113,19 +112,13 @@ def study_pads(
     cases: int,
     seed: int,
     settings: Sequence[Setting] = THIN,
-    progress: Callable[[Setting, str, Errors], None] | None = None,
 ) -> dict[tuple[Setting, str], list[Errors]]:
     """Return the errors of each setting and each of `FORMS` at each width (m)."""
-    results: dict[tuple[Setting, str], list[Errors]] = {}
-    for setting in settings:
-        for form, bench in _make_benches(setting, true).items():
-            results[setting, form] = []
-            for width in widths:
-                errors = bench.errors(width, cases, seed)
-                results[setting, form].append(errors)
-                if progress is not None:
-                    progress(setting, form, errors)
-    return results
+    return {
+        (setting, form): bench.study(widths, cases, seed)
+        for setting in settings
+        for form, bench in _make_benches(setting, true).items()
+    }
 
 
 def layer_example(true: Influence) -> FieldExample:
@@ -134,15 +127,9 @@ def layer_example(true: Influence) -> FieldExample:
     The pressure at the cubes' depth is the true one, and that of the inverse with contacts for each
     of `FORMS`.
     """
-    force = FORCE * np.array([FRICTION, 0.0, -1.0])
-    centre = np.array([2.4e-3, 1.6e-3])
-    width = 5e-3
     pressure = {}
     for form, bench in _make_benches(THIN[0], true, side=10).items():
-        points = bench.inverse.points
-        pressure["truth"] = -bench.truth(points[:, :2], width, force, centre)[:, 2]
-        values = bench.values(width, force, centre, np.random.default_rng(1))
-        tracker = ContactTracker(bench.inverse, CONTACT_PRESSURE)
-        tracker.update(values)
-        pressure[form] = tracker.field.depth_pressure
-    return FieldExample(points, pressure, bench.poses.position, centre)
+        example = bench.example(5e-3, np.array([2.4e-3, 1.6e-3]))
+        pressure["truth"] = example.pressure["truth"]
+        pressure[form] = example.pressure[METHODS[-1]]
+    return replace(example, pressure=pressure)

@@ -7,7 +7,7 @@ whose gains are known to `GAIN_ERROR`, the pad law, a counter's noise, the pipel
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -31,7 +31,7 @@ from cube_tensor_driver.core.oscillator import pad_frequency
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.poses import CubePoses
 from cube_tensor_driver.core.rows import FrequencyRows
-from cube_tensor_driver.core.tensor import rotation_from_rpy
+from cube_tensor_driver.core.tensor import rotate_gradient, rotate_stress, rotation_from_rpy
 from cube_tensor_driver.mechanics import contact
 from cube_tensor_driver.mechanics.influence import Influence
 from cube_tensor_driver.mechanics.kernels import Kernels
@@ -40,7 +40,7 @@ from cube_tensor_driver.touch.inverse import SurfaceInverse
 from cube_tensor_driver.touch.pad_measurement import model_pads
 from cube_tensor_driver.touch.pad_noise import noise_of_all_pads
 from cube_tensor_driver.touch.surface import Surface
-from cube_tensor_driver.touch.tracker.contact_tracker import ContactTracker
+from cube_tensor_driver.touch.tracker.contact_tracker import ContactTracker, TrackedContact
 
 from .field_study import (
     FORCE,
@@ -48,6 +48,7 @@ from .field_study import (
     WINDOW,
     FieldExample,
     draw_force,
+    field_below,
     flat_skin,
 )
 
@@ -193,11 +194,8 @@ class TractionBench:
             unit_fields = self._true_layer.field(points - centre, width / 2)
             return unit_fields @ force
         depth = self.setting.depth + self.setting.depth_error
-        below = np.column_stack([points, np.full(len(points), -depth)])
-        sources, forces = self.point_forces(width, force, centre)
-        stress, gradient = contact.field(below, sources, forces, self.setting.poisson)
-        slopes = gradient.reshape(len(points), 18)
-        return np.concatenate([stress, slopes], axis=1)
+        load = self.point_forces(width, force, centre)
+        return field_below(points, depth, load, self.setting.poisson)
 
     def surface_truth(
         self,
@@ -261,13 +259,11 @@ class TractionBench:
     def pads_in(self, field: Array) -> Array:
         """Return the pad stresses (cubes, P), in Pa, in a field (cubes, 24) in the skin's frame."""
         calibration = self.calibration
-        rotation = self.poses.rotation
         # Tensors of the skin's frame become those of each cube's frame.
-        stress = to_matrix(field[:, :6])
-        stress = np.einsum("nai,nbj,nab->nij", rotation, rotation, stress)
-        slopes = field[:, 6:].reshape(-1, 6, 3)
-        gradient = to_matrix(slopes.swapaxes(1, 2))  # (n, axis, 3, 3)
-        gradient = np.einsum("nai,nbj,nck,ncab->nijk", rotation, rotation, rotation, gradient)
+        to_cube = self.poses.rotation.swapaxes(1, 2)
+        stress = rotate_stress(field[:, :6], to_cube)
+        by_axis = to_matrix(field[:, 6:].reshape(-1, 6, 3).swapaxes(1, 2))
+        gradient = rotate_gradient(np.moveaxis(by_axis, 1, -1), to_cube)
         state = calibration.modes.state(stress, calibration.half_side * gradient)
         return np.asarray(state @ calibration.response.T)
 
@@ -328,15 +324,9 @@ class TractionBench:
         points = self.inverse.points[self.window, :2]
         true = -self.truth(points, width, force, centre)[:, 2]
         values = self.values(width, force, centre, random)
-        tracker = ContactTracker(self.inverse, CONTACT_PRESSURE)
         interpolated = self.surface.contacts(values, CONTACT_PRESSURE)
-        tracked = tracker.update(values)
-
-        fields = [
-            self.surface.field(values).pressure[self.window],
-            self.inverse.field(values).depth_pressure[self.window],
-            tracker.field.depth_pressure[self.window],
-        ]
+        tracker, tracked, pressures = self._solve(values)
+        fields = [pressure[self.window] for pressure in pressures]
         size = (true**2).mean()
         square = [((field - true) ** 2).mean() / size for field in fields]
 
@@ -365,6 +355,47 @@ class TractionBench:
                 ratio[k, 1] = position_error[k] / (total.position_deviation * np.sqrt(2))
         is_single = len(tracked) == 1
         return _CaseErrors(square, force_error, position_error, ratio, field_squares, is_single)
+
+    def _solve(self, values: Array) -> tuple[ContactTracker, list[TrackedContact], list[Array]]:
+        """Return the tracker after these components, its contacts, and the pressure by METHODS."""
+        tracker = ContactTracker(self.inverse, CONTACT_PRESSURE)
+        tracked = tracker.update(values)
+        pressures = [
+            self.surface.field(values).pressure,
+            self.inverse.field(values).depth_pressure,
+            tracker.field.depth_pressure,
+        ]
+        return tracker, tracked, pressures
+
+    def example(self, width: float, centre: Array) -> FieldExample:
+        """Return the pressure at the cubes' depth under one load with friction along x.
+
+        It is the true one, that of each of `METHODS`, and the "standard deviation" that the inverse
+        predicts, in Pa.
+
+        Args:
+            width: Width of the contact, in m.
+            centre: (2,) position of the contact, in m.
+        """
+        force = FORCE * np.array([FRICTION, 0.0, -1.0])
+        values = self.values(width, force, centre, np.random.default_rng(1))
+        points = self.inverse.points
+        tracker, _, pressures = self._solve(values)
+        pressure = {
+            "truth": -self.truth(points[:, :2], width, force, centre)[:, 2],
+            **dict(zip(METHODS, pressures, strict=True)),
+            "standard deviation": tracker.deviation(values).depth_pressure,
+        }
+        return FieldExample(points, pressure, self.poses.position, centre)
+
+    def study(
+        self,
+        widths: Sequence[float],
+        cases: int = CASES,
+        seed: int = 8,
+    ) -> list[Errors]:
+        """Return the errors for random loads of each width (m); a seed gives the same loads."""
+        return [self.errors(width, cases, seed) for width in widths]
 
 
 class _CaseErrors(NamedTuple):
@@ -421,34 +452,9 @@ def _shipped_calibration(setting: Setting) -> Calibration:
 
 
 def traction_example() -> FieldExample:
-    """Return a narrow contact between planar cubes, crosswise.
-
-    The pressure at the cubes' depth is the true one, that of each of `METHODS`, and the "standard
-    deviation" that the inverse predicts, in Pa.
-    """
-    bench = TractionBench(
-        Setting(
-            cubes=CUBES[2],
-            pitch=10e-3,
-            depth=4e-3,
-        ),
-        side=10,
-    )
-    centre = bench.setting.pitch * np.array([0.35, 0.25])
-    width = 6e-3
-    force = FORCE * np.array([FRICTION, 0.0, -1.0])
-    values = bench.values(width, force, centre, np.random.default_rng(1))
-    points = bench.inverse.points
-    tracker = ContactTracker(bench.inverse, CONTACT_PRESSURE)
-    tracker.update(values)
-    pressure = {
-        "truth": -bench.truth(points[:, :2], width, force, centre)[:, 2],
-        "interpolation": bench.surface.field(values).pressure,
-        "inverse": bench.inverse.field(values).depth_pressure,
-        "inverse with contacts": tracker.field.depth_pressure,
-        "standard deviation": tracker.deviation(values).depth_pressure,
-    }
-    return FieldExample(points, pressure, bench.poses.position, centre)
+    """Return a narrow contact between planar cubes, crosswise."""
+    setting = Setting(cubes=CUBES[2], pitch=10e-3, depth=4e-3)
+    return TractionBench(setting, side=10).example(6e-3, setting.pitch * np.array([0.35, 0.25]))
 
 
 def flat_punch(
@@ -487,19 +493,9 @@ def traction_study(
     widths: Sequence[float],
     cases: int = CASES,
     seed: int = 8,
-    progress: Callable[[Setting, Errors], None] | None = None,
 ) -> dict[Setting, list[Errors]]:
     """Return the errors of each setting at each width (m)."""
-    results: dict[Setting, list[Errors]] = {}
-    for setting in settings:
-        bench = TractionBench(setting)
-        results[setting] = []
-        for width in widths:
-            errors = bench.errors(width, cases, seed)
-            results[setting].append(errors)
-            if progress is not None:
-                progress(setting, errors)
-    return results
+    return {setting: TractionBench(setting).study(widths, cases, seed) for setting in settings}
 
 
 MAIN = tuple(Setting(cubes=cubes) for cubes in CUBES)
