@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from cube_tensor_driver.config.grid import grid
+from cube_tensor_driver.config.yaml import write_yaml
 from cube_tensor_driver.core.arrays import AnyArray
 from cube_tensor_driver.core.errors import CubeError
 from cube_tensor_driver.simulation.sample_log import CUBE_RANGE, SampleTable
@@ -15,6 +17,9 @@ from cube_tensor_hub.firmware import build
 
 FIRMWARE = Path(__file__).resolve().parents[2] / "firmware"
 """Folder of the program's source."""
+
+PITCH = 0.012
+"""Distance of neighbouring cubes, in m."""
 
 MAX_CUBES_PER_HUB = 80
 """Largest number of cubes on one simulated hub."""
@@ -51,6 +56,13 @@ class HubLoad:
         """Number of cubes of all hubs."""
         return self.hubs * self.cubes_per_hub
 
+    def write_skin(self, folder: Path, rate: float) -> Path:
+        """Write the file of a skin of these hubs, sampled `rate` times a second."""
+        path = folder / "skin.yaml"
+        data = grid(nx=self.cubes, ny=1, pitch=PITCH, links=self.hubs, rate=rate)
+        write_yaml(path, data)
+        return path
+
     def build(self, folder: Path) -> str:
         """Build the program in a folder and return its path.
 
@@ -62,14 +74,13 @@ class HubLoad:
 
     def arguments(self, ports: Path, rate: float) -> tuple[str, ...]:
         """Return arguments of the program for pseudo-terminals hub0, hub1, … in a folder."""
-        period = str(round(1e6 / rate))
-        numbers = (
-            "--hubs",
-            str(self.hubs),
-            "--cubes",
-            str(self.cubes_per_hub),
-        )
-        return ("--ports", str(ports), *numbers, "--period", period)
+        options = {
+            "--ports": ports,
+            "--hubs": self.hubs,
+            "--cubes": self.cubes_per_hub,
+            "--period": round(1e6 / rate),
+        }
+        return tuple(str(word) for option in options.items() for word in option)
 
 
 def read_samples(path: Path, load: HubLoad) -> SampleTable:

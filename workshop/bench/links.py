@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import subprocess
 import tempfile
 import time
@@ -11,9 +10,10 @@ from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 
-from cube_tensor_driver.config.grid import grid
+import numpy as np
+
 from cube_tensor_driver.config.skin import read_skin
-from cube_tensor_driver.config.yaml import write_yaml
+from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.errors import CubeError
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.demo.running import report
@@ -22,9 +22,6 @@ from cube_tensor_driver.device.live import cube_addresses, link_configs
 from cube_tensor_driver.device.scans.scan import empty_rows
 
 from .hubs_in_c import HubLoad
-
-PITCH = 0.012
-"""Distance of the cubes, in m."""
 
 MAX_START_S = 10.0
 """Longest time, in seconds, until the first rows arrive."""
@@ -64,18 +61,7 @@ def bench_links(
     with tempfile.TemporaryDirectory(prefix="cube_bench_") as name:
         folder = Path(name)
         program = load.build(folder / "firmware")
-        path = folder / "skin.yaml"
-        write_yaml(
-            path,
-            grid(
-                nx=cubes,
-                ny=1,
-                pitch=PITCH,
-                links=load.hubs,
-                rate=rate,
-            ),
-        )
-        skin = read_skin(path)
+        skin = read_skin(load.write_skin(folder, rate))
         delivered = 0
 
         def on_rows(rows: FrequencyRows) -> None:
@@ -92,38 +78,28 @@ def bench_links(
                 # A node fills the same messages again and again, too.
                 make_rows=lru_cache(maxsize=8)(empty_rows),
             )
+
+            def read_counters() -> Array:
+                """Return wall clock (s), processor time (s), rows and lost samples so far."""
+                return np.array([time.monotonic(), time.process_time(), delivered, _lost(links)])
+
             links.start()
             try:
                 _wait(lambda: delivered > 0)
                 # Connecting and the first use of memory are not measured.
                 time.sleep(SETTLE_S)
-                before, lost = (
-                    (
-                        time.monotonic(),
-                        _cpu_s(),
-                        delivered,
-                    ),
-                    _lost(links),
-                )
+                start = read_counters()
                 time.sleep(duration)
-                after, lost = (
-                    (
-                        time.monotonic(),
-                        _cpu_s(),
-                        delivered,
-                    ),
-                    _lost(links) - lost,
-                )
+                seconds, cpu_s, rows, lost = (read_counters() - start).tolist()
             finally:
                 links.close()
-    seconds, cpu_s, rows = (end - begin for begin, end in zip(before, after, strict=True))
     result = {
         "cubes": cubes,
         "rate_hz": rate,
         "duration_s": duration,
-        "rows": rows,
+        "rows": int(rows),
         "rows_expected": round(rate * seconds) * cubes,
-        "lost": lost * load.cubes_per_hub,
+        "lost": int(lost) * load.cubes_per_hub,
         "cpu_percent": round(100 * cpu_s / seconds, 1),
         "cpu_us_per_scan": round(1e6 * cpu_s * cubes / max(rows, 1), 1),
     }
@@ -162,9 +138,3 @@ def _lost(links: LiveLinks) -> int:
     """Return the number of samples that the hubs took and that did not arrive so far."""
     names = ("lost_on_the_way", "dropped_in_hub")
     return sum(int(str(report.values[name])) for report in links.report() for name in names)
-
-
-def _cpu_s() -> float:
-    """Return the processor time of this process, in seconds."""
-    usage = resource.getrusage(resource.RUSAGE_SELF)
-    return usage.ru_utime + usage.ru_stime

@@ -12,7 +12,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +20,9 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
-from cube_tensor_driver.config.grid import grid
 from cube_tensor_driver.config.skin import read_skin
-from cube_tensor_driver.config.yaml import write_yaml
 from cube_tensor_driver.core.errors import CubeError
-from cube_tensor_driver.demo.running import Observer, end_simulator, observing, report
+from cube_tensor_driver.demo.running import end_simulator, observing, report
 from cube_tensor_driver.demo.usage import Usage
 from cube_tensor_driver.demo.verification import Arrivals, compare, percentile
 from cube_tensor_driver.messages.codec import stress_codec
@@ -39,9 +37,6 @@ from cube_tensor_hub.firmware import FirmwareError
 
 from .hubs_in_c import HubLoad, read_samples
 from .scale import draw_scale
-
-PITCH = 0.012
-"""Distance of the cubes, in m."""
 
 INSTANTS = 16
 """Number of instants of the load that the simulator repeats. They are few, because the simulator
@@ -214,16 +209,9 @@ def _measure_skin(
 ) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="cube_bench_") as name:
         folder = Path(name)
-        path, log = folder / "skin.yaml", folder / "log"
+        log = folder / "log"
         load = HubLoad.of(cubes)
-        grid_of_cubes = grid(
-            nx=load.cubes,
-            ny=1,
-            pitch=PITCH,
-            links=load.hubs,
-            rate=bench.rate,
-        )
-        write_yaml(path, grid_of_cubes)
+        path = load.write_skin(folder, bench.rate)
         processes = _make_processes(path, log, load, bench, progress)
         arrivals = Arrivals(read_skin(path), one_per_hub=True)
 
@@ -231,8 +219,8 @@ def _measure_skin(
             arrivals.add(stress_codec.decode(data).rows, time.time_ns())
 
         with Children(folder) as children:
-            observed = _Observed(processes, children, f"skin of {load.cubes} cubes")
-            measured = observed.measure(bench.rate, bench.duration, receive, progress)
+            name = f"skin of {load.cubes} cubes"
+            measured = _measure(processes, children, bench, receive, progress, name)
             taken, skipped = _end_load(processes[0].executable, children, log, load)
     # Rows of the first cube of each hub stand for all: keeping all would delay the receiver.
     comparison = compare(taken, arrivals, measured.start_ns, measured.end_ns)
@@ -274,18 +262,8 @@ def _make_processes(
         return processes
     # Unlike the simulator, the program expects the folder to exist.
     ports.mkdir()
-    arguments = (
-        *load.arguments(ports, bench.rate),
-        "--log",
-        str(log),
-    )
-    hubs = Process(
-        "hubs",
-        "",
-        node=False,
-        program=program,
-        arguments=arguments,
-    )
+    arguments = (*load.arguments(ports, bench.rate), "--log", str(log))
+    hubs = Process("hubs", "", node=False, program=program, arguments=arguments)
     return [hubs, *processes[1:]]
 
 
@@ -316,97 +294,73 @@ def _measure_echo(
         for role in ("echo", "source")
     ]
     with (
-        tempfile.TemporaryDirectory(prefix="cube_bench_") as name,
-        Children(Path(name)) as children,
+        tempfile.TemporaryDirectory(prefix="cube_bench_") as folder,
+        Children(Path(folder)) as children,
     ):
-        observed = _Observed(processes, children, f"echo of {cubes} cubes")
-        duration = min(bench.duration / 2, MAX_ECHO_S)
-        measured = observed.measure(bench.rate, duration, lambda data: None, progress)
+        part = replace(bench, duration=min(bench.duration / 2, MAX_ECHO_S))
+        name = f"echo of {cubes} cubes"
+        measured = _measure(processes, children, part, lambda data: None, progress, name)
     return {"echo_cpu_percent": round(sum(measured.cpu_percent.values()), 1)}
 
 
-@dataclass(frozen=True)
-class _Observed:
-    """Processes that are measured, and their description."""
+def _measure(
+    processes: list[Process],
+    children: Children,
+    bench: Bench,
+    receive: Callable[[bytes], None],
+    progress: Progress,
+    description: str,
+) -> Measurement:
+    """Start the processes, wait for the first tensors and measure.
 
-    processes: list[Process]
-    children: Children
-    description: str
+    Args:
+        processes: The processes.
+        children: Starts them.
+        bench: Rate of the messages and duration of the measurement.
+        receive: Called with each message of stress, serialised, because decoding would cost more
+            than what is measured.
+        progress: Shows how far the measurement is.
+        description: Name of the measurement.
 
-    def measure(
-        self,
-        rate: float,
-        duration: float,
-        receive: Callable[[bytes], None],
-        progress: Progress,
-    ) -> Measurement:
-        """Start the processes, wait for the first tensors and measure.
+    Raises:
+        CubeError: No tensor arrived.
+    """
+    # Garbage collection would delay the receiver.
+    gc.collect()
+    gc.freeze()
+    began_s = time.monotonic()
+    for process in processes:
+        children.start(process)
+    names = [process.executable for process in processes]
+    task = progress.add_task(description, total=bench.duration)
+    n_messages = 0
 
-        Args:
-            rate: Messages per second.
-            duration: Duration of the measurement, in seconds.
-            receive: Called with each message of stress, serialised, because decoding would cost
-                more than what is measured.
-            progress: Shows how far the measurement is.
+    def on_stress(data: bytes) -> None:
+        nonlocal n_messages
+        n_messages += 1
+        receive(data)
 
-        Raises:
-            CubeError: No tensor arrived.
-        """
-        # Garbage collection would delay the receiver.
-        gc.collect()
-        gc.freeze()
-        began_s = time.monotonic()
-        for process in self.processes:
-            self.children.start(process)
-        task = progress.add_task(self.description, total=duration)
-        n_messages = 0
-
-        def on_stress(data: bytes) -> None:
-            nonlocal n_messages
-            n_messages += 1
-            receive(data)
-
-        with observing("bench", self.children) as observer:
-            observer.listen(SkinStress, "stress", on_stress, batch_profile(rate))
-            observer.spin(MAX_START_S, lambda: n_messages > 0)
-            if not n_messages:
-                logs = "\n".join(self.children.log(name)[-800:] for name in self._names())
-                raise CubeError(f"{self.description}: no tensor after {MAX_START_S:g} s\n{logs}")
-            # From here on, discovery and imports do not count.
-            first_tensor_s = time.monotonic() - began_s
-            observer.spin(SETTLE_S)
-            usage = Usage(self.children, self._names())
-            start_ns = time.time_ns()
-            memory_mb = self._watch_memory(
-                observer,
-                usage,
-                duration,
-                lambda elapsed_s: progress.update(task, completed=elapsed_s),
-            )
-            end_ns, cpu_percent = time.time_ns(), usage.cpu_percent()
-            observer.spin(DRAIN_S)
-        progress.remove_task(task)
-        return Measurement(start_ns, end_ns, cpu_percent, memory_mb, first_tensor_s)
-
-    def _watch_memory(
-        self,
-        observer: Observer,
-        usage: Usage,
-        duration: float,
-        on_step: Callable[[float], None],
-    ) -> dict[str, list[float]]:
-        """Receive messages for a time and return the memory of each process meanwhile."""
-        memory_mb: dict[str, list[float]] = {name: [] for name in self._names()}
-        start_s = time.monotonic()
-        while (left_s := duration - (time.monotonic() - start_s)) > 0:
+    with observing("bench", children) as observer:
+        observer.listen(SkinStress, "stress", on_stress, batch_profile(bench.rate))
+        observer.spin(MAX_START_S, lambda: n_messages > 0)
+        if not n_messages:
+            logs = "\n".join(children.log(name)[-800:] for name in names)
+            raise CubeError(f"{description}: no tensor after {MAX_START_S:g} s\n{logs}")
+        # From here on, discovery and imports do not count.
+        first_tensor_s = time.monotonic() - began_s
+        observer.spin(SETTLE_S)
+        usage = Usage(children, names)
+        memory_mb: dict[str, list[float]] = {name: [] for name in names}
+        start_ns, start_s = time.time_ns(), time.monotonic()
+        while (left_s := bench.duration - (time.monotonic() - start_s)) > 0:
             observer.spin(min(MEMORY_PERIOD_S, left_s))
-            on_step(time.monotonic() - start_s)
+            progress.update(task, completed=time.monotonic() - start_s)
             for name, value in usage.memory_mb().items():
                 memory_mb[name].append(value)
-        return memory_mb
-
-    def _names(self) -> list[str]:
-        return [process.executable for process in self.processes]
+        end_ns, cpu_percent = time.time_ns(), usage.cpu_percent()
+        observer.spin(DRAIN_S)
+    progress.remove_task(task)
+    return Measurement(start_ns, end_ns, cpu_percent, memory_mb, first_tensor_s)
 
 
 def summarise_memory(memory_mb: dict[str, list[float]]) -> dict[str, float]:

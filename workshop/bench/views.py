@@ -17,12 +17,9 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-import psutil
-import rclpy
 import viser
 import zstandard
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from selenium import webdriver
 from visualization_msgs.msg import MarkerArray
 from websockets.exceptions import ConnectionClosed
@@ -34,11 +31,12 @@ from cube_tensor_driver.config.skin import Skin, read_skin
 from cube_tensor_driver.config.yaml import write_yaml
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rows import StressRows
+from cube_tensor_driver.demo.running import observing
+from cube_tensor_driver.demo.usage import Usage
 from cube_tensor_driver.messages.codec import stress_codec
 from cube_tensor_driver.msg import SkinContacts, SkinInfo, SkinStress
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import Process
-from cube_tensor_driver.ros.compat import make_executor
 from cube_tensor_driver.ros.messages import info_message
 from cube_tensor_driver.ros.qos import LATCHED, batch_profile
 from cube_tensor_driver.simulation.load import Load, default_script
@@ -200,17 +198,13 @@ def measure(cubes: int, browser: bool) -> dict[str, float]:
     with tempfile.TemporaryDirectory(prefix="cube_views_") as name, contextlib.ExitStack() as stack:
         folder = Path(name)
         skin = make_skin(folder, cubes)
-        node = rclpy.create_node("measure")
-        executor = make_executor()
-        executor.add_node(node)
-        stack.callback(node.destroy_node)
-        stack.callback(executor.remove_node, node)
-        counters = {
-            "markers": MessageCounter(node, MarkerArray, "markers"),
-            "contacts": MessageCounter(node, SkinContacts, "contacts"),
-        }
-        stack.enter_context(SkinSender(node, skin))
         children = stack.enter_context(Children(folder))
+        observer = stack.enter_context(observing("measure", children))
+        counters = {
+            "markers": MessageCounter(observer.node, MarkerArray, "markers"),
+            "contacts": MessageCounter(observer.node, SkinContacts, "contacts"),
+        }
+        stack.enter_context(SkinSender(observer.node, skin))
         for topic in counters:
             children.start(Process(topic, f"cube_tensor_driver.ros.nodes.{topic}"))
         children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view",)))
@@ -218,34 +212,27 @@ def measure(cubes: int, browser: bool) -> dict[str, float]:
         pictures = PictureCounter(url)
         meter = BrowserMeter(stack.enter_context(chromium(url, SHOWN))) if browser else None
 
-        def spin(seconds: float) -> None:
-            until = time.monotonic() + seconds
-            while time.monotonic() < until:
-                executor.spin_once(timeout_sec=0.1)
-
         def read() -> dict[str, float]:
             """Return everything that is counted, so far."""
-            counted: dict[str, float] = {}
-            for topic, counter in counters.items():
-                counted[f"{topic}_hz"] = counter.count
+            counted: dict[str, float] = {f"{name}_hz": one.count for name, one in counters.items()}
             counted["view_hz"] = pictures.pictures
-            for process in (*counters, "view"):
-                counted[f"cpu_{process}_percent"] = 100 * cpu(children.pid(process))
             if meter:
                 counted["shown_hz"] = meter.pictures()
                 counted["script"] = meter.script_seconds()
             return counted
 
         # The first picture takes seconds, which are not measured.
-        spin(SETTLE_S)
+        observer.spin(SETTLE_S)
+        usage = Usage(children, (*counters, "view"))
         before, start = read(), time.monotonic()
-        spin(MEASURE_S)
+        observer.spin(MEASURE_S)
         after, seconds = read(), time.monotonic() - start
         result = {name: (after[name] - before[name]) / seconds for name in after}
         if meter:
             result["script_ms_per_picture"] = 1e3 * result.pop("script") / result["shown_hz"]
-        result["rss_view_mb"] = psutil.Process(children.pid("view")).memory_info().rss / 2**20
-        children.check()
+        cpu = usage.cpu_percent()
+        result |= {f"cpu_{process}_percent": value for process, value in cpu.items()}
+        result["rss_view_mb"] = usage.memory_mb()["view"]
         return {name: round(value, 1) for name, value in result.items()}
 
 
@@ -262,31 +249,12 @@ def make_skin(folder: Path, cubes: int) -> Skin:
 
 def stress_rows(stress: np.ndarray, gradient: np.ndarray) -> StressRows:
     """Return rows as planar cubes would give them, which do not observe all components."""
-    n = len(stress)
-    stress = stress.astype(np.float32)
-    gradient = gradient[:, :3].reshape(n, 9).astype(np.float32)
+    stress = stress.copy()
+    gradient = gradient[:, :3].reshape(-1, 9)
     stress[:, [1, 3, 5]] = np.nan
     gradient[:, [1, 3, 4, 5, 7]] = np.nan
-    return StressRows(
-        cube=np.arange(n, dtype=np.uint16),
-        sequence=np.zeros(n, np.uint32),
-        stamp_ns=np.zeros(n, np.int64),
-        stress=stress,
-        gradient=gradient,
-        residual=np.ones(n, np.float32),
-        status=np.zeros(n, np.uint16),
-        observed=np.zeros(n, np.uint16),
-        left_out=np.zeros(n, np.uint32),
-    )
-
-
-def cpu(pid: int) -> float:
-    """Return the processor time of a process, in seconds."""
-    times = psutil.Process(pid).cpu_times()
-    return float(times.user + times.system)
+    return StressRows.of(np.arange(len(stress)), stress, gradient, residual=1.0)
 
 
 if __name__ == "__main__":
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     print(sys.argv[1:], measure(int(sys.argv[1]), "chromium" in sys.argv), flush=True)
-    rclpy.try_shutdown()

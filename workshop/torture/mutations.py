@@ -9,16 +9,17 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
+from functools import partial
 from itertools import count
 from pkgutil import resolve_name
 from types import SimpleNamespace
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from cube_tensor_driver.core.rows import FrequencyRows, StressRows
+from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.core.status import NOISY, OPEN, RESIDUAL, SHORT, STUCK
 from cube_tensor_driver.device.scans.sequence import Arrival
 from cube_tensor_driver.device.wire import decoder
@@ -27,7 +28,11 @@ from cube_tensor_driver.processes.skin_processes import Process
 Patch = Callable[[], None]
 """Puts a mutation into this process."""
 
-Rows = TypeVar("Rows", FrequencyRows, StressRows)
+RowsChange = Callable[[Any], Any]
+"""Makes changed rows (`FrequencyRows` or `StressRows`) of the rows of one message."""
+
+ColumnChange = Callable[[Any], Any]
+"""Makes the changed column of rows (an array) of the column as it should be."""
 
 MESSAGES_PER_CHANGE = 200
 """Number of messages of which one is changed, where a mutation does not change all."""
@@ -43,29 +48,19 @@ class Mutation(NamedTuple):
     """A programming error.
 
     Attributes:
-        node: Node whose process is patched.
-        description: What it does wrong.
-        patch: Function that puts it into the process.
-        needs_restart: Whether it shows only when the reconstruction starts again.
+        node: Name of the node whose process is patched, "driver" or "reconstruction".
+        patch: Function that puts the error into this process.
     """
 
     node: str
-    description: str
     patch: Patch
-    needs_restart: bool = False
 
 
 def mutated(process: Process, name: str) -> Process:
     """Return the process with a mutation, or as it is if the mutation is of another process."""
     if not name or MUTATIONS[name].node != process.executable:
         return process
-    return Process(
-        process.executable,
-        __name__,
-        True,
-        process.parameters,
-        (name,),
-    )
+    return replace(process, module=__name__, arguments=(name,))
 
 
 def _replace(
@@ -120,8 +115,9 @@ def _change_result(
     return _wrap(place, name, mutate)
 
 
-def _change_frequencies(change: Callable[[FrequencyRows], FrequencyRows]) -> Patch:
-    """Change the rows of each message of frequencies."""
+def _change_frequencies(change: RowsChange | None = None, **columns: ColumnChange) -> Patch:
+    """Change the rows, or columns of them, of each message of frequencies."""
+    change = change or partial(_change_columns, columns)
 
     def publish(original: Any, publisher: Any) -> None:
         if publisher._next is not None:
@@ -135,44 +131,29 @@ def _change_frequencies(change: Callable[[FrequencyRows], FrequencyRows]) -> Pat
     return _wrap("ros.nodes.driver:FrequenciesPublisher", "publish", publish)
 
 
-def _change_stress(change: Callable[[StressRows], StressRows]) -> Patch:
-    """Change the rows of each message of stress."""
+def _change_stress(change: RowsChange | None = None, **columns: ColumnChange) -> Patch:
+    """Change the rows, or columns of them, of each message of stress."""
+    change = change or partial(_change_columns, columns)
 
-    def publish(original: Any, publisher: Any, rows: StressRows, *header: Any) -> None:
+    def publish(original: Any, publisher: Any, rows: Any, *header: Any) -> None:
         original(publisher, change(rows), *header)
 
     return _wrap("ros.nodes.stress_publisher:StressPublisher", "publish", publish)
 
 
-def _make_column_change(**changes: Callable[[Any], Any]) -> Callable[[Rows], Rows]:
+def _change_columns(changes: Mapping[str, ColumnChange], rows: Any) -> Any:
     """Change columns of rows, each by a function of its old values."""
-
-    def change(rows: Rows) -> Rows:
-        columns = {}
-        for name, make in changes.items():
-            # A copy, because the change may be in place, and others still need the old values.
-            columns[name] = make(np.array(getattr(rows, name)))
-        return replace(rows, **columns)
-
-    return change
+    # A copy, because the change may be in place, and others still need the old values.
+    columns = {name: make(np.array(getattr(rows, name))) for name, make in changes.items()}
+    return replace(rows, **columns)
 
 
-def _change_frequency_columns(**changes: Callable[[Any], Any]) -> Patch:
-    """Change columns of each message of frequencies."""
-    return _change_frequencies(_make_column_change(**changes))
-
-
-def _change_stress_columns(**changes: Callable[[Any], Any]) -> Patch:
-    """Change columns of each message of stress."""
-    return _change_stress(_make_column_change(**changes))
-
-
-def _make_stale(name: str) -> Callable[[Rows], Rows]:
+def _make_stale(name: str) -> RowsChange:
     """Give one of `MESSAGES_PER_CHANGE` messages a column of the message before."""
     numbers = count()
     last: list[Any] = []
 
-    def change(rows: Rows) -> Rows:
+    def change(rows: Any) -> Any:
         now = np.array(getattr(rows, name))
         before = last.pop() if last else now
         last.append(now)
@@ -314,265 +295,169 @@ def _lose_silently() -> None:
     _skip("ros.diagnostics.reconstruction:LostMessages", "note_arrival")()
 
 
-DRIVER: dict[str, tuple[str, Patch]] = {
-    "lost row": (
-        "a row is dropped inside a message but counted as published",
-        _drop_last_row(),
+DRIVER: dict[str, Patch] = {
+    # A row is dropped inside a message but counted as published.
+    "lost row": _drop_last_row(),
+    # 1 of 200 messages is not sent.
+    "lost scan": _repeat("ros.nodes.driver:FrequenciesPublisher", 0),
+    # 1 of 200 messages is sent twice.
+    "scan twice": _repeat("ros.nodes.driver:FrequenciesPublisher", 2),
+    # Two pads of each cube are swapped.
+    "swapped pads": _change_frequencies(frequency=_swap_pads),
+    # The readings of two cubes are swapped.
+    "swapped cubes": _change_frequencies(_swap_cubes),
+    # The cubes of two hubs are swapped.
+    "swapped hubs": _change_frequencies(cube=_swap_hubs),
+    # Frequencies are 1 ppm too high.
+    "scaled": _change_frequencies(frequency=lambda f: f * np.float32(1 + 1e-6)),
+    # Frequencies are in mHz.
+    "millihertz": _change_frequencies(frequency=lambda f: 1000 * f),
+    # Frequencies are rounded to 1 Hz.
+    "rounded": _change_frequencies(frequency=np.rint),
+    # 1 of 200 messages has the frequencies of the one before.
+    "stale": _change_frequencies(_make_stale("frequency")),
+    # A pad that was not measured reads 0 Hz.
+    "zero": _change_frequencies(frequency=np.nan_to_num),
+    # Stamps are 0.8 ms late.
+    "late stamps": _change_frequencies(stamp_ns=lambda t: t + 800_000),
+    # Stamps are 1 ms early.
+    "early stamps": _change_frequencies(stamp_ns=lambda t: t - 1_000_000),
+    # Stamps are the time of sending.
+    "arrival stamps": _change_frequencies(stamp_ns=lambda t: np.full_like(t, time.time_ns())),
+    # Sequence numbers are one too high.
+    "sequence": _change_frequencies(sequence=lambda sequence: sequence + np.uint32(1)),
+    # The temperature is 10 °C too high.
+    "warm": _change_frequencies(temperature=lambda celsius: celsius + np.float32(10)),
+    # The temperature is unknown.
+    "no temperature": _change_frequencies(
+        temperature=lambda celsius: np.full_like(celsius, np.nan)
     ),
-    "lost scan": (
-        "1 of 200 messages is not sent",
-        _repeat("ros.nodes.driver:FrequenciesPublisher", 0),
+    # The faults of pads that the hub reports are omitted.
+    "no pad fault": _change_frequencies(pad_fault=np.zeros_like),
+    # The faults of pads that the hub reports are given to the next cube.
+    "other pad fault": _change_frequencies(pad_fault=lambda bits: np.roll(bits, 1)),
+    # Samples that came twice are delivered twice.
+    "duplicates": _treat_as(Arrival.DUPLICATE, Arrival.NEW),
+    # Samples out of order are treated as duplicates.
+    "late lost": _treat_as(Arrival.LATE, Arrival.DUPLICATE),
+    # Samples lost on the way are not counted.
+    "losses uncounted": _change_result(
+        "device.scans.sequence:SampleAccount",
+        "counters",
+        lambda counters: {**counters, "lost_on_the_way": 0},
     ),
-    "scan twice": (
-        "1 of 200 messages is sent twice",
-        _repeat("ros.nodes.driver:FrequenciesPublisher", 2),
-    ),
-    "swapped pads": (
-        "two pads of each cube are swapped",
-        _change_frequency_columns(frequency=_swap_pads),
-    ),
-    "swapped cubes": (
-        "the readings of two cubes are swapped",
-        _change_frequencies(_swap_cubes),
-    ),
-    "swapped hubs": (
-        "the cubes of two hubs are swapped",
-        _change_frequency_columns(cube=_swap_hubs),
-    ),
-    "scaled": (
-        "frequencies are 1 ppm too high",
-        _change_frequency_columns(frequency=lambda f: f * np.float32(1 + 1e-6)),
-    ),
-    "millihertz": (
-        "frequencies are in mHz",
-        _change_frequency_columns(frequency=lambda f: 1000 * f),
-    ),
-    "rounded": ("frequencies are rounded to 1 Hz", _change_frequency_columns(frequency=np.rint)),
-    "stale": (
-        "1 of 200 messages has the frequencies of the one before",
-        _change_frequencies(_make_stale("frequency")),
-    ),
-    "zero": (
-        "a pad that was not measured reads 0 Hz",
-        _change_frequency_columns(frequency=np.nan_to_num),
-    ),
-    "late stamps": (
-        "stamps are 0.8 ms late",
-        _change_frequency_columns(stamp_ns=lambda t: t + 800_000),
-    ),
-    "early stamps": (
-        "stamps are 1 ms early",
-        _change_frequency_columns(stamp_ns=lambda t: t - 1_000_000),
-    ),
-    "arrival stamps": (
-        "stamps are the time of sending",
-        _change_frequency_columns(stamp_ns=lambda t: np.full_like(t, time.time_ns())),
-    ),
-    "sequence": (
-        "sequence numbers are one too high",
-        _change_frequency_columns(sequence=lambda sequence: sequence + np.uint32(1)),
-    ),
-    "warm": (
-        "the temperature is 10 °C too high",
-        _change_frequency_columns(temperature=lambda celsius: celsius + np.float32(10)),
-    ),
-    "no temperature": (
-        "the temperature is unknown",
-        _change_frequency_columns(temperature=lambda celsius: np.full_like(celsius, np.nan)),
-    ),
-    "no pad fault": (
-        "the faults of pads that the hub reports are omitted",
-        _change_frequency_columns(pad_fault=np.zeros_like),
-    ),
-    "other pad fault": (
-        "the faults of pads that the hub reports are given to the next cube",
-        _change_frequency_columns(pad_fault=lambda bits: np.roll(bits, 1)),
-    ),
-    "duplicates": (
-        "samples that came twice are delivered twice",
-        _treat_as(Arrival.DUPLICATE, Arrival.NEW),
-    ),
-    "late lost": (
-        "samples out of order are treated as duplicates",
-        _treat_as(Arrival.LATE, Arrival.DUPLICATE),
-    ),
-    "losses uncounted": (
-        "samples lost on the way are not counted",
-        _change_result(
-            "device.scans.sequence:SampleAccount",
-            "counters",
-            lambda counters: {**counters, "lost_on_the_way": 0},
-        ),
-    ),
-    "checksum": ("checksums are not checked", _ignore_checksums),
-    "rate ignored": ("a new rate is not requested", _skip("device.chain:LiveLinks", "set_rate")),
-    "threads": (
-        "each change of a link's state leaves a thread",
-        _wrap("device.chain:LiveLinks", "_on_state", _leave_thread),
-    ),
+    # Checksums are not checked.
+    "checksum": _ignore_checksums,
+    # A new rate is not requested.
+    "rate ignored": _skip("device.chain:LiveLinks", "set_rate"),
+    # Each change of a link's state leaves a thread.
+    "threads": _wrap("device.chain:LiveLinks", "_on_state", _leave_thread),
 }
-"""Errors of the driver: description and patch by name."""
+"""Patches of the driver by the name of the mutation; the comments say what each does wrong."""
 
-RECONSTRUCTION: dict[str, tuple[str, Patch]] = {
-    "lost stress": (
-        "1 of 200 messages of stress is not sent",
-        _repeat("ros.nodes.stress_publisher:StressPublisher", 0),
+RECONSTRUCTION: dict[str, Patch] = {
+    # 1 of 200 messages of stress is not sent.
+    "lost stress": _repeat("ros.nodes.stress_publisher:StressPublisher", 0),
+    # 1 of 200 messages of stress is sent twice.
+    "stress twice": _repeat("ros.nodes.stress_publisher:StressPublisher", 2),
+    # Queues hold 0.1 s, and nobody counts what they drop.
+    "losses unseen": _lose_silently,
+    # Health finds and flags nothing.
+    "blind": _change_result(
+        "core.health.health:Health", "update", lambda flags: tuple(map(np.zeros_like, flags))
     ),
-    "stress twice": (
-        "1 of 200 messages of stress is sent twice",
-        _repeat("ros.nodes.stress_publisher:StressPublisher", 2),
+    # Health flags a sound pad.
+    "ghosts": _wrap("core.health.health:Health", "update", _flag_sound_pad),
+    # Stuck pads are not found.
+    "never stuck": _change_result(
+        "core.health.diagnosis:PadDiagnosis", "_find_stuck", np.zeros_like
     ),
-    "losses unseen": ("queues hold 0.1 s, and nobody counts what they drop", _lose_silently),
-    "blind": (
-        "health finds and flags nothing",
-        _change_result(
-            "core.health.health:Health", "update", lambda flags: tuple(map(np.zeros_like, flags))
-        ),
+    # Noisy pads are not found.
+    "never noisy": _change_result(
+        "core.health.diagnosis:PadDiagnosis", "_find_noisy", np.zeros_like
     ),
-    "ghosts": (
-        "health flags a sound pad",
-        _wrap("core.health.health:Health", "update", _flag_sound_pad),
+    # The status does not state that a pad is stuck.
+    "no stuck bit": _change_stress(status=lambda status: status & ~np.uint16(STUCK)),
+    # The status states short for open, and open for short.
+    "open is short": _change_stress(status=_swap_open_and_short),
+    # A pad is never used again.
+    "for ever": _wrap("core.health.diagnosis:Conditions", "end_window", _never_release),
+    # Windows of statistics last 2 s.
+    "slow": _replace("core.health.health", "WINDOW_NS", lambda _: 2_000_000_000),
+    # Left_out is 0.
+    "no mask": _change_stress(left_out=np.zeros_like),
+    # Left_out names the next pad.
+    "other mask": _change_stress(left_out=lambda mask: mask << np.uint32(1)),
+    # Left-out pads are used.
+    "mask unused": _wrap("core.pipeline:Pipeline", "process", _use_bad_pads),
+    # The residual is 0.
+    "no residual": _change_stress(residual=np.zeros_like),
+    # The residual is doubled.
+    "residual doubled": _change_stress(residual=lambda value: 2 * value),
+    # The status states nothing about residuals.
+    "no residual bit": _change_stress(status=lambda status: status & ~np.uint16(RESIDUAL)),
+    # Xx and zz are swapped.
+    "swapped components": _change_stress(stress=lambda stress: stress[:, [2, 1, 0, 3, 4, 5]]),
+    # Zx has the other sign.
+    "shear sign": _change_stress(stress=lambda stress: stress * [1, 1, 1, 1, -1, 1]),
+    # Compression is positive.
+    "pressure positive": _change_stress(stress=np.negative, gradient=np.negative),
+    # Stress is in kPa.
+    "kilopascal": _change_stress(stress=lambda stress: stress / 1e3),
+    # Gradients are in Pa/mm.
+    "per millimetre": _change_stress(gradient=lambda value: value / 1e3),
+    # Gradients have columns for rows.
+    "gradient transposed": _change_stress(gradient=_transpose),
+    # Components that are not observed are 0.
+    "unknown is zero": _change_stress(stress=np.nan_to_num, gradient=np.nan_to_num),
+    # 1 of 200 messages has the stress of the one before.
+    "stale stress": _change_stress(_make_stale("stress")),
+    # The tensors of neighbours are swapped.
+    "swapped tensors": _change_stress(stress=lambda stress: stress[::-1]),
+    # Stress has stamps 1 ms later than its frequencies.
+    "stress stamps": _change_stress(stamp_ns=lambda stamp_ns: stamp_ns + 1_000_000),
+    # Stress has sequence numbers one higher.
+    "stress sequence": _change_stress(sequence=lambda sequence: sequence + np.uint32(1)),
+    # A component that is observed is marked as not observed.
+    "observed": _change_stress(observed=lambda observed: observed & ~np.uint16(1)),
+    # A tare gives rest frequencies 100 ppm too high.
+    "wrong tare": _change_result(
+        "core.reconstructor:Reconstructor", "measure_rest", lambda rest: (1 + 1e-4) * rest
     ),
-    "never stuck": (
-        "stuck pads are not found",
-        _change_result("core.health.diagnosis:PadDiagnosis", "_find_stuck", np.zeros_like),
+    # A tare takes the frequencies of the next cube.
+    "tare of others": _change_result(
+        "core.reconstructor:Reconstructor",
+        "measure_rest",
+        lambda rest: np.roll(rest, 1, axis=0),
     ),
-    "never noisy": (
-        "noisy pads are not found",
-        _change_result("core.health.diagnosis:PadDiagnosis", "_find_noisy", np.zeros_like),
+    # A tare changes nothing.
+    "no tare": _wrap("core.reconstructor:Reconstructor", "tare", _undo_tare),
+    # Clearing the tare changes nothing.
+    "no clear": _skip("core.reconstructor:Reconstructor", "clear_tare"),
+    # The covariance of single cubes is doubled.
+    "covariance": _change_result(
+        "ros.nodes.stress_publisher:CubeTopics",
+        "_covariance",
+        lambda covariance: 2 * covariance,
     ),
-    "no stuck bit": (
-        "the status does not state that a pad is stuck",
-        _change_stress_columns(status=lambda status: status & ~np.uint16(STUCK)),
+    # The topic of a cube has the tensor of another one.
+    "other cube": _wrap(
+        "ros.nodes.stress_publisher",
+        "tensor_message",
+        lambda original, header, rows, row, *others: original(header, rows, row - 1, *others),
     ),
-    "open is short": (
-        "the status states short for open, and open for short",
-        _change_stress_columns(status=_swap_open_and_short),
-    ),
-    "for ever": (
-        "a pad is never used again",
-        _wrap("core.health.diagnosis:Conditions", "end_window", _never_release),
-    ),
-    "slow": (
-        "windows of statistics last 2 s",
-        _replace("core.health.health", "WINDOW_NS", lambda _: 2_000_000_000),
-    ),
-    "no mask": ("left_out is 0", _change_stress_columns(left_out=np.zeros_like)),
-    "other mask": (
-        "left_out names the next pad",
-        _change_stress_columns(left_out=lambda mask: mask << np.uint32(1)),
-    ),
-    "mask unused": (
-        "left-out pads are used",
-        _wrap("core.pipeline:Pipeline", "process", _use_bad_pads),
-    ),
-    "no residual": ("the residual is 0", _change_stress_columns(residual=np.zeros_like)),
-    "residual doubled": (
-        "the residual is doubled",
-        _change_stress_columns(residual=lambda value: 2 * value),
-    ),
-    "no residual bit": (
-        "the status states nothing about residuals",
-        _change_stress_columns(status=lambda status: status & ~np.uint16(RESIDUAL)),
-    ),
-    "swapped components": (
-        "xx and zz are swapped",
-        _change_stress_columns(stress=lambda stress: stress[:, [2, 1, 0, 3, 4, 5]]),
-    ),
-    "shear sign": (
-        "zx has the other sign",
-        _change_stress_columns(stress=lambda stress: stress * [1, 1, 1, 1, -1, 1]),
-    ),
-    "pressure positive": (
-        "compression is positive",
-        _change_stress_columns(stress=np.negative, gradient=np.negative),
-    ),
-    "kilopascal": ("stress is in kPa", _change_stress_columns(stress=lambda stress: stress / 1e3)),
-    "per millimetre": (
-        "gradients are in Pa/mm",
-        _change_stress_columns(gradient=lambda value: value / 1e3),
-    ),
-    "gradient transposed": (
-        "gradients have columns for rows",
-        _change_stress_columns(gradient=_transpose),
-    ),
-    "unknown is zero": (
-        "components that are not observed are 0",
-        _change_stress_columns(stress=np.nan_to_num, gradient=np.nan_to_num),
-    ),
-    "stale stress": (
-        "1 of 200 messages has the stress of the one before",
-        _change_stress(_make_stale("stress")),
-    ),
-    "swapped tensors": (
-        "the tensors of neighbours are swapped",
-        _change_stress_columns(stress=lambda stress: stress[::-1]),
-    ),
-    "stress stamps": (
-        "stress has stamps 1 ms later than its frequencies",
-        _change_stress_columns(stamp_ns=lambda stamp_ns: stamp_ns + 1_000_000),
-    ),
-    "stress sequence": (
-        "stress has sequence numbers one higher",
-        _change_stress_columns(sequence=lambda sequence: sequence + np.uint32(1)),
-    ),
-    "observed": (
-        "a component that is observed is marked as not observed",
-        _change_stress_columns(observed=lambda observed: observed & ~np.uint16(1)),
-    ),
-    "wrong tare": (
-        "a tare gives rest frequencies 100 ppm too high",
-        _change_result(
-            "core.reconstructor:Reconstructor", "measure_rest", lambda rest: (1 + 1e-4) * rest
-        ),
-    ),
-    "tare of others": (
-        "a tare takes the frequencies of the next cube",
-        _change_result(
-            "core.reconstructor:Reconstructor",
-            "measure_rest",
-            lambda rest: np.roll(rest, 1, axis=0),
-        ),
-    ),
-    "no tare": (
-        "a tare changes nothing",
-        _wrap("core.reconstructor:Reconstructor", "tare", _undo_tare),
-    ),
-    "no clear": (
-        "clearing the tare changes nothing",
-        _skip("core.reconstructor:Reconstructor", "clear_tare"),
-    ),
-    "covariance": (
-        "the covariance of single cubes is doubled",
-        _change_result(
-            "ros.nodes.stress_publisher:CubeTopics",
-            "_covariance",
-            lambda covariance: 2 * covariance,
-        ),
-    ),
-    "other cube": (
-        "the topic of a cube has the tensor of another one",
-        _wrap(
-            "ros.nodes.stress_publisher",
-            "tensor_message",
-            lambda original, header, rows, row, *others: original(header, rows, row - 1, *others),
-        ),
-    ),
+    # A tare is not restored at the start.
+    "tare not restored": _skip("ros.nodes.taring:Taring", "_restore_tare"),
 }
-"""Errors of the reconstruction: description and patch by name."""
+"""Patches of the reconstruction by the name of the mutation; the comments say what each does
+wrong."""
 
-RESTARTED: dict[str, tuple[str, Patch]] = {
-    "tare not restored": (
-        "a tare is not restored at the start",
-        _skip("ros.nodes.taring:Taring", "_restore_tare"),
-    ),
-}
-"""Errors of the reconstruction that show only when it starts again."""
+NEEDS_RESTART = ("tare not restored",)
+"""Mutations that show only when the reconstruction starts again."""
 
 MUTATIONS: dict[str, Mutation] = {
-    **{name: Mutation("driver", *rest) for name, rest in DRIVER.items()},
-    **{name: Mutation("reconstruction", *rest) for name, rest in RECONSTRUCTION.items()},
-    **{name: Mutation("reconstruction", *rest, True) for name, rest in RESTARTED.items()},
+    **{name: Mutation("driver", patch) for name, patch in DRIVER.items()},
+    **{name: Mutation("reconstruction", patch) for name, patch in RECONSTRUCTION.items()},
 }
 """All mutations by name."""
 

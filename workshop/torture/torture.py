@@ -20,7 +20,7 @@ from cube_tensor_driver.processes.stop_signals import stop_event
 from cube_tensor_driver.views.terminal.output import progress_bar
 
 from ..checks.all_checks import check_all
-from .mutations import MUTATIONS
+from .mutations import MUTATIONS, NEEDS_RESTART
 from .play import play
 
 MUTATED_S = 10.0
@@ -140,7 +140,7 @@ def run_mutations(
 
 def _torture_mutated(name: str, seed: int) -> dict[str, Any]:
     """Return the figures of the torture of one mutation."""
-    duration = RESTARTED_S if MUTATIONS[name].needs_restart else MUTATED_S
+    duration = RESTARTED_S if name in NEEDS_RESTART else MUTATED_S
     return torture(duration, seed, stop_event(), name)
 
 
