@@ -28,8 +28,8 @@ TIME_SCALE = uplot.Scale(
 )
 """Time axis of the plots: seconds relative to the newest value, without automatic range."""
 
-NUDGE_PERIOD = 3
-"""Number of drawings of a chart after which the range of its value axis changes invisibly.
+NUDGE_PERIOD = 10
+"""Number of pictures after which the range of a chart's value axis changes invisibly.
 
 The change makes the browser lay the chart out again. This is needed because a chart that was made
 before the browser knew its width has no time axis until a range changes.
@@ -84,6 +84,11 @@ FIRST_GROUPS = ("normal stress", "gradient of σzz")
 """Names, in `GROUPS`, of the values that the two charts show when the page opens."""
 
 
+Panel = tuple[str, Array, dict[str, Array]]
+"""A chart for a picture: label of its value axis; times (M,) in s before now; name of a line -> its
+values (M,), in the unit of the label."""
+
+
 class ChartLine(NamedTuple):
     """One line of a chart: one value of one cube.
 
@@ -92,12 +97,16 @@ class ChartLine(NamedTuple):
         column: Index of the value in `History.COLUMNS`.
         label: Name of the line in the legend on the page, such as "c05 σzz".
         printed: Name of the line in a PNG file, with the symbol set as mathematics.
+        axis: Label of the value axis of its chart, with the unit.
+        size: Size of this unit, in SI units.
     """
 
     cube: int
     column: int
     label: str
     printed: str
+    axis: str
+    size: float
 
 
 class Charts:
@@ -116,10 +125,10 @@ class Charts:
             tab: The tab of the panel.
             names: Names of the cubes of the skin.
         """
-        self._names = list(names)
-        self._pictures = 0
+        self._gui, self._tab, self._names = gui, tab, list(names)
         self._history: History | None = None
         self._cubes = [0]
+        self._lines: list[tuple[ChartLine, ...]] = [()] * len(FIRST_GROUPS)
         with tab:
             self._text = gui.add_text(
                 "more cubes",
@@ -128,138 +137,65 @@ class Charts:
                 order=0,
             )
             # Each chart takes two positions in the tab: its drop-down list and its plot.
-            self._charts = [
-                Chart(gui, tab, group, 1 + 2 * number) for number, group in enumerate(FIRST_GROUPS)
+            self.lists = [
+                gui.add_dropdown("plot", tuple(GROUPS), initial_value=group, order=1 + 2 * number)
+                for number, group in enumerate(FIRST_GROUPS)
             ]
             files = gui.add_button_group("save as", ("CSV", "PNG"), order=10)
             zoom = "To zoom, pause the page and drag. A double click shows all again."
             gui.add_html(markup.box(zoom), order=11)
+        self._plots: list[viser.GuiUplotHandle | None] = [None] * len(FIRST_GROUPS)
 
         @files.on_click
         def _(event: viser.GuiEvent[Any]) -> None:
             self._save(event.client, str(files.value))
 
-    def draw(self, history: History, chosen: int) -> None:
-        """Draw all charts.
+    def choose(self, history: History, chosen: int) -> tuple[tuple[ChartLine, ...], ...]:
+        """Return the lines of each chart that the user has chosen.
 
         Args:
-            history: Values of all cubes in the last seconds.
+            history: Values of all cubes in the last seconds, which tell what the cubes observe.
             chosen: Index of the cube that the user chose on the page.
         """
-        self._pictures += 1
         self._history = history
         indices = {name: number for number, name in enumerate(self._names)}
         words = str(self._text.value).replace(",", " ").split()
         named = [indices[word] for word in words if word in indices]
         # `dict.fromkeys` removes repeated cubes and keeps the order: the chosen cube is the first.
         self._cubes = list(dict.fromkeys([chosen, *named]))
-        for chart in self._charts:
-            chart.choose(self._lines(chart, history))
-            chart.draw(history, nudge=bool(self._pictures // NUDGE_PERIOD % 2))
+        for number, one in enumerate(self.lists):
+            # A browser may send any text, so the value is checked.
+            group = one.value if one.value in GROUPS else FIRST_GROUPS[0]
+            lines = chart_lines(history, self._names, self._cubes, group)
+            # A chart without lines would have no axes; it keeps those that it has.
+            self._lines[number] = lines or self._lines[number]
+        return tuple(self._lines)
 
-    def offer_observed(self, history: History) -> None:
-        """Limit the lists of both charts to groups of values that at least one cube observes.
-
-        Args:
-            history: Values of all cubes in the last seconds. A cube observes a component of stress
-                or gradient if the component is finite in it.
-        """
-        observed = dict(zip(History.COLUMNS, history.observed, strict=True))
-        # Until the first tensors arrive, it is unknown which components the cubes observe, and all
-        # groups stay in the lists.
-        if not any(observed[name] for name in COMPONENTS):
-            return
-        groups = [
-            group for group, columns in GROUPS.items() if any(observed[name] for name in columns)
-        ]
-        for chart in self._charts:
-            chart.offer(groups)
-
-    def _lines(self, chart: Chart, history: History) -> list[ChartLine]:
-        observed = dict(zip(History.COLUMNS, history.observed, strict=True))
-        columns = [name for name in GROUPS[chart.group] if observed[name]]
-        lines = [
-            ChartLine(
-                cube,
-                History.COLUMNS.index(name),
-                f"{self._names[cube]} {markup.label(name)}",
-                f"{self._names[cube]} {name if name == 'residual' else symbol(name)}",
-            )
-            for cube in self._cubes
-            for name in columns
-        ]
-        return lines[:MAX_LINES]
-
-    def _save(self, client: viser.ClientHandle | None, kind: str) -> None:
-        if client is None or self._history is None:
-            return
-        if kind == "CSV":
-            content = csv_of(self._history, self._cubes, self._names)
-            client.send_file_download("skin.csv", content, save_immediately=True)
-        elif kind == "PNG":
-            panels = [chart.panel(self._history) for chart in self._charts]
-            client.send_file_download("skin.png", png(draw_lines(panels)), save_immediately=True)
-
-
-class Chart:
-    """One chart over time, and the drop-down list in which the user chooses its values."""
-
-    def __init__(
-        self, gui: viser.GuiApi, tab: viser.GuiTabHandle, group: str, order: float
-    ) -> None:
-        """Add the drop-down list to the tab; `choose` adds the plot once there are lines.
+    def replace_plots(self, charts: Sequence[Sequence[ChartLine]]) -> dict[str, Any]:
+        """Replace the plots whose lines have changed, as uPlot cannot add a line to a plot.
 
         Args:
-            gui: The controls of one browser.
-            tab: The tab of the panel.
-            group: Name, in `GROUPS`, of the values that the chart shows at first.
-            order: Position of the list in the tab; the plot has the position `order + 1`.
+            charts: Lines of each chart.
+
+        Returns:
+            Name of each new plot -> the plot.
         """
-        self._gui, self._tab, self._order = gui, tab, order
-        self._range = (0.0, 1.0)
-        self._lines: list[ChartLine] = []
-        self._choice = gui.add_dropdown("plot", tuple(GROUPS), initial_value=group, order=order)
-        self._plot: viser.GuiUplotHandle | None = None
+        new: dict[str, Any] = {}
+        for number, lines in enumerate(charts):
+            plot = self._plots[number]
+            labels = [one["label"] for one in plot.series[1:]] if plot is not None else []
+            if not lines or labels == [line.label for line in lines]:
+                continue
+            if plot is not None:
+                plot.remove()
+            new[f"chart {number}"] = self._plots[number] = self._add_plot(lines, 2 + 2 * number)
+        return new
 
-    @property
-    def group(self) -> str:
-        """Name, in `GROUPS`, of the values that the chart shows."""
-        # A browser may send any text, so the value is checked.
-        return self._choice.value if self._choice.value in GROUPS else "normal stress"
-
-    def offer(self, groups: list[str]) -> None:
-        """Set the entries of the drop-down list to names of `GROUPS`.
-
-        Equal entries are not set again, because that would close a list that the user has opened.
-        """
-        if tuple(groups) != tuple(self._choice.options):
-            self._choice.options = groups
-
-    def choose(self, lines: list[ChartLine]) -> None:
-        """Set the lines that the chart shows from now on.
-
-        Args:
-            lines: The lines, each for one value of one cube; if there are none, nothing changes. If
-                they differ from the present lines, the plot is replaced, because uPlot (the
-                plotting library of the page) cannot add a line to a plot.
-        """
-        if lines == self._lines or not lines:
-            return
-        self._lines = lines
-        if self._plot is not None:
-            self._plot.remove()
-        self._range = (0.0, 1.0)
-
+    def _add_plot(self, lines: Sequence[ChartLine], order: float) -> viser.GuiUplotHandle:
         grid: uplot.Axis_Grid = {"stroke": "#dee2e6", "width": 1}
-        labels = ("time before now / s", self._label)
+        labels = ("time before now / s", lines[0].axis)
         axes = tuple(
-            uplot.Axis(
-                stroke="#343a40",
-                grid=grid,
-                size=size,
-                label=label,
-                labelSize=18,
-            )
+            uplot.Axis(stroke="#343a40", grid=grid, size=size, label=label, labelSize=18)
             for size, label in zip(AXIS_SIZES, labels, strict=True)
         )
         series = [
@@ -272,74 +208,88 @@ class Chart:
             for number, line in enumerate(lines)
         ]
         with self._tab:
-            self._plot = self._gui.add_uplot(
+            return self._gui.add_uplot(
                 (np.array([0.0]),) * (1 + len(lines)),
                 (uplot.Series(label="s"), *series),
                 height=CHART_HEIGHT,
                 axes=axes,
-                scales=self._scales(),
+                scales=_scales(0.0, 1.0),
                 padding=(10, 12, 0, 0),
                 # Plots with the same key share one cursor: both show the values of one instant.
                 cursor={"sync": {"key": "skin"}},
-                order=self._order + 1,
+                order=order,
             )
 
-    def draw(self, history: History, nudge: bool) -> None:
-        """Draw the lines with the values of the last seconds.
-
-        Args:
-            history: Values of all cubes in the last seconds.
-            nudge: Whether to change the range of the value axis by an invisible amount. If the
-                browser made the plot before its width was known, the time axis is missing until
-                a range changes.
-        """
-        if self._plot is None:
+    def _save(self, client: viser.ClientHandle | None, kind: str) -> None:
+        history = self._history
+        if client is None or history is None:
             return
-        values = self._values(history)
-        self._plot.data = (history.times, *values)
-        # The range is computed here, because uPlot cannot compute it from values with NaN.
-        finite = np.concatenate(values)
-        finite = finite[np.isfinite(finite)]
-        low, high = round_range(finite.min(initial=0.0), finite.max(initial=0.0))
-        if nudge:
-            high += 1e-9 * (high - low)
-        if self._range != (low, high):
-            self._range = (low, high)
-            self._plot.scales = self._scales()
+        if kind == "CSV":
+            content = csv_of(history, self._cubes, self._names)
+            client.send_file_download("skin.csv", content, save_immediately=True)
+        elif kind == "PNG":
+            panels = [chart_panel(history, lines) for lines in self._lines if lines]
+            client.send_file_download("skin.png", png(draw_lines(panels)), save_immediately=True)
 
-    def panel(self, history: History) -> tuple[str, Array, dict[str, Array]]:
-        """Return what `draw_lines` needs to draw this chart into a picture.
 
-        Args:
-            history: Values of all cubes in the M pictures of the last seconds.
+def chart_lines(
+    history: History, names: Sequence[str], cubes: Sequence[int], group: str
+) -> tuple[ChartLine, ...]:
+    """Return the lines of a chart: the observed values of a group, of some cubes.
 
-        Returns:
-            Label of the value axis; times (M,) in s before now; name of a line -> values (M,), in
-            the unit of the label.
-        """
-        lines = zip(self._lines, self._values(history), strict=True)
-        # matplotlib sets the symbol of a component as mathematics; the page shows plain text.
-        label = self._label.replace("σzz", symbol("zz"))
-        return label, history.times, {line.printed: values for line, values in lines}
+    Args:
+        history: Values of all cubes in the last seconds.
+        names: Names of all cubes.
+        cubes: Indices of the cubes, in the order of their lines.
+        group: Name of the values in `GROUPS`.
+    """
+    observed = history.observed_names
+    size, unit = markup.unit(GROUPS[group][0])
+    lines = [
+        ChartLine(
+            cube=cube,
+            column=History.COLUMNS.index(name),
+            label=f"{names[cube]} {markup.label(name)}",
+            printed=f"{names[cube]} {name if name == 'residual' else symbol(name)}",
+            axis=f"{group} / {unit}",
+            size=size,
+        )
+        for cube in cubes
+        for name in GROUPS[group]
+        if name in observed
+    ]
+    return tuple(lines[:MAX_LINES])
 
-    @property
-    def _label(self) -> str:
-        return f"{self.group} / {markup.unit(GROUPS[self.group][0])[1]}"
 
-    def _values(self, history: History) -> list[Array]:
-        """Return the values of each line of the chart.
+def chart_properties(history: History, lines: Sequence[ChartLine]) -> dict[str, Any]:
+    """Return the values of a plot and the ranges of its axes.
 
-        Args:
-            history: Values of all cubes in the M pictures of the last seconds.
+    Args:
+        history: Values of all cubes in the last seconds.
+        lines: The lines of the plot; if there are none, nothing is returned.
+    """
+    if not lines:
+        return {}
+    values = [history.of(line.cube, line.column) / line.size for line in lines]
+    # The range is computed here, because uPlot cannot compute it from values with NaN.
+    finite = np.concatenate(values)
+    finite = finite[np.isfinite(finite)]
+    low, high = round_range(finite.min(initial=0.0), finite.max(initial=0.0))
+    if history.count // NUDGE_PERIOD % 2:
+        high += 1e-9 * (high - low)
+    return {"data": (history.times, *values), "scales": _scales(low, high)}
 
-        Returns:
-            For each line the values (M,), in the unit of the value axis.
-        """
-        size = markup.unit(GROUPS[self.group][0])[0]
-        return [history.of(line.cube, line.column) / size for line in self._lines]
 
-    def _scales(self) -> dict[str, uplot.Scale]:
-        return {"x": TIME_SCALE, "y": uplot.Scale(auto=False, range=self._range)}
+def chart_panel(history: History, lines: Sequence[ChartLine]) -> Panel:
+    """Return what `draw_lines` needs to draw a chart into a picture."""
+    # matplotlib sets the symbol of a component as mathematics; the page shows plain text.
+    label = lines[0].axis.replace("σzz", symbol("zz"))
+    values = {line.printed: history.of(line.cube, line.column) / line.size for line in lines}
+    return label, history.times, values
+
+
+def _scales(low: float, high: float) -> dict[str, uplot.Scale]:
+    return {"x": TIME_SCALE, "y": uplot.Scale(auto=False, range=(low, high))}
 
 
 def csv_of(history: History, cubes: Sequence[int], names: Sequence[str]) -> bytes:
@@ -353,12 +303,13 @@ def csv_of(history: History, cubes: Sequence[int], names: Sequence[str]) -> byte
     Returns:
         The content of the file. Components that no cube observes have no column.
     """
-    observed = np.flatnonzero(history.observed).tolist()
+    observed = history.observed_names
     header = ["time / s"]
     columns = [history.times]
     for cube in cubes:
-        for column in observed:
-            name = History.COLUMNS[column]
+        for column, name in enumerate(History.COLUMNS):
+            if name not in observed:
+                continue
             unit = "1" if name == "residual" else "Pa/m" if "_" in name else "Pa"
             header.append(f"{names[cube]} {name} / {unit}")
             columns.append(history.of(cube, column))
@@ -370,11 +321,11 @@ def csv_of(history: History, cubes: Sequence[int], names: Sequence[str]) -> byte
 
 
 @print_style()
-def draw_lines(panels: Sequence[tuple[str, Array, dict[str, Array]]]) -> Figure:
+def draw_lines(panels: Sequence[Panel]) -> Figure:
     """Draw panels one below the other over a common time axis.
 
     Args:
-        panels: Label, times and values of each panel, as `Chart.panel` returns them.
+        panels: Label, times and values of each panel, as `chart_panel` returns them.
     """
     figure = Figure(figsize=(8, 3 * len(panels)))
     axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]

@@ -1,4 +1,4 @@
-"""ROS clients of the page: calls of services, control of a replay, and contacts."""
+"""ROS clients of the page: calls of services, and control of a replay."""
 
 from __future__ import annotations
 
@@ -9,18 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from rclpy.client import Client
 from rclpy.node import Node
-from scipy.spatial import cKDTree
-from sensor_msgs.msg import PointCloud2
 
-from ..core.arrays import Array
 from ..core.latest_stress import STALE_S
-from ..messages.contacts import decode_contacts, decode_traction
-from ..msg import ReplayState, SkinContacts
-from ..ros.callbacks import CallbackErrors
+from ..msg import ReplayState
 from ..srv import SteerReplay
-from ..touch.surface import Contact, Surface
 from .markup import NoteColour
-from .moment import Found, SurfaceField
 
 Say = Callable[[str, str, NoteColour], None]
 """Function that shows a note to the user: it takes the note's title, text and colour."""
@@ -30,15 +23,6 @@ MAX_ANSWER_S = 10.0
 
 After this time the call is cancelled and the user is told so.
 """
-
-MAX_CONTACTS_AGE_S = 1.0
-"""Time since their arrival, in seconds, after which contacts and traction are no longer shown.
-
-Nothing arrives any more if the node `contacts` has ended or the skin sends nothing.
-"""
-
-INTERPOLATION_POINTS = 4
-"""Number of nearest points of the topic `traction` from which the page interpolates each value."""
 
 
 class _Call(NamedTuple):
@@ -205,82 +189,3 @@ class ReplayClient:
 
     def _receive(self, state: ReplayState) -> None:
         self.state, self._received_s = state, time.monotonic()
-
-
-class ContactsClient:
-    """Subscribes to the contacts and the traction that the node `contacts` publishes."""
-
-    def __init__(self, node: Node, errors: CallbackErrors) -> None:
-        node.create_subscription(SkinContacts, "contacts", errors.catch(self._receive_contacts), 2)
-        node.create_subscription(PointCloud2, "traction", errors.catch(self._receive_traction), 2)
-        self._contacts: list[Contact] = []
-        self._cloud = np.empty((0, 6))
-        self._contacts_s = self._cloud_s = -np.inf
-        self._interpolation: _Interpolation | None = None
-
-    def found(self, surface: Surface) -> Found:
-        """Return the latest contacts, and pressure and shear interpolated to points of a surface.
-
-        Contacts or a field that arrived more than `MAX_CONTACTS_AGE_S` ago, or never, are None.
-
-        Args:
-            surface: Points to which pressure and shear are interpolated.
-        """
-        oldest_s = time.monotonic() - MAX_CONTACTS_AGE_S
-        contacts = self._contacts if self._contacts_s > oldest_s else None
-        if self._cloud_s < oldest_s or not len(self._cloud):
-            return Found(contacts)
-        points = self._cloud[:, :3]
-        # The points of a skin do not move, so the weights of the interpolation are computed once.
-        if self._interpolation is None or not self._interpolation.fits(surface, points):
-            self._interpolation = _Interpolation(surface, points)
-        pressure, shear, sigma = self._interpolation.values(self._cloud[:, 3:]).T
-        return Found(contacts, SurfaceField(pressure, shear, sigma))
-
-    def _receive_contacts(self, message: SkinContacts) -> None:
-        self._contacts, self._contacts_s = decode_contacts(message), time.monotonic()
-
-    def _receive_traction(self, message: PointCloud2) -> None:
-        cloud = decode_traction(message)
-        has_position = np.isfinite(cloud[:, :3]).all(axis=1)
-        self._cloud, self._cloud_s = cloud[has_position], time.monotonic()
-
-
-class _Interpolation:
-    """Interpolates from M points of the topic `traction` to all points of a surface.
-
-    The weights are the inverse squared distances to the nearest `INTERPOLATION_POINTS` points
-    (Shepard's method).
-    """
-
-    def __init__(self, surface: Surface, points: Array) -> None:
-        self._surface, self._points = surface, points
-        shape = len(surface.points), min(INTERPOLATION_POINTS, len(points))
-        # `surface.points` lie in the plane of the cubes' centres, those of `traction` on the outer
-        # surface of the skin, so the former are moved up by the depth of the cubes.
-        up = surface.depth * surface.poses.rotation[surface.cube, :, 2]
-        distance, nearest = cKDTree(points).query(surface.points + up, shape[1])
-        self._nearest = nearest.reshape(shape)
-        # The lower limit of the distance avoids a division by zero where two points coincide.
-        weight = 1 / np.maximum(distance.reshape(shape), 1e-3 * surface.spacing) ** 2
-        self._weight = weight / weight.sum(axis=1, keepdims=True)
-
-    def fits(self, surface: Surface, points: Array) -> bool:
-        """Return whether the weights were computed for this surface and these points.
-
-        Args:
-            surface: Surface to whose points values are interpolated.
-            points: (M, 3) points of the topic `traction`, in m, in the parent frame of the skin.
-        """
-        return surface is self._surface and np.array_equal(points, self._points)
-
-    def values(self, values: Array) -> Array:
-        """Interpolate C quantities from the M points to the points of the surface.
-
-        Args:
-            values: Values (M, C) at the M points.
-
-        Returns:
-            Values (points of the surface, C); NaN where one of the nearest values is NaN.
-        """
-        return np.asarray(np.einsum("pk,pkc->pc", self._weight, values[self._nearest]))

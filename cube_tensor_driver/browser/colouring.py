@@ -11,7 +11,8 @@ from ..touch.surface import Surface
 from ..views import scene
 from ..views.scene import QUANTITIES, Quantity
 from . import markup
-from .moment import DEVIATION, Moment
+from .scan import Scan
+from .surface_field import DEVIATION
 
 
 class Colouring(NamedTuple):
@@ -34,27 +35,27 @@ class Colouring(NamedTuple):
 
     @classmethod
     def of(
-        cls, moment: Moment, surface: Surface, quantity: Quantity, fixed_top: float, last_top: float
+        cls, scan: Scan, surface: Surface, quantity: Quantity, fixed_top: float, last_top: float
     ) -> Colouring:
         """Compute the values and the range of the colour scale for one picture.
 
         Args:
-            moment: Values of the cubes and of the surface at the instant that is drawn.
-            surface: Points at which `moment.field` is given.
+            scan: Values of the cubes and of the surface at the instant that is drawn.
+            surface: Points at which `scan.field` is given.
             quantity: The quantity that the colours show.
             fixed_top: Upper end of the colour scale, in SI units; 0: it follows the values.
             last_top: Upper end in the picture before, in SI units; an automatic range falls slowly
                 from it.
         """
-        pressure, sigma = moment.field.pressure, moment.field.sigma
+        pressure, sigma = scan.field.pressure, scan.field.sigma
         above = None
         if sigma is not None:
             # `surface.middle` contains, for each cube, the index of the point nearest to it.
             above = np.stack([pressure, sigma], axis=1)[surface.middle]
-        cubes = quantity.of(moment.values, moment.residual)
+        cubes = quantity.of(scan.values, scan.residual)
         if quantity is DEVIATION and above is not None:
             cubes = above[:, 1]
-        field = _field_values(moment, surface, quantity, cubes)
+        field = _field_values(scan, surface, quantity, cubes)
         top = fixed_top or scene.automatic(quantity, np.concatenate([cubes, field]), last_top)
         return cls(quantity, cubes, field, top, above)
 
@@ -75,7 +76,7 @@ class Colouring(NamedTuple):
 
 
 def _field_values(
-    moment: Moment,
+    scan: Scan,
     surface: Surface,
     quantity: Quantity,
     cubes: Array,
@@ -86,15 +87,15 @@ def _field_values(
     point has the value of the cube around which it lies.
 
     Args:
-        moment: The instant that is drawn.
+        scan: The instant that is drawn.
         surface: Its M points.
         quantity: The quantity that the colours show.
         cubes: (N,) values at the cubes, in SI units.
     """
     if quantity is QUANTITIES["pressure"]:
-        return moment.field.pressure
+        return scan.field.pressure
     if quantity is QUANTITIES["shear"]:
-        return moment.field.shear
-    if quantity is DEVIATION and moment.field.sigma is not None:
-        return moment.field.sigma
+        return scan.field.shear
+    if quantity is DEVIATION and scan.field.sigma is not None:
+        return scan.field.sigma
     return cubes[surface.cube]

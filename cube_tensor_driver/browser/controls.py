@@ -9,11 +9,9 @@ from typing import Any, Protocol
 
 import viser
 
-from ..core.modes import COMPONENTS
 from ..views.scene import QUANTITIES, Quantity
 from . import markup
-from .history import History
-from .moment import DEVIATION, SurfaceField
+from .surface_field import DEVIATION
 
 SLIDER_STEP_S = 0.1
 """Step, in seconds, between two positions of the slider that sets the time within a replay."""
@@ -54,26 +52,24 @@ class ReplayPosition(Protocol):
 
 
 class ColourControls:
-    """The list of quantities for the colours, the upper end of the colour scale, and the legend."""
+    """The list of quantities for the colours, the upper end of the colour scale, and the legend.
 
-    def __init__(self, gui: viser.GuiApi, changed: Callable[[], None]) -> None:
-        """Add the controls to a panel.
+    Attributes:
+        list: Drop-down list of the quantities.
+        legend: HTML element with the legend.
+    """
 
-        Args:
-            gui: The controls of one browser.
-            changed: Function that is called when the user chooses another quantity.
-        """
+    def __init__(self, gui: viser.GuiApi) -> None:
         labels = [quantity.label for quantity in QUANTITIES.values()]
-        self._quantity = gui.add_dropdown("colour", labels)
-        self._quantity.on_update(lambda _: changed())
+        self.list = gui.add_dropdown("colour", labels)
         self._range = gui.add_number("top (0: auto)", 0.0, min=0.0, step=0.1)
-        self._legend = gui.add_html("")
+        self.legend = gui.add_html("")
 
     @property
     def quantity(self) -> Quantity:
         """The quantity that the user chose; the first one if the browser sent an unknown text."""
         offered = (*QUANTITIES.values(), DEVIATION)
-        chosen = [one for one in offered if one.label == self._quantity.value]
+        chosen = [one for one in offered if one.label == self.list.value]
         return chosen[0] if chosen else next(iter(QUANTITIES.values()))
 
     @property
@@ -81,43 +77,6 @@ class ColourControls:
         """Upper end of the colour scale that the user entered, in SI units; 0: it is automatic."""
         value = float(self._range.value)
         return value * self.quantity.size if math.isfinite(value) and value > 0 else 0.0
-
-    def offer_known(self, history: History, field: SurfaceField) -> None:
-        """Limit the list to quantities that can be shown.
-
-        These are the quantities that at least one cube observes and, if the node `contacts`
-        computes it, the standard deviation of the pressure. The latter stays in the list while it
-        is chosen, so that the colours do not change their meaning when that node ends.
-
-        Args:
-            history: Values of all cubes in the last seconds.
-            field: Pressure and shear on the surface at present.
-        """
-        observed = dict(zip(History.COLUMNS, history.observed, strict=True))
-        if not any(observed[name] for name in COMPONENTS):
-            return
-        labels = [
-            quantity.label
-            for name, quantity in QUANTITIES.items()
-            if name not in COMPONENTS or observed[name]
-        ]
-        if field.sigma is not None or self.quantity is DEVIATION:
-            labels.append(DEVIATION.label)
-        # Equal options are not set again, because that would close a list that the user has opened.
-        if tuple(labels) != tuple(self._quantity.options):
-            self._quantity.options = labels
-
-    def write_legend(self, top: float, field: SurfaceField) -> None:
-        """Write the legend of the colours.
-
-        Args:
-            top: Upper end of the colour scale, in SI units.
-            field: Pressure and shear on the surface at present.
-        """
-        if self.quantity is DEVIATION and field.sigma is None:
-            self._legend.content = markup.no_deviation()
-        else:
-            self._legend.content = markup.legend(self.quantity, top)
 
 
 def add_part_controls(gui: viser.GuiApi, shown: Shown) -> None:
@@ -137,11 +96,7 @@ def _add_check_box(gui: viser.GuiApi, shown: Shown, name: str) -> None:
 
 
 class ReplayControls:
-    """A slider for the time within a replay, and a button to stop it; hidden without a replay.
-
-    Attributes:
-        is_held: Whether there is a replay and it is stopped.
-    """
+    """A slider for the time within a replay, and a button to stop it; hidden without a replay."""
 
     def __init__(
         self, gui: viser.GuiApi, hold: Callable[[], None], jump: Callable[[float], None]

@@ -1,17 +1,32 @@
-"""Values of all cubes in the last seconds, and the number of rows per second of each cube."""
+"""Values of all cubes in the last seconds, and the sampling rate of each cube."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from ..core.arrays import Array, Index, Mask
+from ..core.arrays import Array, Index
 from ..core.modes import COMPONENTS
+from ..core.rows import StressRows
+
+RATE_PERIOD_S = 1.0
+"""Minimum time, in seconds, between the two samples of a cube from which its rate is computed."""
+
+MAX_RATE_PERIOD_S = 60.0
+"""Maximum time, in seconds, between two samples from which a rate is computed. After a longer time
+the cube was silent, or its clock was set, and the rate is computed from new samples."""
+
+MAX_SAMPLES = 2**24
+"""Maximum number of samples between two from which a rate is computed. A larger difference of their
+numbers means that the hub has restarted and counts from 0 again."""
 
 
 class History:
     """Values (stress, gradients, residual) of all cubes at the last instants that the page showed.
 
     They are stored in a ring buffer: a new instant overwrites the oldest one.
+
+    Attributes:
+        count: Number of instants that were added since the buffer was empty.
     """
 
     COLUMNS = (*COMPONENTS, "residual")
@@ -27,7 +42,7 @@ class History:
         """
         self._values = np.full((length, cubes, len(self.COLUMNS)), np.nan, np.float32)
         self._times = np.full(length, np.nan)
-        self._count = 0
+        self.count = 0
 
     def add(
         self,
@@ -43,15 +58,15 @@ class History:
             residual: Misfit between pads and tensor relative to the noise (cubes,); about 1 for
                 noise alone.
         """
-        slot = self._count % len(self._times)
+        slot = self.count % len(self._times)
         self._values[slot, :, :-1] = values
         self._values[slot, :, -1] = residual
         self._times[slot] = now
-        self._count += 1
+        self.count += 1
 
     def clear(self) -> None:
         """Remove all instants, for example because a replay has jumped to another time."""
-        self._count = 0
+        self.count = 0
 
     def of(self, cube: int, column: int) -> Array:
         """Return one value of a cube at the M stored instants (M,), in SI units, the oldest first.
@@ -70,50 +85,49 @@ class History:
         return times - times[-1] if len(times) else times
 
     @property
-    def observed(self) -> Mask:
-        """Whether each of `COLUMNS` is finite (16,) for any cube at any stored instant."""
-        return np.asarray(np.isfinite(self._values[self._slots()]).any(axis=(0, 1)))
+    def observed_names(self) -> set[str]:
+        """Names of the `COLUMNS` that are finite for any cube at any stored instant."""
+        finite = np.isfinite(self._values[self._slots()])
+        columns = np.flatnonzero(finite.any(axis=(0, 1)))
+        return {self.COLUMNS[column] for column in columns}
 
     def _slots(self) -> Index:
         """Return the indices (M,) of the stored instants in the ring buffer, the oldest first."""
         length = len(self._times)
-        numbers = np.arange(max(0, self._count - length), self._count)
+        numbers = np.arange(max(0, self.count - length), self.count)
         return np.asarray(numbers % length)
 
 
-class RowRate:
-    """Computes how many rows (measurements of one cube) arrive per second from each cube.
+class SampleRate:
+    """Computes the sampling rate of each cube from the numbers and stamps of its samples.
+
+    So it is the rate of the sensor, however many of the samples reach this process.
 
     Attributes:
-        rate: (cubes,) rows per second, in Hz; NaN until the first period is over.
+        hertz: (cubes,) samples per second; 0 until a cube has samples over `RATE_PERIOD_S`.
     """
 
-    def __init__(
-        self,
-        cubes: int,
-        now: float,
-        period: float = 1.0,
-    ) -> None:
-        """Start to count.
+    def __init__(self, n_cubes: int) -> None:
+        self.hertz = np.zeros(n_cubes)
+        self._first_sequence = np.zeros(n_cubes, np.uint32)
+        # No sample has come: any stamp is then a period or more later.
+        self._first_ns = np.zeros(n_cubes, np.int64)
+
+    def update(self, rows: StressRows) -> None:
+        """Compute new rates of cubes whose period is over.
 
         Args:
-            cubes: Number of cubes.
-            now: Present time, in s, on the clock that `update` uses too.
-            period: Shortest time, in s, over which the rows of a rate are counted.
+            rows: New rows (one sample of one cube each); the time between the stamps of the first
+                and the last sample of a period is the sensor's own time.
         """
-        self.rate = np.full(cubes, np.nan)
-        self._period = period
-        self._count = np.zeros(cubes, np.int64)
-        self._counted_s = now
+        cube = rows.cube
+        elapsed_s = 1e-9 * (rows.stamp_ns - self._first_ns[cube])
+        # Numbers of samples wrap around, as the unsigned difference does.
+        samples = rows.sequence - self._first_sequence[cube]
+        is_new = (elapsed_s < 0) | (elapsed_s > MAX_RATE_PERIOD_S) | (samples > MAX_SAMPLES)
+        is_over = ~is_new & (elapsed_s > RATE_PERIOD_S)
+        self.hertz[cube[is_over]] = samples[is_over] / elapsed_s[is_over]
 
-    def update(self, now: float, count: Index) -> None:
-        """Compute new rates if a period is over.
-
-        Args:
-            now: Present time, in s.
-            count: Number of rows (cubes,) that have arrived since the skin appeared.
-        """
-        elapsed_s = now - self._counted_s
-        if elapsed_s > self._period:
-            self.rate = (count - self._count) / elapsed_s
-            self._count, self._counted_s = count.copy(), now
+        begins = cube[is_new | is_over]
+        self._first_ns[begins] = rows.stamp_ns[is_new | is_over]
+        self._first_sequence[begins] = rows.sequence[is_new | is_over]

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from html import escape
 from typing import Literal
 
 import numpy as np
 
-from ..core.arrays import AnyArray, Array
+from ..core.arrays import Array
 from ..core.latest_stress import FAULTY, HEALTH_WORDS
 from ..core.modes import COMPONENTS
 from ..core.status import STATUS
 from ..touch.surface import Contact
 from ..views import scene
-from .moment import Moment
+from .scan import Scan
+from .surface_field import DEVIATION, SurfaceField
 
 GREEN = "#2b8a3e"
 AMBER = "#e67700"
@@ -40,6 +41,12 @@ LEGEND_STEPS = 9
 It is odd, so that one colour is that of the middle of the range.
 """
 
+NO_DEVIATION = (
+    "Everything is grey: the standard deviation is known only while the node <i>contacts</i> "
+    "runs with <i>method:=inverse</i>."
+)
+"""Text that replaces the legend of the standard deviation of the pressure while it is unknown."""
+
 BOX_STYLE = "padding:0 0.8em 0.4em;font-size:0.85em"
 """CSS style of every text on the page: its margins and the size of its letters."""
 BAR_STYLE = "height:0.9em;border-radius:3px;background:linear-gradient(to right,{})"
@@ -49,32 +56,33 @@ TICKS_STYLE = "display:flex;justify-content:space-between"
 VALUE_STYLE = "text-align:right;font-family:monospace"
 """CSS style of the cells with numbers in a table."""
 
-PHONE_STYLE = (
-    "<style>@media (max-width: 36em) {"
+STYLE = (
+    "<style>"
+    ".mantine-Notification-root {font-size: 0.8em; padding: 0.2em 0.6em}"
+    "@media (max-width: 36em) {"
+    ".mantine-Notification-description {display: none}"
     "[style*='width: 20em'] {width: 100vw !important}"
     "[style*='max-height: 60%'] {max-height: 45% !important}}</style>"
 )
-"""Style sheet for screens of at most 36em.
+"""Style sheet of the page.
 
-viser's panel is 20em wide there and covers the skin. The style makes it as wide as the screen and
-limits its height to 45 % of the screen, so that the skin stays visible above it.
+It makes notes small, so that they cover little of the skin. On a screen of at most 36em a note
+shows only its title. viser's panel is 20em wide there and covers the skin; the style makes it as
+wide as the screen and limits its height to 45 % of the screen, so that the skin stays visible.
 """
 
 
 @dataclass
 class PageStatus:
-    """What the page shows besides measured values: links, recording, result of the last action.
+    """What the page shows besides a scan: recording, and the result of the last action.
 
     Attributes:
-        links: For each link (connection to a hub), one line of text with its name and state, and
-            the level of its diagnostics (0 OK, 1 WARN, 2 ERROR, 3 STALE).
         action: Text about the result of the user's last action, such as a tare.
         title: Title of the note with this text.
         colour: Colour of this note.
         recording: Whether a bag is being recorded.
     """
 
-    links: list[tuple[str, int]] = field(default_factory=list)
     action: str = ""
     title: str = ""
     colour: NoteColour = "blue"
@@ -171,23 +179,16 @@ def newtons(contact: Contact) -> str:
     return f"{contact.normal_force:.2f} N{shear}"
 
 
-def headline(
-    health: AnyArray,
-    hertz: float,
-    contact: Contact | None,
-    paused: bool,
-    recording: bool,
-) -> str:
-    """Return the first line of the page as HTML: state, live cubes, rate, force.
+def headline(scan: Scan, paused: bool, recording: bool) -> str:
+    """Return the first line of the page as HTML: state, live cubes, sampling rate, force.
 
     Args:
-        health: (N,) health of the cubes (fine, doubtful, faulty or stale), coded as in
-            core/latest_stress.py.
-        hertz: Number of rows (measurements) per second of the fastest cube.
-        contact: The contact with the largest force; None without a load.
+        scan: The instant; the rate is that of the fastest cube, the force that of the strongest
+            contact.
         paused: Whether the page or the replay is stopped.
         recording: Whether a bag is being recorded.
     """
+    health, contact = scan.health, scan.strongest_contact
     live = int(np.count_nonzero(health < FAULTY))
     if paused:
         colour, word = BLUE, "paused"
@@ -200,7 +201,7 @@ def headline(
     parts = [
         f"<span style='color:{colour}'>⬤</span> <b>{word}</b>",
         f"{live} of {len(health)} cubes",
-        f"{hertz:.0f} Hz",
+        f"{scan.rate.max():.0f} Hz",
         "no load" if contact is None else newtons(contact).replace(" ", "&nbsp;"),
     ]
     if recording:
@@ -213,21 +214,17 @@ def action_line(action: str) -> str:
     return box(escape(action)) if action else ""
 
 
-def no_deviation() -> str:
-    """Return the text that replaces the legend of the standard deviation while it is unknown."""
-    return box(
-        "Everything is grey: the standard deviation is known only while the node <i>contacts</i> "
-        "runs with <i>method:=inverse</i>."
-    )
-
-
-def legend(quantity: scene.Quantity, top: float) -> str:
+def legend(quantity: scene.Quantity, top: float, field: SurfaceField) -> str:
     """Return the legend of a quantity as HTML: a bar of its colours with numbers and unit.
 
     Args:
         quantity: The quantity that the colours show.
         top: Value at the upper end of the bar, in SI units.
+        field: Pressure and shear on the surface. Without a standard deviation (`sigma`), a text
+            replaces the legend of this quantity.
     """
+    if quantity is DEVIATION and field.sigma is None:
+        return box(NO_DEVIATION)
     values = np.linspace(-top if quantity.signed else 0, top, LEGEND_STEPS)
     colours = (255 * scene.colours(quantity, values, top)).astype(int).tolist()
     stops = ",".join(f"rgb({red},{green},{blue})" for red, green, blue in colours)
@@ -238,20 +235,14 @@ def legend(quantity: scene.Quantity, top: float) -> str:
     return box(bar + _div(TICKS_STYLE, ticks) + _div("text-align:center", meaning))
 
 
-def explanation(
-    bar: float,
-    stress: float,
-    gradient: float,
-    sigma: Array | None,
-) -> str:
+def explanation(bar: float, stress: float, gradient: float, field: SurfaceField) -> str:
     """Return HTML that explains the symbols of the 3-D view and the lengths of its arrows.
 
     Args:
         bar: Length of the scale bar beside the skin, in metres.
         stress: Traction, in Pa, whose arrow is as long as the bar.
         gradient: Gradient, in Pa/m, whose arrow is as long as the bar.
-        sigma: Standard deviation of the pressure (M,) on the surface, in Pa; None if the field is
-            only interpolated between the cubes.
+        field: Pressure and shear on the surface.
     """
     long = f"as long as the bar ({1e3 * bar:g} mm):"
     arrows = [
@@ -260,8 +251,8 @@ def explanation(
     ]
     lines = [f"<div><b style='color:{colour}'>➜</b> {text}</div>" for colour, text in arrows]
     lines += [
-        f"<div><b>▦</b> {_field_source(sigma)}</div>",
-        "<div><b>◯</b> the chosen cube; click another one to choose it</div>",
+        f"<div><b>▦</b> field: {field.source}{_typical(field.sigma)}</div>",
+        "<div><b>⌜⌟</b> the chosen cube; click another one to choose it</div>",
         "<div>principal stresses: <b style='color:#d22828'>red</b> pulls, "
         "<b style='color:#2850dc'>blue</b> pushes</div>",
         "<div><b>✕</b> over a cube: see <i>health</i>. Axes: x red, y green, z blue</div>",
@@ -269,31 +260,33 @@ def explanation(
     return box("".join(lines))
 
 
-def _field_source(sigma: Array | None) -> str:
-    if sigma is None:
-        return "field: interpolated between the cubes, at their depth"
-    known = sigma[np.isfinite(sigma)]
-    # The standard deviation differs from point to point; the text gives the median.
-    typical = f", ±&nbsp;{np.median(known) / 1e3:.2g}&nbsp;kPa" if len(known) else ""
-    return f"field: on the surface, from the node <i>contacts</i>{typical}"
-
-
-def numbers(moment: Moment, cube: int, hertz: float) -> str:
-    """Return an HTML table of a cube's observed components, residual, rate and state.
+def _typical(sigma: Array | None) -> str:
+    """Return the median of the standard deviation of the pressure as text, such as ", ± 0.1 kPa".
 
     Args:
-        moment: Values of all cubes.
+        sigma: (M,) standard deviation at the points of the surface, in Pa; None if it is unknown.
+    """
+    if sigma is None:
+        return ""
+    known = sigma[np.isfinite(sigma)]
+    return f", ±&nbsp;{np.median(known) / 1e3:.2g}&nbsp;kPa" if len(known) else ""
+
+
+def numbers(scan: Scan, cube: int) -> str:
+    """Return an HTML table of a cube's observed components, residual, sampling rate and state.
+
+    Args:
+        scan: Values of all cubes.
         cube: Index of the cube.
-        hertz: Number of rows (measurements) per second of the cube.
     """
     rows = []
-    for name, si_value in zip(COMPONENTS, moment.values[cube], strict=True):
+    for name, si_value in zip(COMPONENTS, scan.values[cube], strict=True):
         size, unit_name = unit(name)
         if np.isfinite(si_value):
             rows.append((label(name), f"{si_value / size:+.3f}", unit_name))
-    rows.append(("residual", f"{moment.residual[cube]:.2f}", "× noise"))
-    rows.append(("rate", f"{hertz:.0f}", "Hz"))
-    rows.append(("state", _state(moment.status[cube], moment.health[cube]), ""))
+    rows.append(("residual", f"{scan.residual[cube]:.2f}", "× noise"))
+    rows.append(("rate", f"{scan.rate[cube]:.0f}", "Hz"))
+    rows.append(("state", _state(scan.status[cube], scan.health[cube]), ""))
     return box(_table(rows))
 
 
@@ -307,22 +300,22 @@ def _state(status: int, health: int) -> str:
     return ", ".join(words) or HEALTH_WORDS[health]
 
 
-def conditions(names: list[str], health: AnyArray, links: list[tuple[str, int]]) -> str:
+def conditions(names: list[str], scan: Scan) -> str:
     """Return HTML about the health of a skin: links, number of cubes per state, cubes with a fault.
 
     Args:
         names: Names of the N cubes.
-        health: (N,) health of the cubes (fine, doubtful, faulty or stale), coded as in
-            core/latest_stress.py.
-        links: Line of text and level of the diagnostics of each link (connection to a hub).
+        scan: The health of the cubes and the state of the links.
     """
+    health = scan.health
     counts = ", ".join(
         f"{np.count_nonzero(health == state)} {word}" for state, word in enumerate(HEALTH_WORDS)
     )
     with_fault = np.flatnonzero(health)[:MAX_LISTED_CUBES].tolist()
     rows = [(names[cube], HEALTH_WORDS[health[cube]], "") for cube in with_fault]
     lines = "".join(
-        _div(f"color:{LEVEL_COLOURS[level]}", escape(line)) for line, level in [*links, (counts, 0)]
+        _div(f"color:{LEVEL_COLOURS[level]}", escape(line))
+        for line, level in (*scan.links, (counts, 0))
     )
     return box(lines + _table(rows))
 

@@ -1,4 +1,4 @@
-"""Triangle meshes of the 3-D view: prisms, arrows and rings as arrays, and coloured squares."""
+"""Triangle meshes of the 3-D view as arrays: prisms, arrows, marks and coloured squares."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-import viser
 from numpy.typing import NDArray
 
-from ..core.arrays import Array, Index
+from ..core.arrays import Array, Index, Mask
 from ..views import scene
 from ..views.scene import Quantity
 
@@ -88,13 +87,7 @@ def rods(lines: Array, start_radius: float, end_radius: float | None = None) -> 
     """
     if not len(lines):
         return NO_MESH
-    along = lines[:, 1] - lines[:, 0]
-    # The cross product with the coordinate axis that is least parallel to the line is never close
-    # to zero, so the perpendicular direction is accurate.
-    axis = np.eye(3)[np.abs(along).argmin(axis=1)]
-    first = _normalised(np.cross(along, axis))
-    second = _normalised(np.cross(along, first))
-
+    first, second = _perpendicular(lines[:, 1] - lines[:, 0])
     angle = 2 * np.pi * np.arange(PRISM_SIDES)[:, None, None] / PRISM_SIDES
     circle = (np.cos(angle) * first + np.sin(angle) * second).swapaxes(0, 1)
     radii = np.array([start_radius, start_radius if end_radius is None else end_radius])
@@ -110,6 +103,15 @@ def rods(lines: Array, start_radius: float, end_radius: float | None = None) -> 
     prism = np.array(triangles).transpose(0, 2, 1).reshape(-1, 3)
     faces = prism + 2 * PRISM_SIDES * np.arange(len(lines))[:, None, None]
     return vertices.reshape(-1, 3), faces.reshape(-1, 3)
+
+
+def _perpendicular(along: Array) -> tuple[Array, Array]:
+    """Return two unit vectors (N, 3), perpendicular to each vector (N, 3) and to each other."""
+    # The cross product with the coordinate axis that is least parallel to the vector is never close
+    # to zero, so the perpendicular direction is accurate.
+    axis = np.eye(3)[np.abs(along).argmin(axis=1)]
+    first = _normalised(np.cross(along, axis))
+    return first, _normalised(np.cross(along, first))
 
 
 def _normalised(vectors: Array) -> Array:
@@ -140,18 +142,32 @@ def arrows(lines: Array, unit: float) -> Mesh:
     return vertices, faces
 
 
-def ring(radius: float, thickness: float) -> Mesh:
-    """Return the mesh of a ring around the origin, in the x-y plane.
+def ring_lines(centre: Array, normal: Array, radius: float) -> Array:
+    """Return the lines (48, 2, 3) of a ring, each with its start and its end.
 
     Args:
-        radius: Radius of the ring.
-        thickness: Radius of the prisms that the ring consists of.
+        centre: (3,) centre of the ring.
+        normal: (3,) unit vector perpendicular to the plane of the ring.
+        radius: Radius of the ring, in the unit of the centre.
     """
-    angle = np.linspace(0, 2 * np.pi, RING_POINTS)
-    unit_circle = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
-    points = radius * unit_circle
-    lines = np.stack([points[:-1], points[1:]], axis=1)
-    return rods(lines, thickness)
+    first, second = _perpendicular(normal[np.newaxis])
+    angle = np.linspace(0, 2 * np.pi, RING_POINTS)[:, None]
+    points = centre + radius * (np.cos(angle) * first + np.sin(angle) * second)
+    return np.stack([points[:-1], points[1:]], axis=1)
+
+
+def corner_lines(rotation: Array, side: float) -> Array:
+    """Return the lines (8, 2, 3) that mark the four corners of a square around the origin.
+
+    Args:
+        rotation: (3, 3) rotation whose first two columns are the directions of the sides.
+        side: Length of the sides of the square.
+    """
+    corners = side * _SQUARE
+    # From each corner a line goes a quarter of the side towards the next and the last corner.
+    towards = [np.roll(corners, step, axis=0) for step in (1, -1)]
+    ends = [np.stack([corners, corners + 0.25 * (to - corners)], axis=1) for to in towards]
+    return np.asarray(np.concatenate(ends) @ rotation[:, :2].T)
 
 
 def hit(
@@ -183,7 +199,7 @@ def hit(
 
 
 class SquareLayer:
-    """Squares whose colours change: the field of a skin, or the cubes of a large skin.
+    """Squares whose colours change: the field of a skin, and the cubes of a large skin.
 
     The squares of one colour are one mesh. A skin then consists of few objects, and a computer
     without a graphics card can draw it often enough. An image would be less data, but browsers
@@ -191,67 +207,32 @@ class SquareLayer:
     than the cubes.
     """
 
-    def __init__(
-        self, api: viser.SceneApi, name: str, points: Array, rotation: Array, side: float
-    ) -> None:
-        """Add the layer to a scene; the squares are invisible until `paint` is called.
+    def __init__(self, points: Array, rotation: Array, side: Array) -> None:
+        """Compute the corners of the squares.
 
         Args:
-            api: The 3-D scene of one browser.
-            name: Name of the layer in the scene.
             points: (M, 3) centres of the squares, in units of the scene.
             rotation: (M, 3, 3) rotations from the frame of each square, in whose x-y plane it
                 lies, to the scene.
-            side: Length of the sides of the squares, in units of the scene.
+            side: (M,) length of the sides of each square, in units of the scene.
         """
-        corners = np.einsum("mij,qj->mqi", rotation[:, :, :2], side * _SQUARE)
-        self._corners = (points[:, None] + corners).astype(np.float32)
-        self._frame = api.add_frame(f"/{name}", show_axes=False)
-        self._meshes = [
-            api.add_mesh_simple(
-                f"/{name}/{step}",
-                *NO_MESH,
-                flat_shading=True,
-                side="double",
-                cast_shadow=False,
-                receive_shadow=False,
-            )
-            for step in range(COLOUR_STEPS + 1)
-        ]
-        self._is_drawn = np.zeros(COLOUR_STEPS + 1, bool)
-        self._quantity: Quantity | None = None
+        offset = side[:, None, None] * _SQUARE
+        corners = points[:, None] + np.einsum("mij,mqj->mqi", rotation[:, :, :2], offset)
+        self._corners = corners.astype(np.float32)
 
-    def hide(self) -> None:
-        self._frame.visible = False
-
-    def paint(
-        self,
-        quantity: Quantity,
-        values: Array,
-        top: float,
-    ) -> None:
-        """Colour the squares by values of a quantity, and show the layer if it was hidden.
+    def paint(self, quantity: Quantity, values: Array, top: float, visible: Mask) -> list[Mesh]:
+        """Return one mesh for each colour of `step_colours`, with the squares of this colour.
 
         Args:
-            quantity: The quantity.
-            values: (M,) its values at the squares, in SI units; NaN is grey.
+            quantity: The quantity that the colours show.
+            values: (M,) its values at the squares, in SI units.
             top: Value at the upper end of the colour scale, in SI units.
+            visible: (M,) whether each square is drawn.
         """
-        # The colours depend on the quantity: a signed one has colours on both sides of zero.
-        if quantity is not self._quantity:
-            self._quantity = quantity
-            for mesh, colour in zip(self._meshes, step_colours(quantity).tolist(), strict=True):
-                mesh.color = tuple(colour)
-        self._frame.visible = True
-        steps = colour_steps(quantity, values, top)
-        for step, mesh in enumerate(self._meshes):
-            chosen = np.flatnonzero(steps == step)
-            # A mesh that was empty and stays empty is not sent to the browser again.
-            if len(chosen) or self._is_drawn[step]:
-                mesh.vertices, mesh.faces = self._squares(chosen)
-                self._is_drawn[step] = bool(len(chosen))
+        steps = np.where(visible, colour_steps(quantity, values, top), -1)
+        return [self._mesh(np.flatnonzero(steps == step)) for step in range(COLOUR_STEPS + 1)]
 
-    def _squares(self, chosen: Index) -> Mesh:
+    def _mesh(self, chosen: Index) -> Mesh:
         if not len(chosen):
             return NO_MESH
         first_vertex = 4 * np.arange(len(chosen), dtype=np.uint32)

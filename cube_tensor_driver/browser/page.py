@@ -5,41 +5,36 @@ It uses viser but not ROS. Each browser has a page of its own, with its own sett
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import copy
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import viser
 
-from ..core.arrays import Array
-from ..core.poses import CubePoses
-from ..touch.surface import Surface
+from ..views.scene import Quantity
 from . import markup
 from .charts import Charts
-from .colouring import Colouring
-from .controls import ColourControls, ReplayControls, ReplayPosition, add_part_controls
+from .controls import ColourControls, ReplayControls, ReplayPosition, Shown, add_part_controls
 from .history import History
 from .markup import PageStatus
-from .moment import Moment
-from .scene_3d import SPAN, Scene3D
-from .top_view import TopView
-
-MAX_SURFACE_POINTS = 5000
-"""Approximate maximum of the number of points of the skin's surface at which the field (pressure
-and shear between the cubes) is drawn."""
-
-MAX_POINTS_PER_SIDE = 12
-"""Maximum number of points of the surface along one side of the square patch around a cube."""
+from .scan import Scan
+from .scene_3d import SPAN, Ranges, Update
+from .update import Choices, ShownSkin, build_update
 
 BRAND_COLOUR = (24, 100, 171)
 BACKGROUND = (246, 247, 249)
 
-LEFT_WIDTH = 440.0
+LEFT_WIDTH = 400.0
 """Width, in pixels, of the panel with the plots at the left of the page."""
 
 RIGHT_WIDTH = 320.0
 """Width, in pixels, of viser's main panel (with the controls) at the right of the page."""
+
+MIN_FREE_SHARE = 0.5
+"""Minimum share of the width of the page that the panels leave free for the skin. In a browser that
+is too narrow for it, the panel with the plots is folded away when the page opens."""
 
 CAMERA_POSITION = np.array([0.1, -1.0, 1.05]) * SPAN
 """Position of the camera in the scene, for a picture that is a little higher than wide.
@@ -79,6 +74,30 @@ NOTE_S = 8.0
 """Time, in seconds, for which the page shows a note about an action of the user."""
 
 
+class Layout:
+    """Arrangement of the page for the size that a browser has when it opens the page.
+
+    Attributes:
+        is_folded: Whether the panel with the plots is folded away at first.
+        target: (3,) point of the scene at which the camera looks.
+        distance: Distance of the camera, relative to that of `CAMERA_POSITION`.
+    """
+
+    def __init__(self, width: int, height: int) -> None:
+        """Choose the arrangement for a size in pixels."""
+        is_phone = width < height
+        self.target = PHONE_TARGET if is_phone else CAMERA_TARGET
+        free = width - LEFT_WIDTH - RIGHT_WIDTH
+        self.is_folded = is_phone or free < MIN_FREE_SHARE * width
+        # The skin, the scale bar and the axes fill the width that the panels leave free.
+        if is_phone:
+            free = width
+        elif self.is_folded:
+            free = width - RIGHT_WIDTH
+        distance = DISTANCE_PER_ASPECT * height / max(free, 1.0)
+        self.distance = max(MIN_CAMERA_DISTANCE, distance)
+
+
 @dataclass(frozen=True)
 class Buttons:
     """Functions that the buttons of the page call, in threads of viser. They return at once.
@@ -98,65 +117,26 @@ class Buttons:
     jump: Callable[[float], None]
 
 
-class ShownSkin:
-    """The skin that is shown, with everything that the pages of all browsers share.
-
-    Attributes:
-        name: Name of the skin.
-        names: Names of its cubes.
-        poses: Poses of its cubes in the parent frame, in m.
-        surface: Grid of points around the cubes at which the field (pressure and shear) is drawn.
-        top_view: Drawing of the skin from above.
-        history: Values of all cubes in the last seconds.
-    """
-
-    def __init__(
-        self, name: str, names: Sequence[str], poses: CubePoses, depth: float, history: History
-    ) -> None:
-        """Prepare the points of the field and the drawing from above.
-
-        Args:
-            name: Name of the skin.
-            names: Names of its cubes.
-            poses: Poses of its cubes in the parent frame, in m.
-            depth: Distance from the centres of the cubes to the surface of the skin, in m.
-            history: Buffer for the values of the last seconds.
-        """
-        # A large skin gets fewer points per cube, so that all have about `MAX_SURFACE_POINTS`.
-        points_per_side = np.sqrt(MAX_SURFACE_POINTS / len(names))
-        points_per_side = np.clip(points_per_side, 2, MAX_POINTS_PER_SIDE)
-        self.name, self.names, self.poses = name, list(names), poses
-        self.surface = Surface(poses, depth, int(points_per_side))
-        self.top_view = TopView(names, poses, self.surface)
-        self.history = history
-
-
 class Page:
     """The page that shows a skin in one browser, with the settings of that browser's user."""
 
     def __init__(
-        self,
-        client: viser.ClientHandle,
-        skin: ShownSkin,
-        buttons: Buttons,
+        self, client: viser.ClientHandle, layout: Layout, skin: ShownSkin, buttons: Buttons
     ) -> None:
-        self._client = client
-        self._skin = skin
-        self._moment: Moment | None = None
+        self._client, self._layout, self._skin = client, layout, skin
+        self._scan: Scan | None = None
+        self._history: History | None = None
         self._paused = False
-        self._is_complete = False
-        self._written = 0
-        self._top = 0.0
+        self._ranges = self._ranges_before = Ranges()
+        self._quantity: Quantity | None = None
+        self._cube = skin.scene.first_cube
+        self._shown = Shown()
         self._noted = ""
-        set_up(client, skin.name)
-        self._scene = Scene3D(client.scene, skin.names, skin.poses, skin.surface, self._choose)
+        self._sent: dict[tuple[str, str], Any] = {}
+        set_up(client, layout, skin.name)
+        self._objects = skin.scene.add_to(client.scene, self._choose)
         self._make_controls(client.gui, buttons)
         self._make_panel(client.gui)
-
-    @property
-    def paused(self) -> bool:
-        """Whether the user has stopped the updates of this page (not the replay)."""
-        return self._paused
 
     def close(self) -> None:
         """Remove all objects of the scene and all controls from the browser."""
@@ -172,60 +152,66 @@ class Page:
         """
         self._replay.show(replay)
 
-    def show(
-        self,
-        moment: Moment,
-        rate: Array,
-        status: PageStatus,
-        with_numbers: bool,
-    ) -> None:
-        """Show the values of one instant; a paused page keeps those of the instant it shows.
+    def show(self, scan: Scan, history: History, status: PageStatus) -> None:
+        """Show a scan; a paused page shows what it has shown, with the choices of its user.
 
         Args:
-            moment: Values, field and contacts at the instant.
-            rate: (N,) number of rows (measurements) per second of each cube.
-            status: Links, recording, and result of the user's last action.
-            with_numbers: Whether to update numbers and plots as well as the 3-D view.
+            scan: The newest instant.
+            history: Values of all cubes in the last seconds; the newest are those of the scan.
+            status: Recording, and result of the user's last action.
         """
-        # `atomic` makes the browser apply all changes at once; otherwise it could show the field
-        # of this instant with the cubes of the one before.
+        is_frozen = self._history is not None
+        if not self._paused or not is_frozen:
+            self._scan, self._ranges_before = scan, self._ranges
+            # The first scan after a pause began is the one that stays.
+            self._history = copy.deepcopy(history) if self._paused else None
+        self._show_status(status)
+        shown_history = self._history or history
+        choices = self._choices(shown_history, status)
+        update, self._ranges = build_update(
+            self._skin, self._scan or scan, shown_history, choices, self._ranges_before
+        )
+        self.send(update, choices)
+
+    def send(self, update: Update, choices: Choices) -> None:
+        """Send the changed properties of all objects to the browser, as one update.
+
+        Args:
+            update: Name of an object on the page -> its properties.
+            choices: What the user has chosen to see.
+        """
+        # `atomic` makes the browser apply all changes at once. Otherwise it could show numbers of
+        # one instant beside the picture of another one.
         with self._client.atomic():
-            if not self._paused or self._moment is None:
-                self._moment = moment
-                self._draw(moment)
-            self._write_first_lines(self._moment, rate, status)
-            if self._paused and not self._is_complete:
-                # Plots and numbers are updated once more after the pause began, so that they
-                # belong to the same instant as the 3-D view.
-                self._write_plots()
-                self._write_numbers(self._moment, rate, status)
-                self._is_complete = True
-            elif with_numbers and not self._paused:
-                self._write(self._moment, rate, status)
+            for name, plot in self._charts.replace_plots(choices.charts).items():
+                self._objects[name] = plot
+                self._sent = {key: value for key, value in self._sent.items() if key[0] != name}
+            for name, properties in update.items():
+                for key, value in properties.items():
+                    # viser sends most assignments to the browser, even if the value is the same.
+                    if not is_same(value, self._sent.get((name, key))):
+                        self._sent[name, key] = value
+                        setattr(self._objects[name], key, value)
 
-    def _draw(self, moment: Moment) -> None:
-        controls = self._colours
-        self._colouring = Colouring.of(
-            moment, self._skin.surface, controls.quantity, controls.fixed_top, self._top
+    def _choices(self, history: History, status: PageStatus) -> Choices:
+        """Return what the user has chosen, as the browser has reported it."""
+        quantity = self._colours.quantity
+        if quantity is not self._quantity:
+            # The automatic range of the colours belongs to another quantity.
+            self._quantity = quantity
+            self._ranges_before = self._ranges_before._replace(colour=0.0)
+        return Choices(
+            quantity=quantity,
+            fixed_top=self._colours.fixed_top,
+            cube=self._cube,
+            shown=self._shown,
+            charts=self._charts.choose(history, self._cube),
+            is_paused=self._paused or self._replay.is_held,
+            is_recording=status.recording,
         )
-        self._top = self._colouring.top
-        self._scene.draw(moment, self._colouring)
 
-    def _write_first_lines(
-        self,
-        moment: Moment,
-        rate: Array,
-        status: PageStatus,
-    ) -> None:
-        is_held = self._paused or self._replay.is_held
-        hertz = float(np.fmax.reduce(rate, axis=None, initial=0.0))
-        line = markup.headline(
-            moment.health, hertz, moment.strongest_contact, is_held, status.recording
-        )
-        # viser sends each assignment to the browser, even if the text is the same.
-        if line != self._headline.content:
-            self._headline.content = line
-        # The text of each button tells what the next press will do.
+    def _show_status(self, status: PageStatus) -> None:
+        """Show the result of the last action, and what the next press of a button will do."""
         view = (GO_ON if self._paused else PAUSE, STOP if status.recording else RECORD)
         if tuple(self._view.options) != view:
             self._view.options = view
@@ -236,48 +222,6 @@ class Page:
                 status.title, status.action, auto_close_seconds=NOTE_S, color=status.colour
             )
 
-    def _write(
-        self,
-        moment: Moment,
-        rate: Array,
-        status: PageStatus,
-    ) -> None:
-        """Update the plots in one call and the numbers in the next.
-
-        Each of the two takes a browser as much time as a picture of the 3-D view.
-
-        Args:
-            moment: Values, field and contacts at the instant.
-            rate: (N,) number of rows (measurements) per second of each cube.
-            status: Links, recording, and result of the user's last action.
-        """
-        self._written += 1
-        if self._written % 2:
-            self._write_plots()
-        else:
-            self._write_numbers(moment, rate, status)
-
-    def _write_plots(self) -> None:
-        self._charts.draw(self._skin.history, self._scene.selected)
-
-    def _write_numbers(
-        self,
-        moment: Moment,
-        rate: Array,
-        status: PageStatus,
-    ) -> None:
-        history, cube = self._skin.history, self._scene.selected
-        self._charts.offer_observed(history)
-        self._colours.offer_known(history, moment.field)
-        self._colours.write_legend(self._top, moment.field)
-        scene = self._scene
-        self._meaning.content = markup.explanation(
-            scene.bar, scene.bar_stress(), scene.bar_gradient(), moment.field.sigma
-        )
-        self._numbers.content = markup.numbers(moment, cube, rate[cube])
-        self._health.content = markup.conditions(self._skin.names, moment.health, status.links)
-        self._above.content = self._skin.top_view.draw(self._colouring, moment.contacts, cube)
-
     def _make_controls(self, gui: viser.GuiApi, buttons: Buttons) -> None:
         """Add the controls to the main panel, from top to bottom.
 
@@ -285,41 +229,45 @@ class Page:
             gui: The controls of one browser.
             buttons: Functions that the buttons call.
         """
+        objects = self._objects
         # A style sheet applies to the whole page, wherever it is inserted.
-        gui.add_html(markup.PHONE_STYLE)
-        self._headline = gui.add_html("")
+        gui.add_html(markup.STYLE)
+        objects["headline"] = gui.add_html("")
         self._make_buttons(gui, buttons)
         self._action = gui.add_html("")
         self._replay = ReplayControls(gui, buttons.hold, buttons.jump)
-        self._colours = ColourControls(gui, self._quantity_changed)
+        self._colours = ColourControls(gui)
+        objects["colour"], objects["legend"] = self._colours.list, self._colours.legend
         names = self._skin.names
-        selected = names[self._scene.selected]
-        self._cube = gui.add_dropdown("cube", names, initial_value=selected)
+        self._cube_list = gui.add_dropdown("cube", names, initial_value=names[self._cube])
 
-        @self._cube.on_update
+        @self._cube_list.on_update
         def _(_: object) -> None:
             # A browser may send any text, so it is compared with the names.
-            if self._cube.value in names:
-                self._scene.selected = names.index(self._cube.value)
+            if self._cube_list.value in names:
+                self._cube = names.index(self._cube_list.value)
 
         with gui.add_folder("numbers of the chosen cube"):
-            self._numbers = gui.add_html("")
+            objects["numbers"] = gui.add_html("")
         with gui.add_folder("what is drawn"):
-            self._meaning = gui.add_html("")
-            add_part_controls(gui, self._scene.shown)
+            objects["meaning"] = gui.add_html("")
+            add_part_controls(gui, self._shown)
         with gui.add_folder("health"):
-            self._health = gui.add_html("")
+            objects["health"] = gui.add_html("")
 
     def _make_panel(self, gui: viser.GuiApi) -> None:
         """Add the second panel with two tabs: plots over time, and the skin from above."""
         panel = gui.add_panel()
-        self._charts = Charts(
-            gui, panel.add_tab("plots of 10 s", viser.Icon.CHART_LINE), self._skin.names
-        )
+        plots = panel.add_tab("plots of 10 s", viser.Icon.CHART_LINE)
+        self._charts = Charts(gui, plots, self._skin.names)
+        for number, one in enumerate(self._charts.lists):
+            self._objects[f"chart list {number}"] = one
         with panel.add_tab("from above", viser.Icon.MAP):
-            self._above = gui.add_html("")
+            self._objects["from above"] = gui.add_html("")
         panel.dock_left()
         panel.set_width(LEFT_WIDTH)
+        if self._layout.is_folded:
+            panel.minimize()
 
     def _make_buttons(self, gui: viser.GuiApi, buttons: Buttons) -> None:
         self._view = gui.add_button_group("view", (PAUSE, RECORD))
@@ -344,23 +292,27 @@ class Page:
                 action()
 
     def _toggle_pause(self) -> None:
-        self._paused, self._is_complete = not self._paused, False
-
-    def _quantity_changed(self) -> None:
-        """Forget the automatic range of the colours, which belongs to another quantity."""
-        self._top = 0.0
+        self._paused = not self._paused
 
     def _choose(self, cube: int) -> None:
         # viser's handle has a setter for the value, which its type annotations do not declare.
-        self._cube.value = self._skin.names[cube]  # type: ignore[misc]
+        self._cube_list.value = self._skin.names[cube]  # type: ignore[misc]
+
+
+def is_same(one: Any, other: Any) -> bool:
+    """Return whether two values of a property are equal: numbers, texts, arrays, tuples of them."""
+    if isinstance(one, tuple) and isinstance(other, tuple):
+        return len(one) == len(other) and all(map(is_same, one, other))
+    return bool(np.array_equal(one, other))
 
 
 class WaitingPage:
     """The page that a browser shows while no skin is published."""
 
-    def __init__(self, client: viser.ClientHandle, text: str) -> None:
-        set_up(client, "no skin yet")
-        self._text = client.gui.add_html(markup.PHONE_STYLE + markup.box(text))
+    def __init__(self, client: viser.ClientHandle, layout: Layout, text: str) -> None:
+        # viser draws a green tick before the title while the browser is connected.
+        set_up(client, layout, "cube_tensor_driver")
+        self._text = client.gui.add_html(markup.STYLE + markup.box(text))
         self._label = client.scene.add_label(
             "/waiting", "Waiting for a skin …", anchor="center-center", font_screen_scale=1.6
         )
@@ -371,11 +323,12 @@ class WaitingPage:
         self._label.remove()
 
 
-def set_up(client: viser.ClientHandle, name: str) -> None:
+def set_up(client: viser.ClientHandle, layout: Layout, name: str) -> None:
     """Set the colours, the main panel and the camera of a browser.
 
     Args:
         client: The browser.
+        layout: Arrangement of the page in this browser.
         name: Title of the main panel.
     """
     client.gui.configure_theme(
@@ -389,11 +342,6 @@ def set_up(client: viser.ClientHandle, name: str) -> None:
     client.gui.set_panel_label(name)
     client.gui.main_panel.dock_right()
 
-    width, height = client.camera.image_width, client.camera.image_height
-    is_phone = width < height
-    target = PHONE_TARGET if is_phone else CAMERA_TARGET
-    # The skin, the scale bar and the axes fill the width that the panels leave free.
-    free_width = width if is_phone else max(width - LEFT_WIDTH - RIGHT_WIDTH, 0.3 * width)
-    distance = max(MIN_CAMERA_DISTANCE, DISTANCE_PER_ASPECT * height / free_width)
-    client.camera.position = target + distance * (CAMERA_POSITION - CAMERA_TARGET)
-    client.camera.look_at = target
+    camera = client.camera
+    camera.position = layout.target + layout.distance * (CAMERA_POSITION - CAMERA_TARGET)
+    camera.look_at = layout.target

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import viser
@@ -22,11 +22,29 @@ from ..core.poses import CubePoses, quaternions
 from ..touch.surface import Contact, Surface
 from ..views import scene
 from ..views.scene import QUANTITIES, Quantity
-from . import markup
 from .colouring import Colouring
 from .controls import Shown
-from .meshes import CUBE, CUBE_EDGES, NO_MESH, Mesh, SquareLayer, arrows, hit, ring, rods
-from .moment import Moment
+from .meshes import (
+    COLOUR_STEPS,
+    CUBE,
+    CUBE_EDGES,
+    NO_MESH,
+    Mesh,
+    SquareLayer,
+    arrows,
+    corner_lines,
+    hit,
+    ring_lines,
+    rods,
+    step_colours,
+)
+from .scan import Scan
+
+Properties = dict[str, Any]
+"""Name of a property of an object on the page (of the 3-D scene or a control) -> its value."""
+
+Update = dict[str, Properties]
+"""Name of an object on the page -> the properties that one scan gives it."""
 
 Colour = tuple[int, int, int]
 """A colour as red, green and blue from 0 to 255."""
@@ -71,16 +89,25 @@ BLUE: Colour = (25, 105, 210)
 EDGE_COLOUR: Colour = (110, 114, 122)
 """Colour of the edges of the cubes."""
 
-TENSION_COLOUR: Colour = (210, 40, 40)
-"""Colour of the lines of positive principal stresses (tension)."""
-COMPRESSION_COLOUR: Colour = (40, 80, 220)
-"""Colour of the lines of negative principal stresses (compression)."""
-
 FAULT_COLOURS = {DOUBTFUL: (230, 130, 0), FAULTY: (215, 25, 25), STALE: DARK}
 """Health of a cube -> colour of the cross that is drawn over it, as red, green, blue from 0 to 255.
 
 A cube whose health is `FINE` has no cross.
 """
+
+MESH_COLOURS: dict[str, Colour] = {
+    "traction": DARK,
+    "gradient": BLUE,
+    "tension": (210, 40, 40),
+    "compression": (40, 80, 220),
+    "chosen": DARK,
+    "contacts": (200, 40, 160),
+    **{f"fault {state}": colour for state, colour in FAULT_COLOURS.items()},
+}
+"""Name of a mesh whose shape changes with the scan -> its colour."""
+
+MIN_RING = 0.01 * SPAN
+"""Minimum radius of the ring around a contact, in units of the scene."""
 
 CROSS_HEIGHT = 0.75
 """Height of the crosses of the principal stresses above the centres of the cubes.
@@ -131,115 +158,243 @@ class Placement:
         return (position - self.centre) * self.unit
 
 
-class Scene3D:
-    """The 3-D view of the page.
+class Ranges(NamedTuple):
+    """Values, in SI units, at the upper ends of the automatic ranges of one picture.
+
+    Each range follows a rise of the values at once and a fall slowly, from picture to picture.
 
     Attributes:
-        shown: Which parts are drawn; the caller may change it between two pictures.
-        selected: Index of the chosen cube, which has a ring around it; the caller may set it.
-        bar: Length of the scale bar beside the skin, in metres.
+        colour: Value at the upper end of the colour scale.
+        traction: Traction of the longest arrow, in Pa.
+        gradient: Gradient of the pressure of the longest arrow, in Pa/m.
     """
 
-    def __init__(
-        self,
-        api: viser.SceneApi,
-        names: Sequence[str],
-        poses: CubePoses,
-        surface: Surface,
-        pick: Callable[[int], None],
-    ) -> None:
-        """Add all objects to the scene.
+    colour: float = 0.0
+    traction: float = 0.0
+    gradient: float = 0.0
+
+
+class Scene:
+    """The skin in 3-D: its fixed geometry, which all browsers share, and what a scan changes.
+
+    Attributes:
+        first_cube: Index of the cube nearest to the centre of the skin.
+        bar: Length of the scale bar beside the skin, in metres: the largest of 1, 2 or 5 times a
+            power of ten that is at most a quarter of the skin's length.
+    """
+
+    def __init__(self, names: Sequence[str], poses: CubePoses, surface: Surface) -> None:
+        """Compute the geometry.
 
         Args:
-            api: The scene of one browser.
             names: Names of the cubes.
             poses: Poses of the cubes in the parent frame, in metres.
             surface: Grid of points around the cubes at which the field (pressure and shear) is
                 drawn.
-            pick: Function that is called with the index of a cube when the user clicks it.
         """
         placement = Placement.of(poses)
-        self.shown = Shown()
-        # Until the user chooses a cube, the one nearest to the centre of the skin is chosen.
+        self._names, self._placement = names, placement
+        self._is_solid = len(names) <= MAX_SOLID_CUBES
+        self._squares = _make_squares(placement, surface, with_cubes=not self._is_solid)
+        # The points of the field are drawn at the lower faces of the cubes, so contacts are too.
+        self._contact_depth = surface.depth * placement.unit + placement.poses.half_side.mean()
+        self._low = placement.point(surface.points).min(axis=0)
+        self._high = placement.point(surface.points).max(axis=0)
+
         distance = np.linalg.norm(placement.poses.position, axis=1)
-        self.selected = int(distance.argmin())
-        self._unit = placement.unit
+        self.first_cube = int(distance.argmin())
+        self.bar = round_down(SPAN / placement.unit / 4)
+
+    def add_to(self, api: viser.SceneApi, pick: Callable[[int], None]) -> dict[str, Any]:
+        """Add all objects to the scene of a browser.
+
+        Args:
+            api: The scene of the browser.
+            pick: Function that is called with the index of a cube when the user clicks it.
+
+        Returns:
+            The objects whose properties `draw` returns, by name.
+        """
         _set_up_lights(api)
-        self.bar = ScaleBar(api, placement, surface).length
-        self._cubes = Cubes(api, placement, surface)
-        self._names = Names(api, placement, names)
-        self._traction = Arrows(api, placement, TRACTION)
-        self._gradient = Arrows(api, placement, GRADIENT)
-        self._crosses = PrincipalCrosses(api, placement)
-        self._faults = FaultCrosses(api, placement)
-        self._chosen = ChosenCube(api, placement, names)
-        self._label = ContactLabel(api, placement)
+        self._add_scale_bar(api)
+        if self._is_solid:
+            self._add_edges(api)
+        meshes = {f"field/{step}": DARK for step in range(COLOUR_STEPS + 1)} | MESH_COLOURS
+        objects: dict[str, Any] = {
+            name: _add_mesh(api, name, colour) for name, colour in meshes.items()
+        }
+        if self._is_solid:
+            objects["cubes"] = self._add_cubes(api)
+        objects["names"] = self._add_names(api)
 
         @api.on_click()
         def _(event: viser.SceneClickEvent) -> None:
             start, direction = np.array(event.ray_origin), np.array(event.ray_direction)
             # viser reports a click as a ray from the camera through the point that was clicked.
+            placement = self._placement
             cube = hit(placement.poses.position, placement.pitch, start, direction)
             if cube is not None:
                 pick(cube)
 
-    def draw(self, moment: Moment, colouring: Colouring) -> None:
-        """Draw the skin at one instant.
+        return objects
+
+    def ranges(self, scan: Scan, colour: float, before: Ranges) -> Ranges:
+        """Return the automatic ranges of a picture.
 
         Args:
-            moment: Values of the cubes at this instant, with their health and the contacts.
-            colouring: The values that are drawn as colours.
+            scan: The instant that is drawn.
+            colour: Value at the upper end of the colour scale, in SI units.
+            before: Ranges of the picture of the scan before.
         """
-        shown, values = self.shown, moment.values
-        self._cubes.draw(colouring, with_field=shown.field)
-        self._names.visible = shown.names
-        self._traction.draw(values, moment.residual, visible=shown.traction)
-        self._gradient.draw(values, moment.residual, visible=shown.gradient)
-        self._crosses.draw(values, self._traction.longest, visible=shown.principal)
-        self._faults.draw(moment.health)
-        self._chosen.show(self.selected, colouring.text(self.selected))
-        self._label.show(moment.strongest_contact)
+        longest = [
+            scene.automatic(style.quantity, style.measured(scan.values, scan.residual), last)
+            for style, last in ((TRACTION, before.traction), (GRADIENT, before.gradient))
+        ]
+        return Ranges(colour, *longest)
 
-    def bar_stress(self) -> float:
-        """Return the traction (force per area on the upper face of a cube), in Pa, whose arrow is
-        as long as the scale bar."""
-        return self.bar * self._unit * self._traction.value_per_length
-
-    def bar_gradient(self) -> float:
-        """Return the gradient of pressure along the skin, in Pa/m, whose arrow is as long as the
-        scale bar."""
-        return self.bar * self._unit * self._gradient.value_per_length
-
-
-class ScaleBar:
-    """A scale bar in front of the skin, and the axes of the skin's parent frame beside it.
-
-    Attributes:
-        length: Length that the bar represents, in metres: the largest of 1, 2 or 5 times a power
-            of ten that is at most a quarter of the skin's length.
-    """
-
-    def __init__(
+    def draw(
         self,
-        api: viser.SceneApi,
-        placement: Placement,
-        surface: Surface,
-    ) -> None:
-        span = SPAN / placement.unit
-        self.length = round_down(span / 4)
-        points = placement.point(surface.points)
-        low, high = points.min(axis=0), points.max(axis=0)
+        scan: Scan,
+        colouring: Colouring,
+        shown: Shown,
+        chosen: int,
+        ranges: Ranges,
+    ) -> Update:
+        """Return the properties of all objects for one instant.
+
+        Args:
+            scan: The instant.
+            colouring: The values that are drawn as colours.
+            shown: Which parts are drawn.
+            chosen: Index of the chosen cube.
+            ranges: Upper ends of the ranges of colours and arrows.
+        """
+        update = self._colours(colouring, shown.field)
+        update["names"] = {"visible": shown.names}
+        update["traction"] = self._arrows(TRACTION, scan.values, ranges.traction, shown.traction)
+        update["gradient"] = self._arrows(GRADIENT, scan.values, ranges.gradient, shown.gradient)
+        update |= self._crosses(scan.values, ranges.traction, shown.principal)
+        for state in FAULT_COLOURS:
+            update[f"fault {state}"] = self._fault_crosses(scan.health, state)
+        update["chosen"] = self._chosen_cube(chosen)
+        update["contacts"] = self._contacts(scan.contacts)
+        return update
+
+    def per_bar(self, ranges: Ranges) -> tuple[float, float]:
+        """Return the values whose arrows are as long as the scale bar.
+
+        Args:
+            ranges: Upper ends of the ranges of the picture.
+
+        Returns:
+            Traction (force per area on the upper face of a cube), in Pa; gradient of the pressure
+            along the skin, in Pa/m.
+        """
+        bar = self.bar * self._placement.unit / self._placement.arrow
+        return (
+            bar * ranges.traction / TRACTION.full_length,
+            bar * ranges.gradient / GRADIENT.full_length,
+        )
+
+    def _colours(self, colouring: Colouring, with_field: bool) -> Update:
+        """Return the properties of the cubes and of the field."""
+        quantity, top = colouring.quantity, colouring.top
+        values, visible = colouring.field, np.full(len(colouring.field), with_field)
+        update: Update = {}
+        if self._is_solid:
+            colours = scene.colours(quantity, colouring.cubes, top)
+            update["cubes"] = {"batched_colors": linear_light(colours)}
+        else:
+            values = np.append(values, colouring.cubes)
+            visible = np.append(visible, np.full(len(colouring.cubes), True))
+
+        meshes = self._squares.paint(quantity, values, top, visible)
+        colours_of_steps = step_colours(quantity).tolist()
+        for step, (mesh, colour) in enumerate(zip(meshes, colours_of_steps, strict=True)):
+            update[f"field/{step}"] = _properties(mesh) | {"color": tuple(colour)}
+        return update
+
+    def _arrows(
+        self, style: ArrowStyle, values: Array, longest: float, visible: bool
+    ) -> Properties:
+        """Return the properties of a mesh of arrows.
+
+        Args:
+            style: Meaning and appearance of the arrows.
+            values: (N, 15) 6 stress components in Pa and 9 gradients in Pa/m, in the frames of the
+                cubes.
+            longest: Value, in SI units, that an arrow of full length stands for.
+            visible: Whether the arrows are drawn.
+        """
+        if not visible:
+            return _properties(NO_MESH)
+        unit = self._placement.arrow
+        lines = style.lines(self._placement.poses, values, style.full_length * unit / longest)
+        return _properties(arrows(lines, unit))
+
+    def _crosses(self, values: Array, longest: float, visible: bool) -> Update:
+        """Return the meshes of the principal stresses: a cross of three lines above each cube.
+
+        Each line lies along a principal direction; its colour tells tension from compression.
+
+        Args:
+            values: (N, 15) 6 stress components in Pa and 9 gradients in Pa/m, in the frames of the
+                cubes.
+            longest: Stress, in Pa, whose line is as long as the pitch (distance of neighbouring
+                cubes).
+            visible: Whether the crosses are drawn.
+        """
+        placement, pitch = self._placement, self._placement.pitch
+        lines, is_tension = scene.principal_crosses(placement.poses, values, pitch / longest)
+        # `scene.principal_crosses` returns crosses centred on the upper faces; this lifts them.
+        lift = _above(placement, CROSS_HEIGHT, pitch) - _above(placement, 1.0)
+        lines = lines + lift[:, None, None]
+        is_drawn = np.full(is_tension.shape, visible)
+        return {
+            "tension": _properties(rods(lines[is_drawn & is_tension], 0.02 * pitch)),
+            "compression": _properties(rods(lines[is_drawn & ~is_tension], 0.02 * pitch)),
+        }
+
+    def _fault_crosses(self, health: AnyArray, state: int) -> Properties:
+        """Return the mesh of a cross over each cube that has this health."""
+        chosen = np.flatnonzero(health == state)
+        poses = CubePoses(*(column[chosen] for column in self._placement.poses))
+        lines = scene.fault_crosses(poses, health[chosen]).reshape(-1, 2, 3)
+        return _properties(rods(lines, 0.03 * self._placement.pitch))
+
+    def _chosen_cube(self, cube: int) -> Properties:
+        """Return the mesh of the marks at the corners of the chosen cube."""
+        placement = self._placement
+        side = max(2.6 * float(placement.poses.half_side[cube]), 0.2 * placement.arrow)
+        lines = corner_lines(placement.poses.rotation[cube], side)
+        thickness = MIN_THICKNESS + 0.003 * placement.arrow
+        return _properties(rods(lines + _above(placement, 1.1)[cube], thickness))
+
+    def _contacts(self, contacts: Sequence[Contact]) -> Properties:
+        """Return the mesh of a ring around each contact, which has the area of the contact."""
+        placement = self._placement
+        rings = [np.zeros((0, 2, 3))]
+        for contact in contacts:
+            radius = max(float(np.sqrt(contact.area / np.pi)) * placement.unit, MIN_RING)
+            centre = placement.point(contact.position) - self._contact_depth * contact.normal
+            rings.append(ring_lines(centre, contact.normal, radius))
+        thickness = MIN_THICKNESS + 0.006 * placement.arrow
+        return _properties(rods(np.concatenate(rings), thickness))
+
+    def _add_scale_bar(self, api: viser.SceneApi) -> None:
+        """Add a scale bar in front of the skin, and the axes of its parent frame beside it."""
+        placement, low, high = self._placement, self._low, self._high
         y = low[1] - 0.16 * SPAN
         z = low[2] - float(placement.poses.half_side.max())
 
         start = np.array([low[0], y, z])
-        end = start + np.array([self.length * placement.unit, 0, 0])
-        bar = np.array([[start, end]])
-        _set_mesh(_add_mesh(api, "bar", DARK), rods(bar, 0.006 * SPAN))
+        end = start + np.array([self.bar * placement.unit, 0, 0])
+        vertices, faces = rods(np.array([[start, end]]), 0.006 * SPAN)
+        bar = _add_mesh(api, "bar", DARK)
+        bar.vertices, bar.faces = vertices, faces
         middle = tuple((start + end) / 2 - np.array([0, 0.03 * SPAN, 0]))
-        api.add_label(
-            "/bar/label", f"{1e3 * self.length:g} mm", position=middle, anchor="top-center"
-        )
+        text = f"{1e3 * self.bar:g} mm"
+        api.add_label("/bar/label", text, position=middle, anchor="top-center")
 
         corner, axis = np.array([high[0] - 0.05 * SPAN, y, z]), 0.1 * SPAN
         api.add_frame(
@@ -250,51 +405,12 @@ class ScaleBar:
             position=tuple(corner),
         )
         for name, direction in zip("xyz", np.eye(3), strict=True):
-            api.add_label(
-                f"/axes/{name}",
-                name,
-                position=tuple(1.3 * axis * direction),
-                anchor="center-center",
-            )
+            position = tuple(1.3 * axis * direction)
+            api.add_label(f"/axes/{name}", name, position=position, anchor="center-center")
 
-
-def round_down(length: float) -> float:
-    """Return the largest number of the form 1, 2 or 5 times a power of ten that is at most
-    `length`, which must be positive."""
-    power = 10.0 ** np.floor(np.log10(length))
-    # Without the tolerance, rounding could reduce a length of exactly 1, 2 or 5.
-    limit = length * (1 + 1e-9)
-    return float(power * max(factor for factor in (1, 2, 5) if factor * power <= limit))
-
-
-class Cubes:
-    """The coloured cubes, and below them the coloured field (values between the cubes)."""
-
-    def __init__(
-        self,
-        api: viser.SceneApi,
-        placement: Placement,
-        surface: Surface,
-    ) -> None:
-        poses, of_cube = placement.poses, surface.cube
-        # The field is drawn at the lower faces of the cubes, so that it does not hide them.
-        down = poses.rotation[of_cube, :, 2] * poses.half_side[of_cube, None]
-        self._field = SquareLayer(
-            api,
-            "field",
-            placement.point(surface.points) - down,
-            poses.rotation[of_cube],
-            surface.spacing * placement.unit,
-        )
-        self._solid: viser.BatchedMeshHandle | None = None
-        self._squares: SquareLayer | None = None
-        if len(poses.position) > MAX_SOLID_CUBES:
-            up = poses.rotation[:, :, 2] * poses.half_side[:, None]
-            side = 2 * float(np.median(poses.half_side))
-            self._squares = SquareLayer(api, "cubes", poses.position + up, poses.rotation, side)
-            return
-
-        self._solid = api.add_batched_meshes_simple(
+    def _add_cubes(self, api: viser.SceneApi) -> Any:
+        poses = self._placement.poses
+        return api.add_batched_meshes_simple(
             "/cubes",
             *CUBE,
             quaternions(poses.rotation),
@@ -306,64 +422,38 @@ class Cubes:
             lod="off",
             **NO_SHADOWS,
         )
-        # Neighbouring cubes of the same colour could not be told apart without drawn edges.
+
+    def _add_edges(self, api: viser.SceneApi) -> None:
+        """Draw the edges of the cubes: neighbours of one colour could not be told apart."""
+        poses = self._placement.poses
         edges = np.einsum("nij,eaj->neai", poses.rotation, CUBE_EDGES)
         lines = poses.position[:, None, None] + poses.half_side[:, None, None, None] * edges
         api.add_line_segments(
             "/edges", lines.reshape(-1, 2, 3), EDGE_COLOUR, thickness=1.5, thickness_units="screen"
         )
 
-    def draw(self, colouring: Colouring, with_field: bool) -> None:
-        """Colour the cubes, and colour or hide the field.
-
-        Args:
-            colouring: The values that are drawn as colours.
-            with_field: Whether the field is shown.
-        """
-        quantity, top = colouring.quantity, colouring.top
-        if with_field:
-            self._field.paint(quantity, colouring.field, top)
-        else:
-            self._field.hide()
-        if self._squares is not None:
-            self._squares.paint(quantity, colouring.cubes, top)
-        elif self._solid is not None:
-            colours = scene.colours(quantity, colouring.cubes, top)
-            self._solid.batched_colors = linear_light(colours)
-
-
-class Names:
-    """The names of the cubes, each above its cube; none in a skin above `MAX_NAMED_CUBES`."""
-
-    def __init__(
-        self,
-        api: viser.SceneApi,
-        placement: Placement,
-        names: Sequence[str],
-    ) -> None:
+    def _add_names(self, api: viser.SceneApi) -> Any:
+        """Add the names of the cubes, each in front of its cube; none above `MAX_NAMED_CUBES`."""
         # All names are children of one frame; hiding the frame hides them with a single message.
-        self._frame = api.add_frame("/names", show_axes=False, visible=False)
-        if len(names) > MAX_NAMED_CUBES:
-            return
-        for number, (name, point) in enumerate(zip(names, _above(placement, 1.3), strict=True)):
-            api.add_label(
-                f"/names/{number}",
-                name,
-                position=tuple(point),
-                anchor="bottom-center",
-                font_screen_scale=0.8,
-            )
+        frame = api.add_frame("/names", show_axes=False, visible=False)
+        if len(self._names) > MAX_NAMED_CUBES:
+            return frame
+        poses = self._placement.poses
+        front = poses.rotation @ np.array([0.0, -1.2, -1.0]) * poses.half_side[:, None]
+        points = poses.position + front
+        for number, (name, point) in enumerate(zip(self._names, points, strict=True)):
+            path, position = f"/names/{number}", tuple(point)
+            api.add_label(path, name, position=position, anchor="top-center", font_screen_scale=0.8)
+        return frame
 
-    @property
-    def visible(self) -> bool:
-        """Whether the names of the cubes are shown."""
-        return bool(self._frame.visible)
 
-    @visible.setter
-    def visible(self, visible: bool) -> None:
-        # viser sends each assignment to the browser, even if the value is the same.
-        if visible != self._frame.visible:
-            self._frame.visible = visible
+def round_down(length: float) -> float:
+    """Return the largest number of the form 1, 2 or 5 times a power of ten that is at most
+    `length`, which must be positive."""
+    power = 10.0 ** np.floor(np.log10(length))
+    # Without the tolerance, rounding could reduce a length of exactly 1, 2 or 5.
+    limit = length * (1 + 1e-9)
+    return float(power * max(factor for factor in (1, 2, 5) if factor * power <= limit))
 
 
 @dataclass(frozen=True)
@@ -371,8 +461,6 @@ class ArrowStyle:
     """Meaning and appearance of a set of arrows, one per cube.
 
     Attributes:
-        name: Name of the set in the scene.
-        colour: Colour of the arrows.
         full_length: Length of the longest arrow, relative to the unit length `Placement.arrow`.
         quantity: Quantity whose `min_top` limits the automatic range of the lengths from below.
         measured: Function of values (N, 15) and residual (N,) that returns the values, in SI
@@ -381,8 +469,6 @@ class ArrowStyle:
             tails and tips (N, 2, 3).
     """
 
-    name: str
-    colour: Colour
     full_length: float
     quantity: Quantity
     measured: Callable[[Array, Array], Array]
@@ -390,16 +476,12 @@ class ArrowStyle:
 
 
 TRACTION = ArrowStyle(
-    name="traction",
-    colour=DARK,
     full_length=1.8,
     quantity=QUANTITIES["shear"],
     measured=lambda values, residual: values[:, 2:5],
     lines=scene.traction_arrows,
 )
 GRADIENT = ArrowStyle(
-    name="gradient",
-    colour=BLUE,
     full_length=1.2,
     quantity=QUANTITIES["gradient"],
     measured=QUANTITIES["gradient"].of,
@@ -407,177 +489,30 @@ GRADIENT = ArrowStyle(
 )
 
 
-class Arrows:
-    """An arrow on the upper face of each cube; all arrows are one mesh.
+def _make_squares(placement: Placement, surface: Surface, with_cubes: bool) -> SquareLayer:
+    """Return the squares of the field, and of the upper faces of the cubes if they are no solids.
 
-    Attributes:
-        longest: Value, in SI units, that an arrow of full length stands for. It follows a rise of
-            the measured values at once and a fall slowly.
+    Args:
+        placement: Poses of the cubes in the scene.
+        surface: Grid of points around the cubes at which the field is drawn.
+        with_cubes: Whether the cubes are drawn as squares.
     """
-
-    def __init__(
-        self,
-        api: viser.SceneApi,
-        placement: Placement,
-        style: ArrowStyle,
-    ) -> None:
-        self.longest = 0.0
-        self._placement = placement
-        self._style = style
-        self._mesh = _add_mesh(api, style.name, style.colour)
-
-    @property
-    def value_per_length(self) -> float:
-        """Value, in SI units, that an arrow with a length of one unit of the scene stands for."""
-        return self.longest / (self._style.full_length * self._placement.arrow)
-
-    def draw(
-        self,
-        values: Array,
-        residual: Array,
-        visible: bool,
-    ) -> None:
-        """Update the automatic range of the lengths, and draw the arrows if they are shown.
-
-        Args:
-            values: (N, 15) 6 stress components in Pa and 9 gradients in Pa/m, in the frames of the
-                cubes.
-            residual: (N,) misfit between pads and tensor relative to the noise.
-            visible: Whether the arrows are shown.
-        """
-        style, unit = self._style, self._placement.arrow
-        measured = style.measured(values, residual)
-        self.longest = scene.automatic(style.quantity, measured, self.longest)
-        # The range was updated even if the arrows are hidden, so it is right when they appear.
-        self._mesh.visible = visible
-        if visible:
-            scale = style.full_length * unit / self.longest
-            lines = style.lines(self._placement.poses, values, scale)
-            _set_mesh(self._mesh, arrows(lines, unit))
+    poses, of_cube = placement.poses, surface.cube
+    # The field is drawn at the lower faces of the cubes, so that it does not hide them.
+    down = poses.rotation[of_cube, :, 2] * poses.half_side[of_cube, None]
+    points = placement.point(surface.points) - down
+    rotation = poses.rotation[of_cube]
+    side = np.full(len(points), surface.spacing * placement.unit)
+    if with_cubes:
+        points = np.concatenate([points, _above(placement, 1.0)])
+        rotation = np.concatenate([rotation, poses.rotation])
+        side = np.append(side, 2 * poses.half_side)
+    return SquareLayer(points, rotation, side)
 
 
-class PrincipalCrosses:
-    """The principal stresses of each cube as a cross of three lines above it.
-
-    Each line lies along a principal direction; its colour tells tension from compression.
-    """
-
-    def __init__(self, api: viser.SceneApi, placement: Placement) -> None:
-        self._placement = placement
-        self._frame = api.add_frame("/principal", show_axes=False, visible=False)
-        # `scene.principal_crosses` returns crosses centred on the upper faces; this lifts them.
-        self._lift = _above(placement, CROSS_HEIGHT, placement.pitch) - _above(placement, 1.0)
-        self._tension = _add_mesh(api, "principal/pulls", TENSION_COLOUR)
-        self._compression = _add_mesh(api, "principal/pushes", COMPRESSION_COLOUR)
-
-    def draw(
-        self,
-        values: Array,
-        longest: float,
-        visible: bool,
-    ) -> None:
-        """Draw or hide the crosses.
-
-        Args:
-            values: (N, 15) 6 stress components in Pa and 9 gradients in Pa/m, in the frames of the
-                cubes.
-            longest: Stress, in Pa, whose line is as long as the pitch (distance of neighbouring
-                cubes).
-            visible: Whether the crosses are shown.
-        """
-        self._frame.visible = visible
-        if not visible:
-            return
-        pitch = self._placement.pitch
-        scale = pitch / longest
-        lines, is_tension = scene.principal_crosses(self._placement.poses, values, scale)
-        lines = lines + self._lift[:, None, None]
-        _set_mesh(self._tension, rods(lines[is_tension], 0.02 * pitch))
-        _set_mesh(self._compression, rods(lines[~is_tension], 0.02 * pitch))
-
-
-class FaultCrosses:
-    """A cross over each cube whose health is not `FINE`, in the colour of `FAULT_COLOURS`."""
-
-    def __init__(self, api: viser.SceneApi, placement: Placement) -> None:
-        self._placement = placement
-        self._drawn: AnyArray | None = None
-        self._meshes = {}
-        for state, colour in FAULT_COLOURS.items():
-            self._meshes[state] = _add_mesh(api, f"faults/{state}", colour)
-
-    def draw(self, health: AnyArray) -> None:
-        """Draw the crosses again if the health of any cube has changed.
-
-        Args:
-            health: (N,) health of the cubes (fine, doubtful, faulty or stale), coded as in
-                core/latest_stress.py.
-        """
-        # The comparison saves work and data: health seldom changes, and each change of a mesh sends
-        # the whole mesh to the browser.
-        if self._drawn is not None and np.array_equal(health, self._drawn):
-            return
-        self._drawn = health
-        for state, mesh in self._meshes.items():
-            chosen = np.flatnonzero(health == state)
-            poses = CubePoses(*(column[chosen] for column in self._placement.poses))
-            lines = scene.fault_crosses(poses, health[chosen]).reshape(-1, 2, 3)
-            _set_mesh(mesh, rods(lines, 0.03 * self._placement.pitch))
-
-
-class ChosenCube:
-    """A ring around the chosen cube, whose numbers the page shows, with a label below it."""
-
-    def __init__(
-        self,
-        api: viser.SceneApi,
-        placement: Placement,
-        names: Sequence[str],
-    ) -> None:
-        self._names = names
-        self._upper_faces = _above(placement, 1.1)
-        self._orientations = quaternions(placement.poses.rotation)
-        radius = 0.6 * placement.pitch + 0.01 * placement.arrow
-        self._ring = _add_mesh(api, "chosen", DARK)
-        _set_mesh(self._ring, ring(radius, MIN_THICKNESS + 0.005 * placement.arrow))
-        # The label stands below the ring, because the label of a contact stands above a cube.
-        self._label = api.add_label(
-            "/chosen/label", "", position=(0.0, -radius, 0.0), anchor="top-center"
-        )
-
-    def show(self, cube: int, text: str) -> None:
-        """Move the ring to a cube, and write the cube's name and a text into the label.
-
-        Args:
-            cube: Index of the cube.
-            text: Text behind the name, such as the value of the cube.
-        """
-        self._ring.position = self._upper_faces[cube]
-        self._ring.wxyz = self._orientations[cube]
-        self._label.text = f"{self._names[cube]}: {text}"
-
-
-class ContactLabel:
-    """A label with the forces of the strongest contact, above the contact."""
-
-    def __init__(self, api: viser.SceneApi, placement: Placement) -> None:
-        self._placement = placement
-        self._label = api.add_label(
-            "/contact", "", visible=False, anchor="bottom-center", font_screen_scale=1.3
-        )
-
-    def show(self, contact: Contact | None) -> None:
-        """Write normal and shear force of a contact above its position.
-
-        Args:
-            contact: The contact; None: there is none, and the label is hidden.
-        """
-        if contact is not None:
-            # The distance keeps the label clear of the cubes and of short arrows.
-            above = 1.1 * self._placement.arrow * contact.normal
-            self._label.text = markup.newtons(contact)
-            self._label.position = self._placement.point(contact.position) + above
-        self._label.visible = contact is not None
+def _properties(mesh: Mesh) -> Properties:
+    vertices, faces = mesh
+    return {"vertices": vertices, "faces": faces}
 
 
 def _above(placement: Placement, factor: float, unit: float | None = None) -> Array:
@@ -608,10 +543,6 @@ def _add_mesh(api: viser.SceneApi, name: str, colour: Colour) -> viser.MeshHandl
     return api.add_mesh_simple(
         f"/{name}", *NO_MESH, color=colour, flat_shading=True, side="double", **NO_SHADOWS
     )
-
-
-def _set_mesh(handle: viser.MeshHandle, mesh: Mesh) -> None:
-    handle.vertices, handle.faces = mesh
 
 
 def linear_light(colours: Array) -> NDArray[np.uint8]:

@@ -18,38 +18,50 @@ import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import rclpy
 import viser
 from diagnostic_msgs.msg import DiagnosticArray
+from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 
+from ..core.arrays import Index
+from ..core.defaults import CONTACT_PRESSURE
 from ..core.errors import ConfigError
-from ..core.latest_stress import STALE_S
+from ..core.latest_stress import STALE, STALE_S
+from ..core.rows import StressRows
+from ..messages.contacts import decode_contacts, decode_traction
+from ..messages.skin_info import cube_calibrations
+from ..msg import SkinContacts
 from ..processes.stop_signals import stop_event
 from ..ros.callbacks import CallbackErrors
 from ..ros.compat import make_executor
+from ..ros.messages import to_ns
 from ..ros.session import start_ros
 from ..ros.skin_subscriber import FollowedSkin, SkinSubscriber
 from ..srv import Tare
 from . import markup
 from .bag_recorder import BagRecorder
 from .charts import HISTORY_S
-from .clients import ContactsClient, ReplayClient, ServiceCalls
+from .clients import ReplayClient, ServiceCalls
 from .gate import LOCAL_HOSTS, check_host, guarded_server
-from .history import History, RowRate
+from .history import History
 from .markup import PageStatus
-from .moment import Moment
-from .page import Buttons, Page, ShownSkin, WaitingPage
+from .page import Buttons, Layout, Page, WaitingPage
+from .scan import Links, Scan, ScanSynchronizer
+from .update import ShownSkin
 
 ALL_ADDRESSES = ("0.0.0.0", "::")
 """Values of --host with which the server listens on all addresses of this machine (IPv4, IPv6)."""
 
-PICTURE_PERIOD_S = 0.05
-"""Period, in seconds, at which the pages get a new picture of the skin."""
+PICTURE_PERIOD_S = 0.1
+"""Period, in seconds, at which the pages get a new scan: picture, numbers and plots together."""
 
-NUMBERS_PERIOD_S = 0.25
-"""Period, in seconds, at which numbers and plots change; people cannot read numbers faster."""
+MIN_PAUSE_SHARE = 1.0
+"""Minimum pause after a picture, divided by the time that the picture took. It leaves a process
+that is too slow for the period at least half of its time for messages."""
 
 WAITING_NOTE_S = 2.0
 """Time, in seconds after the start, at which the terminal prints that no skin is published yet."""
@@ -91,26 +103,23 @@ class Viewer:
         self._depth = depth
         self._node = rclpy.create_node("view")
         self._callback_errors = CallbackErrors(self._node)
-        self._subscriber = SkinSubscriber(self._node, self._show_skin)
-        self._node.create_subscription(
-            DiagnosticArray,
-            "/diagnostics",
-            self._callback_errors.catch(self._receive_diagnostics),
-            10,
-        )
+        self._subscriber = SkinSubscriber(self._node, self._show_skin, self._receive_stress)
+        self._subscribe(DiagnosticArray, "/diagnostics", self._receive_diagnostics)
         self._tare = self._node.create_client(Tare, "reconstruction/tare")
         self._clear_tare = self._node.create_client(Trigger, "reconstruction/clear_tare")
         self._status = PageStatus()
         self._services = ServiceCalls(self._status.say)
         self._replay = ReplayClient(self._node, self._services, self._status.say)
-        self._contacts = ContactsClient(self._node, self._callback_errors)
+        self._subscribe(SkinContacts, "contacts", self._receive_contacts)
+        self._subscribe(PointCloud2, "traction", self._receive_traction)
         self._recorder = BagRecorder(recordings)
         self._links: dict[str, tuple[str, int]] = {}
         self._actions: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        self._followed: FollowedSkin | None = None
         self._shown: ShownSkin | None = None
-        self._rows = RowRate(0, time.monotonic())
+        self._scans = ScanSynchronizer(0)
+        self._history = History(0, 1)
         self._pages: dict[int, Page | WaitingPage] = {}
+        self._layouts: dict[int, Layout] = {}
         # viser calls both functions in threads of its own, so they only put actions into the queue.
         put = self._actions.put
         self._server.on_client_connect(lambda client: put(lambda: self._open_page(client)))
@@ -130,7 +139,7 @@ class Viewer:
 
     def spin(self, stop: threading.Event) -> None:
         """Receive messages, execute actions of users and update the pages until `stop` is set."""
-        next_picture_s = next_numbers_s = time.monotonic()
+        next_picture_s = time.monotonic()
         waiting_note_s = next_picture_s + WAITING_NOTE_S
         while not stop.is_set():
             # `spin_once` waits until the next picture is due, or returns earlier after a message.
@@ -142,16 +151,17 @@ class Viewer:
             if now_s < next_picture_s:
                 continue
 
-            # Pictures that are overdue, for example after the computer slept, are skipped.
-            next_picture_s = max(next_picture_s + PICTURE_PERIOD_S, now_s)
-            with_numbers = now_s >= next_numbers_s
-            if with_numbers:
-                next_numbers_s = now_s + NUMBERS_PERIOD_S
-            if self._followed is not None and self._shown is not None:
-                self._callback_errors.catch(self._update)(self._followed, self._shown, with_numbers)
+            if self._shown is not None:
+                self._callback_errors.catch(self._update)(self._shown)
+                # Pictures that are overdue, for example after the computer slept, are skipped.
+                end_s = time.monotonic()
+                pause_end_s = end_s + MIN_PAUSE_SHARE * (end_s - now_s)
+                next_picture_s = max(next_picture_s + PICTURE_PERIOD_S, pause_end_s)
             elif now_s >= waiting_note_s:
                 waiting_note_s = math.inf
                 print(markup.waiting(_domain()), flush=True)
+            else:
+                next_picture_s = now_s + PICTURE_PERIOD_S
 
     def close(self) -> None:
         """End a recording that runs, destroy the node and stop the server."""
@@ -169,10 +179,10 @@ class Viewer:
             skin: The state of the new skin, as received on its topics.
         """
         names = [cube.name for cube in skin.info.cubes]
-        history = History(len(names), round(HISTORY_S / PICTURE_PERIOD_S))
-        self._shown = ShownSkin(skin.info.name, names, skin.poses, self._depth, history)
-        self._followed = skin
-        self._rows = RowRate(len(names), time.monotonic())
+        calibrations = cube_calibrations(skin.info)
+        self._shown = ShownSkin(skin.info.name, names, skin.poses, calibrations, self._depth)
+        self._scans = ScanSynchronizer(len(names))
+        self._history = History(len(names), round(HISTORY_S / PICTURE_PERIOD_S))
         for page in self._pages.values():
             page.close()
         self._pages.clear()
@@ -188,15 +198,19 @@ class Viewer:
         # The event waited in the queue, and the browser may have disconnected in that time.
         if client.client_id in self._pages or client.client_id not in self._server.get_clients():
             return
+        # Later, panels take a part of the width away.
+        size = client.camera.image_width, client.camera.image_height
+        layout = self._layouts.setdefault(client.client_id, Layout(*size))
         if self._shown is None:
-            self._pages[client.client_id] = WaitingPage(client, markup.waiting(_domain()))
+            self._pages[client.client_id] = WaitingPage(client, layout, markup.waiting(_domain()))
             return
-        page = Page(client, self._shown, self._buttons())
+        page = Page(client, layout, self._shown, self._buttons())
         page.show_replay(self._replay.state)
         self._pages[client.client_id] = page
 
     def _forget_page(self, client_id: int) -> None:
         self._pages.pop(client_id, None)
+        self._layouts.pop(client_id, None)
 
     def _buttons(self) -> Buttons:
         def tare() -> None:
@@ -214,52 +228,40 @@ class Viewer:
             jump=lambda position: put(lambda: self._replay.jump_to(position)),
         )
 
-    def _update(
-        self,
-        followed: FollowedSkin,
-        shown: ShownSkin,
-        with_numbers: bool,
-    ) -> None:
-        """Update the pages of all browsers.
-
-        Args:
-            followed: The skin, with its latest rows.
-            shown: The skin, as the pages show it.
-            with_numbers: Whether to update numbers and plots as well as the 3-D view.
-        """
+    def _update(self, skin: ShownSkin) -> None:
+        """Show the newest scan in all browsers."""
         # After a jump of the replay, the plots would connect values of two different times.
         if self._replay.update():
-            shown.history.clear()
-        is_held = self._replay.is_held
+            self._history.clear()
+        self._services.update()
+        self._replay.forget_if_silent()
+        self._update_recording()
+
         now = self._subscriber.now()
-        health = followed.newest.health(now, NEVER_STALE_S if is_held else STALE_S)
+        scans = self._scans
+        scans.advance()
+        is_held = self._replay.is_held
+        health = scans.latest.health(now, NEVER_STALE_S if is_held else STALE_S)
+        values = scans.latest.usable_values(health)
         if not is_held:
-            shown.history.add(now, followed.newest.usable_values(health), followed.newest.residual)
-        if with_numbers:
-            self._update_status()
-            self._rows.update(time.monotonic(), followed.newest.count)
+            self._history.add(now, values, scans.latest.residual)
         # Without a page, computing the field and the contacts would be useless work.
         if not self._pages:
             return
-        moment = Moment.of(
-            followed.newest, health, shown.surface, self._contacts.found(shown.surface)
-        )
+        scan = make_scan(skin, scans, health, tuple(self._links.values()))
         connected = self._server.get_clients()
         for client_id, page in self._pages.items():
             if isinstance(page, Page) and client_id in connected:
-                if with_numbers and not self._replay.is_jumping:
+                if not self._replay.is_jumping:
                     page.show_replay(self._replay.state)
-                page.show(moment, self._rows.rate, self._status, with_numbers)
+                page.show(scan, self._history, self._status)
 
-    def _update_status(self) -> None:
+    def _update_recording(self) -> None:
         status = self._status
-        self._services.update()
         code = self._recorder.ended_by_itself()
         if code is not None:
             status.say("The recording ended", f"recording ended by itself with code {code}", "red")
         status.recording = self._recorder.recording
-        status.links = list(self._links.values())
-        self._replay.forget_if_silent()
 
     def _toggle_recording(self) -> None:
         if self._recorder.recording:
@@ -273,12 +275,55 @@ class Viewer:
             return
         self._status.say("Recording", f"recording to {self._recorder.path}")
 
+    def _subscribe(self, kind: type, topic: str, receive: Callable[[Any], None]) -> None:
+        self._node.create_subscription(kind, topic, self._callback_errors.catch(receive), 10)
+
+    def _receive_stress(self, stamp_ns: int, rows: StressRows) -> None:
+        self._scans.add_rows(stamp_ns, rows, self._subscriber.now())
+
+    def _receive_contacts(self, message: SkinContacts) -> None:
+        self._scans.add_contacts(to_ns(message.header.stamp), decode_contacts(message))
+
+    def _receive_traction(self, message: PointCloud2) -> None:
+        cloud = decode_traction(message)
+        has_position = np.isfinite(cloud[:, :3]).all(axis=1)
+        self._scans.add_cloud(to_ns(message.header.stamp), cloud[has_position])
+
     def _receive_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             # The driver names the diagnostics of a link (connection to a hub) "NODE: link NAME".
             if ": link " in status.name:
                 name = status.name.rpartition(": ")[2]
                 self._links[status.name] = f"{name}: {status.message}", status.level[0]
+
+
+def make_scan(skin: ShownSkin, scans: ScanSynchronizer, health: Index, links: Links) -> Scan:
+    """Return the present instant, with field and contacts.
+
+    Contacts that the node `contacts` does not find are found here, by interpolation between the
+    cubes.
+
+    Args:
+        skin: The skin.
+        scans: Latest rows and results of the node `contacts`.
+        health: (N,) health of the cubes at this instant.
+        links: Line of text and level of the diagnostics of each link (connection to a hub).
+    """
+    latest = scans.latest
+    values = latest.usable_values(health)
+    contacts = scans.contacts
+    if contacts is None:
+        contacts = skin.surface.contacts(values, CONTACT_PRESSURE)
+    return Scan(
+        values=values,
+        residual=latest.residual.copy(),
+        health=health,
+        status=latest.status.copy(),
+        rate=np.where(health == STALE, 0.0, scans.sample_rate.hertz),
+        field=skin.field.compute(values, scans.cloud),
+        contacts=contacts,
+        links=links,
+    )
 
 
 def _domain() -> str:

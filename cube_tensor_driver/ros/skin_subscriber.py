@@ -16,6 +16,7 @@ from ..core.arrays import Index
 from ..core.errors import CubeError, MessageError
 from ..core.latest_stress import STALE_S, LatestStress
 from ..core.poses import CubePoses
+from ..core.rows import StressRows
 from ..messages.codec import stress_codec
 from ..messages.skin_info import cube_poses, geometry
 from ..msg import SkinInfo, SkinStress
@@ -51,17 +52,24 @@ class SkinSubscriber:
         skin: The state of the skin; None until its first `info` message.
     """
 
-    def __init__(self, node: Node, on_skin: Callable[[FollowedSkin], None]) -> None:
+    def __init__(
+        self,
+        node: Node,
+        on_skin: Callable[[FollowedSkin], None],
+        on_stress: Callable[[int, StressRows], None] | None = None,
+    ) -> None:
         """Subscribe to both topics.
 
         Args:
             node: The node that subscribes.
             on_skin: Called at the first `info` message, and whenever names or poses of the cubes
                 have changed.
+            on_stress: Called at each `stress` message with its stamp, in ns, and its rows.
         """
         self.skin: FollowedSkin | None = None
         self._node = node
         self._on_skin = on_skin
+        self._on_stress = on_stress
         catch = CallbackErrors(node).catch
         on_info, on_stress = catch(self._receive_info), catch(self._receive_stress)
         self._subscriptions = [
@@ -115,6 +123,8 @@ class SkinSubscriber:
         self.skin.newest.update(message.rows, self.now())
         self.skin.messages += 1
         self.skin.stamp_ns = int(message.stamp_ns[0])
+        if self._on_stress is not None:
+            self._on_stress(self.skin.stamp_ns, message.rows)
 
 
 class SkinSubscriberNode(CubeNode):

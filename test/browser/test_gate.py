@@ -123,14 +123,14 @@ def test_values_that_no_control_offers_do_no_harm() -> None:
     """A browser may send any."""
 
     def control(value: object) -> SimpleNamespace:
-        return SimpleNamespace(value=value, on_update=lambda _: None, content="")
+        return SimpleNamespace(value=value)
 
     gui = SimpleNamespace(
         add_dropdown=lambda *_: control("no such quantity"),
         add_number=lambda *_, **__: control(float("nan")),
         add_html=control,
     )
-    controls = ColourControls(gui, lambda: None)
+    controls = ColourControls(gui)
     assert controls.quantity in QUANTITIES.values()
     assert controls.fixed_top == 0.0
 

@@ -135,6 +135,7 @@ def test_losses_of_a_link_are_a_warning_and_coloured_on_the_page(state, notes, l
     rows, link = LinkDiagnostics("skin").statuses(links, with_links=True)
     assert (rows.level, link.level) == (b"\0", level)
     assert link.message == "; ".join(notes) or state.value
-    html = markup.conditions(["c"], np.zeros(1, int), [(link.message, link.level[0])])
+    scan = SimpleNamespace(health=np.zeros(1, int), links=((link.message, link.level[0]),))
+    html = markup.conditions(["c"], scan)
     colour = {b"\0": "inherit", b"\1": markup.AMBER}.get(level, markup.RED)
     assert f"color:{colour}'>{link.message}<" in html

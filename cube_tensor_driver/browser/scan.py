@@ -1,0 +1,143 @@
+"""One instant of a skin: rows of the topic `stress`, with the contacts and the field of these rows.
+
+Everything that the page shows at a time comes from one `Scan`.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any, NamedTuple
+
+from ..core.arrays import AnyArray, Array
+from ..core.latest_stress import LatestStress
+from ..core.rows import StressRows
+from ..touch.surface import Contact
+from .history import SampleRate
+from .surface_field import SurfaceField
+
+MAX_RESULT_DELAY_NS = 1_000_000_000
+"""Maximum difference, in ns, of the stamps of the newest `stress` message and of the newest message
+of the node `contacts`. A larger one means that the node has ended."""
+
+MAX_WAITING_MESSAGES = 300
+"""Maximum number of `stress` messages that wait for a result of the node `contacts`.
+
+It bounds the memory if results come for none of them: 30 MB for a skin of 1260 cubes.
+"""
+
+MAX_RESULTS = 64
+"""Number of newest results of the node `contacts` that are kept, per topic."""
+
+
+Links = tuple[tuple[str, int], ...]
+"""For each link (connection to a hub), a line of text and the level of its diagnostics."""
+
+
+class Scan(NamedTuple):
+    """Values of the N cubes at one instant, with the field and the contacts of the same rows.
+
+    Attributes:
+        values: (N, 15) 6 stress components in Pa and 9 gradients in Pa/m, in the frames of the
+            cubes; NaN where a cube has no usable tensor.
+        residual: (N,) misfit between pads and tensor relative to the noise; 1 for noise alone.
+        health: (N,) health of the cubes (fine, doubtful, faulty or stale), coded as in
+            core/latest_stress.py.
+        status: (N,) status bits, as in core/status.py.
+        rate: (N,) samples per second of each cube, in Hz; 0 where it is unknown.
+        field: Pressure and shear at the points of the surface.
+        contacts: The contacts, strongest first.
+        links: For each link (connection to a hub), one line of text with its name and state, and
+            the level of its diagnostics (0 ok, 1 warning, 2 error, 3 stale).
+    """
+
+    values: Array
+    residual: Array
+    health: AnyArray
+    status: AnyArray
+    rate: Array
+    field: SurfaceField
+    contacts: list[Contact]
+    links: Links = ()
+
+    @property
+    def strongest_contact(self) -> Contact | None:
+        """The contact with the largest force; None if there is no contact."""
+        return self.contacts[0] if self.contacts else None
+
+
+class ScanSynchronizer:
+    """Follows the rows of a skin up to the newest instant whose results are complete.
+
+    The node `contacts` publishes results some time after the rows that they belong to, with the
+    same stamp. While the node runs, later rows wait until a result for one of them has come.
+
+    Attributes:
+        latest: Latest row of each cube at the instant.
+        sample_rate: Samples per second of each cube at the instant.
+        contacts: Contacts for these rows; None if the node does not run.
+        cloud: Points (M, 6) of the topic `traction` for these rows: position in m, pressure, shear
+            and standard deviation of the pressure in Pa; None if it is not published.
+    """
+
+    def __init__(self, n_cubes: int) -> None:
+        self.latest = LatestStress(n_cubes)
+        self.sample_rate = SampleRate(n_cubes)
+        self.contacts: list[Contact] | None = None
+        self.cloud: Array | None = None
+        self._waiting: deque[tuple[int, StressRows, float]] = deque()
+        self._contacts: dict[int, list[Contact]] = {}
+        self._clouds: dict[int, Array] = {}
+
+    def add_rows(self, stamp_ns: int, rows: StressRows, now: float) -> None:
+        """Add the rows of a `stress` message.
+
+        Args:
+            stamp_ns: Stamp of the message, in ns.
+            rows: Its rows (one sample of one cube each).
+            now: Time of arrival, in s, on any clock that all calls share.
+        """
+        self._waiting.append((stamp_ns, rows, now))
+
+    def add_contacts(self, stamp_ns: int, contacts: list[Contact]) -> None:
+        """Add the contacts that belong to the `stress` message with this stamp, in ns."""
+        _add_result(self._contacts, stamp_ns, contacts)
+
+    def add_cloud(self, stamp_ns: int, cloud: Array) -> None:
+        """Add the points of `traction` that belong to the `stress` message with this stamp."""
+        _add_result(self._clouds, stamp_ns, cloud)
+
+    def advance(self) -> None:
+        """Go on to the newest instant whose results are complete, if there is a newer one."""
+        if not self._waiting:
+            return
+        newest_ns = self._waiting[-1][0]
+        required = [
+            results
+            for results in (self._contacts, self._clouds)
+            if results and abs(newest_ns - next(reversed(results))) < MAX_RESULT_DELAY_NS
+        ]
+        if len(self._waiting) > MAX_WAITING_MESSAGES:
+            required = []
+        complete = [
+            count
+            for count, (stamp_ns, _, _) in enumerate(self._waiting, 1)
+            if all(stamp_ns in results for results in required)
+        ]
+        if not complete:
+            return
+        stamp_ns = 0
+        for _ in range(complete[-1]):
+            stamp_ns, rows, arrival = self._waiting.popleft()
+            self.latest.update(rows, arrival)
+            self.sample_rate.update(rows)
+        self.contacts = self._contacts.get(stamp_ns)
+        self.cloud = self._clouds.get(stamp_ns)
+
+
+def _add_result(results: dict[int, Any], stamp_ns: int, result: Any) -> None:
+    """Store a result under its stamp, and forget the oldest of more than `MAX_RESULTS`."""
+    # A stamp that was present, as after a jump of a replay, becomes the newest one.
+    results.pop(stamp_ns, None)
+    results[stamp_ns] = result
+    if len(results) > MAX_RESULTS:
+        del results[next(iter(results))]

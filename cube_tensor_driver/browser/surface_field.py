@@ -1,0 +1,142 @@
+"""Pressure and shear at the points of a skin that the page colours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ..core.arrays import Array
+from ..core.calibration import Calibration
+from ..core.defaults import POISSONS_RATIO
+from ..mechanics.layer import Layer
+from ..touch.inverse import SurfaceInverse
+from ..touch.pad_noise import noise_of_all_pads
+from ..touch.surface import Surface
+from ..views.scene import QUANTITIES, Quantity
+
+INTERPOLATION_POINTS = 4
+"""Number of nearest points of a point cloud (pressure and shear at points of the skin's surface)
+from which the page interpolates each value."""
+
+DEVIATION = Quantity(
+    label="standard deviation of pressure",
+    unit="kPa",
+    size=1e3,
+    min_top=QUANTITIES["pressure"].min_top,
+    signed=False,
+    of=lambda values, residual: np.full(len(values), np.nan),
+)
+"""The standard deviation of the pressure on the surface, as a quantity for colours.
+
+Only the node `contacts` computes it, for points of the surface. From the values of the cubes alone
+it is unknown, so that `of` returns NaN.
+"""
+
+
+class SurfaceField(NamedTuple):
+    """Pressure and shear at the M points of a skin that the page colours.
+
+    Attributes:
+        pressure: (M,) pressure in Pa; NaN where it is unknown.
+        shear: (M,) magnitude of the shear traction in Pa; NaN where it is unknown.
+        source: Where the values come from, as text for the user.
+        sigma: (M,) standard deviation of the pressure, in Pa; None if it is unknown.
+    """
+
+    pressure: Array
+    shear: Array
+    source: str
+    sigma: Array | None = None
+
+
+class FieldModel:
+    """Computes the field from the values of the cubes, or from the node `contacts` if it runs.
+
+    The page computes the traction on the surface of the skin itself, with the inverse for an
+    elastomer of infinite thickness. Preparing this inverse takes up to some seconds on a large
+    skin. Until then, and if it is not possible, the field is interpolated between the cubes.
+
+    Attributes:
+        prepared: The inverse, which another thread prepares.
+    """
+
+    def __init__(self, surface: Surface, calibrations: Sequence[Calibration]) -> None:
+        """Begin to prepare the inverse in another thread.
+
+        Args:
+            surface: Points at which the field is computed.
+            calibrations: Calibration of each cube.
+        """
+        self._surface = surface
+        self._interpolation: _Interpolation | None = None
+        worker = ThreadPoolExecutor(1)
+        self.prepared: Future[SurfaceInverse] = worker.submit(_make_inverse, surface, calibrations)
+        worker.shutdown(wait=False)
+
+    def compute(self, values: Array, cloud: Array | None) -> SurfaceField:
+        """Compute the field at one instant.
+
+        Args:
+            values: (N, 15) values of the cubes, in Pa and Pa/m; NaN where unknown.
+            cloud: Points (M, 6) of the topic `traction` at the same instant; None if the node
+                `contacts` does not publish it.
+        """
+        if cloud is not None and len(cloud):
+            pressure, shear, sigma = self._interpolate(cloud[:, :3], cloud[:, 3:]).T
+            return SurfaceField(pressure, shear, "on the surface, from the node contacts", sigma)
+        if self.prepared.done() and self.prepared.exception() is None:
+            inverse = self.prepared.result()
+            traction = inverse.field(values).traction
+            columns = np.stack([-traction[:, 2], np.hypot(*traction[:, :2].T)], axis=1)
+            pressure, shear = self._interpolate(inverse.points, columns).T
+            return SurfaceField(pressure, shear, "on the surface, for a thick elastomer")
+        between = self._surface.field(values)
+        # A shear component that is unknown (NaN) counts as 0 in the magnitude.
+        shear = np.linalg.norm(np.nan_to_num(between.shear), axis=1)
+        return SurfaceField(between.pressure, shear, "between the cubes, at their depth")
+
+    def _interpolate(self, points: Array, columns: Array) -> Array:
+        # The points of a skin do not move, so the weights of the interpolation are computed once.
+        if self._interpolation is None or not np.array_equal(points, self._interpolation.points):
+            self._interpolation = _Interpolation(self._surface, points)
+        return self._interpolation.values(columns)
+
+
+def _make_inverse(surface: Surface, calibrations: Sequence[Calibration]) -> SurfaceInverse:
+    by_pad = noise_of_all_pads(calibrations)
+    layer = Layer(np.inf, POISSONS_RATIO)
+    return SurfaceInverse.from_poses(surface.poses, by_pad, layer, surface.depth)
+
+
+class _Interpolation:
+    """Interpolates from points on the surface of the skin to all points of a `Surface`.
+
+    The weights are the inverse squared distances to the nearest `INTERPOLATION_POINTS` points
+    (Shepard's method).
+
+    Attributes:
+        points: (M, 3) points with known values, in m, in the parent frame of the skin.
+    """
+
+    def __init__(self, surface: Surface, points: Array) -> None:
+        self.points = points
+        shape = len(surface.points), min(INTERPOLATION_POINTS, len(points))
+        # `surface.points` lie in the plane of the cubes' centres, so they are moved up to the
+        # surface by the depth of the cubes.
+        up = surface.depth * surface.poses.rotation[surface.cube, :, 2]
+        distance, nearest = cKDTree(points).query(surface.points + up, shape[1])
+        self._nearest = nearest.reshape(shape)
+        # The lower limit of the distance avoids a division by zero where two points coincide.
+        weight = 1 / np.maximum(distance.reshape(shape), 1e-3 * surface.spacing) ** 2
+        self._weight = weight / weight.sum(axis=1, keepdims=True)
+
+    def values(self, columns: Array) -> Array:
+        """Interpolate C quantities, given at the M points (M, C), to the points of the surface.
+
+        The result is NaN where one of the nearest values is NaN.
+        """
+        return np.asarray(np.einsum("pk,pkc->pc", self._weight, columns[self._nearest]))

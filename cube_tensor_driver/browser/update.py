@@ -1,0 +1,147 @@
+"""What one scan puts on the page: a pure function of the scan and of what the user has chosen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from ..core.calibration import Calibration
+from ..core.modes import COMPONENTS
+from ..core.poses import CubePoses
+from ..touch.surface import Surface
+from ..views.scene import QUANTITIES, Quantity
+from . import markup
+from .charts import GROUPS, ChartLine, chart_properties
+from .colouring import Colouring
+from .controls import Shown
+from .history import History
+from .scan import Scan
+from .scene_3d import Ranges, Scene, Update
+from .surface_field import DEVIATION, FieldModel
+from .top_view import TopView
+
+MAX_SURFACE_POINTS = 5000
+"""Approximate maximum of the number of points of the skin's surface at which the field (pressure
+and shear between the cubes) is drawn."""
+
+MAX_POINTS_PER_SIDE = 12
+"""Maximum number of points of the surface along one side of the square patch around a cube."""
+
+
+class ShownSkin:
+    """The skin that is shown, with everything that the pages of all browsers share.
+
+    Attributes:
+        name: Name of the skin.
+        names: Names of its cubes.
+        surface: Grid of points around the cubes at which the field (pressure and shear) is drawn.
+        field: Computes the field at these points.
+        scene: The skin in 3-D.
+        top_view: Drawing of the skin from above.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        names: Sequence[str],
+        poses: CubePoses,
+        calibrations: Sequence[Calibration],
+        depth: float,
+    ) -> None:
+        """Prepare the points of the field and both views.
+
+        Args:
+            name: Name of the skin.
+            names: Names of its N cubes.
+            poses: Poses of its cubes in the parent frame, in m.
+            calibrations: Calibration of each cube.
+            depth: Distance from the centres of the cubes to the surface of the skin, in m.
+        """
+        # A large skin gets fewer points per cube, so that all have about `MAX_SURFACE_POINTS`.
+        points_per_side = (MAX_SURFACE_POINTS / len(names)) ** 0.5
+        points_per_side = min(max(points_per_side, 2), MAX_POINTS_PER_SIDE)
+        self.name, self.names = name, list(names)
+        self.surface = Surface(poses, depth, int(points_per_side))
+        self.field = FieldModel(self.surface, calibrations)
+        self.scene = Scene(names, poses, self.surface)
+        self.top_view = TopView(names, poses, self.surface)
+
+
+class Choices(NamedTuple):
+    """What the user of a page has chosen to see.
+
+    Attributes:
+        quantity: The quantity that the colours show.
+        fixed_top: Upper end of the colour scale, in SI units; 0: it follows the values.
+        cube: Index of the chosen cube.
+        shown: Which parts of the 3-D view are drawn.
+        charts: Lines of each chart.
+        is_paused: Whether the page or the replay is stopped.
+        is_recording: Whether a bag is being recorded.
+    """
+
+    quantity: Quantity
+    fixed_top: float
+    cube: int
+    shown: Shown
+    charts: tuple[tuple[ChartLine, ...], ...]
+    is_paused: bool = False
+    is_recording: bool = False
+
+
+def build_update(
+    skin: ShownSkin, scan: Scan, history: History, choices: Choices, before: Ranges
+) -> tuple[Update, Ranges]:
+    """Return everything that a page shows of one scan.
+
+    Args:
+        skin: The skin.
+        scan: The instant.
+        history: Values of all cubes in the last seconds; the newest are those of the scan.
+        choices: What the user has chosen.
+        before: Upper ends of the automatic ranges in the picture of the scan before.
+
+    Returns:
+        Name of an object on the page -> its properties; upper ends of the ranges in this picture.
+    """
+    cube = choices.cube
+    colouring = Colouring.of(scan, skin.surface, choices.quantity, choices.fixed_top, before.colour)
+    ranges = skin.scene.ranges(scan, colouring.top, before)
+    update = skin.scene.draw(scan, colouring, choices.shown, cube, ranges)
+
+    texts = {
+        "headline": markup.headline(scan, choices.is_paused, choices.is_recording),
+        "legend": markup.legend(choices.quantity, colouring.top, scan.field),
+        "meaning": markup.explanation(skin.scene.bar, *skin.scene.per_bar(ranges), scan.field),
+        "numbers": markup.numbers(scan, cube),
+        "health": markup.conditions(skin.names, scan),
+        "from above": skin.top_view.draw(colouring, scan.contacts, cube),
+    }
+    update |= {name: {"content": text} for name, text in texts.items()}
+    for number, lines in enumerate(choices.charts):
+        update[f"chart {number}"] = chart_properties(history, lines)
+    return update | _options(history, scan, choices), ranges
+
+
+def _options(history: History, scan: Scan, choices: Choices) -> Update:
+    """Return the entries of the drop-down lists: only what can be shown of this skin.
+
+    The standard deviation of the pressure stays in the list of colours while it is chosen, so that
+    the colours do not change their meaning when the node that computes it ends.
+    """
+    observed = history.observed_names
+    # Until the first tensors arrive, it is unknown which components the cubes observe.
+    if not observed.intersection(COMPONENTS):
+        return {}
+    quantities = [
+        quantity.label
+        for name, quantity in QUANTITIES.items()
+        if name not in COMPONENTS or name in observed
+    ]
+    if scan.field.sigma is not None or choices.quantity is DEVIATION:
+        quantities.append(DEVIATION.label)
+    groups = tuple(group for group, names in GROUPS.items() if observed.intersection(names))
+    update: Update = {"colour": {"options": tuple(quantities)}}
+    for number in range(len(choices.charts)):
+        update[f"chart list {number}"] = {"options": groups}
+    return update

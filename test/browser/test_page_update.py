@@ -1,0 +1,261 @@
+"""What one scan puts on the page, read from the messages of a websocket as a browser reads it."""
+
+from __future__ import annotations
+
+import re
+import struct
+import threading
+from collections.abc import Iterator
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
+pytest.importorskip("viser", reason="needs viser: run this with ./cube test")
+
+import msgspec
+import viser
+import zstandard
+from sensor_msgs.msg import PointCloud2
+from websockets.sync.client import connect
+
+from cube_tensor_driver.browser.page import LEFT_WIDTH, RIGHT_WIDTH, Layout
+from cube_tensor_driver.browser.scene_3d import linear_light
+from cube_tensor_driver.browser.viewer import Viewer
+from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.skin import read_skin
+from cube_tensor_driver.core.pipeline import Pipeline
+from cube_tensor_driver.core.rows import StressRows
+from cube_tensor_driver.messages.codec import stress_codec
+from cube_tensor_driver.messages.contacts import contacts_message, traction_message
+from cube_tensor_driver.msg import SkinContacts, SkinInfo, SkinStress
+from cube_tensor_driver.ros.messages import info_message, make_message
+from cube_tensor_driver.ros.qos import LATCHED
+from cube_tensor_driver.touch.surface import Contact
+from cube_tensor_driver.views import scene
+from workshop.bench.views import CAMERA
+
+SKIN = read_skin(package_data() / "config" / "skin_demo.yaml")
+N = len(SKIN.cubes)
+CHOSEN = 5
+# Of scan k: the chosen cube is under k steps of pressure, and the strongest contact has k steps of
+# force. So every number on the page tells its scan.
+START_NS = 1_700_000_000_000_000_000
+RATE = 100.0
+STEP_PA = 100.0
+STEP_N = 0.01
+TOP_PA = 50e3
+HERE = "127.0.0.1"
+
+
+class PageReader(threading.Thread):
+    """A browser that draws nothing: it keeps the state of the page after each update."""
+
+    def __init__(self, port: int) -> None:
+        super().__init__(daemon=True)
+        self._socket = connect(
+            f"ws://{HERE}:{port}", subprotocols=[f"viser-v{viser.__version__}"], max_size=None
+        )
+        self._socket.send(msgspec.msgpack.encode(CAMERA))
+        self._objects: dict[str, dict] = {}
+        self.states: list[SimpleNamespace] = []
+        self.windows: list[int] = []
+        self.labels: dict[str, str] = {}
+        self.start()
+
+    def run(self) -> None:
+        for data in self._socket:
+            self._apply(data)
+
+    def close(self) -> None:
+        self._socket.close()
+        self.join()
+
+    def click(self, label: str, value: object) -> None:
+        """Set the value of the control with this label, as a browser does."""
+        (uuid,) = (key for key, text in self.labels.items() if text == label)
+        update = {"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": value}}
+        self._socket.send(msgspec.msgpack.encode(update))
+
+    def _apply(self, data: bytes) -> None:
+        _, size = struct.unpack_from("<QQ", data)
+        content = zstandard.ZstdDecompressor().decompress(
+            data[16 : 16 + size], max_output_size=1 << 26
+        )
+        decoded = msgspec.msgpack.decode(content)
+        offset = 16 + size
+        arrays = []
+        for length in decoded.get("binaryBufferLengths") or []:
+            offset += -offset % 8
+            arrays.append(data[offset : offset + length])
+            offset += length
+        changed = False
+        for message in decoded["messages"]:
+            name = message.get("uuid") or message.get("name")
+            values = message.get("updates") or message.get("props") or {}
+            if not isinstance(values, dict) or name is None:
+                continue
+            if values.get("label"):
+                self.labels[name] = values["label"]
+            resolved = {key: resolve(value, arrays) for key, value in values.items()}
+            self._objects.setdefault(name, {}).update(resolved)
+            changed = changed or message["type"] == "GuiUpdateMessage"
+        if changed:
+            self.windows.append(len(decoded["messages"]))
+            self._read_state()
+
+    def _read_state(self) -> None:
+        """Everything that depends on the scan, as numbers of the scan or in SI units."""
+        texts = [str(one.get("content", "")) for one in self._objects.values()]
+        (headline,) = [text for text in texts if "cubes" in text and "⬤" in text] or [""]
+        (table,) = [text for text in texts if "residual</td>" in text] or [""]
+        (above,) = [text for text in texts if "<svg" in text] or [""]
+        force = re.search(r"([0-9.]+)&nbsp;N", headline)
+        zz = re.search(r"σzz</td><td[^>]*>([-+0-9.]+)<", table)
+        tip = re.search(r"c05: pressure −σzz (-?[0-9.]+) kPa, on the surface (-?[0-9.]+)", above)
+        circle = re.search(r">([0-9.]+) N", above)
+        legend = [text for text in texts if "linear-gradient" in text]
+        top = re.findall(r"<span>([-0-9.]+)</span>", legend[0])[-1] if legend else "nan"
+        plots = [one["data"] for one in self._objects.values() if one.get("data")]
+        newest = [float(series[-1]) for series in plots[0][1:]] if plots else []
+        colours = self._objects.get("/cubes", {}).get("batched_colors")
+        if colours is None or not all((force, zz, circle, newest)):
+            return
+        self.states.append(
+            SimpleNamespace(
+                headline=headline,
+                force=float(force[1]),
+                zz=1e3 * float(zz[1]),
+                tip=1e3 * float(tip[1]) if tip else np.nan,
+                circle=float(circle[1]),
+                top=1e3 * float(top),
+                plotted=1e3 * newest[-1],
+                colour=colours.reshape(-1, 3)[CHOSEN].tolist(),
+                rate=re.search(r"([0-9]+) Hz", headline)[1],
+                surface=1e3 * float(tip[2]) if tip else np.nan,
+                text="".join(texts),
+            )
+        )
+
+
+def resolve(value: object, arrays: list[bytes]) -> object:
+    """A property with the bytes of its arrays in place of their numbers."""
+    if isinstance(value, dict) and "__binary_index" in value:
+        return np.frombuffer(arrays[value["__binary_index"]], value["dtype"])
+    if isinstance(value, list):
+        return [resolve(one, arrays) for one in value]
+    return value
+
+
+class Source:
+    """Publishes scans, and later their contacts and traction, as the nodes of a skin do."""
+
+    def __init__(self, ros) -> None:
+        node = ros.node
+        self._info = node.create_publisher(SkinInfo, "info", LATCHED)
+        self._info.publish(info_message(SKIN, Pipeline(SKIN.calibrations), START_NS))
+        self._stress = node.create_publisher(SkinStress, "stress", 100)
+        self._contacts = node.create_publisher(SkinContacts, "contacts", 10)
+        self._traction = node.create_publisher(PointCloud2, "traction", 10)
+        self._points = SKIN.poses.position + np.array([0, 0, 0.004])
+        self._pause = threading.Event()
+        self.stamp_ns = {0: START_NS}
+
+    def publish(self, numbers: range, hertz: float, contacts: bool = True) -> None:
+        """The contacts come three scans later, and only those of every other scan."""
+        for number in numbers:
+            self.stamp_ns[number] = self.stamp_ns[number - 1] + round(1e9 / hertz)
+            self._publish_scan(number)
+            if contacts and number % 2 == 0 and number > 4:
+                self._publish_results(number - 3)
+            self._pause.wait(0.004)
+
+    def _publish_scan(self, number: int) -> None:
+        stress = np.zeros((N, 6), np.float32)
+        stress[CHOSEN, 2], stress[0, 2] = -STEP_PA * number, -TOP_PA
+        rows = StressRows.of(
+            np.arange(N),
+            stress,
+            np.zeros((N, 9), np.float32),
+            residual=1.0,
+            stamp_ns=self.stamp_ns[number],
+            sequence=number,
+        )
+        self._stress.publish(stress_codec.encode(rows, b"skin_base\0"))
+
+    def _publish_results(self, number: int) -> None:
+        up, force = np.array([0, 0, 1.0]), STEP_N * number
+        contact = Contact(0 * up, up, -force * up, force, 0.0, 1e-5, 1e-4, 0.1)
+        of = self.stamp_ns[number], "skin_base"
+        ones = np.ones(N)
+        cloud = np.column_stack([self._points, STEP_PA * number * ones, 0 * ones, ones])
+        self._traction.publish(traction_message(make_message, *of, cloud))
+        self._contacts.publish(contacts_message(make_message, *of, [contact]))
+
+
+@pytest.fixture
+def page(ros, tmp_path) -> Iterator[SimpleNamespace]:
+    """The view in this process, a reader of its page, and a source of scans."""
+    view = Viewer(HERE, 0, 0.004, tmp_path)
+    stop = threading.Event()
+    spinning = threading.Thread(target=view.spin, args=(stop,))
+    spinning.start()
+    reader = PageReader(int(view.url.rpartition(":")[2]))
+    source = Source(ros)
+    try:
+        ros.wait(lambda: "colour" in reader.labels.values())
+        yield SimpleNamespace(reader=reader, source=source)
+    finally:
+        reader.close()
+        stop.set()
+        spinning.join()
+        view.close()
+
+
+def test_all_that_a_browser_receives_at_once_is_of_one_scan(page, ros):
+    """Picture, numbers, plots, contacts and field; and the rate is that of the stamps."""
+    page.source.publish(range(1, 400), RATE)
+    ros.wait(lambda: page.reader.states and page.reader.states[-1].rate == "100")
+    states = page.reader.states
+    assert len({state.zz for state in states}) > 5
+    for state in states:
+        number = round(-state.zz / STEP_PA)
+        assert state.zz == pytest.approx(-STEP_PA * number, abs=1)
+        assert state.plotted == pytest.approx(state.zz, rel=1e-5)
+        assert state.force == state.circle == pytest.approx(STEP_N * number, abs=0.005)
+        # The text has hundredths of a kPa.
+        assert state.tip == state.surface == pytest.approx(-state.zz, abs=5.1)
+        assert state.top == pytest.approx(TOP_PA)
+        colour = scene.colours(scene.QUANTITIES["pressure"], np.array([-state.zz]), TOP_PA)
+        assert state.colour == linear_light(colour)[0].tolist()
+    # viser applies at most 128 messages at once.
+    assert max(page.reader.windows) < 128
+
+
+def test_a_paused_page_stays_and_only_follows_the_choices_of_its_user(page, ros):
+    reader, source = page.reader, page.source
+    source.publish(range(1, 200), RATE)
+    reader.click("view", "pause the page")
+    ros.wait(lambda: "paused" in reader.states[-1].headline)
+    before = reader.states[-1]
+    source.publish(range(200, 400), RATE / 2)
+    assert reader.states[-1].text == before.text and "100 Hz" in before.text
+
+    reader.click("colour", scene.QUANTITIES["shear"].label)
+    ros.wait(lambda: "shear |σzx, σyz| in kPa" in reader.states[-1].text)
+    assert (reader.states[-1].headline, reader.states[-1].zz) == (before.headline, before.zz)
+
+    reader.click("view", "go on")
+    ros.wait(lambda: "live" in reader.states[-1].headline and reader.states[-1].zz < before.zz)
+
+
+@pytest.mark.parametrize(
+    ("size", "folded"), [((1440, 900), False), ((1024, 768), True), ((390, 844), True)]
+)
+def test_the_skin_keeps_at_least_half_of_the_width(size, folded):
+    layout = Layout(*size)
+    assert layout.is_folded == folded
+    if size[0] > size[1]:
+        panels = RIGHT_WIDTH + (0 if folded else LEFT_WIDTH)
+        assert size[0] - panels >= size[0] / 2
