@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 from ..config.skin import Skin
 from ..core.arrays import Array
 from ..core.errors import ConfigError
+from .load import StressField
 from .simulator import Simulator, StopRequest
 
 
@@ -79,7 +80,10 @@ class BackgroundHubs:
         Raises:
             ConfigError: Stress or gradient has another shape.
         """
-        self._load.set(np.array(stress, float), np.array(gradient, float))
+        self._load.set(
+            np.array(stress, float),
+            np.array(gradient, float),
+        )
 
     def close(self) -> None:
         """Stop the hubs and remove their ports."""
@@ -105,7 +109,10 @@ class _SetLoad:
     period = 0.0
 
     def __init__(self, cubes: int) -> None:
-        self._field = np.zeros((cubes, 6)), np.zeros((cubes, 6, 3))
+        self._field: StressField = (
+            np.zeros((cubes, 6)),
+            np.zeros((cubes, 6, 3)),
+        )
 
     def set(self, stress: Array, gradient: Array) -> None:
         """Replace stress and gradient.
@@ -118,7 +125,8 @@ class _SetLoad:
             ConfigError: Stress or gradient has another shape.
         """
         cubes = len(self._field[0])
-        if stress.shape != (cubes, 6) or gradient.shape != (cubes, 6, 3):
+        fits = stress.shape == (cubes, 6) and gradient.shape == (cubes, 6, 3)
+        if not fits:
             raise ConfigError(
                 f"the load has a stress of shape {stress.shape} and a gradient of shape "
                 f"{gradient.shape}; a skin of {cubes} cubes takes ({cubes}, 6) and ({cubes}, 6, 3)"
@@ -127,5 +135,5 @@ class _SetLoad:
         # needed.
         self._field = stress, gradient
 
-    def at(self, seconds: float) -> tuple[Array, Array]:
+    def at(self, seconds: float) -> StressField:
         return self._field

@@ -102,7 +102,8 @@ class SimulatedCubes:
         if self._is_noisy:
             hertz *= 1 + self._noise * self._random.standard_normal(hertz.shape)
         # The pad law (stress to frequency) returns NaN for a stress that no frequency belongs to.
-        return np.nan_to_num(np.rint(hertz * 1e3), nan=NOT_MEASURED).astype("<u4")
+        millihertz = np.rint(hertz * 1e3)
+        return np.nan_to_num(millihertz, nan=NOT_MEASURED).astype("<u4")
 
 
 @dataclass(frozen=True)
@@ -146,7 +147,11 @@ class HubCubes:
         frequency = np.full(shape, NOT_MEASURED, "<u4")
         cubes = self.skin_cubes
         in_skin = self.members != ABSENT
-        frequency[in_skin] = self.cubes.frequency(stress[cubes], gradient[cubes], seconds)
+        frequency[in_skin] = self.cubes.frequency(
+            stress[cubes],
+            gradient[cubes],
+            seconds,
+        )
         return frequency
 
 
@@ -181,7 +186,8 @@ def hub_cubes(
     hubs = []
     for number, link in enumerate(skin.links):
         members = hub_members(skin, link.name)
-        calibrations = [skin.cubes[cube].calibration for cube in members if cube != ABSENT]
+        present = members[members != ABSENT]
+        calibrations = [skin.calibrations[cube] for cube in present]
         if not calibrations:
             continue
         n_pads = {calibration.layout.n_pads for calibration in calibrations}
@@ -192,7 +198,11 @@ def hub_cubes(
             )
         # The index of the link is the seed, so that the noise of different hubs differs.
         cubes = SimulatedCubes(
-            calibrations, noise=noise, drift=drift, imperfections=imperfections, seed=number
+            calibrations,
+            noise=noise,
+            drift=drift,
+            imperfections=imperfections,
+            seed=number,
         )
         hubs.append(HubCubes(link, members, cubes))
     return hubs
@@ -234,7 +244,9 @@ def hub_members(skin: Skin, link: str) -> Index:
     return members
 
 
-def calibration_groups(calibrations: Sequence[Calibration]) -> list[tuple[Calibration, Index]]:
+def calibration_groups(
+    calibrations: Sequence[Calibration],
+) -> list[tuple[Calibration, Index]]:
     """Group cubes by calibration.
 
     Args:
@@ -246,7 +258,11 @@ def calibration_groups(calibrations: Sequence[Calibration]) -> list[tuple[Calibr
     cubes_by_id: dict[str, list[int]] = {}
     for number, calibration in enumerate(calibrations):
         cubes_by_id.setdefault(calibration.id, []).append(number)
-    return [(calibrations[cubes[0]], np.array(cubes)) for cubes in cubes_by_id.values()]
+    groups = []
+    for cubes in cubes_by_id.values():
+        calibration = calibrations[cubes[0]]
+        groups.append((calibration, np.array(cubes)))
+    return groups
 
 
 def true_state(
@@ -311,7 +327,12 @@ def skin_components(
     Returns:
         Components (cubes, 15): six stresses in Pa, then nine gradients in Pa/m.
     """
-    components = np.empty((len(skin.cubes), len(COMPONENTS)))
+    shape = (len(skin.cubes), len(COMPONENTS))
+    components = np.empty(shape)
     for calibration, rows in calibration_groups(skin.calibrations):
-        components[rows] = true_components(calibration, stress[rows], gradient[rows])
+        components[rows] = true_components(
+            calibration,
+            stress[rows],
+            gradient[rows],
+        )
     return components

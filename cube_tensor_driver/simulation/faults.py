@@ -81,7 +81,10 @@ _SCHEMA = Schema(
     mapping(
         ["kind"],
         {
-            "kind": {"enum": list(KINDS), "description": ", ".join(KINDS)},
+            "kind": {
+                "enum": list(KINDS),
+                "description": ", ".join(KINDS),
+            },
             "at": _AMOUNT,
             "link": {"type": "string", "description": "the name of a link"},
             "seconds": _AMOUNT,
@@ -133,9 +136,11 @@ class Fault:
         for _, mistake in _SCHEMA.mistakes(data):
             raise ConfigError(f"{place}: {mistake}")
         # YAML may contain 2 where a float is needed, and 2.0 where an integer is needed.
-        types: dict[str, Any] = {field.name: type(field.default) for field in fields(cls)}
-        types["kind"] = str
-        return cls(**{key: types[key](value) for key, value in data.items()})
+        types: dict[str, Any] = {"kind": str}
+        for field in fields(cls)[1:]:
+            types[field.name] = type(field.default)
+        values = {key: types[key](value) for key, value in data.items()}
+        return cls(**values)
 
 
 def parse_faults(data: Any, place: str) -> list[Fault]:
@@ -150,7 +155,11 @@ def parse_faults(data: Any, place: str) -> list[Fault]:
     """
     if not isinstance(data, list):
         raise ConfigError(f"{place}: found {str(data)[:60]!r}, allowed: a list of faults")
-    return [Fault.parse(item, f"{place}: [{number}]") for number, item in enumerate(data)]
+    faults = []
+    for number, item in enumerate(data):
+        fault = Fault.parse(item, f"{place}: [{number}]")
+        faults.append(fault)
+    return faults
 
 
 @dataclass(frozen=True)

@@ -181,7 +181,9 @@ class SimulatedHub:
         self.next_us += self.period_us
 
         n = len(frequency)
-        pad_fault = np.zeros(n, "<u4") if self.pad_fault is None else self.pad_fault
+        pad_fault = self.pad_fault
+        if pad_fault is None:
+            pad_fault = np.zeros(n, "<u4")
         temperature = np.full(n, self.celsius, "<i2")
         sample = Sample(
             sequence,
@@ -198,13 +200,15 @@ class SimulatedHub:
         """All samples taken so far, as runs (samples at equal intervals) in the order of time."""
         if self._run is None:
             return []
-        return [*self._ended_runs, replace(self._run, last=self._last)]
+        newest = replace(self._run, last=self._last)
+        return [*self._ended_runs, newest]
 
     def _log_sample(self) -> None:
         """Add the sample of `next_us` to the newest run of the log, or begin a new run with it."""
         # A run is a sequence of samples at equal intervals. It ends when samples are skipped, the
         # period changes or the hub restarts.
-        if (self.next_us, self.period_us, self.boots) != self._expected:
+        now = (self.next_us, self.period_us, self.boots)
+        if now != self._expected:
             self._ended_runs = self.runs
             self._run = SampleRun(
                 first=self.sequence,
@@ -214,7 +218,11 @@ class SimulatedHub:
                 boot=self.boots,
             )
         self._last = self.sequence
-        self._expected = self.next_us + self.period_us, self.period_us, self.boots
+        self._expected = (
+            self.next_us + self.period_us,
+            self.period_us,
+            self.boots,
+        )
 
     def skip(self, now_us: int) -> None:
         """Schedule the next sample after simulated time `now_us`; earlier samples are left out.
@@ -230,7 +238,8 @@ class SimulatedHub:
         argument = 0
         match request.request:
             case Command.HELLO:
-                return encode(Ack(request.request), self.version) + self.hello()
+                ack = encode(Ack(request.request), self.version)
+                return ack + self.hello()
             case Command.TIME:
                 device_us = self._positive_device_us(now_us)
                 return encode(Time(request.argument, device_us), self.version)

@@ -81,7 +81,8 @@ class Imperfections:
 
     def __post_init__(self) -> None:
         # The schema describes the values of a file, in which a term is a list.
-        values = asdict(self) | {"creep": [list(term) for term in self.creep]}
+        values = asdict(self)
+        values["creep"] = [list(term) for term in self.creep]
         _raise_first_mistake(values)
 
 
@@ -97,7 +98,8 @@ def read_imperfections(path: Path) -> Imperfections:
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
     # Tuples, because an instance is immutable.
-    creep = tuple((size, time) for size, time in data.pop("creep", ()))
+    terms = data.pop("creep", ())
+    creep = tuple((size, time) for size, time in terms)
     return Imperfections(creep=creep, **data)
 
 
@@ -129,7 +131,9 @@ class PadBehaviour:
         self._gain = 1 + imperfections.gain_spread * random.standard_normal(shape)
         self._dead = random.random(shape) < imperfections.dead
 
-        terms = np.array(imperfections.creep, float).reshape(-1, 2)
+        # The reshape gives the right shape (0, 2) if there are no terms.
+        terms = np.array(imperfections.creep, float)
+        terms = terms.reshape(-1, 2)
         self._creep_size = terms[:, 0]
         self._creep_time = terms[:, 1]
         self._crept = np.zeros((len(terms), *shape))  # q_i of the module head
@@ -150,8 +154,9 @@ class PadBehaviour:
         if len(self._creep_time):
             elapsed = max(seconds - self._seconds, 0.0)
             # Solution of tau dq/dt = v - q for a constant v: 1 - exp(-t / tau)
-            approach = -np.expm1(-elapsed / self._creep_time)[:, None, None]
-            self._crept += approach * (np.nan_to_num(reported) - self._crept)
+            approach = -np.expm1(-elapsed / self._creep_time)
+            target = np.nan_to_num(reported)
+            self._crept += approach[:, None, None] * (target - self._crept)
             reported += np.tensordot(self._creep_size, self._crept, axes=1)
             self._seconds = seconds
         return reported

@@ -46,7 +46,9 @@ def inject(ports: Path | None, words: Sequence[str]) -> str:
     with os.fdopen(_open_pipe(folder / FAULT_PIPE), "w") as stream:
         # The simulator writes this file before it creates the pipe, so the file exists.
         sizes = read_yaml(folder / HUBS_FILE)
-        hubs = {name: HubSize(**size) for name, size in sizes.items()}
+        hubs = {}
+        for name, size in sizes.items():
+            hubs[name] = HubSize(**size)
         links = check_target(parsed, hubs)
         stream.write(fault_line(fault))
     return f"{', '.join(links)}: {_describe(parsed)}"
@@ -76,8 +78,14 @@ def _open_pipe(pipe: Path) -> int:
 def _describe(fault: Fault) -> str:
     """Return the effect of a fault in words, with its values."""
     text = KINDS[fault.kind]
-    for name, unit in (("seconds", " s"), ("count", ""), ("value", "")):
-        text = text.replace(f"`{name}`", f"{getattr(fault, name):g}{unit}")
+    units = {
+        "seconds": " s",
+        "count": "",
+        "value": "",
+    }
+    for name, unit in units.items():
+        value = getattr(fault, name)
+        text = text.replace(f"`{name}`", f"{value:g}{unit}")
     if fault.kind in PAD_FAULTS:
         text = text.replace("a pad", f"pad {fault.pad} of cube {fault.cube}")
     return text

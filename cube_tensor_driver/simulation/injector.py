@@ -66,7 +66,10 @@ class SimulatedLink:
     name: str
     hub: SimulatedHub
     line: SimulatedLine
-    damaged: list[tuple[int, int]] = field(default_factory=list, kw_only=True)
+    damaged: list[tuple[int, int]] = field(
+        default_factory=list,
+        kw_only=True,
+    )
 
     @property
     def size(self) -> HubSize:
@@ -75,7 +78,8 @@ class SimulatedLink:
 
     def mark_damaged(self) -> None:
         """Record that the frame of the hub's newest sample is altered or not sent."""
-        self.damaged.append((self.hub.boots, self.hub.sequence - 1))
+        newest = self.hub.sequence - 1
+        self.damaged.append((self.hub.boots, newest))
 
 
 @dataclass
@@ -152,14 +156,16 @@ class Injector:
         sizes = {name: link.size for name, link in self._links.items()}
         # A fault without a link becomes one fault per link.
         for name in check_target(fault, sizes):
-            self._schedule(self._begins, at_us, replace(fault, link=name))
+            on_link = replace(fault, link=name)
+            self._schedule(self._begins, at_us, on_link)
 
     def due_us(self) -> int | None:
         """Return the simulated time in µs at which the next fault begins or ends.
 
         The result is None if no fault is scheduled.
         """
-        times = [schedule[0][0] for schedule in (self._begins, self._ends) if schedule]
+        schedules = (self._begins, self._ends)
+        times = [schedule[0][0] for schedule in schedules if schedule]
         return min(times, default=None)
 
     def step(self, now_us: int) -> None:
@@ -200,9 +206,15 @@ class Injector:
             sound = int(frequency[pad])
             if broken.reading is None:
                 broken.reading = sound
-            frequency[pad] = broken_reading(broken.fault, sound, broken.reading, now_us)
+            frequency[pad] = broken_reading(
+                broken.fault,
+                sound,
+                broken.reading,
+                now_us,
+            )
         if hub.extra_pads:
-            frequency = np.pad(frequency, ((0, 0), (0, hub.extra_pads)))
+            widths = ((0, 0), (0, hub.extra_pads))
+            frequency = np.pad(frequency, widths)
         return frequency
 
     def load_us(self, link: SimulatedLink, now_us: int) -> int:
@@ -263,7 +275,8 @@ class Injector:
                 noise = random.bytes(int(random.integers(1, _MAX_INSERTED_BYTES)))
                 return data[:at] + noise + data[at:]
             case "truncate":
-                return data[: int(random.integers(1, len(data) - 1))]
+                end = int(random.integers(1, len(data) - 1))
+                return data[:end]
         return data
 
     def _begin(self, fault: Fault, now_us: int) -> None:
@@ -347,7 +360,8 @@ class Injector:
         line = link.line
         match fault.kind:
             case kind if kind in PAD_FAULTS:
-                state.pads = [broken for broken in state.pads if broken.fault is not fault]
+                pads = state.pads
+                state.pads = [broken for broken in pads if broken.fault is not fault]
                 _report_pads(hub, state)
             case "hold":
                 # If the hold that acts now is another fault, it began later and replaced this one.
@@ -430,7 +444,9 @@ def warming(
         Temperature rise (...) in °C.
     """
     # The temperature rises linearly during the fault and then stays constant.
-    fraction = (np.asarray(time_us) - begin_us) * 1e-6 / max(fault.seconds, 1e-6)
+    elapsed_us = np.asarray(time_us) - begin_us
+    duration = max(fault.seconds, 1e-6)
+    fraction = elapsed_us * 1e-6 / duration
     return fault.value * np.minimum(1.0, fraction)
 
 
@@ -454,7 +470,8 @@ def centi_celsius(warmer: Any) -> Any:
             reports an unknown temperature.
     """
     warmer = np.asarray(warmer)
-    known = np.rint(100 * (ROOM_CELSIUS + warmer)).astype(int)
+    hundredths = 100 * (ROOM_CELSIUS + warmer)
+    known = np.rint(hundredths).astype(int)
     return np.where(warmer != 0, known, TEMPERATURE_UNKNOWN)
 
 
@@ -468,5 +485,6 @@ def _report_pads(hub: SimulatedHub, state: _LinkState) -> None:
     bits = np.zeros(len(hub.cube_uids), "<u4")
     for broken in state.pads:
         if broken.fault.kind == "report":
-            bits[broken.fault.cube] |= np.uint32(1 << broken.fault.pad)
+            bit = np.uint32(1 << broken.fault.pad)
+            bits[broken.fault.cube] |= bit
     hub.pad_fault = bits if bits.any() else None

@@ -86,7 +86,8 @@ class SimulatedLine:
         Returns:
             Whether there was room for the bytes in the queue; otherwise they are lost.
         """
-        has_room = self.plugged and len(self._queue) + len(data) <= MAX_QUEUED_BYTES
+        size = len(self._queue) + len(data)
+        has_room = self.plugged and size <= MAX_QUEUED_BYTES
         if has_room:
             self._queue += data
         self.flush(now_us)
@@ -106,7 +107,8 @@ class SimulatedLine:
         # If the line takes no more bytes, the rest stays in the queue until the host reads.
         with contextlib.suppress(BlockingIOError):
             while self._queue:
-                del self._queue[: os.write(self.fd, self._queue)]
+                written = os.write(self.fd, self._queue)
+                del self._queue[:written]
 
     def due_us(self, now_us: int) -> int | None:
         """Return the simulated time in µs at which a stall or burst lets waiting bytes be sent.
@@ -212,4 +214,6 @@ class TcpLine(SimulatedLine):
         if self._connection is not None:
             self._connection.close()
             self._connection = None
-            self.fd = self._listener.fileno() if self._listener is not None else -1
+            self.fd = -1
+            if self._listener is not None:
+                self.fd = self._listener.fileno()

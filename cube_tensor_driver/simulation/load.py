@@ -43,6 +43,15 @@ def default_script() -> Script:
     return read_script(package_data() / "config" / "load_demo.yaml")
 
 
+StressField = tuple[Array, Array]
+"""Stress (cubes, 6) in Pa and its gradient (cubes, 6, 3) in Pa/m at the cubes of a skin, in the
+frames of the cubes. The components are in the order xx yy zz yz zx xy."""
+
+Resultant = tuple[Array, Array, Array]
+"""Force (3,) on the skin in N, centre of pressure (3,) in m and mean normal (3,) out of the skin of
+some contacts together, in the skin's parent frame. Without a contact, centre and normal are NaN."""
+
+
 class ContactLoad(NamedTuple):
     """One contact at one time, in the skin's parent frame.
 
@@ -72,7 +81,7 @@ class Fields(Protocol):
     def period(self) -> float:
         """Time in s after which the load repeats; if it never does, a typical duration instead."""
 
-    def at(self, seconds: float) -> tuple[Array, Array]:
+    def at(self, seconds: float) -> StressField:
         """Compute stress and gradient at the cubes at a simulated time in s.
 
         Returns:
@@ -92,7 +101,7 @@ class AnyLoad(Fields, Protocol):
     def depth(self) -> float:
         """Distance from the centres of the cubes to the surface, in m."""
 
-    def total(self, seconds: float) -> tuple[Array, Array, Array]:
+    def total(self, seconds: float) -> Resultant:
         """Return total force (3,) in N, centre (3,) in m and mean normal (3,) at a time.
 
         The centre is the centre of pressure. They are those of all contacts together, in the skin's
@@ -154,7 +163,7 @@ class Load:
         for indenter in script.indenters:
             self._check(indenter)
 
-    def at(self, seconds: float) -> tuple[Array, Array]:
+    def at(self, seconds: float) -> StressField:
         """Compute stress and gradient at the cubes at a simulated time in s, as `Fields.at`."""
         # For each cube, the surface is the plane z = 0, and the cube is at z = -depth.
         position, rotation, _ = self.poses
@@ -165,18 +174,26 @@ class Load:
         for load in self.contact_loads(seconds):
             local = np.einsum("nij,ni->nj", rotation, load.position - position)
             distance = np.hypot(local[:, 0], local[:, 1])
-            facing = np.maximum(rotation[:, :, 2] @ load.normal, 0.0)
-            force = np.einsum("nij,i->nj", rotation, load.force) * facing[:, None]
+            outward = rotation[:, :, 2]
+            facing = np.maximum(outward @ load.normal, 0.0)
+            force = np.einsum("nij,i->nj", rotation, load.force)
+            force *= facing[:, None]
             orders = _choose_orders(load.shape, load.radius, self.depth, distance)
 
             # Cubes with the same quadrature order are computed together.
-            for order in np.unique(orders[facing > 0]).tolist():
-                rows = np.flatnonzero((orders == order) & (facing > 0))
+            is_facing = facing > 0
+            for order in np.unique(orders[is_facing]).tolist():
+                rows = np.flatnonzero((orders == order) & is_facing)
                 points, weights = _unit_points(load.shape, order)
                 in_plane = local[rows, None, :] * (1.0, 1.0, 0.0)
                 sources = in_plane + load.radius * points
                 forces = force[rows, None, :] * weights
-                part, slope = contact.field(below, sources, forces, self.script.poisson)
+                part, slope = contact.field(
+                    below,
+                    sources,
+                    forces,
+                    self.script.poisson,
+                )
                 stress[rows] += part[:, 0]
                 gradient[rows] += slope[:, 0]
         return stress, gradient
@@ -195,7 +212,7 @@ class Load:
         # touch the skin.
         return [load for load in loads if load.force.any()]
 
-    def total(self, seconds: float) -> tuple[Array, Array, Array]:
+    def total(self, seconds: float) -> Resultant:
         """Return force, centre and normal of all contacts at a time in s, as `total`."""
         return total(self.contact_loads(seconds))
 
@@ -236,7 +253,9 @@ class Load:
         duration = action.end - action.start
         progress = (seconds - action.start) / duration  # 0 to 1
         path = self._paths[id(action)]
-        position = path.position(progress) if path else self._to_metres(action.path[0])
+        position = self._to_metres(action.path[0])
+        if path:
+            position = path.position(progress)
         normal = surface_normal(self.poses, self._pitch, position)
         size = float(interpolate_knots(action.force, progress))
         if path and action.kind == "slide":
@@ -254,7 +273,13 @@ class Load:
                 shear = interpolate_knots(action.shear, progress)
             shear = shear - normal * (shear @ normal)
         radius = self._contact_radius(indenter, size)
-        return ContactLoad(indenter.shape, position, normal, shear - size * normal, radius)
+        return ContactLoad(
+            indenter.shape,
+            position,
+            normal,
+            force=shear - size * normal,
+            radius=radius,
+        )
 
     def _contact_radius(self, indenter: Indenter, force: float) -> float:
         """Return the radius of a contact, in m.
@@ -267,7 +292,8 @@ class Load:
             return indenter.radius
         # Hertz: a³ = 3 F R / (4 E*) for the contact radius a, with E* = E / (1 − ν²); Johnson 4.2
         stiffness = self.script.young / (1 - self.script.poisson**2)
-        return float(np.cbrt(3 * force * indenter.radius / (4 * stiffness)))
+        cube_of_radius = 3 * force * indenter.radius / (4 * stiffness)
+        return float(np.cbrt(cube_of_radius))
 
     def _to_metres(self, position: Array) -> Array:
         """Convert positions of the script to metres in the skin's parent frame.
@@ -288,7 +314,8 @@ class Load:
         """
         if len(action.path) == 1:
             return None
-        closed = len(action.path) > 2 and np.array_equal(action.path[0], action.path[-1])
+        first, last = action.path[0], action.path[-1]
+        closed = len(action.path) > 2 and np.array_equal(first, last)
         return CubicSpline(self._to_metres(action.path), closed=closed)
 
 
@@ -307,16 +334,20 @@ def surface_normal(
             long).
         position: Position (3,) in m.
     """
-    square = ((poses.position - position) ** 2).sum(axis=1)
+    offset = poses.position - position
+    square = (offset**2).sum(axis=1)
     nearest = np.argmin(square)
-    weight = np.exp((square[nearest] - square) / (2 * pitch**2))
+    excess = square - square[nearest]
+    weight = np.exp(-excess / (2 * pitch**2))
     normal = weight @ poses.rotation[:, :, 2]
     length = np.linalg.norm(normal)
     # Opposite z axes may add up to 0; then the axis of the nearest cube is the normal.
-    return np.asarray(normal / length if length > 0 else poses.rotation[nearest, :, 2])
+    if length > 0:
+        return np.asarray(normal / length)
+    return np.asarray(poses.rotation[nearest, :, 2])
 
 
-def total(loads: Sequence[ContactLoad]) -> tuple[Array, Array, Array]:
+def total(loads: Sequence[ContactLoad]) -> Resultant:
     """Return the total force of some contacts, their centre of pressure and mean normal.
 
     Returns:
@@ -324,13 +355,17 @@ def total(loads: Sequence[ContactLoad]) -> tuple[Array, Array, Array]:
         out of the skin; all in the skin's parent frame. Without a load, centre and normal are NaN.
     """
     if not loads:
-        return np.zeros(3), np.full(3, np.nan), np.full(3, np.nan)
+        unknown = np.full(3, np.nan)
+        return np.zeros(3), unknown, unknown
     # The centre of pressure is the mean of the contacts' centres, weighted with their forces along
     # the normal into the skin.
+    forces = np.array([load.force for load in loads])
+    positions = np.array([load.position for load in loads])
+    normals = np.array([load.normal for load in loads])
     weight = np.array([-load.force @ load.normal for load in loads])
-    force = np.sum([load.force for load in loads], axis=0)
-    centre = weight @ np.array([load.position for load in loads]) / weight.sum()
-    normal = weight @ np.array([load.normal for load in loads])
+    force = forces.sum(axis=0)
+    centre = weight @ positions / weight.sum()
+    normal = weight @ normals
     return force, centre, normal / np.linalg.norm(normal)
 
 
@@ -344,9 +379,9 @@ class LoadMemory:
         self._load = load
         period = load.repeats
         self._period_us = None if period is None else round(1e6 * period)
-        self._fields: dict[int, tuple[Array, Array]] = {}
+        self._fields: dict[int, StressField] = {}
 
-    def at(self, time_us: int) -> tuple[Array, Array]:
+    def at(self, time_us: int) -> StressField:
         """Return stress and gradient at the cubes at a simulated time in µs, as `Fields.at`."""
         if self._period_us is not None:
             time_us %= self._period_us

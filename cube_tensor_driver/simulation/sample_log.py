@@ -148,7 +148,7 @@ class SampleLog:
                 cubes=tuple(link["cubes"]),
                 dropped=link["dropped"],
                 runs=tuple(SampleRun(**run) for run in link["runs"]),
-                damaged=tuple((boot, number) for boot, number in link["damaged"]),
+                damaged=tuple(map(tuple, link["damaged"])),
             )
             for link in data["links"]
         )
@@ -172,22 +172,24 @@ class SampleLog:
         """All samples of the log, link after link, in the order of time."""
         # The log holds runs (samples at equal intervals). They become columns with one row per
         # sample.
-        runs = [(number, run) for number, link in enumerate(self.links) for run in link.runs]
-        lengths = np.array([len(run) for _, run in runs], int)
-        number = [np.arange(run.first, run.last + 1) for _, run in runs]
-        time_us = [run.start_us + run.period_us * np.arange(len(run)) for _, run in runs]
         # An empty array in front gives the columns their type even if there are no runs.
-        no_samples = np.empty(0, np.int64)
-
+        links, numbers, times_us = [[np.empty(0, np.int64)] for _ in range(3)]
+        rows_per_sample = []
         link_of_cube = np.full(CUBE_RANGE, NO_LINK, np.int64)
         for index, link in enumerate(self.links):
             link_of_cube[link.members] = index
+            rows_per_sample.append(len(link.members))
+            for run in link.runs:
+                count = np.arange(len(run))
+                links.append(np.full(len(run), index))
+                numbers.append(run.first + count)
+                times_us.append(run.start_us + run.period_us * count)
         return SampleTable(
             start_time_ns=self.start_time_ns,
-            link=np.repeat(np.array([link for link, _ in runs], int), lengths),
-            number=np.concatenate([no_samples, *number]),
-            time_ns=self.start_time_ns + 1000 * np.concatenate([no_samples, *time_us]),
-            rows_per_sample=np.array([len(link.members) for link in self.links], int),
+            link=np.concatenate(links),
+            number=np.concatenate(numbers),
+            time_ns=self.start_time_ns + 1000 * np.concatenate(times_us),
+            rows_per_sample=np.array(rows_per_sample, int),
             link_of_cube=link_of_cube,
         )
 
@@ -215,7 +217,11 @@ class SampleTable:
     def __len__(self) -> int:
         return len(self.link)
 
-    def match(self, rows: SampleRows, among: Index | None = None) -> Index:
+    def match(
+        self,
+        rows: SampleRows,
+        among: Index | None = None,
+    ) -> Index:
         """Find the logged sample from which each of N received rows comes.
 
         A hub that restarts uses the same sample numbers again. So among the samples of the row's
@@ -232,8 +238,16 @@ class SampleTable:
             among = np.arange(len(self))
         # A sample contains all cubes of a hub, so it is identified by the link instead of the cube.
         number = self.number[among] % SEQUENCE_RANGE
-        known = SampleKeys(self.link[among], number, self.time_ns[among])
-        wanted = SampleKeys(self.link_of_cube[rows.cube], rows.sequence, rows.stamp_ns)
+        known = SampleKeys(
+            self.link[among],
+            number,
+            self.time_ns[among],
+        )
+        wanted = SampleKeys(
+            self.link_of_cube[rows.cube],
+            rows.sequence,
+            rows.stamp_ns,
+        )
         found = match_rows(known, wanted)
         # `NO_MATCH` is -1, so it selects the appended element.
         return np.append(among, NO_MATCH)[found]
@@ -246,4 +260,5 @@ class SampleTable:
             end_ns: End of the interval (exclusive), in ns since the Unix epoch.
         """
         is_within = (self.time_ns >= start_ns) & (self.time_ns < end_ns)
-        return int(self.rows_per_sample[self.link[is_within]].sum())
+        links = self.link[is_within]
+        return int(self.rows_per_sample[links].sum())

@@ -146,10 +146,8 @@ class Simulator:
                 imperfections=imperfections,
             ):
                 self._links.append(_connect(skin, carried, ports, tcp))
-            write_yaml(
-                ports / HUBS_FILE,
-                {link.name: asdict(link.size) for link in self._links},
-            )
+            sizes = {link.name: asdict(link.size) for link in self._links}
+            write_yaml(ports / HUBS_FILE, sizes)
             self._fault_pipe = _open_pipe(ports / FAULT_PIPE)
         except OSError as error:
             raise ConfigError(
@@ -187,14 +185,15 @@ class Simulator:
         # SelectSelector is used, because epoll rounds waiting times to milliseconds.
         with selectors.SelectSelector() as selector:
             watched: dict[str, int] = {}
-            selector.register(stop.fd, selectors.EVENT_READ, partial(os.read, stop.fd, 64))
+            read_stop = partial(os.read, stop.fd, 64)
+            selector.register(stop.fd, selectors.EVENT_READ, read_stop)
             selector.register(self._fault_pipe, selectors.EVENT_READ, self._read_faults)
             report_us = SECOND_US
             while not stop.is_due(self._is_needed()):
                 for link in self._links:
                     self._watch(selector, watched, link)
-                wait_s = max(0.0, (self._due_us(report_us) - self.now_us()) * 1e-6)
-                for key, _ in selector.select(wait_s):
+                wait_us = self._due_us(report_us) - self.now_us()
+                for key, _ in selector.select(max(0.0, wait_us * 1e-6)):
                     key.data()
 
                 now = self.now_us()
@@ -215,7 +214,8 @@ class Simulator:
         """Send the HELLO and STATS frames of all hubs whose line is plugged in."""
         for link in self._links:
             if link.line.plugged:
-                link.line.send(link.hub.hello() + link.hub.stats(now_us), now_us)
+                frames = link.hub.hello() + link.hub.stats(now_us)
+                link.line.send(frames, now_us)
 
     def _is_needed(self) -> bool:
         """Return whether a driver has asked one of the hubs for samples and not stopped it."""
@@ -257,8 +257,9 @@ class Simulator:
         """
         now = self.now_us()
         times: list[int | None] = [report_us, self._injector.due_us()]
-        times += [link.hub.next_us for link in self._links if link.hub.started]
-        times += [link.line.due_us(now) for link in self._links]
+        for link in self._links:
+            sample_us = link.hub.next_us if link.hub.started else None
+            times += [sample_us, link.line.due_us(now)]
         return min(time for time in times if time is not None)
 
     def _skip_late(self, now_us: int) -> None:
@@ -303,9 +304,11 @@ class Simulator:
         else:
             stress, gradient = self._load.at(load_us)
             frequency = link.carried.frequency(stress, gradient, time_us * 1e-6)
-        frame = link.hub.sample(self._injector.measured(link, frequency, time_us))
+        measured = self._injector.measured(link, frequency, time_us)
+        frame = link.hub.sample(measured)
+        sent = self._injector.transmitted(link, frame)
         # If the line has no room for the frame, the hub drops the sample and counts it.
-        if not link.line.send(self._injector.transmitted(link, frame), now_us):
+        if not link.line.send(sent, now_us):
             link.hub.dropped += 1
             link.mark_damaged()
 
@@ -330,23 +333,24 @@ class Simulator:
         if before >= 0:
             selector.unregister(before)
         if fd >= 0:
-            selector.register(fd, selectors.EVENT_READ, partial(self._answer, link))
+            answer = partial(self._answer, link)
+            selector.register(fd, selectors.EVENT_READ, answer)
         watched[link.name] = fd
 
     def _answer(self, link: PlayedLink) -> None:
         """Read the requests of the host on a link and send the hub's answers."""
         now = self.now_us()
-        link.line.send(link.hub.receive(link.line.read(), now), now)
+        request = link.line.read()
+        link.line.send(link.hub.receive(request, now), now)
 
     def _read_faults(self) -> None:
         """Schedule the faults that were written into the pipe to begin now."""
-        text = os.read(self._fault_pipe, _PIPE_BYTES).decode(errors="replace")
-        for line in text.splitlines():
+        data = os.read(self._fault_pipe, _PIPE_BYTES)
+        for line in data.decode(errors="replace").splitlines():
             try:
-                self._injector.add(
-                    Fault.parse(parse_yaml(line, "fault"), "fault"),
-                    self.now_us(),
-                )
+                values = parse_yaml(line, "fault")
+                fault = Fault.parse(values, "fault")
+                self._injector.add(fault, self.now_us())
             except ConfigError as error:
                 # Any process may write into the pipe, so a wrong fault does not end the simulator.
                 print(f"simulator: {error}", file=sys.stderr, flush=True)
@@ -365,7 +369,11 @@ class StopRequest:
         self._until_s = math.inf
         self.fd, self._write = os.pipe()
 
-    def request(self, number: int = signal.SIGTERM, _: object = None) -> None:
+    def request(
+        self,
+        number: int = signal.SIGTERM,
+        _: object = None,
+    ) -> None:
         """Request the stop; this method is also the handler of SIGINT and SIGTERM.
 
         Ctrl-C sends SIGINT to the simulator and to the driver at the same time. A driver would
@@ -423,8 +431,10 @@ def _connect(
         n_pads=carried.cubes.n_pads,
         boot_us=FIRST_BOOT_US * number,
     )
-    is_on_tcp = tcp and link.port.startswith("socket://")
-    line = TcpLine(link.port) if is_on_tcp else SimulatedLine(ports / link.name)
+    if tcp and link.port.startswith("socket://"):
+        line: SimulatedLine = TcpLine(link.port)
+    else:
+        line = SimulatedLine(ports / link.name)
     return PlayedLink(link.name, hub, line, carried)
 
 

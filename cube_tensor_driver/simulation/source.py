@@ -128,13 +128,15 @@ class SimulatedSource:
             self.imperfections,
         )
         fields = LoadMemory(self.load)
+        end_us = None if self.duration is None else round(1e6 * self.duration)
         self.scans = 0
         for number in itertools.count():
             time_us = number * self.period_us
-            if self.duration is not None and time_us >= round(1e6 * self.duration):
+            if end_us is not None and time_us >= end_us:
                 return
             self.scans += 1
-            yield pads.rows(*fields.at(time_us), number, time_us)
+            stress, gradient = fields.at(time_us)
+            yield pads.rows(stress, gradient, number, time_us)
 
     def __enter__(self) -> SimulatedSource:
         return self
@@ -171,7 +173,8 @@ class SkinPads:
             drift=drift,
             imperfections=imperfections,
         )
-        self._cube = np.concatenate([hub.skin_cubes for hub in self._hubs]).astype(np.uint16)
+        cubes = [hub.skin_cubes for hub in self._hubs]
+        self._cube = np.concatenate(cubes).astype(np.uint16)
         self._n_pads = max(hub.cubes.n_pads for hub in self._hubs)
 
     def rows(
@@ -190,13 +193,18 @@ class SkinPads:
             time_us: Simulated time in µs.
         """
         count = len(self._cube)
-        millihertz = np.full((count, self._n_pads), NOT_MEASURED, np.uint32)
+        shape = (count, self._n_pads)
+        millihertz = np.full(shape, NOT_MEASURED, np.uint32)
         # The rows are sorted link by link, as the driver delivers them.
         start = 0
         for hub in self._hubs:
             cubes = hub.skin_cubes
             end = start + len(cubes)
-            own = hub.cubes.frequency(stress[cubes], gradient[cubes], 1e-6 * time_us)
+            own = hub.cubes.frequency(
+                stress[cubes],
+                gradient[cubes],
+                1e-6 * time_us,
+            )
             millihertz[start:end, : hub.cubes.n_pads] = own
             start = end
 

@@ -36,13 +36,20 @@ class CubicSpline:
             # There is one equation for each point except the last, which is equal to the first.
             ring = self._points[:-1]
             identity = np.eye(n - 1)
-            matrix = 4 * identity + np.roll(identity, 1, axis=1) + np.roll(identity, -1, axis=1)
-            right = 3 * (np.roll(ring, -1, axis=0) - np.roll(ring, 1, axis=0))
+            before = np.roll(identity, 1, axis=1)
+            after = np.roll(identity, -1, axis=1)
+            matrix = 4 * identity + before + after
+            next_point = np.roll(ring, -1, axis=0)
+            last_point = np.roll(ring, 1, axis=0)
+            right = 3 * (next_point - last_point)
             slopes = np.linalg.solve(matrix, right)
             self._slopes = np.concatenate([slopes, slopes[:1]])
         else:
             size = n - 2
-            matrix = 4 * np.eye(size) + np.eye(size, k=1) + np.eye(size, k=-1)
+            identity = np.eye(size)
+            before = np.eye(size, k=1)
+            after = np.eye(size, k=-1)
+            matrix = 4 * identity + before + after
             right = 3 * (points[2:] - points[:-2])
             self._slopes = np.zeros_like(self._points)
             self._slopes[1:-1] = np.linalg.solve(matrix, right)
@@ -51,10 +58,11 @@ class CubicSpline:
         """Return the position (D,) at a time from 0 to 1."""
         # Cubic Hermite polynomial with the points p and q at the ends and the slopes m and n there
         t, p, q, m, n = self._interval(time)
-        value = (1 + 2 * t) * (1 - t) ** 2 * p
+        left = 1 - t
+        value = (1 + 2 * t) * left**2 * p
         value = value + t**2 * (3 - 2 * t) * q
-        value = value + t * (1 - t) ** 2 * m
-        return value + t**2 * (t - 1) * n
+        value = value + t * left**2 * m
+        return value - t**2 * left * n
 
     def velocity(self, time: float) -> Array:
         """Return the derivative (D,) of the position by the time, at a time from 0 to 1."""

@@ -24,6 +24,16 @@ import numpy as np
 
 from ...core.arrays import Array
 
+_UNIT_SQUARE = np.array(
+    [
+        [-1, -1],
+        [1, -1],
+        [1, 1],
+        [-1, 1],
+    ]
+)
+"""Corners (4, 2) of a square with half a side of 1, counterclockwise."""
+
 
 class Polygon(NamedTuple):
     """Uniform traction on a polygon, plus a tangential traction that circulates about its centroid.
@@ -57,7 +67,8 @@ def hertz_radius(
     """
     if curvature <= 0:
         return 0.0
-    return float(np.cbrt(3 * force / (4 * stiffness * curvature)))
+    cube_of_radius = 3 * force / (4 * stiffness * curvature)
+    return float(np.cbrt(cube_of_radius))
 
 
 def flat_contact(
@@ -82,14 +93,17 @@ def flat_contact(
     pressing = forces @ normal
     centre = pressing @ flat / pressing.sum()
     arm = flat - centre
-    moment = arm[:, 0] @ tangential[:, 1] - arm[:, 1] @ tangential[:, 0]
+    arm_x, arm_y = arm.T
+    force_x, force_y = tangential.T
+    moment = arm_x @ force_y - arm_y @ force_x
 
     corners = _convex_hull(flat)
     area, centroid, polar = _area_moments(corners)
     if area < min_width * np.abs(corners).max():
         # The points lie on a line. Each becomes a square, so that the polygon has an area.
-        square = min_width / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-        corners = _convex_hull((flat[:, None] + square).reshape(-1, 2))
+        square = min_width / 2 * _UNIT_SQUARE
+        around_points = flat[:, None] + square
+        corners = _convex_hull(around_points.reshape(-1, 2))
         area, centroid, polar = _area_moments(corners)
 
     ratios = _edge_distances(corners, centre) / _edge_distances(corners, centroid)
@@ -97,10 +111,12 @@ def flat_contact(
         float(ratios.min()),
         min(1.0, min_width / np.sqrt(area)),
     )
+    shrunk = centre + shrink * (corners - centroid)
+    total = forces.sum(axis=0)
     return Polygon(
-        corners=origin + (centre + shrink * (corners - centroid)) @ basis.T,
+        corners=origin + shrunk @ basis.T,
         centre=origin + centre @ basis.T,
-        traction=forces.sum(axis=0) / (shrink**2 * area),
+        traction=total / (shrink**2 * area),
         twist=float(moment / (shrink**4 * polar)),
     )
 
@@ -115,9 +131,9 @@ def _edge_distances(corners: Array, place: Array) -> Array:
     Returns:
         Distance (K,) from the line of each edge, positive inside, multiplied by the edge's length.
     """
-    edges = _next_corners(corners) - corners
-    offset = place - corners
-    return np.asarray(edges[:, 0] * offset[:, 1] - edges[:, 1] * offset[:, 0])
+    edge_x, edge_y = (_next_corners(corners) - corners).T
+    x, y = (place - corners).T
+    return np.asarray(edge_x * y - edge_y * x)
 
 
 def _area_moments(corners: Array) -> tuple[float, Array, float]:
@@ -135,7 +151,12 @@ def _area_moments(corners: Array) -> tuple[float, Array, float]:
     if not area > 0:
         return 0.0, corners.mean(axis=0), 0.0
 
-    first = np.array([double_area @ (x + next_x), double_area @ (y + next_y)])
+    first = np.array(
+        [
+            double_area @ (x + next_x),
+            double_area @ (y + next_y),
+        ]
+    )
     centroid = first / (6 * area)
     # Integral of x^2 + y^2 over the triangles between the origin and the edges
     squares = x * x + x * next_x + next_x * next_x
@@ -165,7 +186,9 @@ def _convex_hull(flat: Array) -> Array:
         for x, y in run:
             while len(hull) > start + 1:
                 (ax, ay), (bx, by) = hull[-2:]
-                if (bx - ax) * (y - ay) - (by - ay) * (x - ax) > 0:
+                left = (bx - ax) * (y - ay)
+                right = (by - ay) * (x - ax)
+                if left > right:
                     break  # a left turn
                 hull.pop()
             hull.append((x, y))
@@ -190,4 +213,5 @@ def _plane_basis(
     axis[np.argmin(np.abs(normal))] = 1.0  # the axis that is least parallel to the normal
     first = np.cross(axis, normal)
     first /= np.linalg.norm(first)
-    return np.stack([first, np.cross(normal, first)], axis=1)
+    second = np.cross(normal, first)
+    return np.stack([first, second], axis=1)

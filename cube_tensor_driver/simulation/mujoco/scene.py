@@ -18,7 +18,7 @@ import numpy as np
 from ...config.skin import Skin
 from ...core.arrays import Array
 from ...core.errors import ConfigError
-from ..load import total
+from ..load import Resultant, StressField, total
 from .source import MujocoSkin, Touch, load_mujoco
 
 if TYPE_CHECKING:
@@ -118,17 +118,19 @@ class MujocoLoad:
         self.depth = self.touch.depth
 
         self._times, self._controls = _keyframe_controls(path, model)
-        self.repeats = float(self._times[-1]) if len(self._times) else None
+        self.repeats = None
+        if len(self._times):
+            self.repeats = float(self._times[-1])
         self.period = self.repeats or UNBOUNDED_PERIOD_S
         self._touches: dict[int, list[Touch]] = {}
         self._step = 0
         self._restart()
 
-    def at(self, seconds: float) -> tuple[Array, Array]:
+    def at(self, seconds: float) -> StressField:
         """Compute the fields as `AnyLoad.at`, with the contacts of the last step before a time."""
         return self.touch.field(self._touches_at(seconds))
 
-    def total(self, seconds: float) -> tuple[Array, Array, Array]:
+    def total(self, seconds: float) -> Resultant:
         """Return force, centre and normal of all contacts at a time in s, as `AnyLoad.total`."""
         return total([touch.press for touch in self._touches_at(seconds)])
 
@@ -149,7 +151,8 @@ class MujocoLoad:
         if self.repeats is not None:
             seconds %= self.repeats
         # The small addition keeps exact multiples of the time step from being rounded down.
-        return int(np.floor(seconds / self.touch.model.opt.timestep + 1e-6))
+        steps = seconds / self.touch.model.opt.timestep
+        return int(np.floor(steps + 1e-6))
 
     def _restart(self) -> None:
         """Reset the scene to its start."""
@@ -169,16 +172,24 @@ class MujocoLoad:
         data = self.touch.data
         if len(self._times):
             for actuator, controls in enumerate(self._controls.T):
-                data.ctrl[actuator] = np.interp(data.time, self._times, controls)
+                data.ctrl[actuator] = np.interp(
+                    data.time,
+                    self._times,
+                    controls,
+                )
         self._mujoco.mj_step(model, data)
         self._step += 1
         self._touches[self._step] = self.touch.touches()
         if self.repeats is None:
-            oldest = self._step - round(KEPT_S / model.opt.timestep)
+            kept_steps = round(KEPT_S / model.opt.timestep)
+            oldest = self._step - kept_steps
             self._touches.pop(oldest, None)
 
 
-def _keyframe_controls(path: Path, model: MjModel) -> tuple[Array, Array]:
+def _keyframe_controls(
+    path: Path,
+    model: MjModel,
+) -> tuple[Array, Array]:
     """Return times (K,) in s and controls (K, actuators) of the keyframes.
 
     Both are empty if all keyframes are at time 0.
@@ -192,4 +203,5 @@ def _keyframe_controls(path: Path, model: MjModel) -> tuple[Array, Array]:
     # If all keyframes are at time 0, they are only named states and no motion.
     if not len(times) or times[-1] <= 0:
         return np.empty(0), np.empty((0, model.nu))
-    return times, np.array(model.key_ctrl).reshape(len(times), model.nu)
+    controls = np.array(model.key_ctrl)
+    return times, controls.reshape(len(times), model.nu)

@@ -42,7 +42,7 @@ from ...core.rows import FrequencyRows, StressRows
 from ...mechanics.contact_tables import DiscTables, PolygonTables
 from ...mechanics.layer import Layer
 from ..imperfections import Imperfections
-from ..load import ContactLoad, surface_normal
+from ..load import ContactLoad, StressField, surface_normal
 from ..source import SkinPads
 from .patches import Polygon, flat_contact, hertz_radius
 
@@ -162,7 +162,8 @@ class MujocoSkin:
         self._parts, self.depth = self._attach()
         # The depth is rounded to µm, so that skins whose depths differ only by rounding errors
         # share their tables.
-        self._discs, self._polygons = _tables(Layer(thickness, poisson), round(self.depth, 6))
+        layer = Layer(thickness, poisson)
+        self._discs, self._polygons = _tables(layer, round(self.depth, 6))
         self._stiffness = young / (1 - poisson**2)
         self._curvature = _curvatures(model, self._mujoco)
         self._pads = SkinPads(skin, noise, drift, imperfections)
@@ -189,7 +190,8 @@ class MujocoSkin:
         data = self.data
         geoms = data.contact.geom[: data.ncon]
         # A flexible body has no geom: its number is negative.
-        bodies = np.where(geoms >= 0, self.model.geom_bodyid[geoms], -1)
+        body_of_geom = self.model.geom_bodyid
+        bodies = np.where(geoms >= 0, body_of_geom[geoms], -1)
 
         found: list[Touch] = []
         for part in self._parts:
@@ -197,12 +199,13 @@ class MujocoSkin:
                 rows = np.flatnonzero(bodies[:, side] == part.body)
                 others = geoms[rows, 1 - side]
                 for other in np.unique(others):
-                    touch = self._find_touch(part, rows[others == other], side)
+                    of_pair = rows[others == other]
+                    touch = self._find_touch(part, of_pair, side)
                     if touch is not None:
                         found.append(touch)
         return found
 
-    def field(self, touches: list[Touch]) -> tuple[Array, Array]:
+    def field(self, touches: list[Touch]) -> StressField:
         """Compute stress and gradient at the cubes under contacts.
 
         Args:
@@ -218,13 +221,13 @@ class MujocoSkin:
         # A contact causes stress only at the cubes of the body that is touched.
         for part in self._parts:
             own = [touch for touch in touches if touch.body == part.body]
-            loads = [touch.press for touch in own if touch.polygon is None]
-            polygons = [(one.polygon, one.press.normal) for one in own if one.polygon is not None]
+            round_loads = [touch.press for touch in own if touch.polygon is None]
+            flat = [touch for touch in own if touch.polygon is not None]
             fields = []
-            if loads:
-                fields.append(_field_of_discs(part, loads, self._discs))
-            if polygons:
-                fields.append(_field_of_polygons(part, polygons, self._polygons))
+            if round_loads:
+                fields.append(_field_of_discs(part, round_loads, self._discs))
+            if flat:
+                fields.append(_field_of_polygons(part, flat, self._polygons))
             for part_stress, part_gradient in fields:
                 stress[part.cubes] += part_stress
                 gradient[part.cubes] += part_gradient
@@ -249,7 +252,11 @@ class MujocoSkin:
         contact = data.contact
         sign = 2 * side - 1
         place, force, outward = self._contact_points(part, rows, sign)
-        normal = surface_normal(part.poses, part.pitch, place.mean(axis=0))
+        normal = surface_normal(
+            part.poses,
+            part.pitch,
+            place.mean(axis=0),
+        )
         is_felt = (outward @ normal > 0) & (force @ normal < 0)
         if not is_felt.any():
             return None
@@ -259,18 +266,29 @@ class MujocoSkin:
         total = force.sum(axis=0)
         if len(place) > 1:
             # The round contact with the same area is used where a single position is needed.
-            polygon = flat_contact(place, force, normal, MIN_WIDTH_DEPTHS * self.depth)
+            min_width = MIN_WIDTH_DEPTHS * self.depth
+            polygon = flat_contact(place, force, normal, min_width)
             area = total @ normal / (polygon.traction @ normal)
-            radius = float(np.sqrt(area / np.pi))
-            load = ContactLoad("disc", polygon.centre, normal, total, radius)
+            load = ContactLoad(
+                "disc",
+                polygon.centre,
+                normal,
+                total,
+                radius=float(np.sqrt(area / np.pi)),
+            )
             return Touch(part.body, load, polygon)
         # For a Hertz contact, the curvatures (1 / radius) of both bodies add up (Johnson 4.2).
-        curvature = self._curvature[contact.geom[rows[0]]].sum()
-        radius = hertz_radius(-float(total @ normal), curvature, self._stiffness)
-        return Touch(
-            part.body,
-            ContactLoad("sphere", place[0], normal, total, radius),
+        geoms = contact.geom[rows[0]]
+        curvature = self._curvature[geoms].sum()
+        pressing = -float(total @ normal)
+        load = ContactLoad(
+            "sphere",
+            place[0],
+            normal,
+            total,
+            radius=hertz_radius(pressing, curvature, self._stiffness),
         )
+        return Touch(part.body, load)
 
     def _contact_points(
         self,
@@ -300,7 +318,8 @@ class MujocoSkin:
         to_parent = part.rotation @ body_rotation.T
         offset = data.contact.pos[rows] - data.xpos[part.body]
         place = offset @ to_parent.T + part.position
-        force = sign * np.einsum("nj,njk->nk", in_frames, frames) @ to_parent.T
+        in_world = np.einsum("nj,njk->nk", in_frames, frames)
+        force = sign * in_world @ to_parent.T
         outward = -sign * frames[:, 0] @ to_parent.T
         return place, force, outward
 
@@ -319,7 +338,8 @@ class MujocoSkin:
         self._mujoco.mj_kinematics(model, reference)
         base = self._body_number(skin.parent_frame)
         if base < 0:
-            names = [model.body(number).name for number in range(model.nbody)]
+            numbers = range(model.nbody)
+            names = [model.body(number).name for number in numbers]
             raise ConfigError(
                 f"the MuJoCo model has no body {skin.parent_frame}, which is the parent_frame of "
                 f"skin {skin.name}; its bodies are {', '.join(filter(None, names))}"
@@ -335,7 +355,11 @@ class MujocoSkin:
             place = origin + axes @ self.poses.position[number]
             outward = axes @ self.poses.rotation[number, :, 2]
             depth[number] = self._distance_to_surface(
-                reference, int(bodies[number]), place, outward, cube
+                reference,
+                int(bodies[number]),
+                place,
+                outward,
+                cube,
             )
         # One table serves all cubes, so their depths must be nearly equal.
         median = float(np.median(depth))
@@ -353,24 +377,26 @@ class MujocoSkin:
         for body in np.unique(bodies).tolist():
             cubes = np.flatnonzero(bodies == body)
             poses = CubePoses(*(column[cubes] for column in self.poses))
-            rotation = axes.T @ reference.xmat[body].reshape(3, 3)
-            position = axes.T @ (reference.xpos[body] - origin)
-            parts.append(
-                _BodyCubes(
-                    body,
-                    cubes,
-                    poses,
-                    poses.pitch,
-                    rotation,
-                    position,
-                )
+            to_world = reference.xmat[body].reshape(3, 3)
+            offset = reference.xpos[body] - origin
+            part = _BodyCubes(
+                body,
+                cubes,
+                poses,
+                poses.pitch,
+                rotation=axes.T @ to_world,
+                position=axes.T @ offset,
             )
+            parts.append(part)
         return parts, median
 
     def _body_number(self, name: str | None) -> int:
         """Return the number of a body, -1 if there is none of this name."""
+        if name is None:
+            return -1
         kind = self._mujoco.mjtObj.mjOBJ_BODY
-        return -1 if name is None else self._mujoco.mj_name2id(self.model, kind, name)
+        number: int = self._mujoco.mj_name2id(self.model, kind, name)
+        return number
 
     def _distance_to_surface(
         self,
@@ -406,7 +432,14 @@ class MujocoSkin:
                 position = reference.geom_xpos[geom]
                 rotation = reference.geom_xmat[geom]
                 size = model.geom_size[geom]
-                distance = mujoco.mju_rayGeom(position, rotation, size, place, outward, kind)
+                distance = mujoco.mju_rayGeom(
+                    position,
+                    rotation,
+                    size,
+                    place,
+                    outward,
+                    kind,
+                )
             if distance > 0:
                 distances.append(float(distance))
         if not distances:
@@ -419,7 +452,10 @@ class MujocoSkin:
 
 
 @lru_cache(maxsize=8)
-def _tables(layer: Layer, depth: float) -> tuple[DiscTables, PolygonTables]:
+def _tables(
+    layer: Layer,
+    depth: float,
+) -> tuple[DiscTables, PolygonTables]:
     """Return the tables of the stress under discs and polygons in a layer of elastomer.
 
     They are cached, because the skins of a robot often have the same layer and depth.
@@ -435,7 +471,7 @@ def _field_of_discs(
     part: _BodyCubes,
     loads: list[ContactLoad],
     tables: DiscTables,
-) -> tuple[Array, Array]:
+) -> StressField:
     """Compute stress and gradient at the cubes of a body under round contacts.
 
     Args:
@@ -449,7 +485,8 @@ def _field_of_discs(
     forces = np.stack([load.force for load in loads])
     radii = [load.radius for load in loads]
 
-    facing = np.maximum(rotation[:, :, 2] @ normals, 0.0)
+    outward = rotation[:, :, 2]
+    facing = np.maximum(outward @ normals, 0.0)
     # Positions of the cubes relative to the centre of each contact, and the forces of the contacts,
     # both in the frame of each cube
     place = (position[:, None] - centres) @ rotation
@@ -459,9 +496,9 @@ def _field_of_discs(
 
 def _field_of_polygons(
     part: _BodyCubes,
-    loads: list[tuple[Polygon, Array]],
+    touches: list[Touch],
     tables: PolygonTables,
-) -> tuple[Array, Array]:
+) -> StressField:
     """Compute stress and gradient at the cubes of a body under tractions on polygons.
 
     A polygon is projected onto the plane of a cube, which reduces its area by the cosine of the
@@ -469,13 +506,13 @@ def _field_of_polygons(
 
     Args:
         part: The cubes on the body.
-        loads: Polygons with their unit normals (3,), in the parent frame of the skin.
+        touches: Flat contacts, in the parent frame of the skin.
         tables: Stress under polygons, for the layer and the depth of the cubes.
     """
     position, rotation, _ = part.poses
     in_plane = rotation[..., :2]
-    polygons = [polygon for polygon, _ in loads]
-    normals = np.stack([normal for _, normal in loads], axis=1)
+    polygons = [touch.polygon for touch in touches if touch.polygon is not None]
+    normals = np.stack([touch.press.normal for touch in touches], axis=1)
     next_corner: list[int] = []  # the corner where each edge ends
     number: list[int] = []  # the polygon of each edge
     for index, polygon in enumerate(polygons):
@@ -487,13 +524,16 @@ def _field_of_polygons(
     origin = position[:, None]
     places = np.concatenate([polygon.corners for polygon in polygons])
     corners = (places - origin) @ in_plane
-    centre = (np.stack([polygon.centre for polygon in polygons]) - origin) @ in_plane
+    centres = np.stack([polygon.centre for polygon in polygons])
+    centre = (centres - origin) @ in_plane
 
     # The twist of a polygon is given about its centroid. The tables need it about the point of the
     # surface above the cube.
-    facing = np.maximum(rotation[:, :, 2] @ normals, 0.0)
+    outward = rotation[:, :, 2]
+    facing = np.maximum(outward @ normals, 0.0)
     twist = facing * [polygon.twist for polygon in polygons]
-    traction = np.stack([polygon.traction for polygon in polygons]) @ rotation
+    tractions = np.stack([polygon.traction for polygon in polygons])
+    traction = tractions @ rotation
     traction *= (facing > 0)[..., None]
     traction[..., 0] += twist * centre[..., 1]
     traction[..., 1] -= twist * centre[..., 0]
@@ -513,6 +553,8 @@ def _curvatures(model: MjModel, mujoco: Any) -> Array:
     """
     kinds = mujoco.mjtGeom
     round_kinds = (kinds.mjGEOM_SPHERE, kinds.mjGEOM_CAPSULE, kinds.mjGEOM_CYLINDER)
-    is_round = np.isin(model.geom_type, [int(kind) for kind in round_kinds])
+    numbers = [int(kind) for kind in round_kinds]
+    is_round = np.isin(model.geom_type, numbers)
     radius = np.where(is_round, model.geom_size[:, 0], 1.0)
-    return np.append(np.where(is_round, 1 / radius, 0.0), 0.0)
+    curvature = np.where(is_round, 1 / radius, 0.0)
+    return np.append(curvature, 0.0)
