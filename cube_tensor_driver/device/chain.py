@@ -406,11 +406,8 @@ class LiveLinks:
             self._scans.set_live(link, False)
             self._deliver()
 
-        logger = self._loggers[link]
-        if error is None:
-            logger.info(state.value)
-        elif error.kind != "no_port" or not self._is_port_expected(link):
-            logger.warning(f"{state.value}: {error}")
+        if error is None or error.kind != "no_port" or not self._is_port_expected(link):
+            self._loggers[link].change(state, error)
 
     def _is_port_expected(self, link: int) -> bool:
         """Return whether the port of a link is still to be made by a simulator.

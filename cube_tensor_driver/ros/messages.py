@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib
 from array import array
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
 
@@ -22,12 +22,14 @@ from geometry_msgs.msg import (
     WrenchStamped,
 )
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message
 from std_msgs.msg import Header
 
 from ..config.calibration import calibration_text
 from ..config.skin import Skin, SkinCube
 from ..core.arrays import AnyArray, Array
-from ..core.errors import BagError, CubeError
+from ..core.errors import BagError
 from ..core.pipeline import Pipeline
 from ..core.rows import StressRows
 from ..core.tensor import quaternion_from_rpy
@@ -44,7 +46,7 @@ from .callbacks import LOG_PERIOD_S
 def log_refused_message(
     node: Node,
     topic: str,
-    error: CubeError,
+    error: Exception,
 ) -> None:
     """Log that a message of a topic was refused, at most every `LOG_PERIOD_S`.
 
@@ -54,6 +56,66 @@ def log_refused_message(
         error: States what is wrong with the message.
     """
     node.get_logger().error(f"{topic}: {error}", throttle_duration_sec=LOG_PERIOD_S)
+
+
+class CheckedSubscription:
+    """A subscription that decodes at most one bad message per `LOG_PERIOD_S`.
+
+    The libraries of ROS print a line about each message that they cannot decode, so that a faulty
+    publisher would fill the log. After a bad message, the newest one waits until the period is
+    over.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        kind: type,
+        topic: str,
+        callback: Callable[[Any], None],
+        profile: QoSProfile | int,
+    ) -> None:
+        """Subscribe.
+
+        Args:
+            node: The node that subscribes.
+            kind: Type of the messages.
+            topic: Name of the topic.
+            callback: Called with each message.
+            profile: Quality of service of the subscription, or the depth of its queue.
+        """
+        self._node, self._kind, self._topic = node, kind, topic
+        self._callback = callback
+        self._waiting: bytes | None = None
+        # The timer runs only during a pause after a bad message.
+        self._pause = node.create_timer(LOG_PERIOD_S, self._end_pause)
+        self._pause.cancel()
+        self._subscription = node.create_subscription(kind, topic, self._receive, profile, raw=True)
+
+    def close(self) -> None:
+        """End the subscription."""
+        self._node.destroy_subscription(self._subscription)
+        self._node.destroy_timer(self._pause)
+
+    def _receive(self, data: bytes) -> None:
+        if self._pause.is_canceled():
+            self._decode(data)
+        else:
+            self._waiting = data
+
+    def _decode(self, data: bytes) -> None:
+        try:
+            message = deserialize_message(data, self._kind)
+        except RuntimeError as error:  # RMWError
+            self._pause.reset()
+            log_refused_message(self._node, self._topic, error)
+        else:
+            self._callback(message)
+
+    def _end_pause(self) -> None:
+        self._pause.cancel()
+        data, self._waiting = self._waiting, None
+        if data is not None:
+            self._decode(data)
 
 
 def message_class(topic: str, type_name: str) -> Any:

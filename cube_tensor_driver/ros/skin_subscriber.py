@@ -21,7 +21,7 @@ from ..messages.codec import stress_codec
 from ..messages.skin_info import cube_poses, geometry
 from ..msg import SkinInfo, SkinStress
 from .callbacks import CallbackErrors
-from .messages import log_refused_message
+from .messages import CheckedSubscription, log_refused_message
 from .node import CubeNode
 from .qos import LATCHED, NEWEST
 
@@ -72,26 +72,13 @@ class SkinSubscriber:
         self._on_stress = on_stress
         catch = CallbackErrors(node).catch
         on_info, on_stress = catch(self._receive_info), catch(self._receive_stress)
-        self._subscriptions = [
-            node.create_subscription(
-                SkinInfo,
-                "info",
-                on_info,
-                LATCHED,
-            ),
-            node.create_subscription(
-                SkinStress,
-                "stress",
-                on_stress,
-                NEWEST,
-                raw=True,
-            ),
-        ]
+        self._info = CheckedSubscription(node, SkinInfo, "info", on_info, LATCHED)
+        self._stress = node.create_subscription(SkinStress, "stress", on_stress, NEWEST, raw=True)
 
     def close(self) -> None:
         """End the subscriptions to `info` and `stress`."""
-        for subscription in self._subscriptions:
-            self._node.destroy_subscription(subscription)
+        self._info.close()
+        self._node.destroy_subscription(self._stress)
 
     def now(self) -> float:
         """Return the time of the node's clock, in s. `LatestStress` uses it as arrival time."""

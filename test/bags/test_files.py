@@ -12,6 +12,7 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 
 import mcap.writer
 import numpy as np
@@ -27,6 +28,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 
 from conftest import ROOT
+from cube_tensor_driver.bags import summary
 from cube_tensor_driver.bags.metadata import typestore
 from cube_tensor_driver.bags.read import Bag, report_damage
 from cube_tensor_driver.bags.repair import repair
@@ -668,6 +670,16 @@ def test_fit_says_what_a_bag_lacks(bag, tmp_path, capsys):
         assert words in capsys.readouterr().err
 
 
+def test_info_shows_the_diagnostics_of_the_skins_in_the_bag(bag, capsys, monkeypatch):
+    """All nodes of a robot publish on /diagnostics, also those of another skin."""
+    names = ["/driver: link hub0", "/right/driver: link hub0", "motor: 3"]
+    statuses = [SimpleNamespace(name=name, message="", values=[]) for name in names]
+    monkeypatch.setattr(summary, "last_diagnostics", lambda _: statuses)
+    assert main(["bag", "info", str(bag)]) == 0
+    shown = capsys.readouterr().out.splitlines()[-2:]
+    assert shown == ["/driver: link hub0: nothing wrong; ", "2 diagnostics of other nodes"]
+
+
 def test_plot_and_info(bag, tmp_path, capsys):
     figure = tmp_path / "c03.png"
     assert (
@@ -692,6 +704,7 @@ def test_plot_and_info(bag, tmp_path, capsys):
 FILL_THE_DISK = """
 import resource, signal, sys
 from pathlib import Path
+from types import SimpleNamespace
 
 from cube_tensor_driver.bags.read import Bag
 from cube_tensor_driver.bags.repair import repair
@@ -717,6 +730,7 @@ except BagError as error:
 KILL_THE_WRITER = """
 import os, signal, sys
 from pathlib import Path
+from types import SimpleNamespace
 
 from cube_tensor_driver.bags.write import BagWriter
 

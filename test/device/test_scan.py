@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cube_tensor_driver.core.errors import LinkError
 from cube_tensor_driver.device.chain import LiveLinks
-from cube_tensor_driver.device.links.link import LinkConfig
+from cube_tensor_driver.device.links.link import LinkConfig, LinkState
 from cube_tensor_driver.device.links.link_log import LinkLogger
 from cube_tensor_driver.device.links.reader import LinkFrames
 from cube_tensor_driver.device.scans.cube_table import CubeAddress
@@ -348,6 +349,24 @@ def test_lines_that_were_left_out_are_counted_and_told():
     now[0] = 2.0
     link_log.warning("later")
     assert log.lines[-1] == "link a: later"
+
+
+def test_a_link_that_pauses_often_is_one_line_a_minute():
+    """Other states are logged at once, also right after a silence."""
+    now = [0.0]
+    log = LinesLog()
+    link_log = LinkLogger("a", log, lambda: now[0])
+    for _ in range(130):
+        link_log.change(LinkState.SILENT, LinkError("no sample", "silent"))
+        link_log.change(LinkState.OPEN, None)
+        now[0] += 1.0
+    silence, end = "link a: silent: no sample", "link a: open"
+    assert [line.partition(" (")[0] for line in log.lines] == [silence, end] * 3
+    link_log.change(LinkState.SILENT, LinkError("no sample", "silent"))
+    link_log.change(LinkState.WAITING, LinkError("unplugged", "lost"))
+    link_log.change(LinkState.OPEN, None)
+    shown = [line.partition(" (")[0] for line in log.lines[6:]]
+    assert shown == ["link a: waiting: unplugged", end]
 
 
 def test_stamps_use_the_arrival_of_their_own_read():

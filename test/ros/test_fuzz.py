@@ -11,6 +11,7 @@ pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rclpy.serialization import serialize_message
 
 from cube_tensor_driver.config.calibration import read_calibration
 from cube_tensor_driver.config.package_data import package_data
@@ -18,6 +19,9 @@ from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.errors import CubeError
 from cube_tensor_driver.device.wire.decoder import MAX_RUN, Decoder
 from cube_tensor_driver.device.wire.protocol import Ack, Request, Stats, encode
+from cube_tensor_driver.msg import SkinInfo
+from cube_tensor_driver.ros import messages
+from cube_tensor_driver.ros.markers.legend import four_characters
 from workshop.bench.decode import NOISE, READ
 
 EACH = 2_000_000
@@ -116,3 +120,29 @@ def test_damaged_files_are_read_or_our_error(
         read(path)
     except CubeError as error:
         assert str(error)
+
+
+def test_many_bad_messages_are_one_line_and_the_newest_good_one_is_taken(ros, capfd, monkeypatch):
+    """Libraries below rclpy print a line of their own about each message that they decode."""
+    monkeypatch.setattr(messages, "LOG_PERIOD_S", 0.5)
+    got = []
+    taken = messages.CheckedSubscription(ros.node, SkinInfo, "info", got.append, 100)
+    sender = ros.node.create_publisher(SkinInfo, "info", 100)
+    bad = bytearray(serialize_message(SkinInfo(name="abc")))
+    bad[-12:] = b"\xff" * 12
+    ros.wait(sender.get_subscription_count)
+    sender.publish(SkinInfo(name="first"))
+    ros.wait(lambda: got)
+    for _ in range(50):
+        sender.publish(bytes(bad))
+    sender.publish(SkinInfo(name="last"))
+    ros.wait(lambda: len(got) == 2)
+    taken.close()
+    lines = capfd.readouterr().err.splitlines()
+    assert [info.name for info in got] == ["first", "last"]
+    assert 1 <= len(lines) <= 3 and any("info: failed to deserialize" in line for line in lines)
+
+
+@pytest.mark.parametrize("value", [-5000.0, -1e-9, float("nan"), 1e38])
+def test_the_legend_has_four_characters_for_any_number(value):
+    assert four_characters(value) == "----"

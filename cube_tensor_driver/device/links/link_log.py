@@ -5,13 +5,22 @@ A faulty hub can cause a thousand lines per second.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from typing import Protocol
 
+from ...core.errors import LinkError
+from .link import LinkState
+
 MAX_BURST = 20
 """Number of lines about one link that may be logged without a pause between them. For example, a
 link that is opened and whose cubes do not fit the skin file logs a few lines together."""
+SILENCE_PERIOD_S = 60.0
+"""Minimum time, in s, between two lines about the silence of one link (no sample comes).
+
+A simulator on a busy machine, for example, may pause many times a minute.
+"""
 LINE_PERIOD_S = 1.0
 """Period, in s, at which lines about one link may be logged after `MAX_BURST` lines together."""
 
@@ -53,6 +62,31 @@ class LinkLogger:
         self._allowed = float(MAX_BURST)
         self._updated_at = clock()
         self._reported_left_out = 0
+        # Clock time until which further silences are left out, and whether the last one was.
+        self._silences_until = -math.inf
+        self._left_out_silence = False
+
+    def change(self, state: LinkState, error: LinkError | None) -> None:
+        """Log a change of the state of the link, except a silence, and its end, less than
+        `SILENCE_PERIOD_S` after a logged one.
+
+        Args:
+            state: The new state.
+            error: Reason of the state; None if there is none.
+        """
+        is_end = self._left_out_silence and state is LinkState.OPEN
+        self._left_out_silence = False
+        if error is not None and error.kind == "silent":
+            now = self._clock()
+            self._left_out_silence = now < self._silences_until
+            if not self._left_out_silence:
+                self._silences_until = now + SILENCE_PERIOD_S
+        if is_end or self._left_out_silence:
+            self.left_out += 1
+        elif error is None:
+            self.info(state.value)
+        else:
+            self.warning(f"{state.value}: {error}")
 
     # There is one method for each severity, because a logger of ROS raises an error if the same
     # line of code logs with different severities.

@@ -288,10 +288,10 @@ def legend_markers(
 def four_characters(value: float) -> str:
     """Return a number that is not negative in exactly four characters.
 
-    Examples are 0.25, 18.7 and "250.". NaN and numbers that are too large give "----".
+    Examples are 0.25, 18.7 and "250.". NaN and numbers that are negative or too large give "----".
     """
     # The comparison is false for NaN, too. Numbers from 9999.5 up would be rounded to five digits.
-    if not value < 9999.5:
+    if not 0 <= value < 9999.5:
         return "----"
     texts = [f"{value:.{digits}f}" for digits in (2, 1, 0)]
     return next(text for text in texts if len(text) <= 4).ljust(4, ".")

@@ -9,7 +9,7 @@ from ...core.arrays import Array, Index
 from ...msg import SkinContacts
 from ...views import scene
 from ..markers.canvas import Canvas, Ranges
-from ..messages import to_ns
+from ..messages import CheckedSubscription, to_ns
 from ..node import run
 from ..skin_subscriber import FollowedSkin, SkinSubscriberNode
 
@@ -32,14 +32,8 @@ class Markers(SkinSubscriberNode):
     def configure(self) -> None:
         self._quantity = scene.QUANTITIES[self.value("quantity")]
         self._contacts: SkinContacts | None = None
-        self.own(
-            self.create_subscription(
-                SkinContacts,
-                "contacts",
-                self._on_contacts,
-                2,
-            )
-        )
+        contacts = CheckedSubscription(self, SkinContacts, "contacts", self._on_contacts, 2)
+        self.call_at_cleanup(contacts.close)
         super().configure()
 
     def prepare(self, skin: FollowedSkin) -> None:

@@ -21,7 +21,7 @@ from ..diagnostics.reconstruction import (
     log_changes,
 )
 from ..diagnostics.updater import Diagnostics
-from ..messages import info_message, log_refused_message
+from ..messages import CheckedSubscription, info_message, log_refused_message
 from ..node import CubeNode, run
 from ..qos import LATCHED, scans_per_message
 from .stress_publisher import StressPublisher
@@ -95,14 +95,8 @@ class Reconstruction(CubeNode):
         self._diagnostics = ReconstructionDiagnostics(
             skin, self._reconstructor, self._taring, self._lost
         )
-        self.own(
-            self.create_subscription(
-                SkinInfo,
-                "driver/info",
-                self._taring.on_info,
-                LATCHED,
-            )
-        )
+        info = CheckedSubscription(self, SkinInfo, "driver/info", self._taring.on_info, LATCHED)
+        self.call_at_cleanup(info.close)
         if self._subscribes:
             frequencies = self.create_subscription(
                 SkinFrequencies,
