@@ -215,6 +215,7 @@ def page(ros, tmp_path) -> Iterator[SimpleNamespace]:
 
 def test_all_that_a_browser_receives_at_once_is_of_one_scan(page, ros):
     """Picture, numbers, plots, contacts and field; and the rate is that of the stamps."""
+    page.reader.click("top (0: auto)", TOP_PA / 1e3)
     page.source.publish(range(1, 400), RATE)
     ros.wait(lambda: page.reader.states and page.reader.states[-1].rate == "100")
     # Before the first contacts have come, the page finds some itself.
