@@ -211,6 +211,7 @@ class Conversation:
         # Each START comes at another place within a period.
         for number in range(3):
             self._ask(f"start again {number}", Request(Command.START), seconds=BETWEEN_START_S)
+        self._ask("refused while started", Request(Command.SET_PERIOD, 0), seconds=STOPPED_S)
         self._ask("slower", Request(Command.SET_PERIOD, SLOWER_US), seconds=NEW_PERIOD_S)
         self._ask("stop samples", Request(Command.STOP), seconds=STOPPED_S)
         self._ask("stop again", Request(Command.STOP))
@@ -230,6 +231,16 @@ class Conversation:
 
     def _leave_as_found(self) -> None:
         self._ask("end", Request(Command.STOP))
+        # A hub that was stopped when its port was closed must not send samples to the next host.
+        self._begin("gone while stopped")
+        self._wire.reopen(STOPPED_S)
+        self._listener.reopen()
+        self._ask("back while stopped", Request(Command.HELLO), seconds=STOPPED_S)
+        # The first sample comes so soon after START that its device time is known from TIME.
+        self._ask("shortest period", Request(Command.SET_PERIOD, FAST_US))
+        self._ask_time("before start")
+        self._ask("start at once", Request(Command.START))
+        self._ask("last stop", Request(Command.STOP))
         hello = next(iter(self._transcript.frames(Hello)), None)
         # 0 means that no host had set a period yet.
         if hello is not None and hello.period_us:

@@ -23,14 +23,18 @@ class HubInMemory(SimulatedHub):
 
     def take(self, room: bool) -> bytes:
         """The frames of the sample that is due, b"" if there is no room for them."""
-        frames = self.sample(np.full((len(self.cube_uids), self.n_pads), 10**8, "<u4"))
         if room:
-            return frames
+            return self.sample(np.full((len(self.cube_uids), self.n_pads), 10**8, "<u4"))
+        self.sequence += 1
+        self.next_us += self.period_us
         self.dropped += 1
         return b""
 
     def host_left(self) -> None:
         """The port was closed."""
+
+    def host_came(self, now_us: int) -> None:
+        """The port was opened again."""
 
 
 class MemoryWire:
@@ -67,6 +71,8 @@ class MemoryWire:
     def reopen(self, seconds: float) -> None:
         self._hub.host_left()
         self.ignore(seconds)
+        self._out.clear()
+        self._hub.host_came(self._now_us)
 
     def _next_event(self, until_us: int) -> None:
         hub = self._hub

@@ -6,7 +6,7 @@ from collections import Counter
 from itertools import pairwise
 from statistics import mode
 
-from cube_tensor_driver.device.wire.protocol import Ack, Command, Hello, Sample
+from cube_tensor_driver.device.wire.protocol import Ack, Command, Hello, Sample, Stats
 
 from ..rule import RuleResult, failed, not_tried, passed, rule
 from ..transcript import CheckStep, Heard, Transcript
@@ -14,6 +14,9 @@ from ..transcript import CheckStep, Heard, Transcript
 MAX_BEHIND_ACK_S = 0.3
 """Time, in seconds, after an ACK within which a HELLO counts as its answer. A later one may be the
 HELLO that comes once a second."""
+
+MAX_FIRST_HELLO_S = 0.9
+"""Time, in seconds, after power-up within which a HELLO is not yet one of those once a second."""
 
 MAX_PADS = 32
 """Number of bits in the mask of pad faults."""
@@ -53,13 +56,25 @@ def hello_is_behind_ack(step: CheckStep) -> bool:
 
     A missing ACK is for R1 to report.
     """
-    acks_s = [
-        heard.at_s
-        for heard in step.heard
-        if isinstance(heard.frame, Ack) and heard.frame.request == Command.HELLO
-    ]
-    hellos_s = [heard.at_s for heard in step.heard if isinstance(heard.frame, Hello)]
-    return not acks_s or any(0 <= hello_s - acks_s[0] < MAX_BEHIND_ACK_S for hello_s in hellos_s)
+    acked_s: float | None = None
+    for heard in step.heard:
+        if isinstance(heard.frame, Ack) and heard.frame.request == Command.HELLO:
+            acked_s = heard.at_s
+        elif isinstance(heard.frame, Hello) and acked_s is not None:
+            return heard.at_s - acked_s < MAX_BEHIND_ACK_S
+    return acked_s is None
+
+
+def is_late_after_power_up(transcript: Transcript) -> bool:
+    """Return whether the power came on while the port was open, and HELLO only a second later."""
+    stats = of_kind(transcript, Stats, "opened")
+    hellos = of_kind(transcript, Hello, "opened")
+    if not stats or not isinstance(stats[0].frame, Stats):
+        return False
+    power_up_s = stats[0].at_s - 1e-3 * stats[0].frame.uptime_ms
+    if power_up_s < transcript.steps["opened"].sent_s:
+        return False
+    return not hellos or hellos[0].at_s - power_up_s > MAX_FIRST_HELLO_S
 
 
 @rule(
@@ -73,6 +88,8 @@ def hello_comes(transcript: Transcript) -> RuleResult:
         return failed("no HELLO came, and no other frame")
     if not all(map(hello_is_behind_ack, transcript.steps.values())):
         return failed(f"no HELLO within {MAX_BEHIND_ACK_S:g} s behind the ACK of request 1")
+    if is_late_after_power_up(transcript):
+        return failed(f"no HELLO in the first {MAX_FIRST_HELLO_S:g} s after power-up")
     for name, what in (("quiet", "while stopped"), ("start", "while started")):
         wrong = once_a_second(of_kind(transcript, Hello, name), "HELLO", what)
         if wrong:
@@ -86,6 +103,11 @@ def uids_differ(transcript: Transcript) -> RuleResult:
     hubs = list(dict.fromkeys(hello.hub_uid for hello in hellos))
     if len(hubs) > 1:
         return failed(f"the hub's uid changed from 0x{hubs[0]:x} to 0x{hubs[1]:x}")
+    for one, other in pairwise(hellos):
+        # Nobody exchanges cubes during a check; a hub may find more of them after power-up.
+        same_number = one.n_cubes == other.n_cubes
+        if same_number and one.cube_uids.tolist() != other.cube_uids.tolist():
+            return failed("the uids of the cubes, or their order, changed between two HELLOs")
     # A uid of 0 means that the cube has none.
     uids = [uid for uid in hellos[-1].cube_uids.tolist() if uid]
     twice = [uid for uid in set(uids) if uids.count(uid) > 1]

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from cube_tensor_driver.device.wire.protocol import Command, Hello, Sample, Stats
 
-from ..conversation import AWAY_S
+from ..conversation import AWAY_S, SECOND_S
 from ..rule import ANY_FRAME, RuleResult, failed, not_tried, passed, rule
 from ..transcript import Transcript
 from .request import behind_ack
-from .sample import periods_us
+from .sample import forward, sample_rate
 
 TELNET_COMMANDS = range(0xFB, 0xFF)
 """Second byte of a Telnet negotiation: WILL, WON'T, DO, DON'T (RFC 854)."""
@@ -68,28 +66,39 @@ def lost_connections(transcript: Transcript) -> RuleResult:
 )
 def host_goes_away(transcript: Transcript) -> RuleResult:
     """The counters of STATS around the time in which the port was closed must have gone on."""
-    before, after = (
-        transcript.frames(Stats, *transcript.first_visit),
-        transcript.frames(Stats, "back"),
-    )
-    if not transcript.frames(Hello, "back"):
+    before = transcript.frames(Stats, *transcript.first_visit)[-1]
+    earlier = transcript.frames(Hello, *transcript.first_visit)
+    after = transcript.frames(Stats, "back")
+    hellos = transcript.frames(Hello, "back")
+    if not hellos:
         return failed(f"no HELLO after the port was closed for {AWAY_S:g} s and opened again")
     if not after:
         return failed("no STATS after the port was closed and opened again")
     # The uptime went back, so the hub has restarted; only a serial port may cause that.
-    if after[-1].uptime_ms < before[-1].uptime_ms:
+    if after[-1].uptime_ms < before.uptime_ms:
         if transcript.is_tcp:
             return failed("the hub restarted when the connection was closed and made again")
         return not_tried("this hub restarts when its port is opened, as L2 allows")
-    # The counter wraps at 2^32.
-    taken = after[-1].taken - before[-1].taken & 0xFFFFFFFF
-    seconds = 1e-3 * (after[-1].uptime_ms - before[-1].uptime_ms)
+    if earlier and earlier[-1].period_us != hellos[-1].period_us:
+        return failed(f"HELLO said {earlier[-1].period_us} µs, now {hellos[-1].period_us} µs")
+    if transcript.frames(Sample, "back while stopped"):
+        return failed("samples came after a stopped hub's port was closed and opened again")
+    taken = forward(after[-1].taken, before.taken)
+    if taken < 0:
+        return failed(
+            f"{before.taken} samples taken before the port was closed, {after[-1].taken}"
+            " after it was opened again"
+        )
+    seconds = 1e-3 * (after[-1].uptime_ms - before.uptime_ms)
     # Samples that a busy host reads before the ACK were taken at the faster period.
-    gaps = periods_us(behind_ack(transcript.steps["period again"], Command.SET_PERIOD))[1:]
-    due = 1e6 * seconds / float(np.median(gaps)) if len(gaps) else 0
-    if taken < MIN_TAKEN_SHARE * due:
+    samples = behind_ack(transcript.steps["period again"], Command.SET_PERIOD)
+    rate = sample_rate(samples[1:])
+    if taken < MIN_TAKEN_SHARE * seconds * rate:
         return failed(
             f"{taken} samples taken in the {seconds:.2f} s in which the port was closed and opened "
-            f"again, {due:.0f} were due"
+            f"again, {seconds * rate:.0f} were due"
         )
+    came = len(behind_ack(transcript.steps["back"], Command.HELLO))
+    if came < MIN_TAKEN_SHARE * SECOND_S * rate:
+        return failed(f"{came} samples came in {SECOND_S:g} s after the port was opened again")
     return passed(f"{taken} samples taken in {seconds:.2f} s around a port that was closed")

@@ -32,6 +32,17 @@ MIN_TAKEN_SHARE = 0.1
 MAX_UPTIME_DIFFERENCE_S = 5.0
 """Largest difference between device time and uptime, in seconds: both count from power-up."""
 
+MIN_MILLIHERTZ = 10_000_000
+"""Frequency, in mHz, below which the median of all pads has another unit: no oscillator of a pad is
+so slow."""
+
+MAX_FREQUENCY_RATIO = 2.0
+"""Largest ratio of two frequencies of a pad during a check, of the median pad. A press changes them
+by less; a wrong order of bytes by more."""
+
+NOT_MEASURED = 0xFFFFFFFF
+"""Frequency that some firmware sends for a pad that was not measured, instead of 0."""
+
 MIN_DRIFT_SAMPLES = 20
 """Number of samples that a comparison of the clocks needs."""
 
@@ -56,6 +67,13 @@ def periods_us(samples: list[Sample]) -> Array:
         if forward(after.sequence, before.sequence) > 0
     ]
     return np.array(gaps)
+
+
+def sample_rate(samples: list[Sample]) -> float:
+    """Return the median rate of samples by their device time, in Hz; 0 if it is not known."""
+    gaps = periods_us(samples)
+    median = float(np.median(gaps)) if len(gaps) else 0.0
+    return 1e6 / median if median > 0 else 0.0
 
 
 @rule(
@@ -208,18 +226,27 @@ def drops_are_counted(transcript: Transcript) -> RuleResult:
             previous = number
         elif isinstance(heard.frame, Stats):
             before, counted = counted, heard.frame.dropped - base & 0xFFFFFFFF
-            # A count that stays while it exceeds what is missing was never right.
-            if counted < missing or before == counted > missing:
+            # Samples behind the last one that came may have been dropped, too. A count that stays
+            # while it exceeds what is missing was never right.
+            behind = 0 if previous is None else max(0, forward(heard.frame.taken, previous) - 1)
+            is_too_high = counted > missing + behind or before == counted > missing
+            if counted < missing or is_too_high:
                 return failed(f"{missing} numbers are missing, STATS counts {counted} as dropped")
     if counted:
         return passed(f"{len(frames)} samples came; {counted} were dropped, all are counted")
     return passed(f"{len(frames)} samples came, none is missing and none counts as dropped")
 
 
-@rule("S5", "n_pads is that of HELLO.", needs=(Hello, Sample))
+@rule(
+    "S5",
+    "n_pads is that of HELLO. The frames of a sample have each cube once, and pad faults only bits "
+    "of pads that exist.",
+    needs=(Hello, Sample),
+)
 def samples_fit_hello(transcript: Transcript) -> RuleResult:
     hello: Hello | None = None
-    for heard in transcript.heard():
+    seen: set[tuple[int, int]] = set()
+    for heard in transcript.heard(*transcript.first_visit):
         if isinstance(heard.frame, Hello):
             hello = heard.frame
         elif isinstance(heard.frame, Sample) and hello is not None:
@@ -229,12 +256,41 @@ def samples_fit_hello(transcript: Transcript) -> RuleResult:
             last = sample.first_cube + sample.n_cubes
             if last > hello.n_cubes:
                 return failed(f"SAMPLE has cubes up to {last - 1}, HELLO says {hello.n_cubes}")
+            faults = int(np.bitwise_or.reduce(sample.pad_fault, initial=0))
+            if faults >> sample.n_pads:
+                return failed(f"pad faults 0x{faults:x} of cubes with {sample.n_pads} pads")
+            cubes = {(sample.sequence, cube) for cube in range(sample.first_cube, last)}
+            # A sample that came twice is for S1 to report.
+            if seen & cubes and sample.first_cube:
+                return failed(f"sample {sample.sequence} has cube {sample.first_cube} twice")
+            seen |= cubes
+    never = set(range(hello.n_cubes)) - {cube for _, cube in seen} if hello else set()
+    if never:
+        return failed(f"cube {min(never)} is in no SAMPLE, HELLO says {hello.n_cubes} cubes")
     return passed("pads and cubes of the samples are those of HELLO")
 
 
-@rule("S6", "A frequency of 0 means not measured.", needs=(Sample,))
-def pads_that_are_not_measured(transcript: Transcript) -> RuleResult:
-    return not_tried("bytes do not show it: stop one oscillator, docs/build.md")
+@rule("S6", "Frequencies are in mHz, and 0 means not measured.", needs=(Sample,))
+def frequencies_are_possible(transcript: Transcript) -> RuleResult:
+    """The median over the pads must be possible; a single pad may be broken."""
+    frames = [one for one in transcript.frames(Sample, "start") if one.frequency.size]
+    # Frames with other cubes, or with another number of them, are for H4 and S3 to check.
+    frames = [one for one in frames if one.frequency.shape == frames[0].frequency.shape]
+    if not frames:
+        return not_tried("no frequency came in the step 'start'")
+    table = np.array([one.frequency.ravel() for one in frames], float)
+    if (table == NOT_MEASURED).any():
+        return failed(f"a frequency is 0x{NOT_MEASURED:X}")
+    measured = np.where(table > 0, table, np.nan)[:, (table > 0).any(axis=0)]
+    if not measured.size:
+        return not_tried("no pad was measured")
+    middle = float(np.nanmedian(measured))
+    if middle < MIN_MILLIHERTZ:
+        return failed(f"the median frequency is {middle:.0f} mHz: look for another unit")
+    ratio = float(np.median(np.nanmax(measured, axis=0) / np.nanmin(measured, axis=0)))
+    if ratio > MAX_FREQUENCY_RATIO:
+        return failed(f"frequencies of a pad differ by a factor of {ratio:.1f}: look at the bytes")
+    return passed(f"median {1e-6 * middle:.3f} kHz; stop one oscillator to see its 0")
 
 
 @rule(
@@ -306,8 +362,7 @@ def full_buffer(transcript: Transcript) -> RuleResult:
     if stats[-1].uptime_ms < due_ms:
         return failed(f"no STATS any more after {UNREAD_S:g} s without reading")
     # The period in force may be a rounded one, so it is measured.
-    gaps = periods_us(transcript.frames(Sample, "fast"))
-    rate = 1e6 / float(np.median(gaps)) if len(gaps) else 0.0
+    rate = sample_rate(transcript.frames(Sample, "fast"))
     for one, other in pairwise(stats):
         seconds = 1e-3 * (other.uptime_ms - one.uptime_ms)
         if seconds > MAX_STATS_GAP_S:

@@ -10,13 +10,11 @@ from cube_tensor_driver.device.wire.protocol import Command, Result, Sample, Tim
 from ..rule import ANY_FRAME, RuleResult, failed, not_tried, passed, rule
 from ..transcript import Transcript
 from .hello import of_kind
+from .request import in_force
 
 MAX_RATE_DIFFERENCE = 0.02
 """Largest relative difference between the clocks of hub and host. It is wide, because S2 checks the
 rate of the hub's clock."""
-
-MAX_AGE_S = 1.0
-"""Age of a sample at its arrival, in seconds, above which it has another clock than TIME."""
 
 RESOLUTION_S = 2e-6
 """Sum of the rounding errors of two TIMEs, in seconds."""
@@ -40,11 +38,11 @@ class TimeExchange:
     device_s: float
 
 
-def time_exchanges(transcript: Transcript) -> list[TimeExchange]:
-    """Return the requests for TIME that were answered."""
+def time_exchanges(transcript: Transcript, state: str) -> list[TimeExchange]:
+    """Return the requests for TIME that were answered in a state, such as started."""
     trips = []
     for step in transcript.steps.values():
-        if step.name.startswith("time"):
+        if step.name.startswith(f"time {state}"):
             for heard in step.heard:
                 if isinstance(heard.frame, Time):
                     device_s = 1e-6 * heard.frame.device_us
@@ -69,7 +67,8 @@ def clock_is_read_between(transcript: Transcript) -> RuleResult:
 
     Each reading is uncertain by the time between request and answer.
     """
-    trips = time_exchanges(transcript)
+    # Later ones may follow a restart when the port was opened.
+    trips = time_exchanges(transcript, "st")
     if not knows_time(transcript) or len(trips) < 2:
         return not_tried(NOT_KNOWN)
     # The shortest time between request and answer is what the driver works with.
@@ -97,6 +96,8 @@ def one_time_each(transcript: Transcript) -> RuleResult:
         return not_tried(NOT_KNOWN)
     for step in transcript.steps.values():
         numbers = [time.number for time in step.frames(Time)]
+        if numbers and step.ack(Command.TIME):
+            return failed(f"TIME and ACK came for one request ('{step.name}')")
         asked = [ask.argument for ask in step.requests if ask.request == Command.TIME]
         if numbers != asked:
             wanted, came = (", ".join(map(str, one)) or "none" for one in (asked, numbers))
@@ -106,22 +107,28 @@ def one_time_each(transcript: Transcript) -> RuleResult:
 
 @rule("T3", "The clock is that of the device time in SAMPLE.", needs=(ANY_FRAME,))
 def clock_of_samples(transcript: Transcript) -> RuleResult:
-    trips = time_exchanges(transcript)
-    samples = of_kind(transcript, Sample, "start")
+    """A sample comes after it was measured, and the first one is measured after START."""
+    trips = time_exchanges(transcript, "before start")
+    step = transcript.steps["start at once"]
+    samples = of_kind(transcript, Sample, "start at once")
     if not trips:
         return not_tried(NOT_KNOWN)
     if not samples:
         return not_tried("no SAMPLE came")
-    # The answer with the shortest delay tells the hub's clock best.
-    best = min(trips, key=lambda trip: trip.came_s - trip.sent_s)
-    for heard, sample in zip(samples, transcript.frames(Sample, "start"), strict=True):
-        age_s = heard.at_s - best.sent_s - (1e-6 * sample.device_us - best.device_s)
-        if abs(age_s) > MAX_AGE_S:
+    first, sample = samples[0], transcript.frames(Sample, "start at once")[0]
+    device_s = 1e-6 * sample.device_us
+    # A hub that measures all the time may have begun the first sample before START.
+    period_s = 1e-6 * in_force(transcript.steps["shortest period"])
+    for trip in trips:
+        slack = MAX_RATE_DIFFERENCE * (first.at_s - trip.sent_s) + RESOLUTION_S
+        latest_s = trip.device_s + first.at_s - trip.sent_s + slack
+        earliest_s = trip.device_s + step.sent_s - trip.came_s - period_s - slack
+        if not earliest_s <= device_s <= latest_s:
             return failed(
-                f"by the clock of TIME, sample {sample.sequence} came {age_s:.3f} s after it "
-                "was measured"
+                f"by the clock of TIME, the first sample was measured at {device_s:.3f} s; it was "
+                f"asked for at {earliest_s:.3f} s and came at {latest_s:.3f} s"
             )
-    return passed("samples come after they were measured, by the clock of TIME")
+    return passed("samples are measured between START and their arrival, by the clock of TIME")
 
 
 @rule(
