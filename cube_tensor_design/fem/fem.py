@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -124,30 +125,25 @@ def compute_response(
     check_memory(grids[-1])
 
     # Each axis with a mirror has two parities, and each parity is one solve.
-    total = 0
-    for grid in grids:
-        mirrors = np.sum(grid.p.min(axis=1) >= 0)
-        total += 2 ** int(mirrors)
+    total = sum(2 ** int(np.sum(grid.p.min(axis=1) >= 0)) for grid in grids)
     report = count_steps(progress, total)
 
     rows: list[dict[str, Any]] = []
-    coarser: Array | None = None
+    matrices: list[Array] = []
     for number, grid in enumerate(grids, 1):
         began = time.perf_counter()
         matrix, unknowns = _solve_mesh(body, layout, grid, number, report)
-        if coarser is not None:
-            largest_change = np.abs(matrix - coarser).max()
-            rows[-1]["change"] = float(largest_change / np.abs(matrix).max())
-        rows.append(
-            {
-                "unknowns": unknowns,
-                "seconds": time.perf_counter() - began,
-                "coefficients": project(structure, matrix)[0],
-                "change": None,
-            }
-        )
-        coarser = matrix
+        matrices.append(matrix)
+        row = {
+            "unknowns": unknowns,
+            "seconds": time.perf_counter() - began,
+            "coefficients": project(structure, matrix)[0],
+            "change": None,
+        }
+        rows.append(row)
     report("done")
+    for row, (coarse, fine) in zip(rows, pairwise(matrices), strict=False):
+        row["change"] = float(np.abs(fine - coarse).max() / np.abs(fine).max())
 
     coefficients, residual = project(structure, matrix)
     rank, unobservable = _find_observable(matrix, structure.modes.names)

@@ -75,34 +75,28 @@ def _surface_influence(
     report: Callable[[str], None],
 ) -> tuple[Array, Array]:
     """Return positions (n, dim - 1) and influence (P, n, dim) of the nodes on the surface, d0."""
-    x = solid.positions
     dim = solid.dim
-    height = x[-1]
-    on_top = np.abs(height - height.max()) < 1e-12
-    # The unknowns of the components at the same nodes, in the same order.
-    surface_dofs = []
-    for axis in range(dim):
-        dofs = np.flatnonzero(on_top & (solid.component == axis))
-        surface_dofs.append(dofs[np.lexsort(x[:-1, dofs])])
-    nodes = x[:-1, surface_dofs[0]].T
+    # The components of one node are neighbours among the unknowns.
+    x = solid.positions[:, ::dim]
+    nodes = np.flatnonzero(x[-1] > x[-1].max() - 1e-12)
+    dofs = dim * nodes[:, None] + np.arange(dim)
 
     # Signs of the parts of the body that the mirrors make of the meshed one.
     sides = [(1, -1) if sign else (1,) for sign in solid.parities[0]]
-    mirrors = [np.array(signs) for signs in itertools.product(*sides)]
-    total = np.zeros((len(mirrors), layout.n_pads, len(nodes), dim))
+    mirrors = np.array(list(itertools.product(*sides)))
+    total: Array | float = 0.0
     for parity in each_parity(solid, report):
         # The weights of the pads are the right-hand sides, all of one parity in one solve.
         gaps = solid.pad_weights(layout, parity).T
         displacement = solid.solve(parity, solid.body @ gaps)
-        components = [displacement[dofs].T for dofs in surface_dofs]
-        on_surface = np.stack(components, axis=-1)
-        for number, signs in enumerate(mirrors):
-            # An even field has an odd displacement along the axis.
-            flip = np.prod(np.where(signs < 0, parity, 1)) * signs
-            total[number] += on_surface * flip / len(mirrors)
+        on_surface = np.moveaxis(displacement[dofs], -1, 0)  # (P, n, dim)
+        # An even field has an odd displacement along the axis.
+        sign = np.where(mirrors < 0, parity, 1).prod(axis=1, keepdims=True)
+        flip = sign * mirrors / len(mirrors)
+        total = total + on_surface[:, None] * flip[:, None]
 
-    places = np.concatenate([nodes * signs[:-1] for signs in mirrors])
-    pads = np.concatenate(list(total), axis=1)
+    places = (x[:-1, nodes].T * mirrors[:, None, :-1]).reshape(-1, dim - 1)
+    pads = np.reshape(total, (layout.n_pads, -1, dim))
     # A node on a mirror is there twice, with the same value.
     rounded = np.round(places, 9)
     places, first = np.unique(rounded, axis=0, return_index=True)

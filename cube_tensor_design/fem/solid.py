@@ -81,6 +81,24 @@ def stiffness(basis: skfem.Basis, moduli: tuple[float, float]) -> sp.csr_matrix:
     return total.tocsr()
 
 
+def sample_matrix(basis: skfem.Basis, values: Array) -> sp.csr_matrix:
+    """Return the sparse matrix (S, dofs) from unknowns to samples at the quadrature points.
+
+    Args:
+        basis: The elements, E in number, with Q points each.
+        values: (n, ..., E, Q) samples of each of the n shape functions of an element; they make
+            S = ... x E x Q rows of the matrix, row-major.
+    """
+    rows = np.broadcast_to(np.arange(values[0].size).reshape(values.shape[1:]), values.shape)
+    inner_axes = range(1, values.ndim - 2)
+    dofs = np.expand_dims(basis.element_dofs, (*inner_axes, values.ndim - 1))
+    columns = np.broadcast_to(dofs, values.shape)
+    entries = (values.ravel(), (rows.ravel(), columns.ravel()))
+    matrix = sp.csr_matrix(entries, (values[0].size, basis.N))
+    matrix.eliminate_zeros()
+    return matrix
+
+
 class _Factors(NamedTuple):
     """LU factors of the stiffness of the free unknowns `free` (m,) under one parity."""
 
@@ -167,13 +185,9 @@ class Solid:
             x = np.asarray(face.default_parameters()["x"])
             stress = _parity_part(field, x.reshape(self.dim, -1).T, parity)
             traction = sign * stress[..., axis]  # (q, n, dim)
-            # Weights of the traction at each quadrature point in the force on each node.
+            # A quadrature point loads the nodes whose functions are not zero there.
             values = np.stack([np.asarray(shape[0]) for shape in face.basis]) * face.dx
-            points = np.arange(face.dx.size).reshape(face.dx.shape)
-            nodes = np.broadcast_to(face.element_dofs[:, :, None], values.shape)
-            indices = nodes.ravel(), np.broadcast_to(points, values.shape).ravel()
-            weights = sp.csr_matrix((values.ravel(), indices), (face.N, points.size))
-            forces = weights @ traction.reshape(points.size, -1)
+            forces = sample_matrix(face, values).T @ traction.reshape(face.dx.size, -1)
             # The components of one node are neighbours among the unknowns.
             by_node = forces.reshape(face.N, -1, self.dim).swapaxes(1, 2)
             total = total + by_node.reshape(self.basis.N, -1)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch
+from matplotlib.patches import Patch, Rectangle
 from matplotlib.patheffects import withStroke
 from matplotlib.tri import Triangulation
 
@@ -134,9 +134,9 @@ def _draw_deformation(
     _draw_arrows(axis, deformation, drawn, limits)
 
     # Dotted: where the cube was. White: where it is.
-    corners_x = np.array([-1, 1, 1, -1, -1])
-    corners_z = np.array([-1, -1, 1, 1, -1])
-    axis.plot(1e3 * d0 * corners_x, 1e3 * d0 * corners_z, "k:", linewidth=0.8)
+    side = 2e3 * d0
+    place = (-side / 2, -side / 2)
+    axis.add_patch(Rectangle(place, side, side, fill=False, linestyle=":", linewidth=0.8))
     ring = np.abs(points).max(axis=0)
     face = np.flatnonzero(np.isclose(ring, 1))
     by_angle = np.argsort(np.arctan2(*points[::-1, face]))
@@ -183,12 +183,8 @@ def _draw_stress(
     limit = np.percentile(np.abs(kilopascal[is_near]), COLOUR_PERCENTILE)
 
     mesh = Triangulation(drawn[0], drawn[1], around.T)
-    colours = {
-        "cmap": SIGNED_COLOURS,
-        "vmin": -limit,
-        "vmax": limit,
-    }
-    image = axis.tripcolor(mesh, kilopascal, shading="gouraud", **colours)
+    image = axis.tripcolor(mesh, kilopascal, shading="gouraud", cmap=SIGNED_COLOURS)
+    image.set_clim(-limit, limit)
     # matplotlib dashes the lines below zero.
     levels = _contour_levels(limit)
     lines = axis.tricontour(mesh, kilopascal, levels, colors="black", linewidths=0.7)
@@ -227,10 +223,8 @@ def _draw_arrows(
     window = limits[0] / (1e3 * d0)
     height = min(window, deformation.height / 2 / d0) - 0.25
     grid = np.mgrid[-window + 1 : window - 0.9, -height : height + 0.1 : height / 2.5]
-    nodes = []
-    for point in grid.reshape(2, -1).T:
-        distance = np.hypot(*(deformation.points - point[:, None]))
-        nodes.append(np.argmin(distance))
+    from_points = deformation.points[:, None] - grid.reshape(2, -1, 1)
+    nodes = np.hypot(*from_points).argmin(axis=1)
     # Nodes are drawn where they have moved to, as the body is.
     tails = drawn[:, nodes]
     moved = deformation.displacement[:, nodes]

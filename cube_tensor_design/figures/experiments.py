@@ -9,15 +9,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cube_tensor_driver.core.modes import PLANE
-from cube_tensor_driver.views.figures.style import (
-    curve_style,
-    print_style,
-    symbol,
-)
+from cube_tensor_driver.views.figures.style import print_style, symbol
 
 from ..paper.experiments import ON_LOWER, Experiment, foam_frequency
 from ..paper.rod_parts import RodParts
 from ..paper.rod_shear import RodShear
+from .curves import add_legend_below, draw_curves
 
 PAD_LABELS = tuple(f"$f_{number}$ of pad C{number}" for number in range(1, 5))
 """Labels of the frequencies."""
@@ -42,6 +39,8 @@ SHEAR_LABELS = {
     "pads": "eight pads: influence functions",
 }
 """Labels of the drawn attributes of RodShear."""
+ROD_LABEL = "distance of the rod's centre from the cube's / mm"
+"""Label of the axis of the rod's position."""
 MIN_SHOWN_SHARE = 1e-3
 """Share of the largest stress below which a panel shows no values, because they are zero by
 symmetry."""
@@ -59,30 +58,21 @@ def draw_experiment(result: Experiment, law: str) -> Figure:
         law: Model of the elastomer, "linear" or "finite".
     """
     figure = Figure(figsize=(13, 3.3))
-    axes = figure.subplots(1, 4)
-    x = 1e3 * result.displacement
+    pads, signals, stress, gradient = figure.subplots(1, 4)
+    x = result.displacement
     frequency = foam_frequency(result.pads)[:, ON_LOWER]
-    for number, label in enumerate(PAD_LABELS):
-        curve = frequency[:, number] / 1e3
-        axes[0].plot(x, curve, label=label, **curve_style(number))
-    axes[0].set(title="frequencies", ylabel="frequency / kHz")
-    for number, label in enumerate(SIGNAL_LABELS):
-        style = curve_style(number) | {"linestyle": "-"}
-        curve = result.prototype[:, number] / 1e3
-        axes[1].plot(x, curve, label=label, **style)
-    axes[1].plot(
-        x,
-        result.upper[:, 1] / 1e3,
-        label=UPPER_LABEL,
-        color="tab:red",
-        linestyle="--",
-    )
-    axes[1].set(title="prototype, eqs. 8 to 10", ylabel="signal / kHz")
-    _draw_modes(axes[2], result, range(3))
-    axes[2].set(title="stress (dashed: true)", ylabel=r"$\sigma$ / kPa")
-    _draw_modes(axes[3], result, range(3, 7))
-    axes[3].set(title="gradient (dashed: true)", ylabel=r"$d_0\,\partial\sigma$ / kPa")
-    for axis in axes:
+    draw_curves(pads, x, dict(zip(PAD_LABELS, frequency.T, strict=True)))
+    pads.set(title="frequencies", ylabel="frequency / kHz")
+    by_label = dict(zip(SIGNAL_LABELS, result.prototype.T, strict=True))
+    draw_curves(signals, x, by_label, linestyle="-")
+    upper = {UPPER_LABEL: result.upper[:, 1]}
+    draw_curves(signals, x, upper, color="tab:red", linestyle="--", marker="")
+    signals.set(title="prototype, eqs. 8 to 10", ylabel="signal / kHz")
+    _draw_modes(stress, result, slice(3))
+    stress.set(title="stress (dashed: true)", ylabel=r"$\sigma$ / kPa")
+    _draw_modes(gradient, result, slice(3, 7))
+    gradient.set(title="gradient (dashed: true)", ylabel=r"$d_0\,\partial\sigma$ / kPa")
+    for axis in figure.axes:
         axis.legend(fontsize="small", handlelength=3)
         axis.set_xlabel("displacement / mm")
     figure.suptitle(
@@ -94,22 +84,20 @@ def draw_experiment(result: Experiment, law: str) -> Figure:
 def _draw_modes(
     axis: Any,
     result: Experiment,
-    modes: range,
+    modes: slice,
 ) -> None:
     """Draw the recovered and the true amplitudes of some modes."""
-    x = 1e3 * result.displacement
-    for number, mode in enumerate(modes):
-        style = curve_style(number)
-        recovered = result.recovered[:, mode] / 1e3
-        true = result.truth[:, mode] / 1e3
-        label = symbol(PLANE.names[mode])
-        axis.plot(x, recovered, label=label, **style | {"linestyle": "-"})
-        axis.plot(x, true, **style | {"linestyle": "--"})
+    names = PLANE.names[modes]
+    recovered = result.recovered[:, modes]
+    truth = result.truth[:, modes]
+    labelled = {symbol(name): values for name, values in zip(names, recovered.T, strict=True)}
+    draw_curves(axis, result.displacement, labelled, linestyle="-")
+    # matplotlib puts no label with an underscore into the legend.
+    hidden = {f"_{name}": values for name, values in zip(names, truth.T, strict=True)}
+    draw_curves(axis, result.displacement, hidden, linestyle="--")
     # Rounding errors of modes that are zero must not fill a panel.
-    both = np.stack([result.recovered, result.truth])
-    shown = np.abs(both[:, :, list(modes)])
-    floor = MIN_SHOWN_SHARE * float(np.abs(result.recovered).max())
-    if shown.max() < floor:
+    floor = MIN_SHOWN_SHARE * np.abs(result.recovered).max()
+    if np.abs([recovered, truth]).max() < floor:
         axis.set(ylim=(-1, 1), yticks=[0])
         text = f"zero by symmetry:\nall below {floor / 1e3:.1g} kPa"
         axis.text(0.5, 0.25, text, ha="center", transform=axis.transAxes)
@@ -122,23 +110,11 @@ def draw_rod_parts(found: dict[str, RodParts]) -> Figure:
     figure = Figure(figsize=(10, 4.4))
     axes = figure.subplots(1, len(strips), sharey=True)
     for axis, (name, one) in zip(axes, strips.items(), strict=True):
-        curves = np.column_stack([one.signal, one.parts]) / 1e3
-        for number, label in enumerate(PART_LABELS):
-            curve = curves[:, number]
-            axis.plot(1e3 * one.place, curve, label=label, **curve_style(number))
-        axis.set(
-            title=name,
-            xlabel="distance of the rod's centre from the cube's / mm",
-        )
+        curves = np.vstack([one.signal, one.parts.T])
+        draw_curves(axis, one.place, dict(zip(PART_LABELS, curves, strict=True)))
+        axis.set(title=name, xlabel=ROD_LABEL)
     axes[0].set_ylabel("$-v_1 + v_2 + v_3 - v_4$ / kPa")
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(
-        handles,
-        labels,
-        handlelength=4,
-        ncols=3,
-        loc="outside lower center",
-    )
+    add_legend_below(figure)
     figure.suptitle("Signal for shear and its parts; rod pressed 1 mm and held, bonded bottom")
     return figure
 
@@ -148,12 +124,11 @@ def draw_rod_shear(result: RodShear) -> Figure:
     """Draw the shear at the cube under the rod: true, and as each method recovers it."""
     figure = Figure(figsize=(6, 3.6))
     axis = figure.subplots()
-    for number, (name, label) in enumerate(SHEAR_LABELS.items()):
-        values = getattr(result, name)
-        axis.plot(1e3 * result.place, values / 1e3, label=label, **curve_style(number))
+    curves = {label: getattr(result, name) for name, label in SHEAR_LABELS.items()}
+    draw_curves(axis, result.place, curves)
     axis.set(
         title="Rod pressed 1 mm: shear at the cube over the rod's position",
-        xlabel="distance of the rod's centre from the cube's / mm",
+        xlabel=ROD_LABEL,
         ylabel=r"$\sigma_{zx}$ / kPa",
     )
     axis.legend(handlelength=4, fontsize=7)
@@ -167,27 +142,11 @@ def draw_prototype(experiments: Sequence[Experiment]) -> Figure:
     axes = figure.subplots(1, len(experiments), sharey=True)
     for axis, experiment in zip(axes, experiments, strict=True):
         x = 1e3 * experiment.displacement
-        for number, style in enumerate(("o-", "s-", "^:")):
-            signal = 1e-3 * experiment.prototype[:, number]
-            label = SIGNAL_LABELS[number]
-            axis.plot(
-                x,
-                signal,
-                style,
-                color="black",
-                mfc="white",
-                ms=4,
-                label=label,
-            )
+        signals = zip(SIGNAL_LABELS, ("o-", "s-", "^:"), experiment.prototype.T, strict=True)
+        for label, style, signal in signals:
+            axis.plot(x, 1e-3 * signal, style, color="black", mfc="white", ms=4, label=label)
         upper = 1e-3 * experiment.upper[:, 1]
-        axis.plot(
-            x,
-            upper,
-            color="black",
-            lw=1,
-            dashes=(2, 2),
-            label=UPPER_LABEL,
-        )
+        axis.plot(x, upper, color="black", lw=1, dashes=(2, 2), label=UPPER_LABEL)
         axis.set(title=experiment.name, xlabel="displacement / mm")
         axis.title.set_fontsize(8)
     axes[0].set_ylabel(r"signal $\sum \pm\Delta f_i$ / kHz")

@@ -81,9 +81,7 @@ def draw_traction(example: FieldExample) -> Figure:
 
 def relative_rms(values: Array, reference: Array) -> float:
     """Return the rms of values over the rms of a reference."""
-    square = (values**2).mean()
-    reference_square = (reference**2).mean()
-    return float(np.sqrt(square / reference_square))
+    return float(np.linalg.norm(values) / np.linalg.norm(reference))
 
 
 def _map_axes(
@@ -123,14 +121,13 @@ def _draw_maps(
     # The points are a square grid in the order of the cubes' patches, not of rows.
     rounded = points.round(9)
     order = np.lexsort((rounded[:, 0], rounded[:, 1]))
-    side = round(np.sqrt(len(points)))
-    x = 1e3 * points[order, 0].reshape(side, side)
-    y = 1e3 * points[order, 1].reshape(side, side)
+    shape = (round(np.sqrt(len(points))), -1)
+    x, y = (1e3 * column[order].reshape(shape) for column in points[:, :2].T)
     top = 1e-3 * max(values.max() for values in maps.values())
     levels = np.arange(CONTOUR_STEP_KPA / 2, top, CONTOUR_STEP_KPA)
     for axis, (title, values) in zip(axes, maps.items(), strict=True):
         # A method may compute tension, which no contact makes.
-        kilopascal = 1e-3 * np.maximum(values, 0)[order].reshape(side, side)
+        kilopascal = 1e-3 * np.maximum(values, 0)[order].reshape(shape)
         image = axis.pcolormesh(
             x,
             y,

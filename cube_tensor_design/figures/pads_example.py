@@ -16,11 +16,11 @@ from cube_tensor_driver.core.calibration import Calibration
 from cube_tensor_driver.core.layout import Layout
 from cube_tensor_driver.views.figures.style import (
     SIGNED_COLOURS,
-    curve_style,
     print_style,
 )
 
 from ..studies.pads_example import BALL_X, LOAD, Sweep, simple_loads
+from .curves import draw_curves
 
 ARROWS = np.linspace(-0.8, 0.8, 5)
 """Positions of the arrows on a face, in half sides."""
@@ -144,36 +144,17 @@ def draw_sweep(sweep: Sweep) -> Figure:
     """
     figure = Figure(figsize=(9, 3.4))
     left, right = figure.subplots(1, 2)
-    x = 1e3 * sweep.place
-    left.plot(
-        x,
-        1e-3 * sweep.profile,
-        "k",
-        label="$\\sigma_{zz}$ in the plane of the sensor",
-    )
-    near = np.array([-2.5, 2.5])
-    tangent = 1e-3 * (sweep.value + 1e-3 * sweep.slope * near)
-    left.plot(near, tangent, "tab:red", lw=3, label="value and slope at a cube")
+    stress = {"$\\sigma_{zz}$ in the plane of the sensor": sweep.profile}
+    draw_curves(left, sweep.place, stress, marker="")
+    near = np.array([-2.5e-3, 2.5e-3])
+    tangent = {"value and slope at a cube": sweep.value + sweep.slope * near}
+    draw_curves(left, near, tangent, color="tab:red", linewidth=3, marker="")
     left.plot(0, 1e-3 * sweep.value, "s", color="tab:red")
-    left.axvline(
-        1e3 * BALL_X,
-        color="0.6",
-        ls=":",
-        label="the ball presses here",
-    )
+    left.axvline(1e3 * BALL_X, color="0.6", ls=":", label="the ball presses here")
     left.set(xlabel="$x$ / mm", ylabel="$\\sigma_{zz}$ / kPa")
-    curves = {
-        "true": sweep.truth,
-        "eight pads": sweep.cube,
-        "two upper pads": sweep.pair,
-    }
-    for number, (name, value) in enumerate(curves.items()):
-        style = curve_style(number) | {"markevery": (4 * number, 16)}
-        right.plot(x, 1e-3 * value, label=name, **style)
-    right.set(
-        xlabel="place of the ball, $x$ / mm",
-        ylabel="shear $\\sigma_{zx}$ / kPa",
-    )
+    curves = {"true": sweep.truth, "eight pads": sweep.cube, "two upper pads": sweep.pair}
+    draw_curves(right, sweep.place, curves, spacing=16)
+    right.set(xlabel="place of the ball, $x$ / mm", ylabel="shear $\\sigma_{zx}$ / kPa")
     for axis in (left, right):
         axis.legend(fontsize=7)
     return figure

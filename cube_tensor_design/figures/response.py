@@ -17,6 +17,7 @@ from cube_tensor_driver.views.figures.style import (
 )
 
 from ..fem.fem import Response
+from .curves import add_legend_below, draw_curves
 
 MAX_COEFFICIENTS = 12
 """Number of coefficients in the picture of convergence; the largest ones are drawn."""
@@ -124,39 +125,26 @@ def draw_influence(
     x = np.linspace(-reach, reach, POINTS)
     along_x = np.eye(influence.place.shape[1])[0]
     forces = influence.at(x[:, None] * along_x)
-    stress = forces[:, :, [-1, 0]] * [
-        -1,
-        1,
-    ]  # under a force against z, and along x
+    # Under a force against z, and along x.
+    stress = forces[:, :, [-1, 0]] * [-1, 1]
     # A stress in Pa under 1 N/m has the same number in kPa under 1 N/mm.
     unit, force = (1.0, "1 N/mm") if layout.planar else (1e3, "1 N")
     figure = Figure(figsize=(10, 4.5))
-    axes = figure.subplots(1, 2)
-    for number, pads in enumerate(_equal_curves(stress)):
-        label = ", ".join(layout.pads[pad] for pad in pads)
-        for k, axis in enumerate(axes):
-            curve = stress[pads[0], :, k] / unit
-            axis.plot(
-                1e3 * x,
-                curve,
-                label=label,
-                markevery=20,
-                **curve_style(number),
-            )
-    for axis, direction in zip(axes, ("pressing", "along x"), strict=True):
+    titles = (f"a force of {force} pressing", f"a force of {force} along x")
+    groups = _equal_curves(stress)
+    for axis, title, direction in zip(figure.subplots(1, 2), titles, stress.T, strict=True):
+        curves = {}
+        for pads in groups:
+            # The factor makes Pa of kPa, as the curves are drawn in kPa.
+            label = ", ".join(layout.pads[pad] for pad in pads)
+            curves[label] = 1e3 * direction[:, pads[0]] / unit
+        draw_curves(axis, x, curves, spacing=20)
         axis.set(
             xlabel="place of the force from the cube's centre, x / mm",
             ylabel="stress of the pad / kPa",
-            title=f"a force of {force} {direction}",
+            title=title,
         )
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(
-        handles,
-        labels,
-        loc="outside lower center",
-        ncol=3,
-        fontsize="small",
-    )
+    add_legend_below(figure)
     return figure
 
 

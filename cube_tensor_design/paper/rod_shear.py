@@ -102,6 +102,7 @@ def rod_shear(
     from_tensor = _shear_weights(tensor_kernel, shear_kernel, x, depth)
     from_pads = _shear_weights(pad_kernel, shear_kernel, x, depth)
 
+    eq_4_gain = SHEAR_SIGNS @ response[:4, zx]
     rows = []
     for number, place in enumerate(places):
         if progress is not None:
@@ -112,28 +113,21 @@ def rod_shear(
         modes = estimator.matrix @ pads
         positions, force = with_cube.rod_pressure(step)
         shear_at_rod = np.interp(positions, x, shear_kernel[:, 1])
-        influence_at_rod = influence.at(positions[:, None])
-        pads_at_rod = influence_at_rod[:, :, 1]
-        eq_4_gain = SHEAR_SIGNS @ response[:4, zx]
-        rows.append(
-            RodShear(
-                place=np.array(place),
-                truth=without.run([step]).state[0, zx],
-                # The rod presses against z.
-                same_load=-shear_at_rod @ force,
-                eq_4=SHEAR_SIGNS @ pads[:4] / eq_4_gain,
-                tensor=modes[zx],
-                points=from_tensor @ modes,
-                pads=from_pads @ pads,
-                seen=pads,
-                predicted=-pads_at_rod @ force,
-            )
-        )
-    columns = {}
-    for name in vars(rows[0]):
-        column = [getattr(row, name) for row in rows]
-        columns[name] = np.array(column)
-    return RodShear(**columns)
+        pads_at_rod = influence.at(positions[:, None])[:, :, 1]
+        row = {
+            "place": place,
+            "truth": without.run([step]).state[0, zx],
+            # The rod presses against z.
+            "same_load": -shear_at_rod @ force,
+            "eq_4": SHEAR_SIGNS @ pads[:4] / eq_4_gain,
+            "tensor": modes[zx],
+            "points": from_tensor @ modes,
+            "pads": from_pads @ pads,
+            "seen": pads,
+            "predicted": -pads_at_rod @ force,
+        }
+        rows.append(row)
+    return RodShear(**{name: np.array([row[name] for row in rows]) for name in rows[0]})
 
 
 def _shear_weights(

@@ -16,6 +16,7 @@ from skfem.helpers import det
 
 from cube_tensor_driver.core.arrays import Array, Mask
 
+from ..fem.solid import sample_matrix
 from .material import Material
 from .newton import Balance
 
@@ -39,14 +40,9 @@ class Section:
         self.points = np.asarray(self.basis.default_parameters()["x"])
         self.component = np.arange(self.basis.N) % 2
 
-        # The sparse matrix from u to the gradient d u_i / d x_j (2, 2, E, Q) at all points.
+        # From u to the gradient d u_i / d x_j (2, 2, E, Q) at all points.
         slopes = np.stack([shape[0].grad for shape in self.basis.basis])
-        entries = np.arange(slopes[0].size).reshape(slopes[0].shape)
-        rows = np.broadcast_to(entries, slopes.shape)
-        columns = np.broadcast_to(self.basis.element_dofs[:, None, None, :, None], slopes.shape)
-        indices = (rows.ravel(), columns.ravel())
-        self._gradient = sp.csr_matrix((slopes.ravel(), indices), (entries.size, self.basis.N))
-        self._gradient.eliminate_zeros()
+        self._gradient = sample_matrix(self.basis, slopes)
         self._linear_tangent: sp.csr_matrix | None = None
 
     def node(self, x: float, z: float) -> int:

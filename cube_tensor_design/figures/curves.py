@@ -1,0 +1,45 @@
+"""Curves with labels, as most pictures of this folder draw them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from cube_tensor_driver.core.arrays import Array
+from cube_tensor_driver.views.figures.style import curve_style
+
+
+def draw_curves(
+    axis: Any,
+    x: Array,
+    curves: Mapping[str, Array],
+    spacing: int = 1,
+    **style: Any,
+) -> None:
+    """Draw curves in kPa or kHz over positions in mm, each in a style of its own.
+
+    Args:
+        axis: Panel.
+        x: (n,) positions, in m.
+        curves: (n,) values in Pa or Hz by label.
+        spacing: Number of points from marker to marker; those of two curves are not side by side.
+        style: Styles that all curves share, in place of those of `curve_style`.
+    """
+    for number, (label, values) in enumerate(curves.items()):
+        own_style = curve_style(number) | {"markevery": (4 * number % spacing, spacing)}
+        axis.plot(1e3 * x, 1e-3 * values, label=label, **own_style | style)
+
+
+def add_legend_below(figure: Figure) -> None:
+    """Add a legend of the first panel's curves below all panels."""
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(
+        handles,
+        labels,
+        handlelength=4,
+        ncols=3,
+        fontsize="small",
+        loc="outside lower center",
+    )
