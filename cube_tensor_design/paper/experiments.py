@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -105,11 +105,11 @@ def experiments(
         if progress is not None:
             progress(next(done), total, name)
 
-    found = []
-    for protocol in protocols:
+    found = [
         # Every step reports the name of its experiment.
-        told = partial(report, protocol.name)
-        found.append(_run_experiment(protocol, body, finite, calibration, told))
+        _run_experiment(protocol, body, finite, calibration, partial(report, protocol.name))
+        for protocol in protocols
+    ]
     # Experiment (a) is how (b) begins.
     bonded, sliding = found[:2]
     return [
@@ -122,31 +122,25 @@ def experiments(
 def _protocols(body: Body) -> list[_Protocol]:
     both = np.concatenate([DISPLACEMENTS, 3e-3 + DISPLACEMENTS])
     rods = [Rod(depth, body.side / 4) for depth in DISPLACEMENTS]
-    bonded = [plates(body, pressed) for pressed in DISPLACEMENTS]
-    sheared = [plates(body, 3e-3, shear) for shear in DISPLACEMENTS]
-    sliding = [plates(body, pressed, bonded=False) for pressed in DISPLACEMENTS]
-    gripped = [plates(body, 3e-3, shear, gripped=True) for shear in DISPLACEMENTS]
-    dents = [dent(body, rod) for rod in rods]
-    sliding_dents = [dent(body, rod, bonded=False) for rod in rods]
-    return [
-        _Protocol("b, pressed 3 mm then sheared, bonded", both, bonded + sheared),
-        _Protocol(
-            "b, pressed 3 mm by sliding plates that then grip, sheared",
-            both,
-            sliding + gripped,
-        ),
-        _Protocol("c, 5 mm rod above C2, bonded bottom", DISPLACEMENTS, dents),
-        _Protocol("c, 5 mm rod above C2, sliding bottom", DISPLACEMENTS, sliding_dents),
-    ]
+    protocols = []
+    for bonded, name in (
+        (True, "b, pressed 3 mm then sheared, bonded"),
+        (False, "b, pressed 3 mm by sliding plates that then grip, sheared"),
+    ):
+        pressing = [plates(body, depth, bonded=bonded) for depth in DISPLACEMENTS]
+        shearing = [plates(body, 3e-3, x, gripped=not bonded) for x in DISPLACEMENTS]
+        protocols.append(_Protocol(name, both, pressing + shearing))
+    for bonded, bottom in ((True, "bonded"), (False, "sliding")):
+        dents = [dent(body, rod, bonded) for rod in rods]
+        name = f"c, 5 mm rod above C2, {bottom} bottom"
+        protocols.append(_Protocol(name, DISPLACEMENTS, dents))
+    return protocols
 
 
 def _first_half(experiment: Experiment, name: str) -> Experiment:
     """Return the pressing steps of an experiment, under another name."""
-    columns = {}
-    for field in fields(Experiment)[1:]:
-        column = getattr(experiment, field.name)
-        columns[field.name] = column[: len(DISPLACEMENTS)]
-    return Experiment(name=name, **columns)
+    columns = {key: value[: len(DISPLACEMENTS)] for key, value in vars(experiment).items()}
+    return Experiment(**columns | {"name": name})
 
 
 def _run_experiment(
@@ -161,20 +155,25 @@ def _run_experiment(
     with_cube = bench.run(protocol.steps, report)
     without = empty_bench.run(protocol.steps, report)
     frequency = foam_frequency(with_cube.pads)
-    # All pads have the same noise, and every mode of the plane is wanted.
-    noise = np.ones(8)
-    targets = np.eye(7)
-    estimator = make_estimator(calibration.matrix, noise, PLANE, targets=targets)
     return Experiment(
         name=protocol.name,
         displacement=protocol.displacement,
         pads=with_cube.pads,
         prototype=prototype(frequency[:, ON_LOWER]),
         upper=prototype(frequency[:, ON_UPPER]),
-        recovered=with_cube.pads @ estimator.matrix.T,
+        recovered=with_cube.pads @ plane_estimator(calibration.matrix).T,
         truth=without.state,
         rotation=with_cube.rotation,
     )
+
+
+def plane_estimator(response: Array) -> Array:
+    """Return the matrix (7, 8) from eight pads of equal noise to all modes of the plane.
+
+    Args:
+        response: Response matrix (8, 7) of the pads.
+    """
+    return make_estimator(response, np.ones(8), PLANE, targets=np.eye(7)).matrix
 
 
 def foam_frequency(pads: Array) -> Array:
@@ -202,8 +201,9 @@ def plates(
     sheared: float = 0.0,
     bonded: bool = True,
     gripped: bool = False,
+    rod: Rod | None = None,
 ) -> LoadStep:
-    """Press the top plate down and move the bottom plate along x.
+    """Press the top plate down, or a rod into the top, and move the bottom plate along x.
 
     Args:
         body: The body.
@@ -211,18 +211,24 @@ def plates(
         sheared: Displacement of the bottom plate, in m.
         bonded: Whether the plates hold the body; otherwise they slide and leave x free.
         gripped: Whether plates that slid before hold the body from now on, as it stands.
+        rod: Rod in place of the top plate.
     """
 
     def prescribed(x: Array) -> Array:
-        # Only the bottom plate moves along x, so a bonded top stays.
-        moved = _bottom_plate(body, x, bonded, sheared)
+        moved = np.full(x.shape, np.nan)
+        bottom = x[1] < -body.height / 2 + 1e-9
+        moved[1, bottom] = 0.0
         top = x[1] > body.height / 2 - 1e-9
-        moved[1, top] = -pressed
+        if rod is None:
+            moved[1, top] = -pressed
         if bonded:
+            moved[0, bottom] = sheared
+        # Only the bottom plate moves along x, so a bonded top stays.
+        if bonded and rod is None:
             moved[0, top] = 0.0
         return moved
 
-    return LoadStep(prescribed, gripped=gripped, sliding=not bonded)
+    return LoadStep(prescribed, rod, gripped, sliding=not bonded)
 
 
 def dent(
@@ -231,26 +237,7 @@ def dent(
     bonded: bool = True,
 ) -> LoadStep:
     """Press a rod into the top, with the bottom bonded to its plate or sliding on it."""
-
-    def prescribed(x: Array) -> Array:
-        return _bottom_plate(body, x, bonded, 0.0)
-
-    return LoadStep(prescribed, rod, sliding=not bonded)
-
-
-def _bottom_plate(
-    body: Body,
-    x: Array,
-    bonded: bool,
-    sheared: float,
-) -> Array:
-    """Return the displacements (2, n) that the bottom plate prescribes, NaN elsewhere."""
-    moved = np.full(x.shape, np.nan)
-    bottom = x[1] < -body.height / 2 + 1e-9
-    moved[1, bottom] = 0.0
-    if bonded:
-        moved[0, bottom] = sheared
-    return moved
+    return plates(body, 0.0, bonded=bonded, rod=rod)
 
 
 def figure_4(body: Body | None = None) -> dict[str, Deformation]:

@@ -182,11 +182,10 @@ def split_signals(
     for weights in signals:
         adjoint = np.zeros_like(u)
         # The adjoint turns the solve for w, which is the same for all signals, into one of the
-        # signal's weights.
+        # signal's weights. A held force has one unknown more.
         right = np.zeros(matrix.shape[0])
-        n = len(free)  # a held force has one unknown more
-        right[:n] = -_forces(bench, weights, ~in_cube)[free]
-        adjoint[free] = solver.solve(right)[:n]
+        right[: len(free)] = -_forces(bench, weights, ~in_cube)[free]
+        adjoint[free] = solver.solve(right)[: len(free)]
         # The signal is response @ u0.
         response = _forces(empty, weights + adjoint, in_cube)
         response -= _forces(bench, adjoint, in_cube)

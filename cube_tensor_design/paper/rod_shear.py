@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cube_tensor_driver.core.arrays import Array
-from cube_tensor_driver.core.estimator import make_estimator
 from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.core.modes import PLANE
 from cube_tensor_driver.mechanics.kernels import PRIOR_LENGTHS, SHEAR_RATIO
@@ -30,7 +29,7 @@ from ..fem.body import Body
 from ..fem.fem import Progress, compute_response
 from ..fem.line_load import line_load
 from ..fem.reciprocity import compute_influence
-from .experiments import SHEAR_SIGNS, dent
+from .experiments import SHEAR_SIGNS, dent, plane_estimator
 from .rod import Rod
 from .virtual_bench import VirtualBench
 
@@ -85,10 +84,7 @@ def rod_shear(
     with_cube = VirtualBench(body)
     without = VirtualBench(body, cube=False)
     response = compute_response(body, layout, "slab", meshes=1).matrix
-    # All pads have the same noise, and every mode of the plane is wanted.
-    noise = np.ones(8)
-    targets = np.eye(7)
-    estimator = make_estimator(response, noise, PLANE, targets=targets)
+    estimator = plane_estimator(response)
     zx = PLANE.names.index("zx")
     influence = compute_influence(replace(body, ground=True), layout)
 
@@ -110,7 +106,7 @@ def rod_shear(
         step = dent(body, Rod(pressed, place))
         # The same rod at the same depth; with the cube it needs more force.
         pads = with_cube.run([step]).pads[0]
-        modes = estimator.matrix @ pads
+        modes = estimator @ pads
         positions, force = with_cube.rod_pressure(step)
         shear_at_rod = np.interp(positions, x, shear_kernel[:, 1])
         pads_at_rod = influence.at(positions[:, None])[:, :, 1]

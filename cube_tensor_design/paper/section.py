@@ -47,9 +47,8 @@ class Section:
 
     def node(self, x: float, z: float) -> int:
         """Return the number of the corner of an element that is nearest to this point."""
-        nodes_x, nodes_z = self.mesh.p
-        distance = np.hypot(nodes_x - x, nodes_z - z)
-        return int(np.argmin(distance))
+        from_point = self.mesh.p - np.array([[x], [z]])
+        return int(np.hypot(*from_point).argmin())
 
     def deformation(self, u: Array) -> Array:
         """Return F = 1 + grad u (2, 2, E, Q)."""

@@ -75,13 +75,11 @@ class BenchRun:
         state: (n, 7) modes zz, zx, xx, zz_x, zz_z, xx_z, xx_x in Pa, fitted to the stress within
             d0/2 of the centre. It is the true field if there is no cube, and meaningless in a cube.
         rotation: (n,) angle of the cube, in rad.
-        displacement: (n, 2, nodes) of the mesh's corners, in m.
     """
 
     pads: Array
     state: Array
     rotation: Array
-    displacement: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,10 +198,7 @@ class VirtualBench:
             u = position.u
             if not step.gripped:
                 loose = u
-            displacement = self._half_side * u[self.section.basis.nodal_dofs]
-            pads = self._pad_stresses(u)
-            rotation = self._rotation(u)
-            rows.append((pads, self._state(u), rotation, displacement))
+            rows.append((self._pad_stresses(u), self._state(u), self._rotation(u)))
             report()
         columns = zip(*rows, strict=True)
         return BenchRun(*map(np.array, columns))
@@ -248,8 +243,7 @@ class VirtualBench:
 
     def free(self, step: LoadStep) -> Index:
         """Return the numbers of the unknowns that a step from rest does not prescribe."""
-        rest = np.zeros(self.section.basis.N)
-        task = self._task(step, rest)
+        task = self._task(step, np.zeros(self.section.basis.N))
         return np.flatnonzero(np.isnan(task.constraints.prescribed))
 
     def rod_contact(self, rod: Rod) -> RodContact:
@@ -372,11 +366,9 @@ class VirtualBench:
 
     def _rotation(self, u: Array) -> float:
         """Return the angle of the cube in rad, of the line between the centres of its sides."""
-        nodal_dofs = self.section.basis.nodal_dofs
-        left_node = self.section.node(-1.0, 0.0)
-        right_node = self.section.node(1.0, 0.0)
-        right = u[nodal_dofs[:, right_node]]
-        left = u[nodal_dofs[:, left_node]]
+        section = self.section
+        ends = [section.node(x, 0.0) for x in (-1.0, 1.0)]
+        left, right = u[section.basis.nodal_dofs[:, ends]].T
         # The undeformed line is 2 d0 long.
         along_x, along_z = right - left
         return float(np.arctan2(along_z, 2.0 + along_x))
