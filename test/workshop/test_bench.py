@@ -41,18 +41,15 @@ def test_skin_counts_what_was_sent(domain, tmp_path):
     path = tmp_path / "figures.json"
     # Pauses and a second floor are for figures only.
     code = f"""
-import functools, os, pathlib, sys
+import functools, json, os, pathlib, sys
 from workshop.bench import skin as bench
 bench.SETTLE_S = bench.DRAIN_S = 0.2
 bench._measure_echo = functools.cache(bench._measure_echo)
 os.environ["ROS_DOMAIN_ID"] = "77"
 domains, profile = set(), bench.batch_profile
 bench.batch_profile = lambda rate: domains.add(os.environ["ROS_DOMAIN_ID"]) or profile(rate)
-bench.bench_skin(
-    cubes=3,
-    bench=bench.Bench(rate=100.0, duration=0.6, publish_period=0.02),
-    json_path=pathlib.Path({str(path)!r}),
-)
+figures = bench.bench_skin(3, bench.Bench(rate=100.0, duration=0.6, publish_period=0.02))
+pathlib.Path({str(path)!r}).write_text(json.dumps(figures))
 if domains & {{"77"}} or not domains or os.environ["ROS_DOMAIN_ID"] != "77":
     sys.exit("the skins mix with those of domain 77")
 """
@@ -98,9 +95,11 @@ def test_links_counts_what_hubs_in_c_sent(tmp_path):
 
 
 LINKS = """
+import json
 import sys
 from pathlib import Path
 from workshop.bench import links as bench_links
 bench_links.SETTLE_S = 0.2
-bench_links.bench_links(cubes=3, rate=100.0, duration=1.0, json_path=Path(sys.argv[1]))
+figures = bench_links.bench_links(cubes=3, rate=100.0, duration=1.0)
+Path(sys.argv[1]).write_text(json.dumps(figures))
 """

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cube_tensor_driver.demo.running import report
 from cube_tensor_driver.device.wire.decoder import Decoder, PythonDecoder
 from cube_tensor_driver.device.wire.native import wire
 from cube_tensor_driver.device.wire.protocol import Sample, encode
@@ -71,7 +69,7 @@ NOISE: dict[str, Callable[[int], bytes]] = {
 """Functions that return a number of bytes with no frames, or few, by the name that is printed."""
 
 
-def bench_decode(*, json_path: Path | None = None) -> int:
+def bench_decode() -> dict[str, Any]:
     """Time clean frames and each noise in turn, in GB of wire bytes per second of one core.
 
     The decoders are `c`, in C, which makes no Python objects except the bytes of each frame;
@@ -94,8 +92,7 @@ def bench_decode(*, json_path: Path | None = None) -> int:
         name: {kind: float(f"{gb_per_s:.3g}") for kind, gb_per_s in by_kind.items()}
         for name, by_kind in fastest.items()
     }
-    report({"bytes": BYTES, "gb_per_s": speeds}, json_path)
-    return 0
+    return {"bytes": BYTES, "gb_per_s": speeds}
 
 
 def _time_decoding_ns(decoder: Any, data: bytes) -> int:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +17,6 @@ from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.errors import CubeError
 from cube_tensor_driver.core.rows import FrequencyRows
-from cube_tensor_driver.demo.running import report
 from cube_tensor_driver.device.chain import LiveLinks
 from cube_tensor_driver.device.live import cube_addresses, link_configs
 from cube_tensor_driver.device.scans.scan import empty_rows
@@ -37,12 +37,10 @@ POLL_S = 0.05
 
 
 def bench_links(
-    *,
     cubes: int,
     rate: float,
     duration: float,
-    json_path: Path | None = None,
-) -> int:
+) -> dict[str, Any]:
     """Measure the processor time of reading, with hubs in C (`firmware/`) as the load.
 
     The figure `lost` counts rows that the hubs took and that did not become rows here.
@@ -51,7 +49,6 @@ def bench_links(
         cubes: Number of cubes, rounded up so that all hubs have the same number.
         rate: Samples per second of each cube.
         duration: Duration of the measurement, in seconds.
-        json_path: File for the figures.
 
     Raises:
         CubeError: The hubs cannot be built, or no rows arrive.
@@ -93,7 +90,7 @@ def bench_links(
                 seconds, cpu_s, rows, lost = (read_counters() - start).tolist()
             finally:
                 links.close()
-    result = {
+    return {
         "cubes": cubes,
         "rate_hz": rate,
         "duration_s": duration,
@@ -103,8 +100,6 @@ def bench_links(
         "cpu_percent": round(100 * cpu_s / seconds, 1),
         "cpu_us_per_scan": round(1e6 * cpu_s * cubes / max(rows, 1), 1),
     }
-    report(result, json_path)
-    return 0
 
 
 @contextmanager

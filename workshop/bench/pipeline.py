@@ -5,7 +5,6 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,6 @@ from cube_tensor_driver.core.calibration import illustrative
 from cube_tensor_driver.core.oscillator import pad_frequency
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rows import FrequencyRows
-from cube_tensor_driver.demo.running import report
 
 Function = Callable[[], Any]
 """Function that is timed."""
@@ -29,12 +27,11 @@ LOAD_PA = 5e3
 """Standard deviation of the modes of the load, in Pa."""
 
 
-def bench_pipeline(*, cubes: int, json_path: Path | None = None) -> int:
+def bench_pipeline(cubes: int) -> dict[str, Any]:
     """Time the pipeline and the same pad law and matrix product in bare numpy, in turn.
 
     Args:
         cubes: Number of cubes.
-        json_path: File for the figures.
     """
     result: dict[str, Any] = {"cubes": cubes}
     for dtype in (np.float32, np.float64):
@@ -44,8 +41,7 @@ def bench_pipeline(*, cubes: int, json_path: Path | None = None) -> int:
             "floor_us": floor_us,
             "ratio": pipeline_us / floor_us,
         }
-    report(result, json_path)
-    return 0
+    return result
 
 
 def _make_functions(

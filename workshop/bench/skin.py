@@ -22,7 +22,7 @@ from rich.progress import Progress
 
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.errors import CubeError
-from cube_tensor_driver.demo.running import end_simulator, observing, report
+from cube_tensor_driver.demo.running import end_simulator, observing
 from cube_tensor_driver.demo.usage import Usage
 from cube_tensor_driver.demo.verification import Arrivals, compare, percentile
 from cube_tensor_driver.messages.codec import stress_codec
@@ -102,33 +102,14 @@ class Measurement:
     first_tensor_s: float
 
 
-def bench_echo(
-    *,
-    cubes: int,
-    bench: Bench,
-    json_path: Path | None = None,
-) -> int:
+def bench_echo(cubes: int, bench: Bench) -> dict[str, Any]:
     """Measure the bare floor alone: a source of messages, an echo and a receiver."""
+    settings = {"cubes": cubes, "rate_hz": bench.rate, "duration_s": bench.duration}
     with _prepared() as progress:
-        result = _measure_echo(cubes, bench, progress)
-    report(
-        {
-            "cubes": cubes,
-            "rate_hz": bench.rate,
-            "duration_s": bench.duration,
-            **result,
-        },
-        json_path,
-    )
-    return 0
+        return settings | _measure_echo(cubes, bench, progress)
 
 
-def bench_skin(
-    *,
-    cubes: int,
-    bench: Bench,
-    json_path: Path | None = None,
-) -> int:
+def bench_skin(cubes: int, bench: Bench) -> dict[str, Any]:
     """Measure the whole chain, and the floor before and after it.
 
     The load are hubs in C (`firmware/`), or the simulator where they cannot be built.
@@ -136,34 +117,21 @@ def bench_skin(
     Args:
         cubes: Number of cubes, rounded up so that all hubs have the same number.
         bench: Settings.
-        json_path: File for the figures.
     """
     with _prepared() as progress:
-        result = _measure_both(cubes, bench, progress)
-    report(result, json_path)
-    return 0
+        return _measure_both(cubes, bench, progress)
 
 
 def bench_scale(
-    *,
     counts: list[int],
     bench: Bench,
     figure: Path,
-    json_path: Path | None = None,
-) -> int:
+) -> dict[str, Any]:
     """Measure the whole chain for several numbers of cubes, and draw a picture."""
     with _prepared() as progress:
         rows = [_measure_both(cubes, bench, progress) for cubes in counts]
-    report(
-        {
-            "rate_hz": bench.rate,
-            "duration_s": bench.duration,
-            "skins": rows,
-        },
-        json_path,
-    )
     save(draw_scale(rows), figure)
-    return 0
+    return {"rate_hz": bench.rate, "duration_s": bench.duration, "skins": rows}
 
 
 @contextmanager

@@ -249,8 +249,8 @@ def make_skin(folder: Path, cubes: int) -> Skin:
 
 def stress_rows(stress: np.ndarray, gradient: np.ndarray) -> StressRows:
     """Return rows as planar cubes would give them, which do not observe all components."""
-    stress = stress.copy()
-    gradient = gradient[:, :3].reshape(-1, 9)
+    stress = stress.astype(np.float32)
+    gradient = gradient[:, :3].reshape(-1, 9).astype(np.float32)
     stress[:, [1, 3, 5]] = np.nan
     gradient[:, [1, 3, 4, 5, 7]] = np.nan
     return StressRows.of(np.arange(len(stress)), stress, gradient, residual=1.0)

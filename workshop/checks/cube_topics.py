@@ -13,7 +13,7 @@ from cube_tensor_driver.core.status import INVALID
 from cube_tensor_driver.core.tensor import contact_wrench
 
 from .record import Tensor, Wrench
-from .run import Findings, Run
+from .run import Findings, Run, agree
 
 MAX_RELATIVE_ERROR = 1e-5
 """Largest relative difference: a row of `stress` has float32, a message of one cube float64."""
@@ -75,8 +75,8 @@ def check_cube_topics(run: Run) -> Findings:
 
 def _is_near(found: ArrayLike, wanted: ArrayLike) -> bool:
     """Compare numbers of different precision."""
+    target = np.asarray(wanted, float)
     # Components that are 0 have an error that is small against the largest one.
-    magnitude = np.abs(np.asarray(wanted, float))
-    scale = np.nan_to_num(magnitude).max(initial=0.0)
-    tolerance = {"rtol": MAX_RELATIVE_ERROR, "atol": 1e-9 * scale}
-    return bool(np.allclose(found, wanted, equal_nan=True, **tolerance))
+    size = np.abs(np.nan_to_num(target))
+    allowed = MAX_RELATIVE_ERROR * size + 1e-9 * size.max(initial=0.0)
+    return bool(agree(np.asarray(found), target, allowed).all())

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cube_tensor_driver.core.arrays import Index, Mask, Single
+from cube_tensor_driver.core.arrays import Index, Mask
 from cube_tensor_driver.core.matching import NO_MATCH
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.core.status import STAMP
@@ -14,7 +14,7 @@ from cube_tensor_driver.simulation.faults import CUT_FAULTS
 
 from .expected import Readings, split_in_chunks
 from .record import DRIVER_KILLS, DRIVER_STOPS, UNFLUSHED_S
-from .run import Findings, Run, count, find_matched
+from .run import Findings, Run, agree, count, find_matched
 
 RECOVERY_S = 6.0
 """Time, in seconds, after a cut in which a link delivers again: the driver tries a port at least
@@ -25,9 +25,6 @@ IN_FLIGHT_S = 0.1
 
 RESTART_S = 3.0
 """Time, in seconds, after a start of the driver until all hubs deliver again."""
-
-EXAMPLES = 3
-"""Number of examples of each kind."""
 
 
 @dataclass(frozen=True)
@@ -69,23 +66,17 @@ def check_frequencies(run: Run) -> FrequencyFindings:
     is_recorded = samples.time_ns >= record.begin_ns
     missing = np.where(is_recorded, samples.row_count - received, 0)
     is_lost = is_checked & (missing > 0) & ~_may_be_missing(run)
-    lost = np.flatnonzero(is_lost)
 
     figures = {
         "samples_sent": int(samples.row_count[is_checked].sum()),
         "delivered": int(received[is_checked].sum()),
-        "lost": int(missing[lost].sum()),
+        "lost": int(missing[is_lost].sum()),
         "wrong": count(is_wrong | (sample == NO_MATCH)),
         "repeated": len(known) - len(arrived),
     }
-    examples = [
-        run.describe(f"wrong: cube {rows.cube[row]}", samples.time_ns[sample[row]])
-        for row in np.flatnonzero(is_wrong)[:EXAMPLES]
-    ]
-    examples += [
-        run.describe(f"lost: {missing[at]} rows of link {samples.link[at]}", samples.time_ns[at])
-        for at in lost[:EXAMPLES]
-    ]
+    sampled_ns = samples.time_ns[np.maximum(sample, 0)]
+    examples = run.examples("wrong: cube", rows.cube, sampled_ns, is_wrong)
+    examples += run.examples("lost: link", samples.link, samples.time_ns, is_lost)
     return FrequencyFindings(figures, examples, is_checked, missing)
 
 
@@ -95,21 +86,14 @@ def _differs(rows: FrequencyRows, readings: Readings) -> Mask:
     changed_bits = (rows.pad_fault ^ readings.pad_fault)[:, np.newaxis]
     bit = np.arange(certain.shape[1])
     differs_in_fault = changed_bits >> bit & 1 == 1
-    differs_in_pad = ~_is_same(rows.frequency, readings.frequency) | differs_in_fault
+    differs_in_pad = ~agree(rows.frequency, readings.frequency) | differs_in_fault
     # The temperature changes together with the readings, so all pads are certain or none is.
-    differs_in_temperature = ~_is_same(rows.temperature, readings.temperature)
+    differs_in_temperature = ~agree(rows.temperature, readings.temperature)
     differs: Mask = (certain & differs_in_pad).any(axis=1)
     differs |= certain.all(axis=1) & differs_in_temperature
     # Doubtful stamps are the only condition that a row of frequencies may have.
     differs |= rows.status & ~np.uint16(STAMP) != 0
     return differs
-
-
-def _is_same(one: Single, other: Single) -> Mask:
-    """Compare to the bit; what was not measured (NaN) is equal to what was not measured."""
-    same: Mask = one == other
-    same |= np.isnan(one) & np.isnan(other)
-    return same
 
 
 def _may_be_missing(run: Run) -> Mask:

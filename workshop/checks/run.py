@@ -7,13 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cube_tensor_driver.core.arrays import Index, Mask
+from cube_tensor_driver.core.arrays import AnyArray, Index, Mask, Real
 from cube_tensor_driver.core.matching import NO_MATCH
 from cube_tensor_driver.simulation.sample_log import SampleLog
 
 from .expected import ExpectedReadings
 from .record import NS_PER_S, Record
 from .samples import Samples
+
+EXAMPLES = 3
+"""Number of examples of each kind of finding."""
 
 
 def count(mask: Mask) -> int:
@@ -24,6 +27,12 @@ def count(mask: Mask) -> int:
 def find_matched(index: Index) -> Index:
     """Return the places of an index (N,) that are not `NO_MATCH`."""
     return np.flatnonzero(index != NO_MATCH)
+
+
+def agree(found: Real, wanted: Real, allowed: Real | float = 0.0) -> Mask:
+    """Compare with a tolerance, 0 for equal bits; NaN (not known) agrees with NaN alone."""
+    near: Mask = np.abs(found - wanted) <= allowed
+    return near | (np.isnan(found) & np.isnan(wanted))
 
 
 class Run:
@@ -46,6 +55,17 @@ class Run:
         """Return a line about a finding, with its simulated time in seconds."""
         seconds = (int(time_ns) - self._start_ns) / NS_PER_S
         return f"{finding}, {seconds:.3f} s"
+
+    def examples(
+        self,
+        finding: str,
+        number: AnyArray,
+        time_ns: Index,
+        is_found: Mask,
+    ) -> list[str]:
+        """Return lines about the first rows (N,) that are found, with a number (N,) of each."""
+        rows = np.flatnonzero(is_found)[:EXAMPLES]
+        return [self.describe(f"{finding} {number[row]}", time_ns[row]) for row in rows]
 
 
 @dataclass(frozen=True)

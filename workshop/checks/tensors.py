@@ -21,7 +21,7 @@ from cube_tensor_driver.core.status import INVALID, PAD_FAULT, RESIDUAL, STAMP, 
 from .expected import split_in_chunks
 from .record import DRIVER_KILLS, NODE_STARTS, UNFLUSHED_S
 from .rest import RestFrequencies, RestHistory
-from .run import Findings, Run, count, find_matched
+from .run import Findings, Run, agree, count, find_matched
 
 MAX_ERROR = 1e-4
 """Largest error of a component against the reference, as a share of the component's range.
@@ -112,16 +112,13 @@ def check_tensors(run: Run) -> TensorFindings:
         "wrong_tensors": count(is_wrong | is_invented),
         "repeated": int(np.maximum(n_tensors - 1, 0).sum()),
     }
-    found: list[tuple[str, FrequencyRows | StressRows, Mask]] = [
+    examples = []
+    for what, rows, is_found in (
         ("wrong tensor", stress, is_wrong),
         ("tensor of nothing", stress, is_invented),
         ("no tensor", frequencies, is_missing),
-    ]
-    examples = [
-        run.describe(f"{what}: cube {rows.cube[row]}", rows.stamp_ns[row])
-        for what, rows, is_found in found
-        for row in np.flatnonzero(is_found)[:3]
-    ]
+    ):
+        examples += run.examples(f"{what}: cube", rows.cube, rows.stamp_ns, is_found)
     without = np.setdiff1d(sent_ns, sent_ns[n_tensors > 0])
     return TensorFindings(figures, examples, source, len(without))
 
@@ -183,8 +180,8 @@ class _Reference:
 
         allowed = MAX_ERROR * self._range + MAX_NOISE_SHARE * self._deviation(made)
         allowed_residual = MAX_RESIDUAL_ERROR + MAX_RELATIVE_RESIDUAL_ERROR * wanted.residual
-        agrees = _is_near(made.residual, wanted.residual, allowed_residual)
-        agrees &= _is_near(
+        agrees = agree(made.residual, wanted.residual, allowed_residual)
+        agrees &= agree(
             _components(made),
             _components(wanted),
             allowed,
@@ -214,7 +211,7 @@ class _Reference:
 
         part = made.select(chosen)
         truth = self._expected.truth[instant, part.cube]
-        is_near = _is_near(_components(part), truth, MAX_ERROR_OF_LOAD * self._range)
+        is_near = agree(_components(part), truth, MAX_ERROR_OF_LOAD * self._range)
         # Planar cubes do not observe all components of the load.
         bit = np.arange(is_near.shape[1])
         is_hidden = part.observed[:, np.newaxis] >> bit & 1 == 0
@@ -246,14 +243,3 @@ class _Reference:
 def _components(rows: StressRows) -> Real:
     """Return stresses and gradients in one array (N, 15)."""
     return np.concatenate([rows.stress, rows.gradient], axis=1)
-
-
-def _is_near(
-    found: Real,
-    wanted: Real,
-    allowed: Real,
-) -> Mask:
-    """Compare with a tolerance; what is not observed (NaN) must be so in both."""
-    near: Mask = np.abs(found - wanted) <= allowed
-    near |= np.isnan(found) & np.isnan(wanted)
-    return near

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from cube_tensor_driver.cli.parser import Parser, count, not_negative, positive, sample_rate
 
@@ -99,39 +100,33 @@ def _add_time(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the benchmark. Only its own modules are imported, because two need no ROS."""
-    path = options.json
+    """Run the benchmark and report its figures. Only its own modules are imported."""
+    from cube_tensor_driver.demo.running import report
+
+    report(_measure(options), options.json)
+    return 0
+
+
+def _measure(options: argparse.Namespace) -> dict[str, Any]:
     if options.what == "decode":
         from ..bench.decode import bench_decode
 
-        return bench_decode(json_path=path)
+        return bench_decode()
     if options.what == "pipeline":
         from ..bench.pipeline import bench_pipeline
 
-        return bench_pipeline(cubes=options.cubes, json_path=path)
+        return bench_pipeline(options.cubes)
     if options.what == "links":
         from ..bench.links import bench_links
 
-        return bench_links(
-            cubes=options.cubes, rate=options.rate, duration=options.duration, json_path=path
-        )
+        return bench_links(options.cubes, options.rate, options.duration)
 
     from ..bench.skin import Bench, bench_echo, bench_scale, bench_skin
 
-    if options.what == "skin":
-        bench = Bench(
-            options.rate,
-            options.duration,
-            options.publish_period,
-            options.composed,
-        )
-        return bench_skin(cubes=options.cubes, bench=bench, json_path=path)
     bench = Bench(options.rate, options.duration)
     if options.what == "echo":
-        return bench_echo(cubes=options.cubes, bench=bench, json_path=path)
-    return bench_scale(
-        counts=options.counts,
-        bench=bench,
-        figure=options.figure,
-        json_path=path,
-    )
+        return bench_echo(options.cubes, bench)
+    if options.what == "scale":
+        return bench_scale(options.counts, bench, options.figure)
+    chain = Bench(options.rate, options.duration, options.publish_period, options.composed)
+    return bench_skin(options.cubes, chain)

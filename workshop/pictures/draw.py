@@ -32,7 +32,7 @@ from cube_tensor_design.studies.pads_study import (
 )
 from cube_tensor_design.studies.traction_study import traction_example
 from cube_tensor_driver.cli import ROOT
-from cube_tensor_driver.config.output_files import atomic_write
+from cube_tensor_driver.config.output_files import atomic_write, write_json
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.errors import ConfigError, CubeError
@@ -110,12 +110,8 @@ def make_pictures(folder: Path) -> None:
         _draw_gripper(folder / "gripper.png")
     except ConfigError as error:
         print(f"no gripper.png: {error}", file=sys.stderr)
-    bench_scale(
-        counts=COUNTS,
-        bench=Bench(RATE, MEASURE_S),
-        json_path=folder / "scale.json",
-        figure=folder / "scale.png",
-    )
+    scale = bench_scale(COUNTS, Bench(RATE, MEASURE_S), folder / "scale.png")
+    write_json(folder / "scale.json", scale)
     save(draw_cube(planar_calibration()), folder / "cube.png")
     save(draw_pads(planar_calibration()), folder / "pads.png")
     save(draw_sweep(sweep()), folder / "mistaken_shear.png")
