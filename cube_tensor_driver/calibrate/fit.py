@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -138,18 +139,20 @@ def measured_stress(
         FitError: The shape is wrong, or a frequency is outside the range of the pad law.
     """
     f = np.asarray(frequency, dtype=float)
-    if f.ndim != 2 or f.shape[1] != base.layout.n_pads:
+    layout = base.layout
+    if f.ndim != 2 or f.shape[1] != layout.n_pads:
         raise FitError(
-            f"frequencies have shape {f.shape}; layout {base.layout.name!r} needs "
-            f"(loads, {base.layout.n_pads})"
+            f"frequencies have shape {f.shape}; layout {layout.name!r} needs "
+            f"(loads, {layout.n_pads})"
         )
     rest = base.rest_frequency
     if base.temperature is not None and temperature is not None:
         rest = rest * base.temperature.factor(temperature)
     v = pad_stress(f, rest, base.beta, base.modulus)
-    for load, pad in np.argwhere(~np.isfinite(v)).tolist():
+    invalid = np.argwhere(~np.isfinite(v))
+    for load, pad in invalid.tolist():
         raise FitError(
-            f"load {load + 1}, pad {base.layout.pads[pad]}: {f[load, pad]:g} Hz is outside the "
+            f"load {load + 1}, pad {layout.pads[pad]}: {f[load, pad]:g} Hz is outside the "
             "pad's range; correct or remove this row"
         )
     return v
@@ -157,7 +160,7 @@ def measured_stress(
 
 def loads_from_forces(
     modes: Modes,
-    force: ArrayLike,
+    force: Array,
     area: float,
 ) -> Array:
     """Compute the states of loads that are forces on the face +z of a cube.
@@ -175,17 +178,13 @@ def loads_from_forces(
         States (amplitudes of the modes) (N, M), in Pa.
 
     Raises:
-        FitError: The forces have the wrong shape, or the area is not above 0.
+        FitError: The area is not above 0.
     """
-    f = np.asarray(force, dtype=float)
-    if f.ndim != 2 or f.shape[1] != 3 or not area > 0:
-        raise FitError(
-            f"forces have shape {f.shape} and the area is {area} m^2; "
-            "needed are (loads, 3) and above 0"
-        )
-    stress = np.zeros((len(f), 6))
+    if not area > 0:
+        raise FitError(f"the area that the forces act on is {area} m^2; it must be above 0")
+    stress = np.zeros((len(force), 6))
     zx_yz_zz = [4, 3, 2]
-    stress[:, zx_yz_zz] = f / area
+    stress[:, zx_yz_zz] = force / area
     return modes.state(stress)
 
 
@@ -213,7 +212,13 @@ def fit(
             coefficient at all.
     """
     fixed = dict(fixed or {})
-    x, y, sigma = _check_inputs(structure, loads, measured, noise, fixed)
+    x, y, sigma = _check_inputs(
+        structure,
+        loads,
+        measured,
+        noise,
+        fixed,
+    )
     model = _Model(structure, sigma, fixed, gains)
     design = model.design(x)
     theta, weights, scale = model.solve(design, y)
@@ -222,9 +227,8 @@ def fit(
     null = null_space(jacobian)
     n_free = len(model.free)
     is_open = find_undetermined(null, n_free)
-    names = [structure.names[k] for k in model.free]
     advice = _advise(model, theta, x, null, is_open)
-    if names and is_open.all():
+    if n_free and is_open.all():
         raise FitError(f"these loads determine no coefficient: {'; '.join(advice)}")
 
     residuals = model.residuals(theta, design, y) / scale
@@ -237,14 +241,20 @@ def fit(
     n = structure.n_coefficients
     of_coefficients = np.zeros((n, n))
     free = np.array(model.free, dtype=int)
-    of_coefficients[np.ix_(free, free)] = covariance[:n_free, :n_free]
+    free_pairs = np.ix_(free, free)
+    of_coefficients[free_pairs] = covariance[:n_free, :n_free]
     of_coordinates = covariance[n_free:, n_free:]
     of_gains = model.gains @ of_coordinates @ model.gains.T
     coefficients, gain = model.unpack(theta)
-    coefficients[free[is_open]] = np.nan
+    undetermined = free[is_open]
+    coefficients[undetermined] = np.nan
     deviations = np.sqrt(np.diag(of_coefficients))
     # Rounding can make a variance that should be 0 slightly negative.
     gain_variance = np.diag(of_gains).clip(0)
+
+    def by_name(values: Array) -> dict[str, float]:
+        """Return values (K,) of the coefficients by the names of the coefficients."""
+        return dict(zip(structure.names, values.tolist(), strict=True))
 
     fitted = model.predict(theta, design)
     is_used = weights > 0
@@ -252,8 +262,8 @@ def fit(
     n_determined = jacobian.shape[1] - null.shape[1]
     return Fit(
         structure=structure,
-        coefficients=dict(zip(structure.names, coefficients.tolist(), strict=True)),
-        deviations=dict(zip(structure.names, deviations.tolist(), strict=True)),
+        coefficients=by_name(coefficients),
+        deviations=by_name(deviations),
         covariance=of_coefficients,
         gain=gain,
         gain_deviation=np.sqrt(gain_variance),
@@ -263,7 +273,7 @@ def fit(
         held_out=_cross_validate(model, design, y, is_used),
         fitted=fitted,
         outliers=~is_used,
-        undetermined=tuple(np.array(names, dtype=object)[is_open]),
+        undetermined=tuple(structure.names[k] for k in undetermined),
         advice=tuple(advice),
     )
 
@@ -288,8 +298,9 @@ class _Model:
         gains: bool,
     ) -> None:
         self.structure, self.noise = structure, noise
-        self.free = [k for k, name in enumerate(structure.names) if name not in fixed]
-        values = [fixed.get(name, 0.0) for name in structure.names]
+        names = structure.names
+        self.free = [k for k, name in enumerate(names) if name not in fixed]
+        values = [fixed.get(name, 0.0) for name in names]
         self._fixed = np.array(values, dtype=float)
         n_pads = structure.layout.n_pads
         columns = []
@@ -299,7 +310,8 @@ class _Model:
                 column[pad], column[first] = 1, -1
                 columns.append(column)
         # The reshape gives the matrix the right shape (P, 0) if there are no gains to fit.
-        self.gains: Array = np.array(columns).reshape(-1, n_pads).T
+        rows: Array = np.array(columns)
+        self.gains = rows.reshape(-1, n_pads).T
 
     def unpack(self, theta: Array) -> tuple[Array, Array]:
         """Return all coefficients (K,) and gains (P,) for some values of the parameters.
@@ -318,7 +330,8 @@ class _Model:
         Args:
             x: States (amplitudes of the modes) of the loads (N, M), in Pa.
         """
-        by_coefficient = np.tensordot(x, self.structure.basis, axes=(1, 2))
+        basis = self.structure.basis
+        by_coefficient = np.tensordot(x, basis, axes=(1, 2))
         return np.moveaxis(by_coefficient, 1, 2)
 
     def predict(self, theta: Array, design: Array) -> Array:
@@ -360,14 +373,19 @@ class _Model:
             Derivatives (N P, parameters) with respect to the parameters.
         """
         coefficients, gain = self.unpack(theta)
-        by_coefficient = design[:, :, self.free] * gain[:, None]
+        free = design[:, :, self.free]
+        by_coefficient = free * gain[:, None]
         at_gain_1 = design @ coefficients
         by_gain = at_gain_1[:, :, None] * self.gains
         derivatives = np.concatenate([by_coefficient, by_gain], axis=2)
         whitened: Array = derivatives / self.noise[:, None]
         return whitened.reshape(-1, theta.size)
 
-    def solve(self, design: Array, y: Array) -> tuple[Array, Array, float]:
+    def solve(
+        self,
+        design: Array,
+        y: Array,
+    ) -> tuple[Array, Array, float]:
         """Fit the parameters to readings, in the stages that `STAGES` lists.
 
         Args:
@@ -394,7 +412,8 @@ class _Model:
                 # Multiplying each row by the root of its weight turns weighted least squares into
                 # ordinary least squares.
                 root = np.sqrt(weights)
-                weighted = root[:, None] * self.jacobian(theta, design)
+                jacobian = self.jacobian(theta, design)
+                weighted = root[:, None] * jacobian
                 step = least_squares(weighted, root * r)
                 theta = theta + step
                 # For parameters near 0, the 1 makes the tolerance absolute.
@@ -421,7 +440,9 @@ def _check_inputs(
     """
     n_pads, n_modes = structure.basis.shape[1:]
     try:
-        x, y, sigma = (np.array(values, dtype=float) for values in (loads, measured, noise))
+        x = np.array(loads, dtype=float)
+        y = np.array(measured, dtype=float)
+        sigma = np.array(noise, dtype=float)
     except (TypeError, ValueError):
         raise FitError("loads, measured stresses and noise must be numbers") from None
     has_loads = x.ndim == 2 and len(x) > 0 and x.shape[1] == n_modes
@@ -460,7 +481,8 @@ def _refuse_unknown(
         values: Values (N, columns).
         columns: Names of the columns.
     """
-    for row, column in np.argwhere(~np.isfinite(values)).tolist():
+    invalid = np.argwhere(~np.isfinite(values))
+    for row, column in invalid.tolist():
         raise FitError(
             f"{kind} {row + 1}, {columns[column]}: {values[row, column]}; "
             "correct or remove this row"
@@ -487,14 +509,17 @@ def _cross_validate(
     """
     if len(y) < 2 or not np.any(y[is_used]):
         return float("nan")
+    n_folds = min(FOLDS, len(y))
     errors = np.empty_like(y)
     # Successive loads go to different parts, because tables often hold similar loads one after the
     # other.
-    fold = np.arange(len(y)) % min(FOLDS, len(y))
-    for k in range(fold.max() + 1):
+    fold = np.arange(len(y)) % n_folds
+    for k in range(n_folds):
         is_out = fold == k
-        theta, _, _ = model.solve(design[~is_out], y[~is_out])
-        errors[is_out] = y[is_out] - model.predict(theta, design[is_out])
+        is_in = ~is_out
+        theta, _, _ = model.solve(design[is_in], y[is_in])
+        predicted = model.predict(theta, design[is_out])
+        errors[is_out] = y[is_out] - predicted
     # Outliers are excluded, because they would dominate the mean squares of errors and readings.
     mean_square_error = np.mean(errors[is_used] ** 2)
     mean_square_reading = np.mean(y[is_used] ** 2)
@@ -523,30 +548,32 @@ def _advise(
         One sentence for each load to add.
     """
     advice = []
+    free = [model.structure.names[k] for k in model.free]
     # An array of objects allows to select names with a mask.
-    free = np.array(model.free, dtype=int)
-    names = np.array(model.structure.names, dtype=object)[free]
+    names = np.array(free, dtype=object)
     theta = theta.copy()
     # A coefficient of 0 would give no stress on its pads, so their gains would seem undetermined.
     # Any other value of the unknown coefficients avoids this.
     theta[: len(names)][is_open] = 0.5
     # The advised loads are as large (rms) as the given ones, for which the signals of the pads were
     # large enough.
-    size = np.sqrt(np.mean(x[x != 0] ** 2))
+    amplitudes = x[x != 0]
+    size = np.sqrt(np.mean(amplitudes**2))
     single_modes = size * np.eye(x.shape[1])
     loads = x
     while is_open.any():
-        candidates = [np.vstack([loads, load]) for load in single_modes]
-        designs = [model.design(candidate) for candidate in candidates]
-        null_spaces = [null_space(model.jacobian(theta, design)) for design in designs]
-        opens = [find_undetermined(each, len(names)) for each in null_spaces]
-        # The best load leaves the fewest coefficients undetermined and, among equals, the fewest
-        # independent changes of the parameters that change no reading.
-        left = [
-            (open_.sum(), each.shape[1]) for open_, each in zip(opens, null_spaces, strict=True)
-        ]
-        best = left.index(min(left))
-        if null_spaces[best].shape[1] >= null.shape[1]:
+        results = []
+        for mode, load in enumerate(single_modes):
+            candidate = np.vstack([loads, load])
+            jacobian = model.jacobian(theta, model.design(candidate))
+            new_null = null_space(jacobian)
+            new_open = find_undetermined(new_null, len(names))
+            # The best load leaves the fewest coefficients undetermined and, among equals, the
+            # fewest independent changes of the parameters that change no reading.
+            left = (new_open.sum(), new_null.shape[1], mode)
+            results.append((left, candidate, new_null, new_open))
+        (_, n_left, best), loads, new_null, new_open = min(results, key=itemgetter(0))
+        if n_left >= null.shape[1]:
             advice.append(
                 f"no load determines {', '.join(names[is_open])}: "
                 "give them as fixed, or choose a larger symmetry"
@@ -554,14 +581,14 @@ def _advise(
             break
         # One more load may not determine a coefficient yet, but only together with the next one.
         # The sentence then names all undetermined coefficients.
-        settled = names[is_open & ~opens[best]]
+        settled = names[is_open & ~new_open]
         subject = settled if len(settled) else names[is_open]
-        mode = model.structure.modes.names[best]
+        name = model.structure.modes.names[best]
         advice.append(
-            f"these loads do not determine {', '.join(subject)}: add a load of {mode} "
-            f"alone, {describe_mode(mode)}, of about {size:.3g} Pa"
+            f"these loads do not determine {', '.join(subject)}: add a load of {name} "
+            f"alone, {describe_mode(name)}, of about {size:.3g} Pa"
         )
-        loads, null, is_open = candidates[best], null_spaces[best], opens[best]
+        null, is_open = new_null, new_open
     return advice
 
 

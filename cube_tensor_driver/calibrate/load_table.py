@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,7 +49,8 @@ class Loads:
         is_unloaded = ~self.state.any(axis=1)
         if not is_unloaded.any():
             return None
-        mean: Array = self.frequency[is_unloaded].mean(axis=0)
+        unloaded = self.frequency[is_unloaded]
+        mean: Array = unloaded.mean(axis=0)
         return mean
 
 
@@ -107,9 +109,10 @@ def _check_columns(
     allowed = {*layout.pads, *modes.names, *FORCE, TEMPERATURE}
     # One error message names all columns with the same mistake, so that a user can correct them at
     # once.
+    counts = Counter(header)
     mistakes = {
         "unknown": [name for name in header if name not in allowed],
-        "twice": sorted({name for name in header if header.count(name) > 1}),
+        "twice": [name for name in counts if counts[name] > 1],
         "missing": [pad for pad in layout.pads if pad not in header],
     }
     for mistake, names in mistakes.items():
@@ -158,7 +161,8 @@ def _read_states(
         raise FitError(
             f"{path}: found forces {', '.join(forces)}; all of {', '.join(FORCE)} are needed"
         )
-    force = np.stack([columns[name] for name in FORCE], axis=1)
+    by_axis = [columns[name] for name in FORCE]
+    force = np.stack(by_axis, axis=1)
     return loads_from_forces(modes, force, area)
 
 
@@ -175,7 +179,8 @@ def _read_cells(path: Path) -> tuple[list[str], Array]:
             f"{path}: found {len(lines)} lines; needed are one with column names and one per load"
         )
     header, *rows = lines
-    values = np.empty((len(rows), len(header)))
+    shape = (len(rows), len(header))
+    values = np.empty(shape)
     for number, row in enumerate(rows):
         if len(row) != len(header):
             raise FitError(
@@ -209,5 +214,9 @@ def _read_lines(path: Path) -> list[list[str]]:
         raise FitError(f"{path}: {error.strerror}; name a CSV file that can be read") from None
     except (UnicodeDecodeError, csv.Error) as error:
         raise FitError(f"{path}: not a CSV file ({error})") from None
-    stripped = [[cell.strip() for cell in line] for line in lines]
-    return [line for line in stripped if any(line)]
+    stripped = []
+    for line in lines:
+        cells = [cell.strip() for cell in line]
+        if any(cells):
+            stripped.append(cells)
+    return stripped

@@ -58,41 +58,41 @@ def measure_pads_at_rest(frequency: Array, seconds: Array) -> PadsAtRest:
         frequency: Frequencies (S, C, P), in Hz; NaN where nothing was measured.
         seconds: Times of the samples (S,), in s.
     """
-    is_measured = np.isfinite(frequency)
-    counts = is_measured.sum(axis=0)
-    total = np.where(is_measured, frequency, 0).sum(axis=0)
-    # A count of at least 1 avoids a division by 0. Pads without a sample count as silent below, so
-    # their mean is not used.
-    mean = total / np.maximum(counts, 1)
-    deviation = np.where(is_measured, frequency - mean, 0)
+    measured = np.ma.masked_invalid(frequency)
+    counts = measured.count(axis=0)
+    mean = measured.mean(axis=0).filled(np.nan)
+    silent = counts < MIN_MEASURED_SHARE * len(frequency)
 
     # Second differences remove drift, which would count as noise in a standard deviation.
     second = np.diff(frequency, n=2, axis=0)
-    n_second = np.isfinite(second).sum(axis=0)
-    sum_squares = np.nansum(second**2, axis=0)
-    noise = np.sqrt(sum_squares / (6 * np.maximum(n_second, 1)))
+    squares = np.ma.masked_invalid(second**2)
+    n_squares = np.maximum(squares.count(axis=0), 1)
+    sum_squares = squares.sum(axis=0).filled(0)
+    noise = np.sqrt(sum_squares / (6 * n_squares))
+
+    # Slope of the straight line that is fitted to the measured samples of each pad.
     centred = seconds - seconds.mean()
+    is_measured = ~np.ma.getmaskarray(measured)
     time = np.where(is_measured, centred[:, None, None], 0)
+    deviation = measured - mean
+    covariance = (deviation * time).sum(axis=0).filled(0)
     sum_time_squares = (time**2).sum(axis=0)
-    covariance = (deviation * time).sum(axis=0)
     slope = covariance / np.maximum(sum_time_squares, 1e-12)
 
-    silent = counts < MIN_MEASURED_SHARE * len(frequency)
-    highest = np.where(is_measured, deviation, -np.inf).max(axis=0)
-    lowest = np.where(is_measured, deviation, np.inf).min(axis=0)
-    span = highest - lowest
+    span = np.ma.ptp(measured, axis=0).filled(0)
     varies = ~silent & (span > 0)
     # If all pads of a cube keep a single value, the cube may be a simulated one without noise, so
     # none of its pads counts as stuck.
     others_vary = varies.any(axis=1, keepdims=True)
-    stuck = ~silent & (span == 0) & others_vary
+    stuck = ~silent & ~varies & others_vary
 
     has_frequency = ~silent & (mean > 0)
     scale = np.where(has_frequency, mean, np.nan)
     relative_noise = noise / scale
     usual = np.full(len(relative_noise), np.inf)
-    for cube in np.flatnonzero(varies.any(axis=1)):
-        of_varying = relative_noise[cube][varies[cube]]
+    cubes = np.flatnonzero(varies.any(axis=1))
+    for cube in cubes:
+        of_varying = relative_noise[cube, varies[cube]]
         usual[cube] = np.median(of_varying)
     noisy = varies & (relative_noise > NOISY_ENTER * usual[:, None])
     return PadsAtRest(

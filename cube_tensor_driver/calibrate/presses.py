@@ -149,8 +149,9 @@ class PressDetector:
         change = np.where(self._works, relative, np.nan)
         before, self._before = self._before, change
         size = np.nan_to_num(np.abs(change))
-        strongest = size.max()
-        cube = int(size.max(axis=1).argmax())
+        of_cubes = size.max(axis=1)
+        cube = int(of_cubes.argmax())
+        strongest = of_cubes[cube]
 
         if strongest < RELEASED_SHARE * self._limit:
             self.is_held = False
@@ -158,8 +159,8 @@ class PressDetector:
             return None
         # While the finger still moves, the frequencies of the pads change from one average to the
         # next.
-        movement = np.nanmax(np.abs(change[cube] - before[cube]))
-        if movement > STEADY_SHARE * strongest:
+        movement = np.abs(change[cube] - before[cube])
+        if np.nanmax(movement) > STEADY_SHARE * strongest:
             return None
         self.is_held = True
         return SteadyPress(cube, change[cube])
@@ -195,27 +196,32 @@ def expected_presses(
         Stresses (rotations, SIDES, distances, pads), in Pa, tension positive.
     """
     cube_position = np.array([[0.0, 0.0, -depth]])
-    finger, force = disc(FINGER_RADIUS, (0.0, 0.0, -1.0))
+    downwards = (0.0, 0.0, -1.0)
+    finger, force = disc(FINGER_RADIUS, downwards)
     directions = list(SIDES.values())
-    places = depth * np.einsum("g,kj->kgj", distances, directions)
-    loaded = finger + places[:, :, None, :]
+    places = np.einsum("g,kj->kgj", distances, directions)
+    centres = depth * places
+    loaded = finger + centres[:, :, None, :]
     stress, slope = field(cube_position, loaded, force, POISSONS_RATIO)
     # The slope has the axes (..., k, component) with the axis k of the derivative; a gradient has
     # the axes (..., i, j, k).
     by_component = np.moveaxis(slope, -1, -2)
-    gradient = np.moveaxis(to_matrix(by_component), -3, -1)
+    by_matrix = to_matrix(by_component)
+    gradient = np.moveaxis(by_matrix, -3, -1)
 
     # The inverse of each rotation takes the field of the skin into the frame of the cube.
     inverse = np.swapaxes(rotations, -1, -2)
     to_cube = inverse[:, None, None, None]
     rotated_stress = rotate_stress(stress, to_cube)
     rotated_gradient = rotate_gradient(gradient, to_cube)
+    scaled_gradient = rotated_gradient * calibration.half_side
     state = calibration.modes.state(
         rotated_stress.reshape(-1, 6),
-        rotated_gradient.reshape(-1, 3, 3, 3) * calibration.half_side,
+        scaled_gradient.reshape(-1, 3, 3, 3),
     )
     on_pads: Array = state @ calibration.response.T
-    return on_pads.reshape(len(rotations), len(SIDES), len(distances), -1)
+    shape = (len(rotations), len(SIDES), len(distances), -1)
+    return on_pads.reshape(shape)
 
 
 @dataclass(frozen=True)
@@ -238,14 +244,16 @@ class Explanation:
 
     @property
     def is_rotated(self) -> bool:
-        return not np.array_equal(self.rotation, np.eye(3))
+        identity = np.eye(3)
+        return not np.array_equal(self.rotation, identity)
 
     @property
     def swapped(self) -> list[int]:
         """Numbers of the wires of the hub that lead to another pad than the layout of the cube
         states."""
-        is_swapped = self.places != np.arange(len(self.places))
-        return [int(pad) for pad in np.flatnonzero(is_swapped)]
+        intended = np.arange(len(self.places))
+        swapped: list[int] = np.flatnonzero(self.places != intended).tolist()
+        return swapped
 
     @property
     def is_clear(self) -> bool:
@@ -255,7 +263,8 @@ class Explanation:
     @property
     def changes(self) -> float:
         """Number of changes to the intended cube: 1 for a rotation, and 1 per two swapped pads."""
-        return int(self.is_rotated) + len(self.swapped) / 2
+        n_swaps = len(self.swapped) / 2
+        return int(self.is_rotated) + n_swaps
 
 
 def explain_presses(measured: Array, expected: Array) -> Explanation:
@@ -267,11 +276,12 @@ def explain_presses(measured: Array, expected: Array) -> Explanation:
             `cube_rotations`, the K presses and G distances (24, K, G, P), in Pa.
     """
     explanations = []
-    for rotation, of_rotation in zip(cube_rotations(), expected, strict=True):
+    rotations = cube_rotations()
+    for rotation, of_rotation in zip(rotations, expected, strict=True):
         places, misfit = _find_order(measured, of_rotation)
         explanations.append(Explanation(rotation, places, misfit))
-    lowest = min(each.misfit for each in explanations)
-    limit = max(SIMILAR_MISFIT, SIMILAR_RATIO * lowest)
+    misfits = [each.misfit for each in explanations]
+    limit = max(SIMILAR_MISFIT, SIMILAR_RATIO * min(misfits))
     similar = [each for each in explanations if each.misfit <= limit]
     fewest = min(each.changes for each in similar)
     simplest = [each for each in similar if each.changes == fewest]
@@ -279,7 +289,10 @@ def explain_presses(measured: Array, expected: Array) -> Explanation:
     return replace(best, is_certain=len(simplest) == 1)
 
 
-def _find_order(measured: Array, expected: Array) -> tuple[Index, float]:
+def _find_order(
+    measured: Array,
+    expected: Array,
+) -> tuple[Index, float]:
     """Find the order of the pads, for one rotation of the cube.
 
     The search swaps two pads at a time, as long as the best swap reduces the misfit enough.
@@ -295,7 +308,7 @@ def _find_order(measured: Array, expected: Array) -> tuple[Index, float]:
     places = np.arange(n_pads)
     first, second = np.triu_indices(n_pads, 1)
     swaps = np.arange(len(first))
-    lowest = float(_misfit(measured, expected, places[None])[0])
+    (lowest,) = _misfit(measured, expected, places[None])
     while len(swaps):
         candidates = np.tile(places, (len(swaps), 1))
         candidates[swaps, first] = places[second]
@@ -306,8 +319,9 @@ def _find_order(measured: Array, expected: Array) -> tuple[Index, float]:
         # reduction comes from noise.
         if misfits[best] ** 2 > MAX_SWAP_RATIO * lowest**2:
             break
-        places, lowest = candidates[best], float(misfits[best])
-    return places, lowest
+        places = candidates[best]
+        lowest = misfits[best]
+    return places, float(lowest)
 
 
 def _misfit(
@@ -325,16 +339,21 @@ def _misfit(
     Returns:
         Misfit of each order (S,).
     """
-    works = np.isfinite(measured).all(axis=0)
+    is_measured = np.isfinite(measured)
+    works = is_measured.all(axis=0)
     m = measured[:, works]
-    e = expected[:, :, places][..., works]  # (K, G, S, pads)
+    in_order = expected[:, :, places]  # (K, G, S, P)
+    e = in_order[..., works]
     # The force of a press is unknown. So the expected stresses, which are those for 1 N, are scaled
     # by a fitted factor. It is not negative, because a finger cannot pull.
-    projection = np.maximum(0, np.einsum("kp,kgsp->kgs", m, e))
+    products = np.einsum("kp,kgsp->kgs", m, e)
+    projection = np.maximum(0, products)
     total = (m**2).sum(axis=1)
-    explained = projection**2 / (e * e).sum(axis=3)
+    squares = (e * e).sum(axis=3)
+    explained = projection**2 / squares
     unexplained = total[:, None, None] - explained
     # Rounding can leave a value just below 0.
     at_best_distance = np.maximum(0, unexplained.min(axis=1))
-    misfit: Array = np.sqrt(at_best_distance.sum(axis=0) / total.sum())
+    share = at_best_distance.sum(axis=0) / total.sum()
+    misfit: Array = np.sqrt(share)
     return misfit

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..bags.read import Bag
+from ..bags.recording import stamp_ns as header_stamp_ns
 from ..bags.source import BagSource, open_bag
 from ..core.arrays import AnyArray, Array, Times
 from ..core.calibration import Calibration
@@ -80,14 +81,20 @@ def read_recorded_loads(
         rest = settings.rest_frequency[number, : layout.n_pads]
         stamp_ns, frequency, temperature = _read_samples(source, number, layout.n_pads)
         reference_ns, state = _read_reference(
-            source.bag, reference, number, layout, area, calibration.half_side
+            source.bag,
+            reference,
+            number,
+            layout,
+            area,
+            calibration.half_side,
         )
     # For each sample of the cube, the number of the next message of the reference sensor. Limiting
     # it to 1 … last gives every sample a message before it and one after it.
     following = np.searchsorted(reference_ns, stamp_ns)
     following = following.clip(1, len(reference_ns) - 1)
     steps = np.diff(reference_ns)
-    is_close = steps[following - 1] <= MAX_STEP_RATIO * np.median(steps)
+    max_step = MAX_STEP_RATIO * np.median(steps)
+    is_close = steps[following - 1] <= max_step
     is_after_start = stamp_ns >= reference_ns[0]
     is_before_end = stamp_ns <= reference_ns[-1]
     is_complete = np.isfinite(frequency).all(axis=1)
@@ -100,16 +107,18 @@ def read_recorded_loads(
 
     # Times are computed in seconds from the first message, because a float does not hold the
     # nanoseconds since 1970 exactly.
-    seconds = (stamp_ns[used] - reference_ns[0]) / SECOND
-    known = (reference_ns - reference_ns[0]) / SECOND
+    begin_ns = reference_ns[0]
+    seconds = (stamp_ns[used] - begin_ns) / SECOND
+    known = (reference_ns - begin_ns) / SECOND
     by_mode = [np.interp(seconds, known, amplitude) for amplitude in state.T]
+    states = np.stack(by_mode, axis=1)
     size = math.ceil(len(seconds) / MAX_LOADS)
-    mean_temperature = _average_neighbours(temperature[used].astype(float), size)
-    has_temperature = np.isfinite(mean_temperature).all()
+    mean_temperature = _average_neighbours(temperature[used], size)
+    is_known = np.isfinite(mean_temperature)
     loads = Loads(
-        state=_average_neighbours(np.stack(by_mode, axis=1), size),
-        frequency=_average_neighbours(frequency[used].astype(float), size),
-        temperature=mean_temperature if has_temperature else None,
+        state=_average_neighbours(states, size),
+        frequency=_average_neighbours(frequency[used], size),
+        temperature=mean_temperature if is_known.all() else None,
     )
     return loads, replace(calibration, rest_frequency=rest)
 
@@ -150,9 +159,14 @@ def _read_samples(
     """
     parts = []
     for rows in source:
-        is_good = (rows.cube == number) & (rows.pad_fault == 0)
-        chosen = rows.select(is_good)
-        parts.append((chosen.stamp_ns, chosen.frequency[:, :n_pads], chosen.temperature))
+        is_of_cube = rows.cube == number
+        chosen = rows.select(is_of_cube & (rows.pad_fault == 0))
+        part = (
+            chosen.stamp_ns,
+            chosen.frequency[:, :n_pads],
+            chosen.temperature,
+        )
+        parts.append(part)
     stamp_ns, frequency, temperature = (
         np.concatenate(column) for column in zip(*parts, strict=True)
     )
@@ -184,19 +198,17 @@ def _read_reference(
         BagError: The topic is missing or has another type, has fewer than two messages with
             different times, or holds forces and no area is given.
     """
-    types = {one.msgtype for one in bag.connections if one.topic == topic}
-    msgtype = types.pop() if types else None
+    types = {one.topic: one.msgtype for one in bag.connections}
+    msgtype = types.get(topic)
     if msgtype == BATCH_TYPE:
         stamp_ns, values = _read_batches(bag, topic, number)
     elif msgtype in (WRENCH_TYPE, TENSOR_TYPE):
         messages = [message for _, message in bag.decoded({topic})]
-        stamps = [message.header.stamp for message in messages]
         read = _read_force if msgtype == WRENCH_TYPE else _read_components
-        times = [stamp.sec * SECOND + stamp.nanosec for stamp in stamps]
-        stamp_ns = np.array(times, np.int64)
+        stamp_ns = np.array([header_stamp_ns(message) for message in messages], np.int64)
         values = np.array([read(message) for message in messages])
     else:
-        topics = ", ".join(sorted({one.topic for one in bag.connections}))
+        topics = ", ".join(sorted(types))
         raise BagError(
             f"{bag.path}: --reference {topic} is {msgtype or 'not there'}; needed is a "
             f"WrenchStamped, a StressTensorStamped or a SkinStress. Topics: {topics}"
@@ -219,7 +231,8 @@ def _read_reference(
 
     # The amplitude of a mode with a gradient is the gradient times the half side of the cube.
     values[:, len(STRESS) :] *= half_side
-    state = np.zeros((len(values), modes.n_modes))
+    shape = (len(values), modes.n_modes)
+    state = np.zeros(shape)
     for column, mode in zip(state.T, modes.names, strict=True):
         if mode in COMPONENTS:
             column[:] = values[:, COMPONENTS.index(mode)]
@@ -247,8 +260,10 @@ def _read_batches(
     for messages, _ in bag.stress(topic):
         rows = messages.rows.select(messages.rows.cube == number)
         components = np.hstack([rows.stress, rows.gradient])
-        parts.append((rows.stamp_ns, components.astype(float)))
-    stamp_ns, values = (np.concatenate(column) for column in zip(*parts, strict=True))
+        part = (rows.stamp_ns, components.astype(float))
+        parts.append(part)
+    columns = zip(*parts, strict=True)
+    stamp_ns, values = (np.concatenate(column) for column in columns)
     return stamp_ns, values
 
 
@@ -268,7 +283,7 @@ def _read_components(message: Any) -> list[float]:
     return [*normal_stress, *shear_stress, *tensor.normal_gradient]
 
 
-def _average_neighbours(values: Array, size: int) -> Array:
+def _average_neighbours(values: AnyArray, size: int) -> Array:
     """Return the means of groups of successive values along the first axis.
 
     Args:
@@ -279,7 +294,8 @@ def _average_neighbours(values: Array, size: int) -> Array:
         Means (N // size, ...).
     """
     n_groups = len(values) // size
-    complete = values[: n_groups * size]
-    groups = complete.reshape(n_groups, size, *values.shape[1:])
+    complete = values[: n_groups * size].astype(float)
+    shape = (n_groups, size, *values.shape[1:])
+    groups = complete.reshape(shape)
     means: Array = groups.mean(axis=1)
     return means

@@ -29,7 +29,11 @@ With this limit the estimate has 95 % of the efficiency of least squares for nor
 MAX_STEPS = 100
 """Maximum number of Gauss-Newton steps in one stage of the fit (see `STAGES`)."""
 
-STAGES = {"plain": 1e-10, "huber": 1e-3, "tukey": 1e-9}
+STAGES = {
+    "plain": 1e-10,
+    "huber": 1e-3,
+    "tukey": 1e-9,
+}
 """Stages of the fit in their order: least squares with equal weights, with Huber's weights, and
 with Tukey's weights. A stage ends when a step changes the parameters, relatively, by at most the
 number that stands with it.
@@ -69,10 +73,12 @@ def compute_weights(stage: str, r: Array) -> Array:
     size = np.abs(r)
     if stage == "huber":
         # A tiny number avoids a division by 0 where a residual is 0.
-        weights: Array = np.minimum(1, HUBER_LIMIT / np.maximum(size, 1e-300))
+        divisor = np.maximum(size, 1e-300)
+        weights: Array = np.minimum(1, HUBER_LIMIT / divisor)
         return weights
     u = (r / TUKEY_LIMIT) ** 2
-    return np.where(size < TUKEY_LIMIT, (1 - u) ** 2, 0)
+    inside = (1 - u) ** 2
+    return np.where(size < TUKEY_LIMIT, inside, 0)
 
 
 def least_squares(a: Array, b: Array) -> Array:
@@ -101,10 +107,9 @@ def null_space(jacobian: Array) -> Array:
     """
     scaled, _ = _scale_columns(jacobian)
     _, s, vt = np.linalg.svd(scaled, full_matrices=True)
-    # If no parameter changes a predicted value, the rank is 0.
-    rank = 0
-    if s[0] > 0:
-        rank = int(np.sum(s > DIRECTION_TOLERANCE * s[0]))
+    limit = DIRECTION_TOLERANCE * s[0]
+    # If no parameter changes a predicted value, s[0] is 0, and the rank is 0.
+    rank = int(np.sum(s > limit))
     directions: Array = vt[rank:].T
     return directions
 
@@ -146,17 +151,24 @@ def robust_covariance(
     # With u = (r / limit)², Tukey's psi is r (1 - u)². Setting u to 1 for outliers makes psi and
     # its derivative 0 for them.
     is_inlier = np.abs(r) < TUKEY_LIMIT
-    u = np.where(is_inlier, (r / TUKEY_LIMIT) ** 2, 1)
-    psi_squared = np.mean((r * (1 - u) ** 2) ** 2)
-    psi_slope = np.mean((1 - u) * (1 - 5 * u))
-    rank = jacobian.shape[1] - null_space(jacobian).shape[1]
-    dof = max(len(r) - rank, 1)
-    factor = psi_squared / psi_slope**2 * len(r) / dof
+    ratio = r / TUKEY_LIMIT
+    u = np.where(is_inlier, ratio**2, 1)
+    psi = r * (1 - u) ** 2
+    psi_squared = np.mean(psi**2)
+    slope = (1 - u) * (1 - 5 * u)
+    psi_slope = np.mean(slope)
+    null = null_space(jacobian)
+    rank = jacobian.shape[1] - null.shape[1]
+    n_residuals = len(r)
+    dof = max(n_residuals - rank, 1)
+    factor = psi_squared / psi_slope**2 * n_residuals / dof
 
     scaled, size = _scale_columns(jacobian)
     # The singular values of J'J are the squares of those of J, so the tolerance is squared, too.
-    inverse = np.linalg.pinv(scaled.T @ scaled, rcond=DIRECTION_TOLERANCE**2)
-    covariance: Array = scale**2 * factor * inverse / np.outer(size, size)
+    normal_matrix = scaled.T @ scaled
+    inverse = np.linalg.pinv(normal_matrix, rcond=DIRECTION_TOLERANCE**2)
+    of_scaled = scale**2 * factor * inverse
+    covariance: Array = of_scaled / np.outer(size, size)
     return covariance
 
 

@@ -123,7 +123,10 @@ class DataSet:
             statistics[key] = Statistics(rows)
         return statistics
 
-    def write(self, columns: dict[str, AnyArray | list[bytes]]) -> None:
+    def write(
+        self,
+        columns: dict[str, AnyArray | list[bytes]],
+    ) -> None:
         """Write successive frames as one row group of the current Parquet file.
 
         Args:
@@ -309,7 +312,10 @@ def _feature(
     }
 
 
-def _as_lists(statistics: Statistics, frames: int) -> dict[str, Any]:
+def _as_lists(
+    statistics: Statistics,
+    frames: int,
+) -> dict[str, Any]:
     """Return the statistics of a feature as lists, which JSON and Parquet can contain.
 
     Args:

@@ -325,7 +325,8 @@ def _stress_rows(
             known = rows.select(is_known)
             if not len(known):
                 continue
-            ids = [one.id for one in settings[segment.number].calibrations]
+            calibrations = settings[segment.number].calibrations
+            ids = [one.id for one in calibrations]
             # Only changes are noted, because most data sets have the same calibrations throughout.
             if not noted or noted[-1]["ids"] != ids:
                 since_ns = int(known.stamp_ns.min())

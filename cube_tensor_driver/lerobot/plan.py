@@ -175,7 +175,8 @@ class Episode:
         frame = self.sample_frame_of(stamp_ns)
         n_frames = int(frame.max()) + 1
         if n_frames > self._max_frames:
-            late_s = (int(stamp_ns.max()) - self.begin_ns) / SECOND
+            late_ns = int(stamp_ns.max()) - self.begin_ns
+            late_s = late_ns / SECOND
             raise BagError(
                 f"{self.bag}: a sample is stamped {late_s:.0f} s after the first of its episode, "
                 "which is longer than was recorded: a clock was set; leave it out with --marks"
@@ -363,7 +364,10 @@ def _check_depth(
         )
 
 
-def _marked_spans(bag: Bag, topic: str) -> list[tuple[int, int, str]]:
+def _marked_spans(
+    bag: Bag,
+    topic: str,
+) -> list[tuple[int, int, str]]:
     """Return the episodes into which marks divide a bag.
 
     A mark is a recorded text. At the time of its recording it ends the episode before and begins a

@@ -63,7 +63,8 @@ class Statistics:
         ]
         self._parts.append(np.array(part))
         is_chosen = self._random.random(len(rows)) < self._share
-        self._sample.append(values[is_chosen].filled(np.nan))
+        chosen = values[is_chosen]
+        self._sample.append(chosen.filled(np.nan))
 
     def merge(self, other: Statistics) -> None:
         """Add all rows that were added to another object, such as the statistics of an episode."""
@@ -76,14 +77,16 @@ class Statistics:
         Returns:
             An array of the shape of a row for each statistic, by its name in LeRobot.
         """
-        count, means, variances, lowest, highest = np.stack(self._parts, axis=1)
+        parts = np.stack(self._parts, axis=1)
+        count, means, variances, lowest, highest = parts
         total = count.sum(axis=0)
         is_empty = total == 0
         weight = count / np.maximum(total, 1)
         mean = (weight * means).sum(axis=0)
         # Law of total variance: the variances within the parts, plus that of the means of the parts
         within = (weight * variances).sum(axis=0)
-        between = (weight * (means - mean) ** 2).sum(axis=0)
+        differences = (means - mean) ** 2
+        between = (weight * differences).sum(axis=0)
         deviation = np.sqrt(within + between)
         low = lowest.min(axis=0)
         high = highest.max(axis=0)
@@ -93,9 +96,9 @@ class Statistics:
         # mean stands for all of its quantiles.
         is_drawn = np.isfinite(drawn).any(axis=0)
         substitute = np.where(is_drawn, np.nan, mean)
-        sample = np.concatenate([drawn, substitute[np.newaxis]])
+        known = np.concatenate([drawn, substitute[np.newaxis]])
         shares = list(QUANTILES.values())
-        quantiles = np.nanquantile(sample, shares, axis=0)
+        quantiles = np.nanquantile(known, shares, axis=0)
         return {
             "min": np.where(is_empty, 0, low),
             "max": np.where(is_empty, 0, high),

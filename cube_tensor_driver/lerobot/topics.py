@@ -135,7 +135,10 @@ class Signal:
         return values
 
 
-def find_topics(paths: Sequence[Path], choices: Choices) -> list[Topic]:
+def find_topics(
+    paths: Sequence[Path],
+    choices: Choices,
+) -> list[Topic]:
     """Find the topics of the bags that become features of a data set.
 
     Args:
@@ -223,7 +226,10 @@ def _read_numbers(
         yield stamp_ns(message), numbers
 
 
-def _stamped_topics(bag: Bag, skin: str) -> list[tuple[str, str]]:
+def _stamped_topics(
+    bag: Bag,
+    skin: str,
+) -> list[tuple[str, str]]:
     """Return name and type of the topics with images, joint states or other stamped numbers.
 
     Topics of single cubes are left out, because the stress of the skin contains the same numbers.
@@ -288,7 +294,10 @@ def _nested_paths(
             yield f"{prefix}{name}"
 
 
-def _joint_numbers(message: Any, where: str) -> dict[str, float]:
+def _joint_numbers(
+    message: Any,
+    where: str,
+) -> dict[str, float]:
     """Return the numbers in a JointState message by their names, such as ``elbow.position``.
 
     Args:
@@ -299,13 +308,14 @@ def _joint_numbers(message: Any, where: str) -> dict[str, float]:
         BagError: The message has more or fewer values of a quantity than joint names.
     """
     numbers = {}
+    names = message.name
     for quantity in JOINT_FIELDS:
         values = getattr(message, quantity)
-        if len(values) and len(values) != len(message.name):
+        if len(values) and len(values) != len(names):
             raise BagError(
-                f"{where}: a message has {len(message.name)} joints and {len(values)} values of "
+                f"{where}: a message has {len(names)} joints and {len(values)} values of "
                 f"{quantity}; leave the topic out by naming the others with --topics"
             )
-        for name, value in zip(message.name, values, strict=False):
+        for name, value in zip(names, values, strict=False):
             numbers[f"{name}.{quantity}"] = float(value)
     return numbers

@@ -86,11 +86,12 @@ class Windows:
             # The first pass over the bag has counted the rows of every frame. A block is complete
             # only when all of them are there, including those of hubs that deliver late.
             expected = int(block.sum(dtype=np.int64))
-            ready = sum(np.count_nonzero(frame < end) for frame, _ in self._waiting)
+            frames = [frame for frame, _ in self._waiting]
+            ready = sum(np.count_nonzero(frame < end) for frame in frames)
             if ready < expected:
                 return
-            frame = np.concatenate([one for one, _ in self._waiting])
-            rows = concatenate([one for _, one in self._waiting])
+            frame = np.concatenate(frames)
+            rows = concatenate([rows for _, rows in self._waiting])
             inside = frame < end
             windows = self._arrange(
                 block,
@@ -98,7 +99,8 @@ class Windows:
                 rows.select(inside),
             )
             later = ~inside
-            self._waiting = [(frame[later], rows.select(later))]
+            late_rows = rows.select(later)
+            self._waiting = [(frame[later], late_rows)]
             self.done = end
             yield windows
 
@@ -127,9 +129,13 @@ class Windows:
         cell = cell[order]
         # The last row of each cell gets the last entry of the window, so that the newest sample is
         # always there; the rows before it get the entries before.
-        end_of_cell = np.cumsum(counts, dtype=np.intp)[cell]
-        slot = self._depth - end_of_cell + np.arange(len(cell))
-        place = cell // n_cubes, slot, cell % n_cubes
+        ends = np.cumsum(counts, dtype=np.intp)
+        to_end = ends[cell] - np.arange(len(cell))
+        place = (
+            cell // n_cubes,
+            self._depth - to_end,
+            cell % n_cubes,
+        )
 
         shape = (n_frames, self._depth, n_cubes)
         components = np.hstack([rows.stress, rows.gradient])

@@ -290,28 +290,6 @@ def true_state(
     return calibration.modes.state(stress, scaled)
 
 
-def true_components(
-    calibration: Calibration,
-    stress: Array,
-    gradient: Array,
-) -> Array:
-    """Return the 15 components of stress and gradient that cubes without errors would measure.
-
-    Args:
-        calibration: Calibration of the cubes.
-        stress: Stress (N, 6) in Pa, order xx yy zz yz zx xy.
-        gradient: Gradient (N, 6, 3) in Pa/m.
-
-    Returns:
-        Components (N, 15): six stresses in Pa, then nine gradients of normal stresses in Pa/m.
-    """
-    # Modes of gradients are in Pa (change over half a side), the components in Pa/m.
-    is_stress = np.arange(len(COMPONENTS)) < len(STRESS)
-    scale = np.where(is_stress, 1.0, 1 / calibration.half_side)
-    state = true_state(calibration, stress, gradient)
-    return np.asarray(state @ calibration.modes.components.T * scale)
-
-
 def skin_components(
     skin: Skin,
     stress: Array,
@@ -327,12 +305,12 @@ def skin_components(
     Returns:
         Components (cubes, 15): six stresses in Pa, then nine gradients in Pa/m.
     """
+    is_stress = np.arange(len(COMPONENTS)) < len(STRESS)
     shape = (len(skin.cubes), len(COMPONENTS))
     components = np.empty(shape)
     for calibration, rows in calibration_groups(skin.calibrations):
-        components[rows] = true_components(
-            calibration,
-            stress[rows],
-            gradient[rows],
-        )
+        # Modes of gradients are in Pa (change over half a side), the components in Pa/m.
+        scale = np.where(is_stress, 1.0, 1 / calibration.half_side)
+        state = true_state(calibration, stress[rows], gradient[rows])
+        components[rows] = state @ calibration.modes.components.T * scale
     return components

@@ -1,4 +1,4 @@
-"""Line between a simulated hub and the host: a pseudo-terminal or a TCP connection.
+"""Line between a simulated hub and the host: a pseudo-terminal.
 
 The faults of injector.py can unplug it, stall it, or let it send in bursts.
 """
@@ -7,12 +7,8 @@ from __future__ import annotations
 
 import contextlib
 import os
-import socket
 import tty
 from pathlib import Path
-
-from ..core.errors import ConfigError
-from ..device.links.tcp import parse_url
 
 MAX_QUEUED_BYTES = 1 << 16
 """Maximum number of bytes that wait to be sent on a line. A hub drops and counts samples for which
@@ -135,85 +131,3 @@ class SimulatedLine:
             return os.read(self.fd, _READ_BYTES)
         except BlockingIOError:
             return b""
-
-
-class TcpLine(SimulatedLine):
-    """A line that listens for one TCP connection of the host at a URL socket://host:port.
-
-    `unplug` closes the connection and stops listening; `plug` listens again at the same address.
-    """
-
-    def __init__(self, url: str) -> None:
-        """Listen at the address.
-
-        Raises:
-            LinkError: The URL does not have the form socket://host:port.
-            ConfigError: Listening at this address failed.
-        """
-        self._address = parse_url(url)
-        self._listener: socket.socket | None = None
-        self._connection: socket.socket | None = None
-        super().__init__(Path(url))
-
-    def plug(self, port: Path | None = None) -> None:
-        """Listen at the address of the line; `port` is ignored."""
-        try:
-            self._listener = socket.create_server(self._address, backlog=1)
-        except OSError as error:
-            host, number = self._address
-            raise ConfigError(
-                f"{host}:{number}: {error.strerror}; name an address that is free here"
-            ) from None
-        self._listener.setblocking(False)
-        self.fd = self._listener.fileno()
-
-    def unplug(self) -> None:
-        """Close the connection and stop listening; bytes that wait to be sent are lost."""
-        self._hang_up()
-        if self._listener is not None:
-            self._listener.close()
-            self._listener = None
-            self.fd = -1
-        self._queue.clear()
-
-    def flush(self, now_us: int) -> None:
-        """Write as many waiting bytes as the connection takes now; without one, they wait."""
-        if self._connection is None:
-            return
-        try:
-            super().flush(now_us)
-        except ConnectionError:
-            self._hang_up()
-
-    def read(self) -> bytes:
-        """Return the bytes that the host has sent; without a connection, accept one instead."""
-        if self._connection is None:
-            self._accept()
-            return b""
-        try:
-            data = super().read()
-        except ConnectionError:
-            data = b""
-        if not data:  # the host has closed the connection
-            self._hang_up()
-        return data
-
-    def _accept(self) -> None:
-        """Accept the connection that made the listener readable."""
-        if self._listener is None:
-            return
-        with contextlib.suppress(OSError):  # the host has closed it again
-            self._connection, _ = self._listener.accept()
-            self._connection.setblocking(False)
-            # Without this option, TCP would delay samples to send several of them together.
-            self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self.fd = self._connection.fileno()
-
-    def _hang_up(self) -> None:
-        """Close the connection and wait for the next one."""
-        if self._connection is not None:
-            self._connection.close()
-            self._connection = None
-            self.fd = -1
-            if self._listener is not None:
-                self.fd = self._listener.fileno()

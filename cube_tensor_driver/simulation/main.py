@@ -1,8 +1,7 @@
 """Process that simulates all hubs of a skin on pseudo-terminals under a load.
 
-The port of each link appears as PORTS/<link name>. With --tcp, links whose port in the skin file is
-a TCP address listen there. On SIGINT or SIGTERM, the simulator ends and writes its sample log, with
-which a check compares the samples that arrived.
+The port of each link appears as PORTS/<link name>. On SIGINT or SIGTERM, the simulator ends and
+writes its sample log, with which a check compares the samples that arrived.
 """
 
 from __future__ import annotations
@@ -22,11 +21,15 @@ from .load import AnyLoad, Load, default_script
 from .simulator import Simulator, StopRequest
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main(
+    arguments: list[str] | None = None,
+    simulator: type[Simulator] = Simulator,
+) -> int:
     """Run the simulator until SIGINT or SIGTERM.
 
     Args:
         arguments: Command line arguments; None: those of the process.
+        simulator: Class of the simulator.
 
     Returns:
         Exit code: 0, or 1 if an input file cannot be used.
@@ -38,13 +41,13 @@ def main(arguments: list[str] | None = None) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stop.request)
     try:
-        simulator = _create_simulator(options)
+        hubs = _create_simulator(options, simulator)
         try:
-            simulator.run(stop)
+            hubs.run(stop)
         finally:
-            simulator.close()
+            hubs.close()
         if options.log:
-            simulator.log().write(options.log)
+            hubs.log().write(options.log)
     except CubeError as error:
         print(f"simulator: {error}", file=sys.stderr)
         return 1
@@ -101,12 +104,18 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--faults", type=Path, help="faults to carry out: YAML, a list, see docs/reliability.md")
     add("--seed", type=int, default=0, help="seed of what is random in the faults")
-    add("--tcp", action="store_true", help="play links whose port is socket://host:port there")
     return parser
 
 
-def _create_simulator(options: argparse.Namespace) -> Simulator:
+def _create_simulator(
+    options: argparse.Namespace,
+    simulator: type[Simulator],
+) -> Simulator:
     """Read all files and create the simulator.
+
+    Args:
+        options: Command line options.
+        simulator: Class of the simulator.
 
     Raises:
         CubeError: A file cannot be used.
@@ -119,7 +128,7 @@ def _create_simulator(options: argparse.Namespace) -> Simulator:
     imperfections = None
     if options.imperfections:
         imperfections = read_imperfections(options.imperfections)
-    return Simulator(
+    return simulator(
         skin,
         load,
         options.ports,
@@ -129,7 +138,6 @@ def _create_simulator(options: argparse.Namespace) -> Simulator:
         instants=options.instants,
         faults=faults,
         seed=options.seed,
-        tcp=options.tcp,
     )
 
 

@@ -1,6 +1,6 @@
 """Simulates all hubs of a skin in one process, under a load and faults, and logs their samples.
 
-The hubs are connected to the host by pseudo-terminals or TCP.
+The hubs are connected to the host by pseudo-terminals.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 
-from ..config.skin import Skin
+from ..config.skin import Skin, SkinLink
 from ..config.yaml import parse_yaml, write_yaml
 from ..core.errors import ConfigError
 from .cubes import HubCubes, Millihertz, hub_cubes
@@ -25,7 +25,7 @@ from .faults import Fault
 from .hub import SimulatedHub
 from .imperfections import Imperfections
 from .injector import Injector, SimulatedLink
-from .line import SimulatedLine, TcpLine
+from .line import SimulatedLine
 from .load import Fields, LoadMemory
 from .sample_log import ABSENT, LinkLog, SampleLog
 
@@ -106,7 +106,6 @@ class Simulator:
         instants: int = 0,
         faults: Sequence[Fault] = (),
         seed: int = 0,
-        tcp: bool = False,
     ) -> None:
         """Create the hubs and their ports.
 
@@ -123,12 +122,10 @@ class Simulator:
                 0: the load is computed for each sample.
             faults: Faults to carry out at their times.
             seed: Seed of the random numbers in the faults.
-            tcp: Whether a link whose port in the skin file is socket://host:port listens at this
-                address; otherwise it gets a pseudo-terminal.
 
         Raises:
-            ConfigError: Cubes of one hub have different numbers of pads, the folder or a TCP
-                address cannot be used, or a fault names a link, cube or pad that does not exist.
+            ConfigError: Cubes of one hub have different numbers of pads, the folder cannot be used,
+                or a fault names a link, cube or pad that does not exist.
         """
         self._ports = ports
         self._load = LoadMemory(load)
@@ -145,7 +142,8 @@ class Simulator:
                 drift=drift,
                 imperfections=imperfections,
             ):
-                self._links.append(_connect(skin, carried, ports, tcp))
+                line = self._make_line(carried.link)
+                self._links.append(_connect(skin, carried, line))
             sizes = {link.name: asdict(link.size) for link in self._links}
             write_yaml(ports / HUBS_FILE, sizes)
             self._fault_pipe = _open_pipe(ports / FAULT_PIPE)
@@ -159,6 +157,10 @@ class Simulator:
         self._prepare(load, instants)
         for link in self._links:
             link.line.send(link.hub.hello(), 0)
+
+    def _make_line(self, link: SkinLink) -> SimulatedLine:
+        """Create the line of a hub to the host; torture has hubs that are on other lines."""
+        return SimulatedLine(self._ports / link.name)
 
     def _prepare(self, load: Fields, instants: int) -> None:
         """Compute the frequencies of all hubs in advance.
@@ -405,16 +407,14 @@ class StopRequest:
 def _connect(
     skin: Skin,
     carried: HubCubes,
-    ports: Path,
-    tcp: bool,
+    line: SimulatedLine,
 ) -> PlayedLink:
-    """Create a simulated link with its hub and its line.
+    """Create a simulated link with its hub.
 
     Args:
         skin: Skin that contains the link.
         carried: Link and cubes of the hub.
-        ports: Folder in which the pseudo-terminal appears under the name of the link.
-        tcp: Whether a port socket://host:port of the skin file is used instead.
+        line: Line of the hub to the host.
     """
     link = carried.link
     number = skin.links.index(link) + 1
@@ -431,10 +431,6 @@ def _connect(
         n_pads=carried.cubes.n_pads,
         boot_us=FIRST_BOOT_US * number,
     )
-    if tcp and link.port.startswith("socket://"):
-        line: SimulatedLine = TcpLine(link.port)
-    else:
-        line = SimulatedLine(ports / link.name)
     return PlayedLink(link.name, hub, line, carried)
 
 

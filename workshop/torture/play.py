@@ -192,7 +192,7 @@ def _make_processes(
         if process.executable == "reconstruction":
             process.parameters["tare_folder"] = str(skin_path.parent / "tare")
         if process.executable == "simulator":
-            process = replace(process, arguments=(*process.arguments, "--tcp"))
+            process = replace(process, module="workshop.torture.tcp_hubs")
         processes[process.executable] = mutated(process, mutation)
     return processes
 
