@@ -7,15 +7,20 @@
 #define Py_LIMITED_API 0x030A0000
 #include <Python.h>
 
+#include "cube_track.h"
 #include "cube_wire.h"
 
 #include <errno.h>
 #include <math.h>
+#include <poll.h>
 #include <stdlib.h>
 #include <string.h>
+#include <time.h>
 #include <unistd.h>
 
 #define READ_CHUNK 65536
+#define MAX_USUAL 64         /* samples in one usual read of one link */
+#define WAIT_STEP_NS 200000L /* between two looks for the samples of other links */
 
 /* ------------------------------------------------------------------------------ Decoder ------- */
 
@@ -227,39 +232,75 @@ static PyObject *cobs_decode(PyObject *module, PyObject *argument) {
     return data;
 }
 
-/* One link to read, with the result of read(), or minus the errno of its error. */
+/* One link to read.
+ *
+ * result: of read(), or minus the errno of its error; 0 where nothing was read.
+ * count: number of its samples if the read was usual (cube_track.h); 0: it was not. */
 typedef struct {
     Decoder *decoder;
-    int fd;
+    cube_track *track;
     ssize_t result;
-    bool no_memory;
+    bool was_read, has_frames, no_memory;
+    size_t count;
+    int64_t stamps_ns[MAX_USUAL];
 } Link;
 
-static void read_link(Link *link) {
+static void read_link(Link *link, int fd) {
     do {
-        link->result = read(link->fd, link->decoder->input, READ_CHUNK);
+        link->result = read(fd, link->decoder->input, READ_CHUNK);
     } while (link->result < 0 && errno == EINTR);
     if (link->result < 0)
         link->result = -errno;
+    link->was_read = link->result != -EAGAIN;
 }
 
-static void decode_link(Link *link) {
-    if (link->result > 0)
-        link->no_memory = !decode(link->decoder, link->decoder->input, (size_t)link->result);
+/* Decodes what was read, and takes the samples where all frames are usual ones. */
+static void decode_link(Link *link, int64_t arrival_ns, bool is_late) {
+    Decoder *decoder = link->decoder;
+    link->count = 0;
+    if (link->result <= 0)
+        return;
+    link->no_memory = !decode(decoder, decoder->input, (size_t)link->result);
+    cube_sample samples[MAX_USUAL];
+    size_t count = 0;
+    for (size_t at = 0; at < decoder->used; count++) {
+        uint32_t length;
+        memcpy(&length, decoder->frames + at, sizeof length);
+        cube_frame frame = {.raw = decoder->frames + at + sizeof length, .size = length};
+        at += sizeof length + length;
+        link->has_frames = true;
+        if (count == MAX_USUAL || !cube_parse_sample(&frame)) {
+            link->track->head.is_usual = false;
+            return;
+        }
+        samples[count] = frame.as.sample;
+    }
+    if (count == 0)
+        return;
+    if (cube_follow(link->track, samples, count, arrival_ns, is_late, link->stamps_ns))
+        link->count = count;
+    else /* what follows must wait until the interpreter has handled this read */
+        link->track->head.is_usual = false;
 }
 
-/* Reserves the decoders of a list of pairs (Decoder, file descriptor) for this call. Returns their
- * number; fewer than `count`: an exception is set. */
-static Py_ssize_t take_links(PyObject *pairs, Link *links, Py_ssize_t count) {
+/* Reserves the decoders of a list of tuples (Decoder, file descriptor, address of a cube_track) for
+ * this call. Returns their number; fewer than `count`: an exception is set. */
+static Py_ssize_t take_links(PyObject *list, Link *links, struct pollfd *polled, Py_ssize_t count) {
     for (Py_ssize_t i = 0; i < count; i++) {
-        PyObject *pair = PyList_GetItem(pairs, i), *decoder;
-        links[i] = (Link){.no_memory = false};
-        if (!PyTuple_Check(pair)) {
-            PyErr_SetString(PyExc_TypeError, "a link is a tuple (Decoder, file descriptor)");
+        PyObject *tuple = PyList_GetItem(list, i), *decoder, *address;
+        if (!PyTuple_Check(tuple)) {
+            PyErr_SetString(PyExc_TypeError, "a link is (Decoder, file descriptor, address)");
             return i;
         }
-        if (!PyArg_ParseTuple(pair, "O!i:read_links", decoder_type, &decoder, &links[i].fd) ||
+        polled[i] = (struct pollfd){.events = POLLIN};
+        links[i] = (Link){.count = 0};
+        if (!PyArg_ParseTuple(
+                tuple, "O!iO!:read_links", decoder_type, &decoder, &polled[i].fd, &PyLong_Type,
+                &address) ||
             !is_free((Decoder *)decoder))
+            return i;
+        links[i].track = PyLong_AsVoidPtr(address);
+        if (PyErr_Occurred())
             return i;
         Py_INCREF(decoder);
         links[i].decoder = (Decoder *)decoder;
@@ -268,82 +309,148 @@ static Py_ssize_t take_links(PyObject *pairs, Link *links, Py_ssize_t count) {
     return count;
 }
 
-/* Returns the results of all links, and releases their decoders. NULL: an exception is set. */
-static PyObject *give_links(Link *links, Py_ssize_t count, bool is_read) {
-    PyObject *results = is_read ? PyList_New(count) : NULL;
-    for (Py_ssize_t i = 0; i < count; i++) {
-        links[i].decoder->is_busy = false;
-        if (results != NULL) {
-            PyObject *frames =
-                links[i].no_memory ? PyErr_NoMemory() : take_frames(links[i].decoder);
-            PyObject *result =
-                frames == NULL ? NULL : Py_BuildValue("(nN)", (Py_ssize_t)links[i].result, frames);
-            if (result == NULL || PyList_SetItem(results, i, result) < 0)
-                Py_CLEAR(results);
-        }
-        Py_DECREF(links[i].decoder);
+/* Appends to a list and gives up the reference. false: an exception is set. */
+static bool append(PyObject *list, PyObject *item) {
+    bool is_right = item != NULL && PyList_Append(list, item) == 0;
+    Py_XDECREF(item);
+    return is_right;
+}
+
+/* Adds what was read from a link to the lists of the result. false: an exception is set. */
+static bool give_link(PyObject *result, Link *link, Py_ssize_t index, int64_t arrival_ns) {
+    bool is_event = link->result <= 0 || (link->count == 0 && link->decoder->used > 0);
+    PyObject *frames = link->no_memory ? PyErr_NoMemory() : take_frames(link->decoder);
+    if (frames == NULL)
+        return false;
+    if (is_event)
+        return append(
+            PyTuple_GetItem(result, 4), Py_BuildValue(
+                                            "(nLnN)", index, (long long)arrival_ns,
+                                            (Py_ssize_t)link->result, frames));
+    bool is_right = true;
+    for (size_t i = 0; i < link->count && is_right; i++) {
+        PyObject *raw = PyList_GetItem(frames, (Py_ssize_t)i);
+        is_right = append(PyTuple_GetItem(result, 1), PyLong_FromSsize_t(index)) &&
+                   PyList_Append(PyTuple_GetItem(result, 2), raw) == 0 &&
+                   append(PyTuple_GetItem(result, 3), PyLong_FromLongLong(link->stamps_ns[i]));
     }
-    return results;
+    Py_DECREF(frames);
+    return is_right;
+}
+
+static int64_t steady_ns(void) {
+    struct timespec now;
+    clock_gettime(CLOCK_MONOTONIC, &now);
+    return (int64_t)now.tv_sec * 1000000000 + now.tv_nsec;
+}
+
+/* Reads all links that have data once, decodes them and adds the results. false: an exception. */
+static bool read_round(
+    PyObject *result, Link *links, struct pollfd *polled, Py_ssize_t count, PyObject *clock,
+    bool is_late) {
+    Py_BEGIN_ALLOW_THREADS
+    for (Py_ssize_t i = 0; i < count; i++) {
+        links[i].was_read = false;
+        if (polled[i].revents != 0)
+            read_link(&links[i], polled[i].fd);
+    }
+    Py_END_ALLOW_THREADS
+    /* The clock is read between reading and decoding, so that the time is that of the bytes. */
+    PyObject *time = PyObject_CallNoArgs(clock);
+    int64_t arrival_ns = time == NULL ? -1 : PyLong_AsLongLong(time);
+    Py_XDECREF(time);
+    if (arrival_ns == -1 && PyErr_Occurred())
+        return false;
+    Py_BEGIN_ALLOW_THREADS
+    for (Py_ssize_t i = 0; i < count; i++)
+        if (links[i].was_read)
+            decode_link(&links[i], arrival_ns, is_late);
+    Py_END_ALLOW_THREADS
+    for (Py_ssize_t i = 0; i < count; i++)
+        if (links[i].was_read && !give_link(result, &links[i], i, arrival_ns))
+            return false;
+    return true;
+}
+
+/* Waits for data, and then up to gather_ns until `expected` links have delivered frames. */
+static bool read_rounds(
+    PyObject *result, Link *links, struct pollfd *polled, Py_ssize_t count, PyObject *clock,
+    bool is_late, Py_ssize_t expected, int64_t gather_ns) {
+    int64_t begin_ns = steady_ns();
+    for (;;) {
+        if (!read_round(result, links, polled, count, clock, is_late))
+            return false;
+        Py_ssize_t delivered = 0;
+        for (Py_ssize_t i = 0; i < count; i++)
+            delivered += links[i].has_frames;
+        if (is_late || delivered == 0 || delivered >= expected ||
+            steady_ns() - begin_ns >= gather_ns)
+            return true;
+        struct timespec step = {.tv_nsec = WAIT_STEP_NS};
+        Py_BEGIN_ALLOW_THREADS
+        nanosleep(&step, NULL);
+        poll(polled, (nfds_t)count, 0);
+        Py_END_ALLOW_THREADS
+    }
 }
 
 static PyObject *read_links(PyObject *module, PyObject *args) {
     (void)module;
-    PyObject *pairs, *clock, *arrival = NULL;
-    if (!PyArg_ParseTuple(args, "O!O:read_links", &PyList_Type, &pairs, &clock))
+    PyObject *list, *clock;
+    int wake_fd;
+    double timeout_s, gather_s;
+    Py_ssize_t expected;
+    if (!PyArg_ParseTuple(
+            args, "O!iddnO:read_links", &PyList_Type, &list, &wake_fd, &timeout_s, &gather_s,
+            &expected, &clock))
         return NULL;
-    Py_ssize_t count = PyList_Size(pairs);
-    Link *links = PyMem_Malloc((size_t)count * sizeof *links);
-    if (links == NULL)
-        return PyErr_NoMemory();
-    Py_ssize_t taken = take_links(pairs, links, count);
-    if (taken == count) {
+    Py_ssize_t count = PyList_Size(list);
+    Link *links = PyMem_Calloc((size_t)count + 1, sizeof *links);
+    struct pollfd *polled = PyMem_Calloc((size_t)count + 1, sizeof *polled);
+    PyObject *result = NULL;
+    Py_ssize_t taken = 0;
+    if (links == NULL || polled == NULL) {
+        PyErr_NoMemory();
+    } else if ((taken = take_links(list, links, polled, count)) == count) {
+        polled[count] = (struct pollfd){.fd = wake_fd, .events = POLLIN};
+        int ready;
+        bool is_late;
         Py_BEGIN_ALLOW_THREADS
-        for (Py_ssize_t i = 0; i < count; i++)
-            read_link(&links[i]);
+        ready = poll(polled, (nfds_t)count + 1, 0);
+        is_late = ready > 0;
+        if (!is_late)
+            ready = poll(polled, (nfds_t)count + 1, (int)(1e3 * timeout_s + 0.999));
+        if (polled[count].revents != 0) {
+            uint8_t discarded[64];
+            ready += read(wake_fd, discarded, sizeof discarded) < 0; /* it is empty already */
+        }
         Py_END_ALLOW_THREADS
-        /* The clock is read between reading and decoding, so that the time is that of the bytes. */
-        arrival = PyObject_CallNoArgs(clock);
+        result = Py_BuildValue("(N[][][][])", PyBool_FromLong(is_late));
+        if (result != NULL && ready > 0 &&
+            !read_rounds(
+                result, links, polled, count, clock, is_late, expected, (int64_t)(1e9 * gather_s)))
+            Py_CLEAR(result);
     }
-    if (arrival != NULL) {
-        Py_BEGIN_ALLOW_THREADS
-        for (Py_ssize_t i = 0; i < count; i++)
-            decode_link(&links[i]);
-        Py_END_ALLOW_THREADS
+    for (Py_ssize_t i = 0; i < taken; i++) {
+        links[i].decoder->is_busy = false;
+        Py_DECREF(links[i].decoder);
     }
-    PyObject *results = give_links(links, taken, arrival != NULL);
     PyMem_Free(links);
-    if (results == NULL) {
-        Py_XDECREF(arrival);
-        return NULL;
-    }
-    return Py_BuildValue("(NN)", arrival, results);
+    PyMem_Free(polled);
+    return result;
 }
 
 /* ------------------------------------------------------------------------------ rows ---------- */
 
-/* Places of the columns of rows in one block of memory, one after the other. */
+/* Columns of rows, each contiguous. */
 typedef struct {
-    float *frequency;
-    uint32_t *sequence;
     int64_t *stamp_ns;
+    uint32_t *sequence;
     uint32_t *pad_fault;
     float *temperature;
+    float *frequency;
     size_t n_pads;
 } Columns;
-
-static size_t columns_size(size_t n_rows, size_t n_pads) {
-    return n_rows * (8 + 4 + 4 + 4 + 4 * n_pads);
-}
-
-static Columns columns_of(uint8_t *memory, size_t n_rows, size_t n_pads) {
-    Columns columns = {.n_pads = n_pads};
-    columns.stamp_ns = (int64_t *)(void *)memory;
-    columns.sequence = (uint32_t *)(void *)(columns.stamp_ns + n_rows);
-    columns.pad_fault = columns.sequence + n_rows;
-    columns.temperature = (float *)(columns.pad_fault + n_rows);
-    columns.frequency = columns.temperature + n_rows;
-    return columns;
-}
 
 static uint32_t load_u32(const uint8_t *at) {
     return (uint32_t)at[0] | (uint32_t)at[1] << 8 | (uint32_t)at[2] << 16 | (uint32_t)at[3] << 24;
@@ -385,11 +492,12 @@ static bool get_sample(PyObject *raw, cube_frame *frame) {
 
 static PyObject *place_rows(PyObject *module, PyObject *args) {
     (void)module;
-    PyObject *raws, *stamps, *memory;
-    Py_ssize_t pads;
+    PyObject *raws, *stamps;
+    Py_ssize_t rows, pads;
+    unsigned long long at[5]; /* addresses of the columns */
     if (!PyArg_ParseTuple(
-            args, "O!O!nO!:place_rows", &PyList_Type, &raws, &PyList_Type, &stamps, &pads,
-            &PyByteArray_Type, &memory))
+            args, "O!O!nn(KKKKK):place_rows", &PyList_Type, &raws, &PyList_Type, &stamps, &rows,
+            &pads, &at[0], &at[1], &at[2], &at[3], &at[4]))
         return NULL;
     Py_ssize_t count = PyList_Size(raws);
     size_t n_rows = 0, n_pads = pads < 0 ? 0 : (size_t)pads;
@@ -412,11 +520,18 @@ static PyObject *place_rows(PyObject *module, PyObject *args) {
         }
         n_rows += frame.as.sample.n_cubes;
     }
-    if ((size_t)PyByteArray_Size(memory) != columns_size(n_rows, n_pads)) {
-        PyErr_SetString(PyExc_ValueError, "the memory must have the size of the rows");
+    if (rows < 0 || n_rows != (size_t)rows) {
+        PyErr_SetString(PyExc_ValueError, "there must be one row for each cube of the samples");
         return NULL;
     }
-    Columns columns = columns_of((uint8_t *)PyByteArray_AsString(memory), n_rows, n_pads);
+    Columns columns = {
+        .stamp_ns = (int64_t *)(uintptr_t)at[0],
+        .sequence = (uint32_t *)(uintptr_t)at[1],
+        .pad_fault = (uint32_t *)(uintptr_t)at[2],
+        .temperature = (float *)(uintptr_t)at[3],
+        .frequency = (float *)(uintptr_t)at[4],
+        .n_pads = n_pads,
+    };
     size_t row = 0;
     for (Py_ssize_t i = 0; i < count; i++) {
         int64_t stamp_ns = PyLong_AsLongLong(PyList_GetItem(stamps, i));
@@ -443,7 +558,7 @@ static struct PyModuleDef module = {
 
 PyMODINIT_FUNC PyInit__wire(void) {
     PyObject *made = PyModule_Create(&module);
-    if (made == NULL)
+    if (made == NULL || PyModule_AddIntConstant(made, "TRACK_SIZE", sizeof(cube_track)) < 0)
         return NULL;
     decoder_type = (PyTypeObject *)PyType_FromSpec(&decoder_spec);
     if (decoder_type == NULL || PyModule_AddObject(made, "Decoder", (PyObject *)decoder_type) < 0) {

@@ -19,6 +19,7 @@ from ..core.rows import FrequencyRows
 from ..core.status import STAMP
 from .clock.hub_clock import HubClock
 from .clock.steps import HostClockWatch
+from .links.intake import UsualSamples
 from .links.link import Link, LinkConfig, LinkState
 from .links.link_log import LinkLogger, Log
 from .links.reader import LOGGED_ERRORS, LinkFrames, Reader
@@ -26,6 +27,8 @@ from .scans.cube_table import CubeAddress
 from .scans.row_account import RowAccount, RowCounts
 from .scans.scan import MakeRows, ScanBuilder, empty_rows
 from .scans.sequence import Arrival, SampleAccount
+from .track import LinkTrack
+from .wire.decoder import unpack_all
 from .wire.native import NOT_COMPILED, wire
 from .wire.protocol import VERSION, Ack, Command, Frame, Hello, Request, Sample, Stats, Time
 
@@ -68,6 +71,7 @@ class _LinkRecord:
     """Data that `LiveLinks` keeps for one link.
 
     Attributes:
+        track: State that each sample of the link changes; account and clock work on it.
         account: Counters of the samples of the link: delivered, missing, duplicate.
         clock: Conversion of the device times of the hub to host time.
         problems: Texts about the cubes of the hub that do not fit the skin file.
@@ -81,8 +85,9 @@ class _LinkRecord:
         reported: Counters of the samples at the last report.
     """
 
-    account: SampleAccount = field(default_factory=SampleAccount)
-    clock: HubClock = field(default_factory=HubClock)
+    track: LinkTrack
+    account: SampleAccount
+    clock: HubClock
     problems: list[str] = field(default_factory=list)
     account_errors: list[str] = field(default_factory=list)
     events: deque[tuple[LinkState, str]] = field(default_factory=lambda: deque(maxlen=MAX_EVENTS))
@@ -90,6 +95,12 @@ class _LinkRecord:
     hub_changes: int = 0
     was_open: bool = False
     reported: dict[str, int] = field(default_factory=dict)
+
+    @classmethod
+    def new(cls) -> _LinkRecord:
+        """Return the record of a link from which nothing has come yet."""
+        track = LinkTrack()
+        return cls(track, SampleAccount(track), HubClock(track))
 
 
 class LiveLinks:
@@ -127,7 +138,7 @@ class LiveLinks:
     ) -> None:
         self._configs = tuple(links)
         self._scans = ScanBuilder(len(links), cubes)
-        self._records = [_LinkRecord() for _ in links]
+        self._records = [_LinkRecord.new() for _ in links]
         self._on_rows = on_rows
         self._on_end = on_end
         self._rate = rate
@@ -144,7 +155,8 @@ class LiveLinks:
         self._rows = RowAccount(self._scans)
         # The reader's thread holds this lock while it changes sample counters and clocks, and
         # `report` holds it while it reads them from another thread.
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
+        self._step_ns = 0
         self._errors = 0
         self._reader: Reader | None = None
 
@@ -160,9 +172,10 @@ class LiveLinks:
             self._configs,
             on_frames=self.receive,
             on_state=self._on_state,
-            clock_ns=self._clock_ns,
+            clock_ns=self._read_clock,
             period_us=_period_us(self._rate),
             on_end=self._on_end,
+            tracks=[record.track for record in self._records],
         )
         self._reader.start()
 
@@ -226,15 +239,60 @@ class LiveLinks:
         with self._lock:
             return [self._report(link, record, logger, lag_s) for link, record, logger in links]
 
-    def receive(self, received: Sequence[LinkFrames]) -> None:
-        """Handle frames of the links, and call `on_rows` with the rows of the scans they complete.
+    def receive(
+        self,
+        received: Sequence[LinkFrames],
+        usual: UsualSamples | None = None,
+    ) -> None:
+        """Handle what the links have sent, and call `on_rows` with the rows of complete scans.
 
         A row is one sample of one cube, a scan one sample of every cube.
 
         The reader's thread calls this method once each time it has read data.
+
+        Args:
+            received: Frames of the links.
+            usual: Samples that came before them and are counted and stamped already.
         """
+        if usual is not None and usual.links and not self._deliver_whole(usual):
+            self._add_usual(usual)
+        if received:
+            self._handle_received(received)
+        self._step_ns = 0
+        self._deliver()
+        self._rows.check()
+
+    def _deliver_whole(self, usual: UsualSamples) -> bool:
+        """Call `on_rows` at once if these samples are whole scans of all links that deliver.
+
+        Returns:
+            Whether they are. If not, they must be added to the scans.
+        """
+        whole = self._scans.order_whole(usual, self._scans_per_call, self._max_scans)
+        if whole is None:
+            return False
+        self._rows.received += len(whole.cubes)
+        try:
+            rows = self._scans.build_whole(whole, self._make_rows)
+            self._on_rows(rows)
+            self._rows.delivered += len(rows)
+        except Exception as error:  # noqa: BLE001  (later rows must still be delivered)
+            self._count_error(error)
+        return True
+
+    def _add_usual(self, usual: UsualSamples) -> None:
+        """Add samples that are counted and stamped already to the scans."""
+        samples = unpack_all(usual.raws)
+        for link, sample, stamp_ns in zip(usual.links, samples, usual.stamps_ns, strict=True):
+            if isinstance(sample, Sample):
+                self._rows.received += sample.n_cubes
+                self._scans.add(link, [sample], [stamp_ns])
+
+    def _handle_received(self, received: Sequence[LinkFrames]) -> None:
+        """Handle frames of links that are not all usual samples."""
         with self._lock:
             now_ns, step_ns = self._check_host_clock()
+            step_ns += self._step_ns
             for link, arrival_ns, frames, asked_ns, is_late in received:
                 if step_ns:
                     # The arrival of bytes that were read just before the host's clock was set is a
@@ -254,8 +312,12 @@ class LiveLinks:
                     self._handle_frames(link, arrival_ns, frames, asked_ns, is_late)
                 except Exception as error:  # noqa: BLE001  (other links must still be handled)
                     self._count_error(error)
-        self._deliver()
-        self._rows.check()
+
+    def _read_clock(self) -> int:
+        """Return the time of the host's clock, in ns, for bytes that have arrived just now."""
+        now_ns, step_ns = self._check_host_clock()
+        self._step_ns += step_ns
+        return now_ns
 
     def _check_host_clock(self) -> tuple[int, int]:
         """Look for a step of the host's clock, and move the clocks of all hubs by it.
@@ -269,9 +331,10 @@ class LiveLinks:
             return now_ns, 0
         text = f"the host's clock was set by {1e-9 * step_ns:+.6g} s: stamps follow it at once"
         self._log.warning(text)
-        for record in self._records:
-            record.clock.shift(step_ns)
-            record.clock.problems.add(text)
+        with self._lock:
+            for record in self._records:
+                record.clock.shift(step_ns)
+                record.clock.problems.add(text)
         if self._reader is not None:
             self._reader.forget_questions()
         return now_ns, step_ns
@@ -308,7 +371,7 @@ class LiveLinks:
                 else:
                     samples.append(frame)
             elif isinstance(frame, Hello):
-                record.account.announce(frame.n_cubes)
+                record.account.announce(frame.n_cubes, frame.n_pads)
                 self._learn_cubes(link, frame)
             elif isinstance(frame, Time):
                 if asked_ns:
@@ -339,12 +402,14 @@ class LiveLinks:
         """
         if not samples:
             return
-        clock = self._records[link].clock
+        record = self._records[link]
+        clock = record.clock
         device_us = [sample.device_us for sample in samples]
         numbers = [sample.sequence for sample in samples]
         stamps_ns = clock.update(device_us, arrival_ns, numbers, is_late)
         status = STAMP if clock.in_doubt else 0
         self._scans.add(link, samples, stamps_ns, status)
+        record.track.is_usual = record.account.is_usual and clock.is_usual
 
     def _deliver(self) -> None:
         """Call `on_rows` with the rows (samples of cubes) of all complete scans.
@@ -399,6 +464,7 @@ class LiveLinks:
         record = self._records[link]
         record.was_open |= state is LinkState.OPEN
         if state is not LinkState.OPEN:
+            record.track.is_usual = False
             # A link that is WAITING without an error is about to be opened for the first time,
             # which is no event to report.
             if error is not None or state is LinkState.CLOSED:

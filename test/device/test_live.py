@@ -326,7 +326,7 @@ def test_a_reader_that_fails_raises_its_error_in_the_iteration(
         def fail(*arguments: object) -> None:
             raise broken
 
-        monkeypatch.setattr(reader, "read_links", fail)
+        monkeypatch.setattr(reader.Intake, "read", fail)
         begun = time.monotonic()
         with pytest.raises(OSError, match="not foreseen") as raised:
             for _ in source:

@@ -188,7 +188,7 @@ def test_a_hub_that_announces_fewer_cubes_is_counted_right() -> None:
 
 def test_frames_of_cubes_that_the_hub_does_not_have_are_not_remembered() -> None:
     account = SampleAccount()
-    account.announce(8)
+    account.announce(8, 2)
     for first in range(20_000):
         account.sample(sample(0, first=first))
     account.stats(Stats(10, 1, 0))

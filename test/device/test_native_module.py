@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import subprocess
 import sys
+import threading
+from ctypes import addressof
 from dataclasses import fields
 
 import numpy as np
@@ -17,9 +18,12 @@ from test_protocol import cobs_of
 
 from conftest import ROOT
 from cube_tensor_driver.core.rows import FrequencyRows
+from cube_tensor_driver.device.clock.hub_clock import HubClock
 from cube_tensor_driver.device.scans import scan
 from cube_tensor_driver.device.scans.cube_table import CubeAddress
 from cube_tensor_driver.device.scans.scan import ScanBuilder
+from cube_tensor_driver.device.scans.sequence import Arrival, SampleAccount
+from cube_tensor_driver.device.track import LinkTrack
 from cube_tensor_driver.device.wire import cobs, native
 from cube_tensor_driver.device.wire.decoder import NativeDecoder, PythonDecoder
 from cube_tensor_driver.device.wire.protocol import (
@@ -119,13 +123,16 @@ def test_rows_have_the_same_bits(pads: tuple[int, ...], monkeypatch: pytest.Monk
 @needs_the_module
 def test_rows_are_made_of_samples_only() -> None:
     sample = random_sample(np.random.default_rng(1), 2, 3)
-    memory = bytearray(2 * (20 + 4 * 3))
+    rows = scan.empty_rows(2, 3)
+    columns = rows.stamp_ns, rows.sequence, rows.pad_fault, rows.temperature, rows.frequency
+    addresses = tuple(column.ctypes.data for column in columns)
 
     def place(raws: list[bytes], stamps: list[int], n_pads: int) -> None:
-        native.wire.place_rows(raws, stamps, n_pads, memory)
+        native.wire.place_rows(raws, stamps, 2, n_pads, addresses)
 
     place([sample.raw], [1], 3)
-    with pytest.raises(ValueError, match="size of the rows"):
+    assert rows.stamp_ns.tolist() == [1, 1]
+    with pytest.raises(ValueError, match="one row for each cube"):
         place([sample.raw] * 2, [1, 2], 3)
     (stats,) = native.wire.Decoder().feed(encode(Stats(1, 2, 3)))
     for raw in (b"", sample.raw[:-1], sample.raw + b"\0", stats, b"\2\1" + bytes(26)):
@@ -145,27 +152,110 @@ def test_rows_are_made_of_samples_only() -> None:
 @needs_the_module
 def test_links_are_read_once_each_and_their_errors_told() -> None:
     near, far = os.pipe()
+    wake, waker = os.pipe()
     os.set_blocking(near, False)
     decoder, other, stats = native.wire.Decoder(), native.wire.Decoder(), encode(Stats(1, 2, 3))
-    read = native.wire.read_links
-    assert read([(decoder, near)], lambda: 5) == (5, [(-errno.EAGAIN, [])])
+    track = LinkTrack()
+    here = (decoder, near, addressof(track))
+
+    def read(links: list, timeout_s: float = 0.0, clock=lambda: 5) -> tuple:
+        return native.wire.read_links(links, wake, timeout_s, 0.0, len(links), clock)
+
+    assert read([here]) == (False, [], [], [], [])
     os.write(far, stats + stats[:9])
-    _, [(size, frames), (failed, none)] = read([(decoder, near), (other, -1)], lambda: 5)
-    assert (size, len(frames)) == (len(stats) + 9, 1)
-    assert (failed, none) == (-errno.EBADF, [])
+    closed = (other, -1, addressof(LinkTrack()))
+    is_late, *usual, [(index, arrival_ns, size, frames)] = read([closed, here])
+    assert (is_late, usual) == (True, [[], [], []]), "data were there before the call"
+    assert (index, arrival_ns, size, len(frames)) == (1, 5, len(stats) + 9, 1)
     with pytest.raises(RuntimeError, match="has this decoder"):
-        read([(decoder, near), (decoder, near)], lambda: 5)
-    with pytest.raises(ZeroDivisionError):
-        read([(decoder, near)], lambda: 1 // 0)
-    for wrong in ([1], [(decoder,)], [(decoder, "x")], [("x", near)]):
-        with pytest.raises(TypeError):
-            read(wrong, lambda: 5)
+        read([here, here])
     os.write(far, stats[9:])
+    with pytest.raises(ZeroDivisionError):
+        read([here], clock=lambda: 1 // 0)
+    for wrong in ([1], [(decoder, near)], [(decoder, "x", 0)], [("x", near, 0)]):
+        with pytest.raises(TypeError):
+            read(wrong)
+    os.write(waker, b"x")
+    assert read([here], timeout_s=60.0) == (True, [], [], [], [])
+    os.write(far, stats)
     os.close(far)
-    assert [len(frames) for _, frames in read([(decoder, near)], lambda: 5)[1]] == [1]
-    assert read([(decoder, near)], lambda: 5) == (5, [(0, [])])
-    assert decoder.counters()[:2] == (2 * len(stats), 2)
-    os.close(near)
+    assert [len(frames) for *_, frames in read([here])[-1]] == [1]
+    assert read([here]) == (True, [], [], [], [(0, 5, 0, [])])
+    for fd in (near, wake, waker):
+        os.close(fd)
+
+
+class UsualLink:
+    """Account and clock of one link of a hub with two cubes of three pads."""
+
+    def __init__(self) -> None:
+        self.track = LinkTrack()
+        self.account, self.clock = SampleAccount(self.track), HubClock(self.track)
+        self.account.announce(2, 3)
+
+    def handle(self, samples: list[Sample], arrival_ns: int, is_late: bool) -> list[int]:
+        """Count and stamp samples in Python, as the chain does with those that are not usual."""
+        for sample in samples:
+            assert self.account.sample(sample) is Arrival.NEW
+        numbers = [sample.sequence for sample in samples]
+        times_us = [sample.device_us for sample in samples]
+        stamps = self.clock.update(times_us, arrival_ns, numbers, is_late)
+        self.track.is_usual = self.account.is_usual and self.clock.is_usual
+        return stamps
+
+
+def read_of_samples(random: np.random.Generator, number: int, step_us: int) -> list[Sample]:
+    """One to three samples at 1 kHz behind a number, 0.5 % of them lost, with 30 µs of jitter."""
+    samples = []
+    for _ in range(int(random.integers(1, 4))):
+        number += 1 if random.random() < 0.995 else 5
+        sample = random_sample(random, 2, 3)
+        sample.sequence = number % 2**32
+        sample.device_us = 1000 * number + step_us + int(random.integers(0, 30))
+        samples.append(sample)
+    return samples
+
+
+@needs_the_module
+@pytest.mark.parametrize("seed", range(2))
+def test_usual_samples_have_the_same_stamps_and_counters_in_c(seed: int) -> None:
+    """Over the wrap of numbers; with delays, and a clock that is set. What is not usual is handled
+    in Python, and then C continues."""
+    random = np.random.default_rng(seed)
+    here, there = UsualLink(), UsualLink()
+    near, far = os.pipe()
+    wake, waker = os.pipe()
+    decoder = native.wire.Decoder()
+    number, step_us, arrival_ns, n_usual, n_late = 2**32 - 1000, 0, 0, 0, 0
+    for turn in range(2000):
+        step_us += 20_000 if turn % 800 == 600 else 0
+        samples = read_of_samples(random, number, step_us)
+        for sample in samples:
+            number += (sample.sequence - number) % 2**32
+        sampled_ns = 1_000_000 * number
+        arrival_ns = max(arrival_ns, sampled_ns + 200_000 + int(random.exponential(3e5)))
+        data = b"".join(map(encode, samples))
+        # Data that come during the wait show that this process is in time.
+        timer = threading.Timer(2e-4 if turn % 5 else 0, os.write, (far, data))
+        timer.start()
+        is_late, _, _, stamps, events = native.wire.read_links(
+            [(decoder, near, addressof(here.track))], wake, 60.0, 0.0, 1, lambda now=arrival_ns: now
+        )
+        timer.join()
+        n_usual += len(stamps)
+        n_late += is_late
+        if events:
+            stamps = here.handle(samples, arrival_ns, is_late)
+        assert stamps == there.handle(samples, arrival_ns, is_late)
+        assert here.account.counters() == there.account.counters()
+        for name in LinkTrack.__annotations__:
+            if name not in ("is_usual", "usual", "seen"):
+                assert getattr(here.track, name) == getattr(there.track, name), name
+    assert sorted(map(tuple, here.track.seen)) == sorted(map(tuple, there.track.seen))
+    assert n_usual > 2000 > n_late
+    assert here.clock.resets == there.clock.resets == 2
+    for fd in (near, far, wake, waker):
+        os.close(fd)
 
 
 @needs_the_module

@@ -24,7 +24,7 @@ from cube_tensor_driver.device.links import reader as reader_module
 from cube_tensor_driver.device.links import session as session_module
 from cube_tensor_driver.device.links import tcp
 from cube_tensor_driver.device.links.link import LinkConfig, LinkState
-from cube_tensor_driver.device.links.reader import LinkFrames, LinkRead, Reader
+from cube_tensor_driver.device.links.reader import LinkFrames, LinkRead, Reader, UsualSamples
 from cube_tensor_driver.device.wire import cobs
 from cube_tensor_driver.device.wire.decoder import Decoder
 from cube_tensor_driver.device.wire.protocol import (
@@ -142,7 +142,7 @@ class Watch:
         self.states: queue.Queue[tuple[int, LinkState, LinkError | None, float]] = queue.Queue()
         self.reader = Reader(configs, self._on_frames, self._on_state, **options)  # type: ignore[arg-type]
 
-    def _on_frames(self, received: list[LinkFrames]) -> None:
+    def _on_frames(self, received: list[LinkFrames], _usual: UsualSamples) -> None:
         self.batches.append(
             [
                 (link, arrival_ns, frame)
@@ -277,7 +277,7 @@ def test_who_comes_first_waits_for_those_that_deliver(
 def test_what_follows_a_loss_is_not_looked_at(hub: PtyHub) -> None:
     """Two looks of one wake-up may both find the port gone; frames of before the loss are delivered
     all the same."""
-    reader = Reader([LinkConfig("a", hub.port)], lambda batch: None, lambda *state: None)
+    reader = Reader([LinkConfig("a", hub.port)], lambda *batch: None, lambda *state: None)
     (link,) = reader.links
     link.open()
     hello, sample = Hello(0xC0FFEE, 1, 8, 10_000, np.arange(2, dtype="<u8")), make_sample(1)
@@ -675,14 +675,14 @@ def test_the_answer_to_the_last_question_for_the_time_is_delivered(
     clock = iter(range(1, 1_000_000))
     watch = start(LinkConfig("a", hub.port), clock_ns=lambda: next(clock))
     asked: list[tuple[int, int]] = []
-    watch.reader._on_frames = lambda received: (
+    watch.reader._on_frames = lambda received, usual: (
         asked.extend(
             (batch.asked_ns, batch.arrival_ns)
             for batch in received
             for frame in batch.frames
             if isinstance(frame, Time)
         ),
-        watch._on_frames(received),
+        watch._on_frames(received, usual),
     )
     hub.greet()
     hub.sample(1)
@@ -720,7 +720,7 @@ def test_a_hub_that_does_not_know_the_time_is_not_asked_again_until_it_restarts(
 def test_failing_callback_does_not_end_the_reader(start: Start, hub: PtyHub, caplog) -> None:
     seen: queue.Queue[int] = queue.Queue()
 
-    def on_frames(received: list[LinkFrames]) -> None:
+    def on_frames(received: list[LinkFrames], _usual: UsualSamples) -> None:
         for frame in (frame for _, _, frames, *_ in received for frame in frames):
             if isinstance(frame, Sample):
                 seen.put(frame.sequence)
@@ -744,15 +744,20 @@ def test_a_thread_that_ends_unasked_says_why_and_lets_go_of_the_ports(
     closed = threading.Event()
     reader = Reader(
         [LinkConfig("a", hub.port)],
-        lambda batch: None,
+        lambda *batch: None,
         lambda link, state, error: closed.set() if state is LinkState.CLOSED else None,
     )
     broken = OSError("not foreseen")
 
-    def fail(*arguments: object) -> None:
-        raise broken
+    read = reader_module.Intake.read
 
-    monkeypatch.setattr(reader_module, "read_links", fail)
+    def fail(*arguments: object) -> object:
+        result = read(*arguments)
+        if result[-1]:
+            raise broken
+        return result
+
+    monkeypatch.setattr(reader_module.Intake, "read", fail)
     reader.start()
     hub.expect(Command.HELLO)
     assert reader.failure is None
@@ -766,7 +771,7 @@ def test_close_from_a_callback(hub: PtyHub) -> None:
     closed = threading.Event()
     reader = Reader(
         [LinkConfig("a", hub.port)],
-        lambda batch: reader.close(),
+        lambda *batch: reader.close(),
         lambda link, state, error: closed.set() if state is LinkState.CLOSED else None,
     )
     reader.start()
@@ -785,7 +790,7 @@ def test_one_thread_and_nothing_left_behind(hub: PtyHub) -> None:
     threads, files = threading.active_count(), open_files()
     for _ in range(30):
         links = [LinkConfig("a", hub.port), LinkConfig("b", "/nowhere")]
-        reader = Reader(links, lambda batch: None, lambda *state: None)
+        reader = Reader(links, lambda *batch: None, lambda *state: None)
         reader.start()
         assert threading.active_count() == threads + 1
         hub.expect(Command.HELLO)

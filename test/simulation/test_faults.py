@@ -109,7 +109,7 @@ def test_stats_complete_the_account_and_tell_drops_from_loss():
     assert (account.counters()["dropped_in_hub"], account.counters()["lost_on_the_way"]) == (3, 1)
     assert account.sample(samples[7]) is Arrival.LATE
     assert account.counters()["lost_on_the_way"] + account.counters()["dropped_in_hub"] == 3
-    account.received += 1
+    account._received += 1
     assert "lost count" in account.contradictions()[0]
 
 

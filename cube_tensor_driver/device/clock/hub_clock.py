@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 
+from ..track import MAX_DEVICE_US, NEVER, LinkTrack
 from .line import ClockLine, ClockRoundTrip
 from .steps import SampleTiming, StepDecision
 
@@ -48,8 +49,6 @@ CLOCK_KEEPS_JUMPING = (
     "rows are stamped by their arrival"
 )
 BAD_ANSWERS = "the hub's answers to TIME contradict its samples: they are not used"
-# This time, in ns, is earlier than every device time (the hub's clock, 64 bits in µs).
-_NEVER = -(2**80)
 
 
 class HubClock:
@@ -69,23 +68,33 @@ class HubClock:
     # because a float would round absolute times to 256 ns. When one of the clocks was set, its
     # origin (_first_us or _first_ns) is moved by the step, so that the line still holds.
 
-    def __init__(self) -> None:
+    def __init__(self, track: LinkTrack | None = None) -> None:
+        self._track = LinkTrack() if track is None else track
         self.resets = 0
         self.in_doubt = False
         self.problems: set[str] = set()
-        self._line = ClockLine()
-        self._timing = SampleTiming()
+        self._line = ClockLine(self._track)
+        self._timing = SampleTiming(self._track)
         self._is_late = False  # whether the samples of the last update were read late
         self._last_us = -1  # newest device time, in µs, in the last read
         self._moved_ns = 0  # arrival time at which _last_us changed last
         self._n_still = 0  # number of reads since _last_us changed
         self._steps_ns: deque[int] = deque(maxlen=MAX_STEPS)
         self._n_bad_answers = 0
-        self._last_arrival = _NEVER
-        self._last_stamp = _NEVER
+        self._track.last_arrival_ns = NEVER
+        self._track.last_stamp_ns = NEVER
         # Last stamp before the latest step of the hub's clock was confirmed; it may be too late.
-        self._doubtful_stamp = _NEVER
+        self._doubtful_stamp = NEVER
         self._restart()
+
+    @property
+    def is_usual(self) -> bool:
+        """Whether samples in step with their numbers need no decision about the hub's clock."""
+        track = self._track
+        is_newest = 1000 * (track.newest_us - track.first_us) == track.newest_ns
+        in_step = is_newest and track.reference_us == track.newest_us and track.period_us > 0
+        is_open = self.in_doubt or self._decision is not None or self._n_still > 0
+        return in_step and not is_open and len(self._steps_ns) < MAX_STEPS
 
     @property
     def drift_ppm(self) -> float:
@@ -93,7 +102,7 @@ class HubClock:
 
         It is positive if host time runs faster than device time.
         """
-        return 1e6 * self._line.drift
+        return 1e6 * self._track.drift
 
     @property
     def jitter_ns(self) -> float:
@@ -101,15 +110,17 @@ class HubClock:
 
         The delay is the time between the sampling of a sample and its arrival at the host.
         """
-        return self._line.jitter_ns
+        return self._track.jitter_ns
 
     @property
     def offset_ns(self) -> int:
         """Host time minus hub's time at the newest sample, in ns; 0 before the first sample."""
         if self._is_fresh:
             return 0
-        at_first = self._first_ns - 1000 * self._first_us
-        return at_first + round(self._line.bounded_offset + self._line.drift * self._newest)
+        at_first = self._track.first_ns - 1000 * self._track.first_us
+        return at_first + round(
+            self._track.bounded_offset + self._track.drift * self._track.newest_ns
+        )
 
     @property
     def delay_ns(self) -> float:
@@ -117,7 +128,7 @@ class HubClock:
 
         It is estimated from round trips: questions for the hub's time and their answers.
         """
-        return self._line.offset - self._line.bounded_offset
+        return self._track.offset - self._track.bounded_offset
 
     @property
     def bound_ns(self) -> float | None:
@@ -142,13 +153,13 @@ class HubClock:
         Args:
             step_ns: New time minus old time of the host's clock, in ns.
         """
-        self._first_ns += step_ns
+        self._track.first_ns += step_ns
         self._moved_ns += step_ns
         self._steps_ns = deque((at + step_ns for at in self._steps_ns), MAX_STEPS)
-        if self._last_arrival != _NEVER:
-            self._last_arrival += step_ns
-        if self._last_stamp != _NEVER:
-            self._last_stamp += step_ns
+        if self._track.last_arrival_ns != NEVER:
+            self._track.last_arrival_ns += step_ns
+        if self._track.last_stamp_ns != NEVER:
+            self._track.last_stamp_ns += step_ns
             self._doubtful_stamp += step_ns
 
     def add_answer(self, sent_ns: int, device_us: int, arrival_ns: int) -> None:
@@ -164,8 +175,8 @@ class HubClock:
         """
         if self._is_fresh or self.in_doubt or not sent_ns <= arrival_ns:
             return
-        device_ns = 1000.0 * (device_us - self._first_us)
-        since_first = -self._first_ns - device_ns
+        device_ns = 1000.0 * (device_us - self._track.first_us)
+        since_first = -self._track.first_ns - device_ns
         trip = ClockRoundTrip(device_ns, sent_ns + since_first, arrival_ns + since_first)
         if self._line.add_round_trip(trip):
             self._n_bad_answers = 0
@@ -200,6 +211,7 @@ class HubClock:
         """
         self.in_doubt = False
         self._is_late = is_late
+        device_us = [min(time_us, MAX_DEVICE_US) for time_us in device_us]
         stamps: list[int] = []
         start = 0
         for k, number in enumerate(numbers):
@@ -210,7 +222,7 @@ class HubClock:
             if k > start:
                 stamps += self._convert(device_us[start:k], arrival_ns)
                 start = k
-            if self._newest != _NEVER:
+            if self._track.newest_ns != NEVER:
                 self._begin_decision(step_us, arrival_ns)
         remaining = device_us[start:] if start else device_us
         return stamps + self._convert(remaining, arrival_ns)
@@ -218,12 +230,12 @@ class HubClock:
     @property
     def _is_fresh(self) -> bool:
         """Whether no sample has come since the start or the last restart of the hub."""
-        return self._newest == _NEVER
+        return self._track.newest_ns == NEVER
 
     def _restart(self) -> None:
         """Discard the clock line and all samples; keep the drift and the last stamp (host time)."""
-        self._first_us = self._first_ns = 0
-        self._newest = _NEVER  # device time of the newest sample, in ns since _first_us
+        self._track.first_us = self._track.first_ns = 0
+        self._track.newest_ns = NEVER  # device time of the newest sample, in ns since _first_us
         self._line.restart()
         self._timing.restart()
         self._decision: StepDecision | None = None
@@ -234,7 +246,7 @@ class HubClock:
         The time of the event is kept, to find a clock that is set again and again.
         """
         self.resets += 1
-        self._steps_ns.append(self._last_arrival)
+        self._steps_ns.append(self._track.last_arrival_ns)
 
     def _convert(self, times: Sequence[int], arrival_ns: int) -> list[int]:
         """Fit the clock line to the newest of some samples, and convert the device times of all.
@@ -252,24 +264,25 @@ class HubClock:
             return []
         # Of samples that arrive together the newest one has the smallest delay. Only the smallest
         # delays determine the line, so the others need not be added to it.
+        track = self._track
         is_usable = self._learn(max(times), arrival_ns)
-        offset, drift = self._line.bounded_offset, self._line.drift
+        offset, drift = track.bounded_offset, track.drift
         stamps = []
         for time_us in times:
-            device_ns = 1000 * (time_us - self._first_us)
-            stamp = self._first_ns + device_ns + round(offset + drift * device_ns)
+            device_ns = 1000 * (time_us - track.first_us)
+            stamp = track.first_ns + device_ns + round(offset + drift * device_ns)
             if not is_usable or not 0 <= arrival_ns - stamp <= MAX_DELAY_NS:
                 stamp = arrival_ns
             # Stamps must not decrease with increasing device time. A sample with an older device
             # time, which came late, must not have a later stamp than the newest one.
-            if device_ns <= self._newest and is_usable:
-                stamp = min(stamp, self._last_stamp)
+            if device_ns <= track.newest_ns and is_usable:
+                stamp = min(stamp, track.last_stamp_ns)
             else:
-                self._newest = max(device_ns, self._newest)
-                if stamp < self._last_stamp:
+                track.newest_ns = max(device_ns, track.newest_ns)
+                if stamp < track.last_stamp_ns:
                     self.in_doubt |= stamp < self._doubtful_stamp
-                    stamp = self._last_stamp
-                self._last_stamp = stamp
+                    stamp = track.last_stamp_ns
+                track.last_stamp_ns = stamp
             stamps.append(stamp)
         return stamps
 
@@ -285,16 +298,17 @@ class HubClock:
         Returns:
             Whether device times of this hub can be converted now.
         """
-        goes_back = arrival_ns < self._last_arrival
+        track = self._track
+        goes_back = arrival_ns < track.last_arrival_ns
         pause_ns = min(
-            arrival_ns - self._last_arrival,
-            1000 * (newest_us - self._first_us) - self._newest,
+            arrival_ns - track.last_arrival_ns,
+            1000 * (newest_us - track.first_us) - track.newest_ns,
         )
-        self._last_arrival = arrival_ns
+        track.last_arrival_ns = arrival_ns
         if goes_back:
             # The arrival time went back although no step of the host's clock was reported: either
             # the step was missed, or the host time is a simulated time that was restarted.
-            self._last_stamp = _NEVER
+            track.last_stamp_ns = NEVER
             self.reset()
         elif pause_ns > MAX_PAUSE_NS and not self._is_fresh:
             self._restart()
@@ -306,16 +320,16 @@ class HubClock:
         elif self._decision is not None and not self._n_still and not self._is_late:
             self._decide(self._decision, newest_us, arrival_ns)
 
-        device_ns = 1000 * (newest_us - self._first_us)
-        if device_ns + 1000 * RESTART_US < self._newest:
+        device_ns = 1000 * (newest_us - track.first_us)
+        if device_ns + 1000 * RESTART_US < track.newest_ns:
             self.reset()
-        if self._newest == _NEVER:
-            self._first_us, self._first_ns = newest_us, arrival_ns
+        if track.newest_ns == NEVER:
+            track.first_us, track.first_ns = newest_us, arrival_ns
             device_ns = 0
 
         # Until it is decided whether the hub's clock was set, the delay of a sample is unknown, so
         # the line is not fitted to it.
-        arrival = arrival_ns - self._first_ns
+        arrival = arrival_ns - track.first_ns
         if self._decision is None and self._line.add(device_ns, arrival, self._is_late):
             self.problems.add(CLOCK_SET)
             self._count_reset()
@@ -366,9 +380,9 @@ class HubClock:
                 µs.
             arrival_ns: Host time at which the sample after the step arrived, in ns.
         """
-        newest_ns = self._newest
-        before_ns = self._last_arrival - self._first_ns
-        since_ns = arrival_ns - self._first_ns
+        newest_ns = self._track.newest_ns
+        before_ns = self._track.last_arrival_ns - self._track.first_ns
+        since_ns = arrival_ns - self._track.first_ns
         if self._decision is not None:
             step_us += self._decision.step_us
             newest_ns = self._decision.newest_ns
@@ -394,10 +408,10 @@ class HubClock:
             newest_us: Device time of the newest sample, in µs.
             arrival_ns: Host time at which it arrived, in ns.
         """
-        device_ns = 1000 * (newest_us - self._first_us)
-        arrival = arrival_ns - self._first_ns
+        device_ns = 1000 * (newest_us - self._track.first_us)
+        arrival = arrival_ns - self._track.first_ns
         delay = self._line.height(device_ns, arrival)
-        was_set = decision.was_set(device_ns, delay, arrival, self._line.jitter_ns)
+        was_set = decision.was_set(device_ns, delay, arrival, self._track.jitter_ns)
         if was_set is None:
             return
         self._decision = None
@@ -406,9 +420,9 @@ class HubClock:
             return
         # The origin of device times is moved by the step, so that device times relative to it
         # continue as before the step, and the line and its points stay valid.
-        self._first_us += decision.step_us
-        self._newest = min(self._newest, decision.newest_ns)
-        self._doubtful_stamp = self._last_stamp
+        self._track.first_us += decision.step_us
+        self._track.newest_ns = min(self._track.newest_ns, decision.newest_ns)
+        self._doubtful_stamp = self._track.last_stamp_ns
         self._line.discard_round_trips_after(decision.before_ns)
         self.problems.add(CLOCK_SET)
         self._count_reset()

@@ -24,6 +24,8 @@ from collections import deque
 from itertools import pairwise
 from typing import NamedTuple
 
+from ..track import LinkTrack
+
 BUCKET_NS = 1_000_000_000
 """Length, in ns, of the time intervals (buckets) into which the samples of a hub are divided. Of
 each bucket only the sample with the smallest delay between sampling and arrival is kept."""
@@ -97,9 +99,8 @@ class ClockLine:
         jitter_ns: Mean height of the newest points above the line.
     """
 
-    def __init__(self) -> None:
-        self.drift = 0.0
-        self.jitter_ns = 0.0
+    def __init__(self, track: LinkTrack | None = None) -> None:
+        self._track = LinkTrack() if track is None else track
         self.restart()
 
     def restart(self) -> None:
@@ -107,12 +108,12 @@ class ClockLine:
 
         A round trip is a question for the hub's time and its answer.
         """
-        self.offset = self.bounded_offset = 0.0
+        self._track.offset = self._track.bounded_offset = 0.0
         self.error_bound: float | None = None
-        self._bucket_end = BUCKET_NS
-        self._bucket_height = self._previous_height = math.inf
-        self._earliest = (0.0, 0.0)
-        self._is_earliest_late = False
+        self._track.bucket_end = BUCKET_NS
+        self._track.bucket_height = self._previous_height = math.inf
+        self._track.earliest_ns = self._track.earliest_delay = 0.0
+        self._track.is_earliest_late = False
         self._points: deque[tuple[float, float]] = deque(maxlen=MAX_BUCKETS)
         self._round_trips: deque[ClockRoundTrip] = deque(maxlen=MAX_ROUND_TRIPS)
         self._trip_offset = math.inf
@@ -130,7 +131,7 @@ class ClockLine:
         It is counted from the clock line (host time over device time, through the samples of
         smallest delay); without a sample it is 0.
         """
-        height = min(self._bucket_height, self._previous_height)
+        height = min(self._track.bucket_height, self._previous_height)
         return height if math.isfinite(height) else 0.0
 
     def height(self, device_ns: float, arrival_ns: float) -> float:
@@ -142,7 +143,7 @@ class ClockLine:
             device_ns: Device time of the sample, in ns since the first sample.
             arrival_ns: Host time of its arrival, in ns since the first sample.
         """
-        return arrival_ns - device_ns - self.offset - self.drift * device_ns
+        return arrival_ns - device_ns - self._track.offset - self._track.drift * device_ns
 
     def add(self, device_ns: float, arrival_ns: int, is_late: bool = False) -> bool:
         """Add the point (device time, arrival time) of a sample to the clock line.
@@ -159,17 +160,19 @@ class ClockLine:
         Returns:
             Whether the points show that the hub's or the host's clock was set.
         """
+        track = self._track
         height = self.height(device_ns, arrival_ns)
         was_set = False
         if height < 0:
             was_set = self._lower(height)
             height = 0.0
-        self.jitter_ns += (height - self.jitter_ns) / JITTER_POINTS
-        if height < self._bucket_height:
-            self._bucket_height = height
-            self._earliest = (device_ns, arrival_ns - device_ns)
-            self._is_earliest_late = is_late
-        if arrival_ns >= self._bucket_end:
+        track.jitter_ns += (height - track.jitter_ns) / JITTER_POINTS
+        if height < track.bucket_height:
+            track.bucket_height = height
+            track.earliest_ns = device_ns
+            track.earliest_delay = arrival_ns - device_ns
+            track.is_earliest_late = is_late
+        if arrival_ns >= track.bucket_end:
             was_set = self._fit(arrival_ns) or was_set
         return was_set
 
@@ -182,7 +185,7 @@ class ClockLine:
         Returns:
             Whether the answer is consistent with the samples; otherwise it is not used.
         """
-        line = self.offset + self.drift * trip.device_ns
+        line = self._track.offset + self._track.drift * trip.device_ns
         if trip.low_ns > line + MAX_FALL_NS or trip.high_ns < line - MAX_COMMON_DELAY_NS:
             return False
         self._round_trips.append(trip)
@@ -213,13 +216,13 @@ class ClockLine:
         # is known. Such a fall is not added to _fall, because it does not show that a clock was
         # set.
         self._fall -= height if self._points else 0.0
-        is_known = bool(self._points) or not self._is_earliest_late
+        is_known = bool(self._points) or not self._track.is_earliest_late
         was_set = self._fall > MAX_FALL_NS or (-height > MAX_RISE_NS and is_known)
         if was_set:
             self._fall = 0.0
             self._points.clear()
-        self.offset += height
-        self._bucket_height = math.inf
+        self._track.offset += height
+        self._track.bucket_height = math.inf
         self._set_bounded_offset()
         return was_set
 
@@ -235,11 +238,11 @@ class ClockLine:
             Whether the last `MIN_BUCKETS_HIGH` buckets show that a clock was set before them.
         """
         was_set = False
-        if not self._is_earliest_late:
+        if not self._track.is_earliest_late:
             was_set = self._add_point()
-        self._bucket_end = arrival_ns + BUCKET_NS
+        self._track.bucket_end = arrival_ns + BUCKET_NS
         self._fall = 0.0
-        self._previous_height, self._bucket_height = self._bucket_height, math.inf
+        self._previous_height, self._track.bucket_height = self._track.bucket_height, math.inf
         self._intersect_bounds()
         return was_set
 
@@ -249,22 +252,23 @@ class ClockLine:
         Returns:
             Whether the last `MIN_BUCKETS_HIGH` buckets show that a clock was set before them.
         """
-        device_ns, delay = self._earliest
-        height = delay - self.offset - self.drift * device_ns
+        track = self._track
+        device_ns, delay = track.earliest_ns, track.earliest_delay
+        height = delay - track.offset - track.drift * device_ns
         self._n_high = self._n_high + 1 if height > MAX_RISE_NS else 0
         was_set = self._n_high >= MIN_BUCKETS_HIGH
         if was_set:
             self._n_high = 0
             self._points.clear()
-        self._points.append(self._earliest)
+        self._points.append((device_ns, delay))
 
         points = sorted(self._points)
         if len(points) >= MIN_BUCKETS_FOR_DRIFT:
             slope = _slope_at_centre(points)
-            self.drift = min(max(slope, -MAX_DRIFT), MAX_DRIFT)
+            track.drift = min(max(slope, -MAX_DRIFT), MAX_DRIFT)
         # The line must not lie above any point, because no delay is negative. With a limited slope
         # it need not touch two points, so the offset is computed from all of them.
-        self.offset = min(delay - self.drift * device_ns for device_ns, delay in points)
+        track.offset = min(delay - track.drift * device_ns for device_ns, delay in points)
         return was_set
 
     def _drift_error(self) -> float:
@@ -279,7 +283,7 @@ class ClockLine:
         last, _ = self._points[-1]
         if last <= first:
             return UNKNOWN_DRIFT
-        return min(UNKNOWN_DRIFT, self.jitter_ns / (last - first))
+        return min(UNKNOWN_DRIFT, self._track.jitter_ns / (last - first))
 
     def _intersect_bounds(self) -> None:
         """Compute the offset (host minus device time) from all kept round trips, and its error.
@@ -292,7 +296,7 @@ class ClockLine:
         low, high = -math.inf, math.inf
         drift_error = self._drift_error()
         for trip in reversed(self._round_trips):
-            drifted = self.drift * trip.device_ns
+            drifted = self._track.drift * trip.device_ns
             # The bounds of the offset from older round trips are widened by the error of the drift
             # since then.
             age = abs(self._round_trips[-1].device_ns - trip.device_ns)
@@ -313,7 +317,7 @@ class ClockLine:
 
         With a larger offset, the delays of some samples would be negative.
         """
-        self.bounded_offset = min(self.offset, self._trip_offset)
+        self._track.bounded_offset = min(self._track.offset, self._trip_offset)
 
 
 def _slope_at_centre(points: list[tuple[float, float]]) -> float:

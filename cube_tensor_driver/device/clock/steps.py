@@ -13,6 +13,8 @@ import math
 import time
 from collections.abc import Callable
 
+from ..track import LinkTrack
+
 MIN_STEP_US = 4000.0
 """Smallest deviation, in µs, of the device time (hub's clock) of a sample from the time expected
 from its number and the sample period, at which a step of the hub's clock is suspected. Steps of 5
@@ -99,19 +101,18 @@ class SampleTiming:
     The expected device time (hub's clock) grows by the estimated sample period with each number.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, track: LinkTrack) -> None:
+        self._track = track
         self.restart()
 
     def restart(self) -> None:
         """Discard the sample period and the last sample, because the hub restarted."""
-        self._number: int | None = None
-        self._reference = 0
-        self._reference_us = 0
-        self._period_us = 0.0
+        self._track.reference = -1
+        self._track.period_us = 0.0
 
     def forget_period(self) -> None:
         """Discard the estimated sample period; the next sample gives a new estimate."""
-        self._period_us = 0.0
+        self._track.period_us = 0.0
 
     def find_step(self, number: int, device_us: int) -> int:
         """Compare the device time of a sample with the time expected from its number.
@@ -124,24 +125,22 @@ class SampleTiming:
             Device time minus expected device time, in µs, if the difference is large enough for a
             step of the hub's clock; else 0.
         """
-        if self._number is None:
-            self._number = self._reference = number
-            self._reference_us = device_us
+        track = self._track
+        if track.reference < 0:
+            track.reference, track.reference_us = number, device_us
             return 0
-        # A number that is not ahead belongs to a late sample or to a further frame of one sample.
-        advance = (number - self._number) % _WRAP
-        if not 0 < advance < _WRAP // 2:
-            return 0
-        self._number = number
         # The expected time is counted from a reference: the newest earlier sample whose device time
-        # differed from that of the sample before it.
-        n_periods = (number - self._reference) % _WRAP
-        interval = device_us - self._reference_us
-        period = self._period_us
+        # differed from that of the sample before it. A number that is not ahead of it belongs to a
+        # late sample or to a further frame of one sample.
+        n_periods = (number - track.reference) % _WRAP
+        if not 0 < n_periods < _WRAP // 2:
+            return 0
+        interval = device_us - track.reference_us
+        period = track.period_us
         error = interval - n_periods * period
         is_step = False
         if period <= 0.0:
-            self._period_us = interval / n_periods
+            track.period_us = interval / n_periods
         elif abs(error) > MIN_STEP_US + PERIOD_TOLERANCE * n_periods * period:
             is_step = True
         else:
@@ -152,11 +151,11 @@ class SampleTiming:
                 error = bound
             elif error < -bound:
                 error = -bound
-            self._period_us = period + error / PERIOD_SAMPLES
+            track.period_us = period + error / PERIOD_SAMPLES
         # While the hub's clock stands still, the reference sample stays the same, so that the
         # deviation grows with each sample until it counts as a step.
         if interval or is_step or period <= 0.0:
-            self._reference, self._reference_us = number, device_us
+            track.reference, track.reference_us = number, device_us
         return round(error) if is_step else 0
 
 

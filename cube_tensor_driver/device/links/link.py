@@ -28,6 +28,7 @@ import serial
 
 from ...config.port import TCP, port_problem
 from ...core.errors import LinkError
+from ..track import LinkTrack
 from ..wire.decoder import Decoder
 from ..wire.protocol import Hello
 from .tcp import TcpConnection
@@ -118,8 +119,10 @@ class Link:
 
     Args:
         config: Port of the link, and the hub that is expected there.
+        track: State of the samples of the link; None for a new one.
 
     Attributes:
+        track: State of the samples of the link, which is kept when the link is reopened.
         state: State of the link; `Session` sets it.
         error: Reason of the state; None if there is none. `Session` sets it.
         period_problem: Text about a sample period of the hub that differs from the requested one;
@@ -134,8 +137,9 @@ class Link:
         LinkError: With the kind `bad_port`: the port is neither a device path nor a TCP address.
     """
 
-    def __init__(self, config: LinkConfig) -> None:
+    def __init__(self, config: LinkConfig, track: LinkTrack | None = None) -> None:
         self.config = config
+        self.track = LinkTrack() if track is None else track
         self.state = LinkState.CLOSED
         self.error: LinkError | None = None
         self.decoder = Decoder()

@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import selectors
 import threading
 import time
 from collections import deque
@@ -20,8 +19,9 @@ from functools import partial
 from typing import NamedTuple
 
 from ...core.errors import LinkError
+from ..track import LinkTrack
 from ..wire.protocol import Command, Frame, Request, encode
-from .intake import read_links
+from .intake import Intake, LinkRead, UsualSamples
 from .link import Link, LinkConfig, LinkState
 from .session import TICK_S, Session
 
@@ -32,9 +32,6 @@ other; the wait lets one callback receive them all."""
 MAX_WAIT_S = 1e-3
 """Longest time, in s, for which the reader waits for the other hubs after the first one has
 delivered a sample; `MAX_WAIT_PERIODS` is the limit at high sample rates."""
-WAIT_STEP_S = 2e-4
-"""Period, in s, at which the reader checks for data while it waits for the other hubs. Waking up
-for each hub would take more processor time. Arrival times may be late by up to this period."""
 DRAIN_S = 0.05
 """Longest time, in s, that closing the links waits until the STOP requests (send no more samples)
 have left the serial ports."""
@@ -44,20 +41,6 @@ of them would fill the log."""
 CLOSE_S = 1.5
 """Longest time, in s, for which `Reader.close` waits for the end of the reader's thread. If the
 thread still runs then, an error is logged."""
-
-
-class LinkRead(NamedTuple):
-    """Result of reading one link once.
-
-    Attributes:
-        link: Index of the link.
-        arrival_ns: Host time, in ns, at which the bytes had arrived.
-        result: The decoded frames, or the error that shows that the link is lost.
-    """
-
-    link: int
-    arrival_ns: int
-    result: list[Frame] | LinkError
 
 
 class LinkFrames(NamedTuple):
@@ -80,7 +63,7 @@ class LinkFrames(NamedTuple):
     is_late: bool = False
 
 
-OnFrames = Callable[[list[LinkFrames]], None]
+OnFrames = Callable[[list[LinkFrames], UsualSamples], None]
 OnState = Callable[[int, LinkState, LinkError | None], None]
 
 _log = logging.getLogger(__name__)
@@ -94,14 +77,16 @@ class Reader:
 
     Args:
         links: Port of each link, and the hub that is expected there.
-        on_frames: Called with a list of `LinkFrames` each time data were read. The frames of each
-            link are in the order of their arrival.
+        on_frames: Called each time data were read, with a list of `LinkFrames` and the samples that
+            came before them and are counted and stamped already (`UsualSamples`). The frames of
+            each link are in the order of their arrival.
         on_state: Called when the state of a link or its reason changes, with the index of the link,
             the state, and the error that is the reason (None if there is none).
         clock_ns: Clock of the arrival times, in ns. It is read after the bytes, so that no arrival
             time is earlier than the true one.
         period_us: Sample period to set on every hub, in µs; with None the hubs keep their own.
         on_end: Called in this thread as its last step, also after an error.
+        tracks: State of the samples of each link; None for new ones.
 
     Attributes:
         links: The links, in the order of the argument.
@@ -120,21 +105,24 @@ class Reader:
         clock_ns: Callable[[], int] = time.time_ns,
         period_us: int | None = None,
         on_end: Callable[[], None] = lambda: None,
+        tracks: Sequence[LinkTrack] | None = None,
     ) -> None:
-        self.links = [Link(config) for config in links]
+        tracks = [LinkTrack() for _ in links] if tracks is None else tracks
+        self.links = [Link(config, track) for config, track in zip(links, tracks, strict=True)]
         self.callback_errors = 0
         self.failure: Exception | None = None
         self._sessions = [
             Session(link, period_us, clock_ns, partial(self._call, on_state, i))
             for i, link in enumerate(self.links)
         ]
-        self._selector = selectors.DefaultSelector()
         self._on_frames = on_frames
         self._on_end = on_end
         self._clock_ns = clock_ns
         self._requests: deque[tuple[int, Request]] = deque()
         self._stopping = False
         self._lag_s = 0.0
+        # Number of links that deliver samples, and how long to wait for all of them, in s.
+        self._expected, self._gather_s = 0, 0.0
         self._thread: threading.Thread | None = None
         self._wake_lock = threading.Lock()
         self._wake_write = -1
@@ -226,8 +214,8 @@ class Reader:
             wake_read: File descriptor of the pipe by which other threads wake up this one.
         """
         try:
-            self._selector.register(wake_read, selectors.EVENT_READ, None)
-            self._loop(wake_read)
+            self._intake = Intake(self.links, wake_read, self._clock_ns)
+            self._loop()
         except Exception as error:  # noqa: BLE001  (a thread that ends unseen would look like silent hubs)
             self.failure = error
             _log.exception("the thread that reads the links has ended")
@@ -237,35 +225,25 @@ class Reader:
             finally:
                 self._on_end()
 
-    def _loop(self, wake_read: int) -> None:
-        """Wait for data of the links and handle them, until `close` is called.
-
-        Args:
-            wake_read: File descriptor of the pipe by which other threads wake up this one.
-        """
+    def _loop(self) -> None:
+        """Wait for data of the links and handle them, until `close` is called."""
         tick_at = 0.0
         in_time_at = time.monotonic()
         while not self._stopping:
             now = time.monotonic()
-            # Data that are there without waiting came while the last ones were handled.
-            ready = self._selector.select(0)
-            is_late = bool(ready)
-            if not is_late:
-                ready = self._selector.select(max(0.0, tick_at - now))
+            is_late, usual, reads = self._intake.read(
+                max(0.0, tick_at - now), self._gather_s, self._expected
+            )
             awake_at = time.monotonic()
-            reads = self._read_ready(ready, wake_read)
             if is_late:
                 self._lag_s = max(self._lag_s, awake_at - in_time_at)
             else:
                 # A wait ends within a tick, unless this thread or machine stood still.
                 self._lag_s = max(self._lag_s, awake_at - now - TICK_S)
                 in_time_at = awake_at
-                while reads and time.monotonic() - awake_at < self._waiting_time(reads):
-                    time.sleep(WAIT_STEP_S)
-                    reads += self._read_ready(self._selector.select(0), wake_read)
             received, failed = self._handle_reads(reads, is_late)
-            if received:
-                self._call(self._on_frames, received)
+            if received or usual.links:
+                self._call(self._on_frames, received, usual)
             # Failed links are closed only after the callback, which marks every link whose frames
             # it receives as delivering; in the other order it would undo the closing.
             for i, error in failed.items():
@@ -277,40 +255,7 @@ class Reader:
                 tick_at = now + TICK_S
                 for i in range(len(self.links)):
                     self._check_timers(i, now)
-
-    def _read_ready(
-        self,
-        ready: list[tuple[selectors.SelectorKey, int]],
-        wake_read: int,
-    ) -> list[LinkRead]:
-        """Read and decode all links that have data, and send bytes that wait on links.
-
-        Args:
-            ready: The keys and events that the selector has returned.
-            wake_read: File descriptor of the pipe by which other threads wake up this one.
-        """
-        reads: list[LinkRead] = []
-        readable: list[int] = []
-        for key, events in ready:
-            if key.data is None:
-                os.read(wake_read, 4096)
-                continue
-            if events & selectors.EVENT_WRITE:
-                try:
-                    self.links[key.data].flush()
-                    self._watch(key.data)
-                except LinkError as error:
-                    reads.append(LinkRead(key.data, 0, error))
-                    continue
-            if events & selectors.EVENT_READ:
-                readable.append(key.data)
-        if readable:
-            links = [self.links[i] for i in readable]
-            arrival_ns, results = read_links(links, self._clock_ns)
-            for i, result in zip(readable, results, strict=True):
-                if result is not None:
-                    reads.append(LinkRead(i, arrival_ns, result))
-        return reads
+                self._plan_gathering()
 
     def _handle_reads(
         self,
@@ -346,37 +291,22 @@ class Reader:
                 for frame in result:
                     if session.take(frame):
                         frames.append(frame)
-                if session.link.unsent:
-                    self._watch(i)
             except LinkError as error:
                 failed[i] = error
             if frames:
                 received.append(LinkFrames(i, arrival_ns, frames, asked_ns, is_late))
         return received, failed
 
-    def _waiting_time(self, reads: list[LinkRead]) -> float:
-        """Return how long to wait for the links that should deliver a sample but have not yet.
+    def _plan_gathering(self) -> None:
+        """Determine how many links deliver samples, and how long to wait for all of them.
 
-        Args:
-            reads: Results of reading since the last callback.
-
-        Returns:
-            Time in s, at most `MAX_WAIT_S`; 0 if there is no such link, or nothing was delivered.
+        The wait is limited by the shortest sample period, because no hub must deliver its next
+        sample during it.
         """
-        delivered = {read.link for read in reads if isinstance(read.result, list) and read.result}
-        if not delivered or len(delivered) == len(self.links):
-            return 0.0
-        periods_us = [
-            session.actual_us
-            for i, session in enumerate(self._sessions)
-            if i not in delivered and session.is_delivering
-        ]
-        if not periods_us:
-            return 0.0
-        # The wait is limited by the shortest sample period of the missing hubs, because a hub must
-        # not deliver its next sample during the wait.
-        period_s = 1e-6 * min(periods_us)
-        return min(MAX_WAIT_PERIODS * period_s, MAX_WAIT_S)
+        periods_us = [session.actual_us for session in self._sessions if session.is_delivering]
+        self._expected = len(periods_us)
+        period_s = 1e-6 * min(periods_us, default=0)
+        self._gather_s = min(MAX_WAIT_PERIODS * period_s, MAX_WAIT_S)
 
     def _send_requests(self) -> None:
         """Send the requests that other threads have given to `send`."""
@@ -384,7 +314,6 @@ class Reader:
             i, request = self._requests.popleft()
             try:
                 self._sessions[i].send(request)
-                self._watch(i)
             except LinkError as error:
                 self._drop(i, error)
 
@@ -400,9 +329,8 @@ class Reader:
             if session.link.is_open:
                 session.check_timers(now)
             elif session.open(now):
-                self._selector.register(session.link, selectors.EVENT_READ, i)
+                self._intake.update()
                 session.begin()
-            self._watch(i)
         except LinkError as error:
             self._drop(i, error)
 
@@ -411,21 +339,8 @@ class Reader:
         link = self.links[i]
         if link.is_open:
             link.lost += 1
-            self._selector.unregister(link)
         self._sessions[i].close(error)
-
-    def _watch(self, i: int) -> None:
-        """Make the selector report when link number `i` can be written, while bytes wait for it.
-
-        If no bytes wait, the selector must not report this: a port can almost always be written, so
-        that the reader's thread would never sleep.
-        """
-        link = self.links[i]
-        if not link.is_open:
-            return
-        events = selectors.EVENT_READ | (selectors.EVENT_WRITE if link.unsent else 0)
-        if self._selector.get_key(link).events != events:
-            self._selector.modify(link, events, i)
+        self._intake.update()
 
     def _call(self, callback: Callable[..., None], *arguments: object) -> None:
         """Call a callback with these arguments; if it raises an exception, log and count it."""
@@ -454,7 +369,6 @@ class Reader:
         for session in self._sessions:
             session.link.close()
             session.set_state(LinkState.CLOSED)
-        self._selector.close()
         with self._wake_lock:
             os.close(wake_read)
             os.close(self._wake_write)

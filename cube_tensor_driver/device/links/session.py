@@ -82,6 +82,8 @@ class Session:
         self._retry_at = self._check_port_at = self._hello_at = self._ask_time_at = 0.0
         # Whether the hub supports the request TIME. One that does not answers it by an ACK.
         self._knows_time = True
+        # Counters at the last check of the timers: bytes, and samples that were taken in C.
+        self._n_bytes = self._n_usual = 0
         self._question = 0  # number of the last request TIME
         self._ports: tuple[object, ...] = ()
 
@@ -216,6 +218,9 @@ class Session:
                 or sending failed. The link must be closed.
         """
         link = self.link
+        if link.unsent:
+            link.flush()
+        self._note_progress(now)
         self._check_silence(now)
         if now - self.last_byte > REOPEN_S:
             link.skip_match()
@@ -251,6 +256,18 @@ class Session:
         link.state, link.error = state, error
         if (state, error and error.kind) != before:
             self._on_state(state, error)
+
+    def _note_progress(self, now: float) -> None:
+        """Note whether bytes, and samples that were taken in C, have come since the last check.
+
+        Args:
+            now: Monotonic time, in s.
+        """
+        n_bytes, n_usual = self.link.decoder.counters.bytes, self.link.track.usual
+        if n_bytes != self._n_bytes:
+            self._n_bytes, self.last_byte = n_bytes, now
+        if n_usual != self._n_usual:
+            self._n_usual, self._last_sample = n_usual, now
 
     def _handle_hello(self, frame: Hello) -> None:
         """Check the unique number and the sample period of a hub, and send its settings if needed.

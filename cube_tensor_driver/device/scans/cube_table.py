@@ -65,15 +65,14 @@ class _HubCubes:
             (once a second), the cube of this hub is used.
         cubes: Index in the skin of each cube of the hub (n_cubes,); `ABSENT` for cubes that are not
             in the skin file.
-        complete: The indices as uint16 and the shape (n_cubes, n_pads) of a sample of all cubes of
-            the hub, if every one of them is in the skin; else None.
+        is_complete: Whether all cubes of the hub are in the skin, with as many pads.
     """
 
     hello: Hello | None = None
     is_present: bool = False
     waits_for_cube: bool = False
     cubes: HubIndex = field(default_factory=lambda: np.empty(0, np.int32))
-    complete: tuple[RowIndex, tuple[int, int]] | None = None
+    is_complete: bool = False
 
 
 class CubeTable:
@@ -99,6 +98,7 @@ class CubeTable:
         self._addresses = tuple(addresses)
         self._pads = np.array([address.n_pads for address in addresses])
         self._hubs = [_HubCubes() for _ in range(n_links)]
+        self._whole: dict[tuple[int, ...], RowIndex | None] = {}  # last result of `find_all`
 
     def learn(self, link: int, hello: Hello) -> list[str] | None:
         """Store which cubes the hub of a link has, from its HELLO frame.
@@ -117,17 +117,15 @@ class CubeTable:
             return None
         hub.hello = hello
         hub.is_present = True
+        self._whole = {}
         cubes, problems = self._match(link, hello)
         if is_same and np.array_equal(cubes, hub.cubes):
             return None
 
         hub.cubes = cubes
-        hub.complete = None
         is_known = cubes != ABSENT
         fits = self._pads[cubes] == hello.n_pads
-        if is_known.all() and fits.all():
-            shape = hello.n_cubes, hello.n_pads
-            hub.complete = cubes.astype(np.uint16), shape
+        hub.is_complete = bool((is_known & fits).all())
 
         known_uids = hello.cube_uids[is_known].tolist()
         uids = dict(self.uids)
@@ -145,43 +143,17 @@ class CubeTable:
         """
         self._hubs[link].is_present = False
 
-    def find(self, link: int, sample: Sample) -> tuple[RowIndex, Sample] | None:
-        """Find the cube of the skin for each row of a sample, and leave out rows without one.
+    def find(self, link: int, sample: Sample) -> tuple[RowIndex, Sample]:
+        """Find the cube of the skin for each row of a sample; leave out and count rows without one.
 
         Args:
             link: Index of the link that the sample came from.
             sample: The sample, with one row for each cube of the hub.
 
         Returns:
-            Index in the skin of the cube of each kept row, and the sample with only these rows;
-            None if no row is left.
+            Index in the skin of the cube of each kept row, and the sample with only these rows.
         """
-        if not sample.n_cubes:
-            return None
         hub = self._hubs[link]
-        # Usually a sample holds all cubes of the hub and all of them are in the skin, so that the
-        # indices stored by `learn` can be returned without a search.
-        if hub.complete is not None and sample.first_cube == 0:
-            cubes, shape = hub.complete
-            if sample.shape == shape:
-                return cubes, sample
-        return self._select(hub, sample)
-
-    def _select(
-        self,
-        hub: _HubCubes,
-        sample: Sample,
-    ) -> tuple[RowIndex, Sample] | None:
-        """Select the rows (one per cube) of a sample whose cubes are in the skin; count the others.
-
-        Args:
-            hub: The cubes of the hub that sent the sample.
-            sample: The sample, which may hold cubes that the skin does not have.
-
-        Returns:
-            Index in the skin of the cube of each kept row, and the sample with only these rows;
-            None if no row is left.
-        """
         end = sample.first_cube + sample.n_cubes
         cubes = hub.cubes[sample.first_cube : end]
         is_known = cubes != ABSENT
@@ -194,8 +166,6 @@ class CubeTable:
         n_fitting = int(fits.sum())
         self.unknown_cube += sample.n_cubes - n_known
         self.wrong_pads += n_known - n_fitting
-        if not fits.any():
-            return None
         rows = np.flatnonzero(fits)
         kept = Sample(
             sequence=sample.sequence,
@@ -206,6 +176,23 @@ class CubeTable:
             temperature=sample.temperature[rows],
         )
         return cubes[rows].astype(np.uint16), kept
+
+    def find_all(self, links: Sequence[int]) -> RowIndex | None:
+        """Return the index in the skin of the cube of each row of one whole sample of these links.
+
+        A sample is whole if it holds all cubes of its hub. If the skin does not have all of these
+        cubes, or has them with another number of pads, the result is None.
+
+        Args:
+            links: Indices of the links, in order.
+        """
+        key = tuple(links)
+        if key not in self._whole:
+            hubs = [self._hubs[link] for link in links]
+            is_whole = all(hub.is_complete for hub in hubs)
+            cubes = np.concatenate([hub.cubes for hub in hubs]).astype(np.uint16)
+            self._whole = {key: cubes if is_whole else None}
+        return self._whole[key]
 
     def _match(self, link: int, hello: Hello) -> tuple[HubIndex, list[str]]:
         """Find each cube of a hub in the skin.

@@ -8,16 +8,14 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
-from functools import lru_cache
-from itertools import groupby
 from typing import NamedTuple
 
 import numpy as np
 
-from ...core.arrays import AnyArray
 from ...core.rows import FrequencyRows
+from ..links.intake import UsualSamples
 from ..wire.native import wire
-from ..wire.protocol import NOT_MEASURED, TEMPERATURE_UNKNOWN, Sample, join
+from ..wire.protocol import NOT_MEASURED, TEMPERATURE_UNKNOWN, Sample
 from .cube_table import CubeAddress, CubeTable, RowIndex
 
 MAX_SCANS_AHEAD = 4
@@ -27,8 +25,6 @@ MAX_SPAN_NS = 2_000_000_000
 """Longest time, in ns, between the earliest and the latest row (sample of a cube) that one call of
 `ScanBuilder.build` returns. These rows become one message, whose 32-bit offsets in ns reach up to
 2.1 s after its time stamp."""
-CACHED_SHAPES = 4
-"""Number of different shapes (rows, pads) for which a buffer is kept and used again."""
 MAX_PERIODS_EARLIER = 0.75
 """Largest time, in sample periods, by which an incomplete scan (one sample of each link) may be
 earlier than a sample that is put into it. It is less than one period, so that no sample is put into
@@ -58,25 +54,25 @@ def empty_rows(n_rows: int, n_pads: int) -> FrequencyRows:
     )
 
 
-class StampedSample(NamedTuple):
-    """A sample of one hub with its host time.
+class WholeScans(NamedTuple):
+    """Successive scans with the whole sample of every link that delivers.
 
     Attributes:
-        sample: The sample.
-        stamp_ns: Host time at which the sample was taken, in ns since the Unix epoch.
-        status: Status bits of all rows of the sample (core/status.py).
+        cubes: Index in the skin of the cube of each row (N,).
+        raws: Bytes of the samples, from type to CRC, scan after scan.
+        stamps_ns: Host time at which each sample was taken, in ns since the Unix epoch.
     """
 
-    sample: Sample
-    stamp_ns: int
-    status: int
+    cubes: RowIndex
+    raws: list[bytes]
+    stamps_ns: list[int]
 
 
 class _SampleRows(NamedTuple):
     """The rows of one sample, each with the index of its cube.
 
     Attributes:
-        cubes: Index in the skin of each cube of the sample (n_cubes,).
+        cubes: Index in the skin of each cube of the sample (n_cubes,), which may be empty.
         sample: The sample, without the rows of cubes that are not in the skin.
         stamp_ns: Host time at which the sample was taken, in ns since the Unix epoch.
         status: Status bits of all rows of the sample (core/status.py).
@@ -104,7 +100,7 @@ class ScanBuilder:
         self._live: set[int] = set()
         # The scans that were not built yet, oldest first. Each has the samples by link in
         # _pending, and the host time of the sample that was added first in _pending_ns.
-        self._pending: list[dict[int, StampedSample]] = []
+        self._pending: list[dict[int, _SampleRows]] = []
         self._pending_ns: list[int] = []
         # For each link, the number of pending scans up to the one with its newest sample.
         self._n_pending = [0] * n_links
@@ -114,9 +110,6 @@ class ScanBuilder:
         self._holds_back = False
         # For each link, the host time, in ns, of its newest sample that was built.
         self._built_ns = [0] * n_links
-        # Buffers are kept, because the same few shapes (rows, pads) come again and again and
-        # allocating memory would take longer than copying the rows.
-        self._columns_of = lru_cache(maxsize=CACHED_SHAPES)(_Columns)
 
     def set_live(self, link: int, live: bool) -> None:
         """Set whether a link delivers samples.
@@ -153,6 +146,8 @@ class ScanBuilder:
         self._live.add(link)
         self._holds_back = False
         for sample, stamp_ns in zip(samples, stamps_ns, strict=True):
+            cubes, kept = self.cubes.find(link, sample)
+            part = _SampleRows(cubes, kept, stamp_ns, status)
             # A link that started later or lost samples has no sample in some scans. Its next sample
             # joins the scan of its own time, not merely the next scan; otherwise this link would
             # stay behind the others for good.
@@ -162,7 +157,7 @@ class ScanBuilder:
             if scan == len(self._pending):
                 self._pending.append({})
                 self._pending_ns.append(stamp_ns)
-            self._pending[scan][link] = StampedSample(sample, stamp_ns, status)
+            self._pending[scan][link] = part
             self._n_pending[link] = scan + 1
 
     def is_complete(self, n_scans: int = 1) -> bool:
@@ -212,27 +207,77 @@ class ScanBuilder:
         parts, self._deferred = _split_by_span(taken)
         if not parts:
             return None
-        rows = make_rows(sum(_n_rows(parts)), self.cubes.n_pads)
-        # Usually all cubes have the same number of pads, and one step fills all rows. Otherwise
-        # successive samples with the same number of pads are filled together.
-        if len({part.sample.n_pads for part in parts}) == 1:
-            _fill(rows, parts, self._columns_of)
+        rows = make_rows(sum(len(part.cubes) for part in parts), self.cubes.n_pads)
+        raws = [part.sample.raw for part in parts]
+        if wire is None or not all(raws):
+            start = 0
+            for part in parts:
+                end = start + len(part.cubes)
+                _fill(rows.select(slice(start, end)), part)
+                start = end
             return rows
+        np.concatenate([part.cubes for part in parts], out=rows.cube)
+        rows.status[:] = 0
+        if any(part.status for part in parts):
+            counts = [len(part.cubes) for part in parts]
+            rows.status[:] = np.repeat([part.status for part in parts], counts)
+        _place(rows, raws, [part.stamp_ns for part in parts])
+        return rows
 
-        start = 0
-        for _, group in groupby(parts, key=lambda part: part.sample.n_pads):
-            same_width = list(group)
-            end = start + sum(len(part.cubes) for part in same_width)
-            _fill(rows.select(slice(start, end)), same_width, self._columns_of)
-            start = end
+    def order_whole(
+        self,
+        usual: UsualSamples,
+        n_scans: int,
+        max_scans: int,
+    ) -> WholeScans | None:
+        """Return samples as whole scans if every link that delivers has given as many of them.
+
+        Then they need not be added and built one by one. None is returned if they are no whole
+        scans, or if other samples wait.
+
+        Args:
+            usual: The samples, each with all cubes of its hub.
+            n_scans: Number of scans to wait for.
+            max_scans: Largest number of scans.
+        """
+        live = sorted(self._live)
+        count = len(usual.links) // max(1, len(live))
+        if self._pending or self._deferred or not n_scans <= count <= max_scans:
+            return None
+        raws, stamps_ns = usual.raws, usual.stamps_ns
+        if usual.links != live:
+            by_link = sorted(range(len(raws)), key=usual.links.__getitem__)
+            if [usual.links[i] for i in by_link] != [link for link in live for _ in range(count)]:
+                return None
+            order = [i for scan in range(count) for i in by_link[scan::count]]
+            raws = [raws[i] for i in order]
+            stamps_ns = [stamps_ns[i] for i in order]
+        cubes = self.cubes.find_all(live)
+        if cubes is None or max(stamps_ns) - min(stamps_ns) > MAX_SPAN_NS:
+            return None
+        for link, stamp_ns in zip(live, stamps_ns[-len(live) :], strict=True):
+            self._built_ns[link] = stamp_ns
+        return WholeScans(np.tile(cubes, count) if count > 1 else cubes, raws, stamps_ns)
+
+    def build_whole(self, scans: WholeScans, make_rows: MakeRows) -> FrequencyRows:
+        """Convert whole scans to rows.
+
+        Args:
+            scans: The scans.
+            make_rows: Makes the rows to fill, for example in the memory of a message.
+        """
+        rows = make_rows(len(scans.cubes), self.cubes.n_pads)
+        rows.cube[:] = scans.cubes
+        rows.status[:] = 0
+        _place(rows, scans.raws, scans.stamps_ns)
         return rows
 
     def rows_waiting(self) -> int:
         """Return how many rows (samples of cubes) were added, but not yet built or left out."""
-        waiting = sum(len(part.cubes) for part in self._deferred)
+        parts = [*self._deferred]
         for scan in self._pending:
-            waiting += sum(stamped.sample.n_cubes for stamped in scan.values())
-        return waiting
+            parts += scan.values()
+        return sum(len(part.cubes) for part in parts)
 
     def _take_scans(self, max_scans: int | None) -> list[_SampleRows]:
         """Remove the oldest scans (one sample of each link); find the cube of each of their rows.
@@ -258,12 +303,9 @@ class ScanBuilder:
         parts: list[_SampleRows] = []
         for scan in scans:
             for link in sorted(scan):
-                sample, stamp_ns, status = scan[link]
-                self._built_ns[link] = stamp_ns
-                found = self.cubes.find(link, sample)
-                if found is not None:
-                    cubes, kept = found
-                    parts.append(_SampleRows(cubes, kept, stamp_ns, status))
+                self._built_ns[link] = scan[link].stamp_ns
+                if len(scan[link].cubes):
+                    parts.append(scan[link])
         return parts
 
     def _holds_late_sample(self, missing: set[int]) -> bool:
@@ -316,7 +358,7 @@ class ScanBuilder:
         more messages, which cost even more time. With this step the process keeps up with 1260
         cubes at 1 kHz; without it, a third of their rows were lost.
         """
-        queues: dict[int, list[StampedSample]] = {}
+        queues: dict[int, list[_SampleRows]] = {}
         for scan in self._pending:
             for link, stamped in scan.items():
                 queues.setdefault(link, []).append(stamped)
@@ -370,96 +412,42 @@ def _split_by_span(
     return within, beyond
 
 
-def _fill(
+def _place(
     rows: FrequencyRows,
-    parts: Sequence[_SampleRows],
-    columns_of: Callable[[int, int], _Columns],
+    raws: list[bytes],
+    stamps_ns: list[int],
 ) -> None:
-    """Write samples with the same number of pads into rows.
-
-    Frequencies of pads that a cube does not have become NaN.
+    """Write the values and stamps of samples into rows, by the wire module in C.
 
     Args:
         rows: Rows to fill, one for each cube of the samples.
-        parts: The samples.
-        columns_of: Returns the buffer for a number of rows and of pads.
-    """
-    np.concatenate([part.cubes for part in parts], out=rows.cube)
-    rows.status[:] = 0
-    if any(part.status for part in parts):
-        statuses = [part.status for part in parts]
-        rows.status[:] = np.repeat(statuses, _n_rows(parts))
+        raws: Bytes of the samples, from type to CRC.
+        stamps_ns: Host time at which each sample was taken, in ns since the Unix epoch.
 
-    raws = [part.sample.raw for part in parts]
-    if wire is None or not all(raws):
-        _fill_in_python(rows, parts)
-        return
+    Raises:
+        ValueError: A column of the rows is not contiguous in memory.
+    """
+    columns = rows.stamp_ns, rows.sequence, rows.pad_fault, rows.temperature, rows.frequency
+    if not all(column.flags.c_contiguous for column in columns):
+        raise ValueError("the columns of the rows are not contiguous in memory")
     n_rows, n_pads = rows.frequency.shape
-    columns = columns_of(n_rows, n_pads)
-    stamps_ns = [part.stamp_ns for part in parts]
-    wire.place_rows(raws, stamps_ns, n_pads, columns.memory)
-    columns.copy_to(rows)
+    addresses = tuple(column.ctypes.data for column in columns)
+    wire.place_rows(raws, stamps_ns, n_rows, n_pads, addresses)
 
 
-class _Columns:
-    """Buffer for the columns of rows, which `wire.place_rows` (in C) writes one after the other.
+def _fill(rows: FrequencyRows, part: _SampleRows) -> None:
+    """Write one sample into rows, for installations without the wire module in C."""
+    sample = part.sample
+    rows.cube[:] = part.cubes
+    rows.sequence[:] = sample.sequence
+    rows.stamp_ns[:] = part.stamp_ns
+    rows.status[:] = part.status
+    rows.pad_fault[:] = sample.pad_fault
+    rows.temperature[:] = _CELSIUS[sample.temperature.view(np.uint16)]
 
-    Args:
-        n_rows: Number of rows.
-        n_pads: Number of pads of a row.
-
-    Attributes:
-        memory: The bytes of all columns.
-    """
-
-    def __init__(self, n_rows: int, n_pads: int) -> None:
-        bytes_per_row = 8 + 4 + 4 + 4 + 4 * n_pads
-        self.memory = bytearray(n_rows * bytes_per_row)
-        # The order, offsets and types of the columns are those that `wire.place_rows` writes.
-        self._stamp_ns = self._view(0, n_rows, np.int64)
-        self._sequence = self._view(8 * n_rows, n_rows, np.uint32)
-        self._pad_fault = self._view(12 * n_rows, n_rows, np.uint32)
-        self._temperature = self._view(16 * n_rows, n_rows, np.float32)
-        frequency = self._view(20 * n_rows, n_rows * n_pads, np.float32)
-        self._frequency = frequency.reshape(n_rows, n_pads)
-
-    def _view(self, offset: int, count: int, dtype: type[np.generic]) -> AnyArray:
-        """Return `count` values of a type, from byte `offset` of the buffer on, as an array."""
-        return np.frombuffer(self.memory, dtype, count, offset)
-
-    def copy_to(self, rows: FrequencyRows) -> None:
-        """Copy the columns of the buffer into rows of the same shape."""
-        rows.stamp_ns[:] = self._stamp_ns
-        rows.sequence[:] = self._sequence
-        rows.pad_fault[:] = self._pad_fault
-        rows.temperature[:] = self._temperature
-        rows.frequency[:] = self._frequency
-
-
-def _n_rows(parts: Sequence[_SampleRows]) -> list[int]:
-    """Return the number of rows of each sample."""
-    return [len(part.cubes) for part in parts]
-
-
-def _fill_in_python(rows: FrequencyRows, parts: Sequence[_SampleRows]) -> None:
-    """Write the values of samples into rows, for installations without the wire module in C."""
-    samples = [part.sample for part in parts]
-    counts = _n_rows(parts)
-    numbers = [sample.sequence for sample in samples]
-    rows.sequence[:] = np.repeat(numbers, counts)
-    stamps_ns = [part.stamp_ns for part in parts]
-    rows.stamp_ns[:] = np.repeat(stamps_ns, counts)
-
-    frequency, pad_fault, temperature = join(samples)
-    rows.pad_fault[:] = pad_fault
-    patterns = temperature.view(np.uint16)
-    _CELSIUS.take(patterns, out=rows.temperature, mode="clip")
-
-    width = frequency.shape[1]
-    measured = rows.frequency[:, :width]
+    measured = rows.frequency[:, : sample.n_pads]
     # The sample has frequencies in mHz as integers. They are converted to Hz in double precision
     # and rounded once, because float32 cannot represent 1 mHz of 100 kHz.
-    np.multiply(frequency, 1e-3, out=measured, casting="same_kind")
-    rows.frequency[:, width:] = np.nan
-    if frequency.size and frequency.min() == NOT_MEASURED:
-        measured[frequency == NOT_MEASURED] = np.nan
+    np.multiply(sample.frequency, 1e-3, out=measured, casting="same_kind")
+    rows.frequency[:, sample.n_pads :] = np.nan
+    measured[sample.frequency == NOT_MEASURED] = np.nan

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
+from ..track import MAX_DEVICE_US, MAX_DISORDER, NEVER, LinkTrack
 from ..wire.protocol import Sample, Stats
 
-MAX_DISORDER = 64
-"""Number of newest samples of a hub whose numbers and device times are kept, to recognise late and
-repeated ones. A sample that is older than these and lies in the past of the hub's run (the samples
-since its last restart) is taken for a repeated one."""
 MAX_GAP = 1 << 20
 """Largest gap in the numbers of successive samples of a hub (17 minutes at 1 kHz) that counts as
 lost samples without a look at the device times. A larger gap counts only if the device time has
@@ -94,17 +90,15 @@ class SequenceTracker:
     # The 32-bit numbers of samples wrap to 0. In the attributes below they are unwrapped, so that
     # they continue beyond 2**32.
 
-    def __init__(self) -> None:
+    def __init__(self, track: LinkTrack | None = None) -> None:
         self.counters = SequenceCounters()
         self.n_cubes = -1
-        # Each entry is the number and the device time, in µs, of one of the newest samples.
-        self._seen: deque[tuple[int, int]] = deque(maxlen=MAX_DISORDER)
+        self._track = LinkTrack() if track is None else track
+        self._is_begun = False
         self._first = 0
         self._first_us = 0
-        self._next = 0
-        self._newest_us = 0
         self._set_back = 0  # number of the first sample after the clock was last set back
-        self._started_at = -1  # value of _next when the hub was last started
+        self._started_at = -1  # number of the next sample when the hub was last started
 
     def update(self, sequence: int, device_us: int) -> Arrival:
         """Classify one sample as new, late, duplicate or first after a restart, and count it.
@@ -113,27 +107,22 @@ class SequenceTracker:
             sequence: Number of the sample, 32 bits, which wraps to 0.
             device_us: Device time (the hub's clock) of the sample, in µs.
         """
-        # Almost every sample has the next number, so this case is handled first, for speed.
-        if sequence == self._next % _WRAP and device_us >= self._newest_us:
-            self._seen.append((self._next, device_us))
-            self._next += 1
-            self._newest_us = device_us
-            self.counters.delivered += 1
-            return Arrival.NEW
-        if not self._seen:
+        track = self._track
+        device_us = min(device_us, MAX_DEVICE_US)
+        if not self._is_begun:
             return self._begin(sequence, device_us, Arrival.NEW)
 
         ahead = self._ahead(sequence)
-        number = self._next + ahead
+        number = track.next + ahead
         if ahead >= 0:
-            if ahead > MAX_GAP and device_us - self._newest_us < MIN_PERIOD_US * ahead:
+            if ahead > MAX_GAP and device_us - track.newest_us < MIN_PERIOD_US * ahead:
                 return self._restart(sequence, device_us)
             return self._skip(number, device_us)
 
         # The number lies behind. A hub that has been started since its newest sample begins anew.
-        if self._started_at == self._next and device_us < self._newest_us:
+        if self._started_at == track.next and device_us < track.newest_us:
             return self._restart(sequence, device_us)
-        if (number, device_us) in self._seen or self._is_old_repeat(number, device_us):
+        if (number, device_us) in self._seen() or self._is_old_repeat(number, device_us):
             self.counters.duplicate += 1
             return Arrival.DUPLICATE
         if ahead < -MAX_DISORDER or not self._fits_run(number, device_us):
@@ -154,7 +143,7 @@ class SequenceTracker:
 
         It is called when the hub was started, because after power-up it does not sample before.
         """
-        self._started_at = self._next
+        self._started_at = self._track.next
 
     def count_missing(self, taken: int) -> None:
         """Count samples as missing that the hub has taken but that have not arrived.
@@ -164,9 +153,9 @@ class SequenceTracker:
                 which wraps to 0.
         """
         ahead = self._ahead(taken)
-        if self._seen and 0 < ahead <= MAX_GAP:
+        if self._is_begun and 0 < ahead <= MAX_GAP:
             self.counters.missing += ahead
-            self._next += ahead
+            self._track.next += ahead
 
     @property
     def first(self) -> int:
@@ -179,7 +168,7 @@ class SequenceTracker:
         The result is negative if the number is behind.
         """
         half = _WRAP // 2
-        distance = (sequence - self._next) % _WRAP
+        distance = (sequence - self._track.next) % _WRAP
         return distance if distance < half else distance - _WRAP
 
     def _skip(self, number: int, device_us: int) -> Arrival:
@@ -189,13 +178,13 @@ class SequenceTracker:
             number: Unwrapped number of the sample.
             device_us: Device time of the sample, in µs.
         """
-        self.counters.missing += number - self._next
+        self.counters.missing += number - self._track.next
         arrival = Arrival.NEW
-        if device_us < self._newest_us:
+        if device_us < self._track.newest_us:
             arrival, self._set_back = Arrival.SET_BACK, number
             self.counters.resets += 1
-        self._next = number + 1
-        self._newest_us = device_us
+        self._track.next = number + 1
+        self._track.newest_us = device_us
         return self._deliver(number, device_us, arrival)
 
     def _is_old_repeat(self, number: int, device_us: int) -> bool:
@@ -207,9 +196,9 @@ class SequenceTracker:
             number: Unwrapped number of the sample.
             device_us: Device time of the sample, in µs.
         """
-        if not self._first <= number < self._next - MAX_DISORDER:
+        if not self._first <= number < self._track.next - MAX_DISORDER:
             return False
-        age_us = self._newest_us - device_us
+        age_us = self._track.newest_us - device_us
         return self._first_us <= device_us and 0 < age_us <= MAX_REPEAT_US
 
     def _fits_run(self, number: int, device_us: int) -> bool:
@@ -223,13 +212,13 @@ class SequenceTracker:
             number: Unwrapped number of the sample.
             device_us: Device time of the sample, in µs.
         """
-        if any(other == number for other, _ in self._seen):
+        if any(other == number for other, _ in self._seen()):
             return False
         if number < self._first:
-            return abs(self._newest_us - device_us) < RESTART_US
+            return abs(self._track.newest_us - device_us) < RESTART_US
 
-        before = [entry for entry in self._seen if entry[0] < self._set_back]
-        after = [entry for entry in self._seen if entry[0] >= self._set_back]
+        before = [entry for entry in self._seen() if entry[0] < self._set_back]
+        after = [entry for entry in self._seen() if entry[0] >= self._set_back]
         fits_after = _is_in_order(number, device_us, after)
         if number >= self._set_back:
             return fits_after
@@ -253,7 +242,6 @@ class SequenceTracker:
             device_us: Device time (the hub's clock) of the sample, in µs.
         """
         self.counters.resets += 1
-        self._seen.clear()
         arrival = self._begin(sequence, device_us, Arrival.RESET)
         if sequence <= MAX_GAP:
             # Numbers begin at 0 with power-up, so all samples before this one are missing.
@@ -269,10 +257,13 @@ class SequenceTracker:
             device_us: Device time of the sample, in µs.
             arrival: Class of the sample (new or reset), which is returned.
         """
+        self._is_begun = True
+        for entry in self._track.seen:
+            entry[0] = NEVER
         self._first = self._set_back = sequence
         self._first_us = device_us
-        self._next = sequence + 1
-        self._newest_us = device_us
+        self._track.next = sequence + 1
+        self._track.newest_us = device_us
         return self._deliver(sequence, device_us, arrival)
 
     def _deliver(self, number: int, device_us: int, arrival: Arrival) -> Arrival:
@@ -284,8 +275,13 @@ class SequenceTracker:
             arrival: Class of the sample (new, late …), which is returned.
         """
         self.counters.delivered += 1
-        self._seen.append((number, device_us))
+        self._track.seen[number % MAX_DISORDER] = number, device_us
         return arrival
+
+    def _seen(self) -> list[tuple[int, int]]:
+        """Return number and device time, in µs, of the newest `MAX_DISORDER` samples that came."""
+        oldest = self._track.next - MAX_DISORDER
+        return [(number, us) for number, us in self._track.seen if number >= oldest]
 
 
 def _is_in_order(number: int, device_us: int, seen: Sequence[tuple[int, int]]) -> bool:
@@ -310,12 +306,12 @@ class SampleAccount:
     many cubes spreads a sample over several frames, and each frame counts as one sample.
 
     Attributes:
-        received: Number of SAMPLE frames received.
         stats_frame: Last STATS frame (counters of the hub); None before the first.
     """
 
-    def __init__(self) -> None:
-        self.received = 0
+    def __init__(self, track: LinkTrack | None = None) -> None:
+        self._track = LinkTrack() if track is None else track
+        self._received = 0
         self.stats_frame: Stats | None = None
         # One tracker for each part of a sample, by the index of the first cube in its frame; and
         # the sums of the parts that the hub no longer sends.
@@ -327,7 +323,7 @@ class SampleAccount:
 
     def sample(self, frame: Sample) -> Arrival:
         """Classify one SAMPLE frame by its number (new, late, duplicate …), and count it."""
-        self.received += 1
+        self._received += 1
         tracker = self._trackers.get(frame.first_cube)
         if tracker is None or tracker.n_cubes != frame.n_cubes:
             if frame.first_cube >= self._n_cubes:
@@ -337,8 +333,9 @@ class SampleAccount:
             tracker = self._begin_part(frame)
         return tracker.update(frame.sequence, frame.device_us)
 
-    def announce(self, n_cubes: int) -> None:
-        """Take over the number of cubes of the hub from HELLO, and end the parts beyond them."""
+    def announce(self, n_cubes: int, n_pads: int) -> None:
+        """Take over numbers of cubes and pads from HELLO, and end the parts beyond these cubes."""
+        self._track.n_cubes, self._track.n_pads = n_cubes, n_pads
         if n_cubes != self._n_cubes:
             self._n_cubes = n_cubes
             self._end_parts(n_cubes, 1 << 16)
@@ -378,7 +375,10 @@ class SampleAccount:
         """
         first = frame.first_cube
         self._end_parts(first + 1, first + frame.n_cubes)
-        tracker = self._trackers.setdefault(first, SequenceTracker())
+        if first not in self._trackers:
+            # The module in C takes samples of a single part, which begins with the first cube.
+            self._trackers[first] = SequenceTracker(None if first else self._track)
+        tracker = self._trackers[first]
         tracker.n_cubes = frame.n_cubes
         return tracker
 
@@ -386,6 +386,17 @@ class SampleAccount:
         """End the parts of samples whose first cube has an index from `begin` to `end` - 1."""
         for first in [first for first in self._trackers if begin <= first < end]:
             self._ended.add(self._trackers.pop(first).counters)
+
+    @property
+    def received(self) -> int:
+        """Number of SAMPLE frames received."""
+        return self._received + self._track.usual
+
+    @property
+    def is_usual(self) -> bool:
+        """Whether samples have a single part, which holds all cubes of the hub."""
+        tracker = self._trackers.get(0)
+        return tracker is not None and len(self._trackers) == 1 and tracker.n_cubes == self._n_cubes
 
     @property
     def resets(self) -> int:
@@ -414,6 +425,7 @@ class SampleAccount:
         """Return the sums of the counters of all parts of the samples, also of ended ones."""
         total = SequenceCounters()
         total.add(self._ended)
+        total.delivered += self._track.usual
         for tracker in self._trackers.values():
             total.add(tracker.counters)
         return total

@@ -5,15 +5,23 @@ Where it was not compiled, `wire` is None, and the same functions run in Python,
 
 from __future__ import annotations
 
+from ctypes import sizeof
+
+from ..track import LinkTrack
+
 try:
     from ... import _wire as wire
 except ImportError:
     wire = None  # type: ignore[assignment]
+else:
+    # A module that was built from other sources would write beside the fields of the state.
+    if getattr(wire, "TRACK_SIZE", 0) != sizeof(LinkTrack):
+        wire = None  # type: ignore[assignment]
 
 __all__ = ["NOT_COMPILED", "wire"]
 
 NOT_COMPILED = (
-    "the wire is decoded in Python, which is slower, because no C compiler was there at the "
-    "installation: install one (sudo apt install gcc python3-dev) and install again"
+    "the wire is decoded in Python, which is slower, because the module in C is missing or of "
+    "another version: install a compiler (sudo apt install gcc python3-dev) and install again"
 )
-"""Warning that is logged where the wire module in C was not compiled (`wire` is None)."""
+"""Warning that is logged where `wire`, the wire module in C, is None."""

@@ -14,10 +14,9 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from enum import IntEnum
-from functools import lru_cache
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -205,10 +204,15 @@ class Sample:
         return self.raw[_FREQUENCY - 3 : _FREQUENCY] or bytes(3)
 
     def _make_arrays(self) -> _Arrays:
-        # Usually `join` makes the arrays of several samples at once, so they are made here only if
-        # somebody asks for those of a single sample.
+        # The module in C reads the bytes, so the arrays are made only if somebody asks for them.
         if self._arrays is None:
-            self._arrays = join([self])
+            n_cubes, n_pads = self.shape
+            faults = _FREQUENCY + 4 * n_cubes * n_pads
+            self._arrays = (
+                np.frombuffer(self.raw, _U32, n_cubes * n_pads, _FREQUENCY).reshape(self.shape),
+                np.frombuffer(self.raw, _U32, n_cubes, faults),
+                np.frombuffer(self.raw, _I16, n_cubes, faults + 4 * n_cubes),
+            )
         return self._arrays
 
     def _pack(self) -> bytes:
@@ -242,47 +246,6 @@ class Sample:
         sample.shape = n_cubes, n_pads
         sample.raw, sample._arrays = raw, None
         return sample
-
-
-@lru_cache(maxsize=64)
-def _split_fields(n_cubes: int, n_pads: int) -> struct.Struct:
-    """Return the `struct.Struct` that splits the bytes of a decoded SAMPLE frame of this shape.
-
-    Its `unpack` returns the bytes of the frequencies, the pad faults and the temperatures.
-    """
-    sizes = 4 * n_cubes * n_pads, 4 * n_cubes, 2 * n_cubes
-    fields = "".join(f"{size}s" for size in sizes)
-    return struct.Struct(f"{_FREQUENCY}x{fields}4x")
-
-
-def join(samples: Sequence[Sample]) -> _Arrays:
-    """Return the arrays of several samples, concatenated.
-
-    Args:
-        samples: At least one sample; all have the same number of pads per cube.
-
-    Returns:
-        Frequencies (N, n_pads) in mHz, pad faults (N,) and temperatures (N,) in 0.01 °C of all N
-        cubes, sample after sample. They are read-only if all samples were received.
-    """
-    if not all(sample.raw for sample in samples):
-        arrays = [sample._make_arrays() for sample in samples]
-        frequency, pad_fault, temperature = zip(*arrays, strict=True)
-        return (
-            np.concatenate(frequency),
-            np.concatenate(pad_fault),
-            np.concatenate(temperature),
-        )
-
-    parts: list[bytes] = []
-    for sample in samples:
-        parts += _split_fields(*sample.shape).unpack(sample.raw)
-    # Each sample gave three parts: frequencies, pad faults and temperatures.
-    frequencies = np.frombuffer(b"".join(parts[::3]), _U32)
-    pad_faults = np.frombuffer(b"".join(parts[1::3]), _U32)
-    temperatures = np.frombuffer(b"".join(parts[2::3]), _I16)
-    shape = len(pad_faults), samples[0].n_pads
-    return frequencies.reshape(shape), pad_faults, temperatures
 
 
 _Fixed = TypeVar("_Fixed", bound="_FixedFrame")

@@ -1,0 +1,88 @@
+"""State of one link that each of its samples changes: sample numbers, sample period, clock line.
+
+The module in C (native/cube_track.c) handles usual samples and changes this state in place; Python
+handles all others: lost, late, repeated or restarted ones, and those that change the clock line.
+"""
+
+from __future__ import annotations
+
+from ctypes import Structure, c_double, c_int64
+from typing import Any
+
+MAX_DISORDER = 64
+"""Number of newest samples of a hub whose numbers and device times are kept, to recognise late and
+repeated ones. A sample that is older than these and lies in the past of the hub's run (the samples
+since its last restart) is taken for a repeated one."""
+MAX_DEVICE_US = 1 << 51
+"""Largest device time (time since power-up by a hub's clock), in µs, that is used: 71 years. Larger
+ones, which only a faulty hub sends, count as this one. In ns it still fits 64 bits."""
+NEVER = -(1 << 62)
+"""Time, in ns, that is earlier than every device time and every host time."""
+
+_TYPES: dict[str, Any] = {
+    "int": c_int64,
+    "bool": c_int64,
+    "float": c_double,
+    "list[Any]": c_int64 * 2 * MAX_DISORDER,
+}
+
+
+class LinkTrack(Structure):
+    """Numbers and clock of the samples of one link, in memory that the module in C changes as well.
+
+    Times in ns are relative to the origins `first_us` (device time) and `first_ns` (host time).
+
+    Attributes:
+        is_usual: Whether the module in C may take the next samples. It clears this when a read
+            holds anything else; Python sets it after it has handled that.
+        usual: Number of samples that the module in C has taken.
+        n_cubes, n_pads: Shape of usual samples, which hold all cubes of the hub.
+        next: Number of the next sample, continued beyond 32 bits.
+        newest_us: Device time of the newest sample, in µs.
+        reference: Number (32 bits) of the sample from which device times are predicted; -1 if there
+            is none.
+        reference_us: Device time of this sample, in µs.
+        first_us: Device time that is the origin of device times in ns.
+        first_ns: Host time that is the origin of host times in ns.
+        newest_ns: Newest device time, in ns; `NEVER` before the first sample.
+        last_arrival_ns: Host time of the last arrival, in ns since the Unix epoch.
+        last_stamp_ns: Last stamp (host time of sampling) that was given, in ns since the epoch.
+        is_earliest_late: Whether the host has read the earliest point of this second late.
+        period_us: Estimated sample period, in µs; 0 if it is not known.
+        offset: Arrival minus device time on the clock line at device time 0, in ns.
+        bounded_offset: The offset without the smallest delay, as far as it is known, in ns.
+        drift: Slope of arrival minus device time over device time.
+        jitter_ns: Mean height of the newest points above the clock line, in ns.
+        bucket_end: Arrival time, in ns, at which the present second (bucket) ends.
+        bucket_height: Smallest height above the line in this bucket, in ns; infinite if none.
+        earliest_ns: Device time of the point with this height, in ns.
+        earliest_delay: Arrival minus device time of this point, in ns.
+        seen: Number and device time, in µs, of the newest samples; the place of number n is n % 64.
+    """
+
+    is_usual: bool
+    usual: int
+    n_cubes: int
+    n_pads: int
+    next: int
+    newest_us: int
+    reference: int
+    reference_us: int
+    first_us: int
+    first_ns: int
+    newest_ns: int
+    last_arrival_ns: int
+    last_stamp_ns: int
+    is_earliest_late: bool
+    period_us: float
+    offset: float
+    bounded_offset: float
+    drift: float
+    jitter_ns: float
+    bucket_end: float
+    bucket_height: float
+    earliest_ns: float
+    earliest_delay: float
+    seen: list[Any]
+
+    _fields_ = tuple((name, _TYPES[kind]) for name, kind in __annotations__.items())

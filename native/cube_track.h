@@ -1,0 +1,44 @@
+/* Numbers and clock of the samples of one link: what the usual sample changes.
+ *
+ * The structure is cube_tensor_driver/device/track.py's `LinkTrack`, whose memory the interpreter
+ * and this code share. The equations are those of device/scans/sequence.py and device/clock/, which
+ * handle every other sample; a test holds both equal.
+ */
+#ifndef CUBE_TRACK_H
+#define CUBE_TRACK_H
+
+#include "cube_wire.h"
+
+#define CUBE_TRACK_SEEN 64
+
+/* Names, units and origins are explained in track.py. */
+typedef struct {
+    int64_t is_usual;
+    int64_t usual;
+    int64_t n_cubes, n_pads;
+    int64_t next, newest_us;
+    int64_t reference, reference_us;
+    int64_t first_us, first_ns;
+    int64_t newest_ns, last_arrival_ns, last_stamp_ns;
+    int64_t is_earliest_late;
+    double period_us;
+    double offset, bounded_offset, drift, jitter_ns;
+    double bucket_end, bucket_height, earliest_ns, earliest_delay;
+} cube_track_head;
+
+typedef struct {
+    cube_track_head head;
+    int64_t seen[CUBE_TRACK_SEEN][2]; /* number, device time in us; number % 64 is the place */
+} cube_track;
+
+/* Takes the samples of one read. false: one of them is not usual, and nothing was changed.
+ *
+ * A sample is usual if it has the next number, all cubes of the hub, a device time as its number
+ * lets expect, and a delay that does not change the clock line.
+ * samples: count of them, in order. is_late: the host reads late.
+ * stamps_ns: host time at which each sample was taken. */
+bool cube_follow(
+    cube_track *track, const cube_sample *samples, size_t count, int64_t arrival_ns, bool is_late,
+    int64_t *stamps_ns);
+
+#endif
