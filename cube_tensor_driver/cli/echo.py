@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import os
 import sys
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from .parser import Parser
 
@@ -28,6 +26,7 @@ def run(options: argparse.Namespace) -> int:
     Returns:
         0, because both are normal ends.
     """
+    from ..config.output_files import to_json
     from ..config.yaml import to_yaml
     from ..ros.commands.echo import StressReading, listen
 
@@ -37,7 +36,7 @@ def run(options: argparse.Namespace) -> int:
                 if isinstance(item, StressReading):
                     print(reading_json(item) if options.json else reading_line(item))
                 elif options.json:
-                    print(message_json(item))
+                    print(to_json(item))
                 else:
                     print(f"{to_yaml(item)}---")
             # Without this, Python would hold messages back if stdout is a pipe.
@@ -78,6 +77,7 @@ def reading_json(reading: StressReading) -> str:
     Args:
         reading: The row: one cube at one time. Components that are not observed (NaN) become null.
     """
+    from ..config.output_files import to_json
     from ..core.modes import COMPONENTS, STRESS
 
     values = dict(zip(COMPONENTS, reading.values, strict=True))
@@ -89,7 +89,7 @@ def reading_json(reading: StressReading) -> str:
         "residual": reading.residual,
         "status": status_words(reading.status),
     }
-    return message_json(content)
+    return to_json(content)
 
 
 def status_words(status: int) -> list[str]:
@@ -101,22 +101,3 @@ def status_words(status: int) -> list[str]:
 
     names = [name for name, bit in STATUS.items() if status & bit]
     return names + [f"pad {word}" for bit, word in WORDS.items() if status & bit]
-
-
-def message_json(content: Mapping[str, Any]) -> str:
-    """Return a message, given as names and plain values, as a JSON object on one line."""
-    return json.dumps(without_nan(content))
-
-
-def without_nan(value: Any) -> Any:
-    """Replace NaN and infinity, also inside lists and mappings, by None.
-
-    JSON can represent neither of them; None becomes null.
-    """
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {name: without_nan(field) for name, field in value.items()}
-    if isinstance(value, list):
-        return [without_nan(one) for one in value]
-    return value

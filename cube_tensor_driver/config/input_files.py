@@ -10,11 +10,12 @@ import struct
 import zipfile
 import zlib
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from ..core.arrays import AnyArray
 from ..core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from ..core.arrays import AnyArray
 
 _ARCHIVE_ERRORS = (
     zipfile.BadZipFile,
@@ -82,6 +83,9 @@ def read_arrays(path: Path, limit: int) -> dict[str, AnyArray]:
         ConfigError: The file is damaged, too large, or no file of arrays.
         OSError: The file does not exist or cannot be read.
     """
+    # Programs that read other files start without numpy, which takes 0.1 s to import.
+    import numpy as np
+
     check_regular(path)
     try:
         with zipfile.ZipFile(path) as archive:

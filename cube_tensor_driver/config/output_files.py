@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import atexit
 import json
+import math
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -109,6 +110,26 @@ def check_yaml(option: str, path: Path | None) -> None:
         raise ConfigError(f"{option} {path}: a YAML file ends in {suffixes}; name one")
 
 
+def to_json(value: Any, indent: int | None = None) -> str:
+    """Return plain values as JSON text. NaN and infinity, which JSON lacks, become null.
+
+    Args:
+        value: Numbers, texts, lists and mappings.
+        indent: Number of spaces per level of nesting; None: the text is one line.
+    """
+    return json.dumps(_without_nan(value), indent=indent, allow_nan=False)
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {name: _without_nan(one) for name, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_without_nan(one) for one in value]
+    return value
+
+
 def write_json(path: Path, value: Any) -> None:
     """Write plain values as a JSON file, completely or not at all.
 
@@ -116,7 +137,7 @@ def write_json(path: Path, value: Any) -> None:
         ConfigError: The file cannot be written.
     """
     with atomic_write(path) as temporary:
-        temporary.write_text(json.dumps(value, indent=2) + "\n", encoding="utf-8")
+        temporary.write_text(to_json(value, indent=2) + "\n", encoding="utf-8")
 
 
 def temporary_folder(prefix: str) -> Path:

@@ -17,6 +17,7 @@ from ..config.package_data import package_data
 from ..config.yaml import read_yaml, write_yaml
 from ..core.errors import ConfigError
 from ..processes.children import Children
+from ..processes.domain import is_domain_used
 from ..processes.skin_processes import Process, SimulatedHubs, skin_processes
 from ..processes.stop_signals import stop_event
 
@@ -89,6 +90,10 @@ def run_demo(settings: DemoSettings) -> int:
     # From here on Ctrl-C only sets this event. The loop in `watch` ends by it, and `Children` then
     # ends all processes.
     interrupted = stop_event()
+    if is_domain_used():
+        from .watching import check_no_skin
+
+        check_no_skin()
     with tempfile.TemporaryDirectory(prefix="cube_demo_") as name:
         folder = Path(name)
         skin_file = choose_skin_file(settings, folder)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -13,7 +12,7 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
-from ..config.output_files import write_json
+from ..config.output_files import to_json, write_json
 from ..core.errors import CubeError
 from ..processes.children import Children
 from ..ros.session import STEP_S, node_session, spin_until
@@ -139,6 +138,6 @@ def report(result: dict[str, Any], json_path: Path | None) -> None:
         result: Names and values of the results.
         json_path: Path of the file; None: no file is written.
     """
-    print(json.dumps(result, indent=2))
+    print(to_json(result, indent=2))
     if json_path is not None:
         write_json(json_path, result)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import os
 import threading
 import time
 from contextlib import ExitStack
@@ -14,13 +12,14 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from diagnostic_msgs.msg import DiagnosticArray
 
 from ..config.load_script import read_script
-from ..config.output_files import write_json
+from ..config.output_files import to_json, write_json
 from ..config.skin import Skin, read_skin
 from ..core.errors import CubeError, MessageError
 from ..messages.codec import frequency_codec, stress_codec
 from ..msg import SkinFrequencies, SkinStress
 from ..processes.children import Children
 from ..ros.qos import batch_profile
+from ..ros.session import domain_text, node_session, spin_until
 from ..simulation.imperfections import read_imperfections
 from ..simulation.load import AnyLoad, Load, default_script
 from ..views.terminal.live_table import LiveTable
@@ -68,16 +67,22 @@ class DemoResult:
     load: AnyLoad
 
     def publish(self, settings: DemoSettings) -> None:
-        """Draw the picture if the settings name one, and print the results or write them."""
+        """Draw the picture if the settings name one, and print the results or write them.
+
+        Raises:
+            CubeError: No tensor arrived, or a file cannot be written.
+        """
         figures = self.figures
         if settings.figure is not None:
             figures = figures | self._draw(settings.figure)
         if settings.json is None:
-            print(json.dumps(figures, indent=2))
-            return
-        write_json(settings.json, figures)
-        sent, lost = figures["samples_sent"], figures["lost"]
-        print(f"wrote {settings.json}: {sent} samples sent, {lost} lost")
+            print(to_json(figures, indent=2))
+        else:
+            write_json(settings.json, figures)
+            sent, lost = figures["samples_sent"], figures["lost"]
+            print(f"wrote {settings.json}: {sent} samples sent, {lost} lost")
+        if not figures["tensors_received"]:
+            raise CubeError("no tensor arrived in the measured time; is the machine overloaded?")
 
     def _draw(self, path: Path) -> dict[str, object]:
         """Draw applied and measured force on the whole skin into a file.
@@ -162,6 +167,25 @@ def watch(
         figures = watcher.measure(verification, settings.duration, log)
     head = {"cubes": len(skin.cubes), "rate_hz": rate, "duration_s": settings.duration}
     return DemoResult(head | figures, verification, load)
+
+
+def check_no_skin() -> None:
+    """Check, before the demo starts its own skin, that none publishes in this DDS domain.
+
+    Raises:
+        CubeError: A skin publishes.
+    """
+    with node_session("demo") as (node, executor):
+        if spin_until(executor, lambda: node.count_publishers("stress"), DISCOVERY_S):
+            raise other_skin_error()
+
+
+def other_skin_error() -> CubeError:
+    """Return the error that a demo raises because another skin publishes in its DDS domain."""
+    return CubeError(
+        f"another skin publishes stress in {domain_text()}: "
+        "end it, or set another ROS_DOMAIN_ID for this one"
+    )
 
 
 def make_load(skin: Skin, settings: DemoSettings) -> AnyLoad:
@@ -307,10 +331,7 @@ class SkinWatcher:
         """
         # Messages of a smaller skin look like those of this skin, so publishers are counted, too.
         if self._sees_other_skin or self._observer.node.count_publishers("stress") > 1:
-            raise CubeError(
-                f"another skin publishes stress in DDS domain {os.environ.get('ROS_DOMAIN_ID', 0)}:"
-                " end it, or set another ROS_DOMAIN_ID for this one"
-            )
+            raise other_skin_error()
 
     def _on_stress(self, data: bytes) -> None:
         received_ns = time.time_ns()

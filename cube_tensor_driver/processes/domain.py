@@ -52,6 +52,14 @@ def check_domain() -> None:
         raise ConfigError(f"{VARIABLE} is {text!r}, allowed: 0 to {MAX_DOMAIN}; set it or unset it")
 
 
+def is_domain_used() -> bool:
+    """Return whether a node of this host seems to run in the domain of ROS_DOMAIN_ID."""
+    socket_of_first = _bind(int(os.environ.get(VARIABLE) or 0), PARTICIPANT_OFFSET)
+    if socket_of_first is not None:
+        socket_of_first.close()
+    return socket_of_first is None
+
+
 @contextmanager
 def own_domain() -> Iterator[int]:
     """Set, for a `with` block, a DDS domain that no other process on this host uses.

@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
+import math
 import os
 import signal
 import subprocess
@@ -31,8 +32,11 @@ from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.config.yaml import parse_yaml
 from cube_tensor_driver.core.calibration import Calibration
+from cube_tensor_driver.core.errors import CubeError
 from cube_tensor_driver.core.forces import Forces
 from cube_tensor_driver.core.reconstructor import Reconstructor
+from cube_tensor_driver.demo.demo import DemoSettings
+from cube_tensor_driver.demo.watching import DemoResult
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress, StressTensorStamped
 from cube_tensor_driver.processes.children import Children, ros_arguments
 from cube_tensor_driver.processes.skin_processes import SimulatedHubs, skin_processes
@@ -130,11 +134,28 @@ def test_demo_says_what_is_wrong_in_one_line(domain, arguments, words):
 
 
 def test_demo_does_not_mix_with_another_skin(ros):
+    """It is refused before it disturbs the other one, which is a demo, too, and would end."""
     ros.node.create_publisher(SkinStress, "stress", 10)
     process = demo("--headless", "--cubes", "4", "--duration", "1")
-    _, errors = process.communicate(timeout=60)
-    assert process.returncode == 1 and "Traceback" not in errors
+    publishers = {1}
+
+    def ended() -> bool:
+        publishers.add(ros.node.count_publishers("stress"))
+        return process.poll() is not None
+
+    ros.wait(ended, 60)
+    errors = process.communicate()[1]
+    assert process.returncode == 1 and "Traceback" not in errors and publishers == {1}
     assert "another skin publishes stress in DDS domain" in errors and "ROS_DOMAIN_ID" in errors
+
+
+def test_a_demo_without_a_tensor_fails_and_its_figures_are_json(tmp_path):
+    """JSON has no NaN, and a program that reads the figures would not read them."""
+    figures = {"samples_sent": 0, "tensors_received": 0, "lost": 0, "error": [math.nan]}
+    settings = DemoSettings(json=tmp_path / "figures.json")
+    with pytest.raises(CubeError, match="no tensor arrived"):
+        DemoResult(figures, None, None).publish(settings)
+    assert json.loads(settings.json.read_text(), parse_constant=pytest.fail)["error"] == [None]
 
 
 @pytest.mark.alone
