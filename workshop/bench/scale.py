@@ -15,6 +15,9 @@ CPU_LINES = (
 )
 """Label, figure, line style and colour of each processor time."""
 
+MARKER: dict[str, Any] = {"mfc": "white", "ms": 5}
+"""Style of the markers of all lines."""
+
 LATENCY_LINES = (
     ("median", "latency_p50_ms", "o-"),
     ("99th percentile", "latency_p99_ms", "s--"),
@@ -37,26 +40,10 @@ def draw_scale(rows: list[dict[str, Any]]) -> Figure:
     for label, key, style, color in CPU_LINES:
         # One percent of a core is 10 ms per second.
         cpu_us = [1e4 * row[key] / row["rate_hz"] for row in rows]
-        left.plot(
-            cubes,
-            cpu_us,
-            style,
-            color=color,
-            mfc="white",
-            ms=5,
-            label=label,
-        )
+        left.plot(cubes, cpu_us, style, color=color, label=label, **MARKER)
     for label, key, style in LATENCY_LINES:
         latency_ms = [row[key] for row in rows]
-        right.plot(
-            cubes,
-            latency_ms,
-            style,
-            color="black",
-            mfc="white",
-            ms=5,
-            label=label,
-        )
+        right.plot(cubes, latency_ms, style, color="black", label=label, **MARKER)
     left.set(ylabel="CPU per scan / µs", title="cost of one scan of all cubes")
     right.set(ylabel="latency / ms", title="from reading the pads to receiving the tensor")
     for axes in (left, right):

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from cube_tensor_driver.core.matching import NO_MATCH
+from cube_tensor_driver.demo.verification import percentile
 from cube_tensor_driver.simulation.sample_log import SampleLog
 
 from .counters import check_counters
@@ -54,9 +55,7 @@ def check_all(record: Record, log: SampleLog) -> dict[str, Any]:
         "worst_reconnect_s": round(max(reconnects_s, default=0.0), 3),
         "stamps_judged": len(stamp_errors_ms),
         **{
-            f"stamp_error_p{percent}_ms": round(float(np.percentile(stamp_errors_ms, percent)), 3)
-            if len(stamp_errors_ms)
-            else None
+            f"stamp_error_p{percent}_ms": percentile(stamp_errors_ms, percent)
             for percent in PERCENTILES
         },
     }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -114,16 +115,16 @@ class Actions:
         self._tare = make_client(Tare, "reconstruction/tare")
         self._clear = make_client(Trigger, "reconstruction/clear_tare")
         self._parameters = make_client(SetParameters, "driver/set_parameters")
-        self._kinds: dict[str, Callable[[Mapping[str, Any]], ActionResult]] = {
-            "stall reconstruction": lambda event: self._pause("reconstruction", event["seconds"]),
-            "stall subscriber": lambda event: self._pause(OTHER_SUBSCRIBER, event["seconds"]),
-            "rate": lambda event: self._set_rate(event["value"]),
-            "tare": lambda _: self._take_tare(),
-            "clear": lambda _: self._call(self._clear, Trigger.Request()),
-            "restart reconstruction": lambda _: self._restart_reconstruction(),
-            "reconfigure reconstruction": lambda _: self._reconfigure_reconstruction(),
-            "cycle driver": lambda _: self._cycle_driver(),
-            "restart driver": lambda _: self._restart_driver(),
+        self._kinds: dict[str, Callable[..., ActionResult]] = {
+            "stall reconstruction": partial(self._pause, "reconstruction"),
+            "stall subscriber": partial(self._pause, OTHER_SUBSCRIBER),
+            "rate": self._set_rate,
+            "tare": self._take_tare,
+            "clear": partial(self._call, self._clear, Trigger.Request()),
+            "restart reconstruction": self._restart_reconstruction,
+            "reconfigure reconstruction": self._reconfigure_reconstruction,
+            "cycle driver": self._cycle_driver,
+            "restart driver": self._restart_driver,
         }
 
     def start_driver(self, fault_pipe: Path) -> None:
@@ -144,10 +145,11 @@ class Actions:
 
     def do(self, event: Mapping[str, Any], delay_s: float) -> None:
         """Carry out an event of the mix, `delay_s` seconds after its time."""
-        kind = event["action"]
+        options = dict(event)
+        kind = options.pop("action")
         self._is_late = delay_s > MAX_DELAY_S
         self._begin_ns = time.time_ns()
-        succeeded, answer = self._kinds[kind](event)
+        succeeded, answer = self._kinds[kind](**options)
         action = NodeAction(
             kind=kind,
             begin_ns=self._begin_ns,
@@ -169,11 +171,11 @@ class Actions:
         self._children.resume(name)
         return True, ""
 
-    def _set_rate(self, rate: float) -> ActionResult:
-        value = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=float(rate))
-        request = SetParameters.Request(parameters=[Parameter(name="rate", value=value)])
+    def _set_rate(self, value: float) -> ActionResult:
+        rate = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=float(value))
+        request = SetParameters.Request(parameters=[Parameter(name="rate", value=rate)])
         answer = self._ask(self._parameters, request)
-        return answer is not None and answer.results[0].successful, str(rate)
+        return answer is not None and answer.results[0].successful, str(value)
 
     def _take_tare(self) -> ActionResult:
         names = [self._skin.names[cube] for cube in HELD_CUBES]

@@ -48,7 +48,7 @@ class Message(NamedTuple):
     sent_ns: int
 
 
-class _RawSubscription:
+class RawSubscription:
     """Takes the serialised messages of a topic with their numbers."""
 
     def __init__(
@@ -83,14 +83,6 @@ class _RawSubscription:
         self._node.destroy_subscription(self._subscription)
 
 
-class BatchTopic(NamedTuple, Generic[AnyRows]):
-    """A batch topic: its name, type of message and codec."""
-
-    name: str
-    kind: type
-    codec: MessageCodec[AnyRows]
-
-
 class TopicLog(Generic[AnyRows]):
     """Collects all rows of one batch topic.
 
@@ -100,21 +92,19 @@ class TopicLog(Generic[AnyRows]):
 
     def __init__(
         self,
-        node: Node,
-        topic: BatchTopic[AnyRows],
-        quality: QoSProfile,
+        subscription: RawSubscription,
+        codec: MessageCodec[AnyRows],
         skin: Skin,
     ) -> None:
         self.count = 0
-        self._codec: MessageCodec[AnyRows] = topic.codec
+        self._codec: MessageCodec[AnyRows] = codec
         self._frame_id = skin.parent_frame.encode() + b"\0"
-        self._subscription = _RawSubscription(node, topic.kind, topic.name, quality)
+        self._subscription = subscription
         self._decoded: list[AnyRows] = []
         self._waiting: list[Message] = []
         self._sent_ns: list[AnyArray] = []
         self._last_number = self._n_rows = self._unreadable = 0
         self._gaps: list[tuple[int, int]] = []
-        self._cubes: set[int] = set()
 
     def take(self) -> None:
         """Take what has arrived; to be called again and again."""
@@ -139,7 +129,7 @@ class TopicLog(Generic[AnyRows]):
     def count_cubes(self) -> int:
         """Return the number of cubes of which rows have arrived."""
         self._decode()
-        return len(self._cubes)
+        return len({cube for rows in self._decoded for cube in rows.cube.tolist()})
 
     def newest_ns(self) -> int:
         """Return the stamp of the newest message, 0 before the first."""
@@ -184,7 +174,6 @@ class TopicLog(Generic[AnyRows]):
             # Messages of one shape have the same number of rows.
             rows_per_message = len(decoded.rows) // len(messages)
             self._sent_ns.append(np.repeat(sent_ns, rows_per_message))
-            self._cubes.update(np.unique(decoded.rows.cube).tolist())
 
     def _shape_of(self, message: Message) -> tuple[int, bytes]:
         return len(message.data), self._codec.shape_bytes(message.data)
@@ -203,7 +192,7 @@ class CubeTopicLog:
         self._cube = cube
         self._kinds = {"stress": StressTensorStamped, "wrench": WrenchStamped}
         self._subscriptions = {
-            name: _RawSubscription(node, kind, f"cubes/{skin.cubes[cube].name}/{name}", quality)
+            name: RawSubscription(node, kind, f"cubes/{skin.cubes[cube].name}/{name}", quality)
             for name, kind in self._kinds.items()
         }
         self._kept: dict[str, list[Any]] = {name: [] for name in self._kinds}

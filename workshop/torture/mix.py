@@ -124,11 +124,11 @@ class _Mix:
     def _add(self, at: float, **event: Any) -> None:
         self.events.append((round(at, 3), event))
 
-    def _add_quietly(self, at: float, **fault: Any) -> None:
-        """Add a fault unless it would disturb a tare."""
-        is_held_hub = fault["link"] == f"hub{HELD_HUB}"
-        if not is_held_hub or not _disturbs_tare(at, fault.get("seconds", 0.0)):
-            self._add(at, **fault)
+    def _add_fault(self, at: float, hub: int, **fault: Any) -> None:
+        """Add a fault of a hub unless it would disturb a tare; damage to single frames does not."""
+        disturbs = fault["kind"] not in FRAME_FAULTS and hub == HELD_HUB
+        if not (disturbs and _disturbs_tare(at, fault.get("seconds", 0.0))):
+            self._add(at, link=f"hub{hub}", **fault)
 
     def add_rounds(self) -> None:
         """Add the actions, and the holds of the load."""
@@ -147,34 +147,16 @@ class _Mix:
         while (at := at + random.exponential(0.15)) < self._duration:
             kind = str(random.choice(FRAME_FAULTS))
             hub = int(random.integers(HUBS))
-            self._add(
-                at,
-                kind=kind,
-                link=f"hub{hub}",
-                count=int(random.integers(1, 6)),
-            )
+            self._add_fault(at, hub, kind=kind, count=int(random.integers(1, 6)))
 
     def add_opening(self) -> None:
         """Add one fault of each kind to the pads of a hub, and a warm hub."""
         for kind, cube in zip(PAD_FAULTS, OPENING_CUBES, strict=True):
             pad = int(self._random.integers(PADS))
-            self._add(
-                0.5,
-                kind=kind,
-                link=f"hub{OPENING_HUB}",
-                cube=cube,
-                pad=pad,
-                seconds=1.8,
-            )
-        self._add(
-            1.5,
-            kind="temperature",
-            link="hub1",
-            value=5.0,
-            seconds=1.0,
-        )
+            self._add_fault(0.5, OPENING_HUB, kind=kind, cube=cube, pad=pad, seconds=1.8)
+        self._add_fault(1.5, 1, kind="temperature", value=5.0, seconds=1.0)
         # A temperature lasts until the next one.
-        self._add(4.5, kind="temperature", link="hub1", value=0.0)
+        self._add_fault(4.5, 1, kind="temperature", value=0.0)
         rounds = range(1 + int(self._duration))
         # More than enough: a cut is always followed by seconds without one.
         self._cuts = [
@@ -187,19 +169,19 @@ class _Mix:
         at = random.uniform(FIRST_CUT_S, FIRST_CUT_S + 3.0)
         while at < self._end:
             kind, seconds = self._cuts.pop(), random.uniform(0.3, 2.0)
-            fault = {"kind": kind, "link": f"hub{hub}", "seconds": round(seconds, 3)}
+            fault = {"kind": kind, "seconds": round(seconds, 3)}
             if kind == "drift":
                 # A drift stands for a hub that was replaced by one with another crystal, so the
                 # clock rate changes only together with a restart.
                 ppm = round(random.uniform(-100, 100), 3)
-                self._add_quietly(at, kind="drift", link=f"hub{hub}", value=ppm)
+                self._add_fault(at, hub, kind="drift", value=ppm)
                 fault["kind"] = "reset"
             elif kind == "step":
                 fault["value"] = round(random.uniform(-0.5, 5.0), 3)
             elif kind == "wrap":
                 # The numbers of the samples begin again at 0 after this number of samples.
                 fault["count"] = int(random.integers(100, 3000))
-            self._add_quietly(at, **fault)
+            self._add_fault(at, hub, **fault)
             # A link that was cut delivers for a while before the next cut.
             at += seconds + random.uniform(4.0, 20.0)
 
@@ -207,10 +189,11 @@ class _Mix:
         """Break pads of all hubs."""
         random, at = self._random, FIRST_CUT_S
         while (at := at + random.uniform(1.0, 4.0)) < self._end:
-            self._add_quietly(
+            kind = str(random.choice(PAD_FAULTS))
+            self._add_fault(
                 at,
-                kind=str(random.choice(PAD_FAULTS)),
-                link=f"hub{random.integers(HUBS)}",
+                int(random.integers(HUBS)),
+                kind=kind,
                 cube=int(random.integers(CUBES_PER_HUB)),
                 pad=int(random.integers(PADS)),
                 seconds=round(random.uniform(0.5, 3.0), 3),
@@ -220,20 +203,9 @@ class _Mix:
         """Warm hubs, except the one whose load is held."""
         random, at = self._random, 0.0
         while (at := at + random.uniform(8.0, 25.0)) < self._end - 1:
-            link, value = f"hub{random.integers(1, HUBS)}", round(random.uniform(1.0, 10.0), 2)
-            self._add(
-                at,
-                kind="temperature",
-                link=link,
-                value=value,
-                seconds=2.0,
-            )
-            self._add(
-                at + 3.0,
-                kind="temperature",
-                link=link,
-                value=0.0,
-            )
+            hub, value = int(random.integers(1, HUBS)), round(random.uniform(1.0, 10.0), 2)
+            self._add_fault(at, hub, kind="temperature", value=value, seconds=2.0)
+            self._add_fault(at + 3.0, hub, kind="temperature", value=0.0)
 
 
 def _disturbs_tare(at: float, seconds: float) -> bool:

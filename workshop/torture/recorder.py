@@ -22,7 +22,7 @@ from cube_tensor_driver.ros.qos import batch_profile
 
 from ..checks.record import NodeAction, Record, Span
 from .memory import MemoryMonitor
-from .message_log import BatchTopic, CubeTopicLog, TopicLog
+from .message_log import CubeTopicLog, RawSubscription, TopicLog
 from .mix import CUBES_PER_HUB, OPENING_CUBES, OPENING_HUB, RATE
 
 INSTANTS = 1000
@@ -60,10 +60,10 @@ class TortureRecorder:
         self.observer, self._skin = observer, skin
         quality = batch_profile(RATE)
         quality.depth = QUEUE_DEPTH
-        frequencies = BatchTopic("frequencies", SkinFrequencies, frequency_codec)
-        stress = BatchTopic("stress", SkinStress, stress_codec)
-        self._frequencies = TopicLog(node, frequencies, quality, skin)
-        self.stress = TopicLog(node, stress, quality, skin)
+        frequencies = RawSubscription(node, SkinFrequencies, "frequencies", quality)
+        stress = RawSubscription(node, SkinStress, "stress", quality)
+        self._frequencies = TopicLog(frequencies, frequency_codec, skin)
+        self.stress = TopicLog(stress, stress_codec, skin)
         self._cube_topics = CubeTopicLog(node, skin, RECORDED_CUBE, quality)
 
         self._links: dict[str, dict[str, str]] = {}
