@@ -23,7 +23,7 @@ def arguments(parser: Parser) -> None:
     parser.add_json()
     parser.epilog = (
         "Takes half a minute. The hub is started and stopped, its sample period changes and is set "
-        "back at the end, and its port is closed and opened once. End a driver that has the port "
+        "back at the end, and its port is closed and opened twice. End a driver that has the port "
         "open first. docs/firmware.md says more."
     )
 

@@ -206,8 +206,7 @@ def frames_of_a_sample(transcript: Transcript) -> RuleResult:
 def drops_are_counted(transcript: Transcript) -> RuleResult:
     """All numbers that are missing before a STATS must be in its count.
 
-    It may count more, which were dropped behind the last number that came, until it has dropped
-    nothing for a second.
+    It may count more: those that were dropped behind the last number that came.
     """
     names = transcript.first_visit
     base = transcript.frames(Stats, *names)[0].dropped
@@ -225,12 +224,10 @@ def drops_are_counted(transcript: Transcript) -> RuleResult:
             missing += max(0, step - 1) + (frames[number] < n_frames)
             previous = number
         elif isinstance(heard.frame, Stats):
-            before, counted = counted, heard.frame.dropped - base & 0xFFFFFFFF
-            # Samples behind the last one that came may have been dropped, too. A count that stays
-            # while it exceeds what is missing was never right.
+            counted = heard.frame.dropped - base & 0xFFFFFFFF
+            # Samples behind the last one that came may have been dropped, too.
             behind = 0 if previous is None else max(0, forward(heard.frame.taken, previous) - 1)
-            is_too_high = counted > missing + behind or before == counted > missing
-            if counted < missing or is_too_high:
+            if not missing <= counted <= missing + behind:
                 return failed(f"{missing} numbers are missing, STATS counts {counted} as dropped")
     if counted:
         return passed(f"{len(frames)} samples came; {counted} were dropped, all are counted")
@@ -264,9 +261,10 @@ def samples_fit_hello(transcript: Transcript) -> RuleResult:
             if seen & cubes and sample.first_cube:
                 return failed(f"sample {sample.sequence} has cube {sample.first_cube} twice")
             seen |= cubes
-    never = set(range(hello.n_cubes)) - {cube for _, cube in seen} if hello else set()
+    n_cubes = 0 if hello is None else hello.n_cubes
+    never = set(range(n_cubes)) - {cube for _, cube in seen}
     if never:
-        return failed(f"cube {min(never)} is in no SAMPLE, HELLO says {hello.n_cubes} cubes")
+        return failed(f"cube {min(never)} is in no SAMPLE, HELLO says {n_cubes} cubes")
     return passed("pads and cubes of the samples are those of HELLO")
 
 
@@ -350,6 +348,8 @@ def full_buffer(transcript: Transcript) -> RuleResult:
         return not_tried("frames are damaged in any case: see F5")
     if step.damaged:
         return failed(f"{step.damaged} damaged frames after {UNREAD_S:g} s without reading")
+    if transcript.frames(Sample, "fast") and not transcript.frames(Sample, "period again"):
+        return failed(f"no sample came any more after {UNREAD_S:g} s without reading")
     # Only the steps before it, in which everything was read.
     read = transcript.first_visit[: transcript.first_visit.index("unread")]
     before = transcript.frames(Stats, *read)[-1]

@@ -420,6 +420,10 @@ class CannotDoFast(HubInMemory):
         return super()._answer(request, now_us)
 
 
+class AsManyCubesAsFit(CannotDoFast):
+    """As many cubes of 8 pads as fit a frame."""
+
+
 class Rounds(HubInMemory):
     """Every period, also 0, to a multiple of 8 ms."""
 
@@ -427,6 +431,18 @@ class Rounds(HubInMemory):
         if request.request == Command.SET_PERIOD:
             request = replace(request, argument=max(8_000, request.argument // 8_000 * 8_000))
         return super()._answer(request, now_us)
+
+
+class Sleeps(HubInMemory):
+    """Takes no samples while nobody reads, as an emulator on a busy machine, but sends STATS."""
+
+    def take(self, room):
+        if room or self.sequence % 2:
+            return super().take(room)
+        self.next_us += 1_100_000
+        self.sequence += 1
+        self.dropped += 1
+        return b""
 
 
 class BrokenPads(HubInMemory):
@@ -486,11 +502,13 @@ class SlowWire(MemoryWire):
         (HubInMemory, {"cube_uids": (0,) * 5, "n_pads": 1}),
         (HubInMemory, {"cube_uids": range(1, 65), "n_pads": 8}),
         (HubInMemory, {"n_pads": 32}),
+        (AsManyCubesAsFit, {"cube_uids": range(1, 1725)}),
         (SplitsSamples, {}),
         (NoTime, {}),
         (Restarts, {}),
         (CannotDoFast, {"period_us": 33_000}),
         (Rounds, {}),
+        (Sleeps, {}),
         (BrokenPads, {}),
         (BrokenPads, {"n_pads": 32}),
         (FindsCubesLater, {}),
