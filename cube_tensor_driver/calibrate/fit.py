@@ -42,18 +42,20 @@ from .robust import (
 )
 
 FOLDS = 10
-"""Number of parts into which the loads are divided for cross-validation. The fit is repeated
+"""Number of parts into which the known loads are divided for cross-validation. The fit is repeated
 without each of the parts, and its error is measured on the part that was left out."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Result of a fit of K coefficients and P gains to N loads.
+    """Result of a fit of a cube's response (stress on its P pads per known stress) to N loads.
 
-    A reading is the measured stress of one pad under one load.
+    The response consists of K coefficients, which are the same for pads that the symmetry maps onto
+    each other, and of a gain for each pad. A reading is the stress that one pad measured under one
+    load.
 
     Attributes:
-        structure: Structure of the response: names of the coefficients and basis matrices.
+        structure: Layout, symmetry, names of the coefficients, and the matrix of each coefficient.
         coefficients: Values of the coefficients of the response by name, in Pa per Pa; NaN where
             the loads do not determine them.
         deviations: Standard deviations of the coefficients by name, in Pa per Pa.
@@ -67,9 +69,9 @@ class Fit:
         held_out: Ratio of the rms error on loads that are left out of the fit (cross-validation) to
             the rms reading, without outliers.
         fitted: Fitted pad stresses (N, P), in Pa.
-        outliers: Whether a reading had the weight 0 (N, P).
+        outliers: Whether the fit ignores a reading, because it deviates too much (N, P).
         undetermined: Names of the coefficients that the loads do not determine.
-        advice: Sentences that name the loads to add.
+        advice: Sentences that name the loads to add, so that they determine all coefficients.
     """
 
     structure: Structure
@@ -93,11 +95,12 @@ class Fit:
         created: str = "",
         source: str = "",
     ) -> Calibration:
-        """Return a calibration with the fitted values.
+        """Return a calibration with the fitted coefficients and gains.
 
         Args:
-            base: Calibration with all other values. Its noise is multiplied by the scatter of the
-                residuals, if that is above 1.
+            base: Calibration that provides all other values, such as rest frequencies. Its noise is
+                multiplied by `scale` (scatter of the residuals in units of the noise) if that is
+                above 1.
             created: Time of creation, ISO 8601.
             source: Origin of the values.
 
@@ -128,15 +131,16 @@ def measured_stress(
     frequency: ArrayLike,
     temperature: Array | None = None,
 ) -> Array:
-    """Compute pad stresses (N, P), in Pa, by the pad law of a calibration.
+    """Compute the stresses on P pads under N loads (N, P), in Pa, from their frequencies.
 
     Args:
-        base: Calibration with the parameters of the pad law and the frequencies without load.
+        base: Calibration with the pad law (relation of the frequency of a pad and the stress on it)
+            and the frequencies without load.
         frequency: Frequencies (N, P), in Hz.
         temperature: Temperatures (N,), in °C, if they are known.
 
     Raises:
-        FitError: The shape is wrong, or a frequency is outside the range of the pad law.
+        FitError: The shape is wrong, or no stress belongs to a frequency by the pad law.
     """
     f = np.asarray(frequency, dtype=float)
     layout = base.layout
@@ -163,15 +167,15 @@ def loads_from_forces(
     force: Array,
     area: float,
 ) -> Array:
-    """Compute the states of loads that are forces on the face +z of a cube.
+    """Compute the states (amplitudes of the modes) of loads that are forces on a cube's face +z.
 
     A reference sensor measured the forces. They are taken as a uniform stress with the components
     zz, yz and zx. The normal stresses along the skin, xx and yy, are taken as 0, because nothing
     holds the layer sideways.
 
     Args:
-        modes: The M modes.
-        force: Forces (N, 3), in N.
+        modes: The M modes (linear stress fields) of the cube.
+        force: Forces (N, 3) in the frame of the cube, in N.
         area: Area that the forces act on, in m².
 
     Returns:
@@ -196,11 +200,14 @@ def fit(
     fixed: Mapping[str, float] | None = None,
     gains: bool = True,
 ) -> Fit:
-    """Fit coefficients and gains to known loads.
+    """Fit the response of a cube (stress on its P pads per known stress) to N known loads.
+
+    The response consists of coefficients, which are the same for pads that the symmetry maps onto
+    each other, and of a gain (relative sensitivity) for each pad.
 
     Args:
-        structure: Structure of the response: layout, modes and symmetry.
-        loads: Known states (amplitudes of the modes) (N, M), in Pa.
+        structure: Layout of the pads, modes and symmetry, which define the coefficients.
+        loads: Amplitudes of the modes (linear stress fields) under each load (N, M), in Pa.
         measured: Measured pad stresses (N, P), in Pa.
         noise: Standard deviation of the measured pad stresses, one number or (P,), in Pa.
         fixed: Values of coefficients that are known from elsewhere, by name.
@@ -233,8 +240,8 @@ def fit(
 
     residuals = model.residuals(theta, design, y) / scale
     covariance = robust_covariance(jacobian, residuals, scale)
-    # The covariance is computed with a pseudo-inverse, which gives coefficients that the loads do
-    # not determine a small variance, although their variance is unknown.
+    # Coefficients that the loads do not determine have an unknown variance (NaN). The covariance is
+    # computed with a pseudo-inverse, which gives them a small one.
     covariance[:n_free][is_open] = np.nan
     covariance[:, :n_free][:, is_open] = np.nan
     # Coefficients that the caller fixed have the variance 0.
@@ -281,7 +288,8 @@ def fit(
 class _Model:
     """Model of the measured pad stresses (readings) as a function of parameters theta.
 
-    The parameters are the coefficients that are not fixed, then G coordinates of the gains.
+    The parameters are the coefficients of the response that the caller did not fix, then G
+    coordinates of the gains (relative sensitivities of the P pads).
 
     Attributes:
         free: Numbers of the coefficients that are not fixed.
@@ -314,10 +322,11 @@ class _Model:
         self.gains = rows.reshape(-1, n_pads).T
 
     def unpack(self, theta: Array) -> tuple[Array, Array]:
-        """Return all coefficients (K,) and gains (P,) for some values of the parameters.
+        """Return all coefficients (K,) and gains (P,) that some values of the parameters stand for.
 
         Args:
-            theta: Parameters: the coefficients that are not fixed, then coordinates of the gains.
+            theta: Parameters: the coefficients of the response that are not fixed, then the
+                coordinates that are multiplied by the matrix `gains`.
         """
         coefficients = self._fixed.copy()
         coefficients[self.free] = theta[: len(self.free)]
@@ -325,7 +334,9 @@ class _Model:
         return coefficients, 1 + self.gains @ coordinates
 
     def design(self, x: Array) -> Array:
-        """Return the contribution of each coefficient to each reading (N, P, K), with gains of 1.
+        """Return the change of each reading (stress on a pad under a load) per coefficient.
+
+        All gains are taken as 1. The result has the shape (loads N, pads P, coefficients K).
 
         Args:
             x: States (amplitudes of the modes) of the loads (N, M), in Pa.
@@ -335,10 +346,10 @@ class _Model:
         return np.moveaxis(by_coefficient, 1, 2)
 
     def predict(self, theta: Array, design: Array) -> Array:
-        """Return the pad stresses (N, P), in Pa, that the model predicts.
+        """Return the stresses on P pads under N loads (N, P), in Pa, that the model predicts.
 
         Args:
-            theta: Parameters.
+            theta: Parameters (coefficients, then coordinates of the gains).
             design: Result of `design` for the loads (N, P, K), in Pa.
         """
         coefficients, gain = self.unpack(theta)
@@ -351,10 +362,10 @@ class _Model:
         design: Array,
         y: Array,
     ) -> Array:
-        """Return the residuals (measured minus predicted) divided by the noise (N P,).
+        """Return the residuals (measured minus predicted pad stress) divided by the noise (N P,).
 
         Args:
-            theta: Parameters.
+            theta: Parameters (coefficients, then coordinates of the gains).
             design: Result of `design` for the loads (N, P, K), in Pa.
             y: Measured pad stresses (N, P), in Pa.
         """
@@ -363,14 +374,14 @@ class _Model:
         return residuals.ravel()
 
     def jacobian(self, theta: Array, design: Array) -> Array:
-        """Return the derivatives of the predicted readings, divided by the noise.
+        """Return the derivatives of the predicted pad stresses with respect to the parameters.
 
         Args:
-            theta: Parameters.
-            design: Result of `design` for the loads (N, P, K), in Pa.
+            theta: Parameters (coefficients, then coordinates of the gains).
+            design: Result of `design` for N loads (N, P, K), in Pa.
 
         Returns:
-            Derivatives (N P, parameters) with respect to the parameters.
+            Derivatives (N P, parameters), divided by the noise of the pad.
         """
         coefficients, gain = self.unpack(theta)
         free = design[:, :, self.free]
@@ -386,7 +397,7 @@ class _Model:
         design: Array,
         y: Array,
     ) -> tuple[Array, Array, float]:
-        """Fit the parameters to readings, in the stages that `STAGES` lists.
+        """Fit the parameters to readings: with equal, then Huber's, then Tukey's weights.
 
         Args:
             design: Result of `design` for the loads (N, P, K), in Pa.
@@ -404,8 +415,8 @@ class _Model:
             for _ in range(MAX_STEPS):
                 r = self.residuals(theta, design, y)
                 if stage == "huber":
-                    # Tukey's stage keeps the last scatter of Huber's, because with a new one in
-                    # each step it might not converge.
+                    # Tukey's stage keeps the last scatter (standard deviation of the residuals) of
+                    # Huber's, because with a new one in each step it might not converge.
                     scale = estimate_scatter(r)
                 if stage != "plain":
                     weights = compute_weights(stage, r / scale)
@@ -416,7 +427,8 @@ class _Model:
                 weighted = root[:, None] * jacobian
                 step = least_squares(weighted, root * r)
                 theta = theta + step
-                # For parameters near 0, the 1 makes the tolerance absolute.
+                # The tolerance is relative to the parameters. If they are near 0, the 1 makes it
+                # absolute.
                 limit = tolerance * (1 + np.linalg.norm(theta))
                 if np.linalg.norm(step) <= limit:
                     break
@@ -501,7 +513,7 @@ def _cross_validate(
         model: The model.
         design: Result of `_Model.design` for the loads (N, P, K), in Pa.
         y: Measured pad stresses (N, P), in Pa.
-        is_used: Whether a reading is no outlier (N, P).
+        is_used: Whether a reading (stress on a pad under a load) is no outlier (N, P).
 
     Returns:
         Ratio of the rms error of predicted pad stresses to the rms of measured ones; NaN with fewer
@@ -533,30 +545,30 @@ def _advise(
     null: Array,
     is_open: Mask,
 ) -> list[str]:
-    """Find loads that, added to the given ones, would determine the remaining coefficients.
+    """Find loads to add, so that all loads together determine all coefficients of the response.
 
     Each advised load has a single mode (linear stress field).
 
     Args:
         model: The model.
-        theta: Fitted parameters.
+        theta: Fitted parameters (coefficients, then coordinates of the gains).
         x: States (amplitudes of the modes) of the given loads (N, M), in Pa.
         null: Basis (parameters, H) of the changes of the parameters that change no reading.
-        is_open: Whether the loads do not determine a coefficient, for those that are not fixed.
+        is_open: For each coefficient that is not fixed, whether the loads leave it undetermined.
 
     Returns:
         One sentence for each load to add.
     """
     advice = []
     free = [model.structure.names[k] for k in model.free]
-    # An array of objects allows to select names with a mask.
+    # As an array of objects, the names can be selected with a mask.
     names = np.array(free, dtype=object)
     theta = theta.copy()
-    # A coefficient of 0 would give no stress on its pads, so their gains would seem undetermined.
-    # Any other value of the unknown coefficients avoids this.
+    # If an unknown coefficient was 0, it would cause no stress on its pads, and the gains of these
+    # pads would seem undetermined, too. Any other value avoids this.
     theta[: len(names)][is_open] = 0.5
-    # The advised loads are as large (rms) as the given ones, for which the signals of the pads were
-    # large enough.
+    # The advised loads have the rms amplitude of the given ones, under which the pads had signals
+    # that were large enough.
     amplitudes = x[x != 0]
     size = np.sqrt(np.mean(amplitudes**2))
     single_modes = size * np.eye(x.shape[1])
@@ -568,8 +580,8 @@ def _advise(
             jacobian = model.jacobian(theta, model.design(candidate))
             new_null = null_space(jacobian)
             new_open = find_undetermined(new_null, len(names))
-            # The best load leaves the fewest coefficients undetermined and, among equals, the
-            # fewest independent changes of the parameters that change no reading.
+            # The best load leaves the fewest coefficients undetermined. Among equal ones, it leaves
+            # the fewest independent changes of the parameters that change no reading.
             left = (new_open.sum(), new_null.shape[1], mode)
             results.append((left, candidate, new_null, new_open))
         (_, n_left, best), loads, new_null, new_open = min(results, key=itemgetter(0))
@@ -579,8 +591,8 @@ def _advise(
                 "give them as fixed, or choose a larger symmetry"
             )
             break
-        # One more load may not determine a coefficient yet, but only together with the next one.
-        # The sentence then names all undetermined coefficients.
+        # Sometimes this load determines a coefficient only together with the next advised one. The
+        # sentence then names all undetermined coefficients.
         settled = names[is_open & ~new_open]
         subject = settled if len(settled) else names[is_open]
         name = model.structure.modes.names[best]
@@ -593,7 +605,7 @@ def _advise(
 
 
 def describe_mode(name: str) -> str:
-    """Return a mode in words, such as "sigma_zz growing along x" for the name "zz_x"."""
+    """Return a mode (linear stress field) in words: for "zz_x", "sigma_zz growing along x"."""
     terms = []
     for part in name.split("-"):
         place = f" growing along {part[3]}" if "_" in part else ", uniform"

@@ -64,9 +64,9 @@ def read_loads(
     The columns are:
 
     - the frequency of each pad in Hz, with the name of the pad (`+z-x` …);
-    - the load: either amplitudes of modes in Pa (`zz`, `zz_x` …; gradients times the half side; a
-      mode without a column is 0), or the force `fx`, `fy`, `fz` in N of a reference sensor on the
-      face +z;
+    - the load: either amplitudes of modes (linear stress fields) in Pa (`zz`, `zz_x` …; gradients
+      are multiplied by half the side of the cube; a mode without a column is 0), or the force `fx`,
+      `fy`, `fz` in N that a reference sensor measured on the face +z;
     - `temperature` in °C, if it is known.
 
     Args:
@@ -144,7 +144,7 @@ def _read_states(
     """
     forces = [name for name in FORCE if name in columns]
     amplitudes = [name for name in modes.names if name in columns]
-    # Amplitudes and forces together could contradict each other.
+    # Amplitudes of modes and forces both state the load, so they could contradict each other.
     if bool(forces) == bool(amplitudes):
         found = "both" if amplitudes else "neither"
         raise FitError(
@@ -205,7 +205,8 @@ def _read_lines(path: Path) -> list[list[str]]:
     try:
         # Spreadsheet programs begin a file with a byte order mark, which this encoding removes.
         text = read_bounded(path, MAX_BYTES, "table of loads").decode("utf-8-sig")
-        # The csv module must see the ends of lines unchanged, because a quoted cell may hold some.
+        # The csv module must get the ends of lines unchanged, because a cell in quotation marks may
+        # contain some.
         file = io.StringIO(text, newline="")
         lines = list(csv.reader(file))
     except ConfigError as error:

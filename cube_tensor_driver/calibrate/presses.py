@@ -40,11 +40,11 @@ Smaller changes may be noise.
 
 MIN_PRESS_CHANGE = 2e-4
 """Smallest frequency change of a pad that counts as a press, relative to its frequency without
-load. It holds if the noise of the pads would allow a smaller change."""
+load. A smaller change is no press, even if it is far above the noise of the pads."""
 
 STEADY_SHARE = 0.1
-"""Limit below which a press counts as steady: no pad's frequency differs between two successive
-averages by more than this fraction of the largest frequency change that the press caused."""
+"""A press counts as steady when no pad's frequency differs between two successive averages by more
+than this fraction of the largest frequency change that the press caused."""
 
 RELEASED_SHARE = 0.4
 """A press has ended when the largest frequency change of all pads is below this fraction of the
@@ -124,7 +124,7 @@ class PressDetector:
 
         Args:
             rest: Frequencies without load (C, P), in Hz, of the P pads of C cubes.
-            noise: Standard deviations of the frequencies relative to them (C, P).
+            noise: Standard deviations of these frequencies, divided by the frequencies (C, P).
             works: Whether a pad works and is used (C, P).
         """
         self._rest, self._works = rest, works
@@ -203,8 +203,8 @@ def expected_presses(
     centres = depth * places
     loaded = finger + centres[:, :, None, :]
     stress, slope = field(cube_position, loaded, force, POISSONS_RATIO)
-    # The slope has the axes (..., k, component) with the axis k of the derivative; a gradient has
-    # the axes (..., i, j, k).
+    # The slope (derivative of the stress along axis k) has the axes (..., k, component). A gradient
+    # is a matrix for each k and has the axes (..., i, j, k).
     by_component = np.moveaxis(slope, -1, -2)
     by_matrix = to_matrix(by_component)
     gradient = np.moveaxis(by_matrix, -3, -1)
@@ -295,7 +295,8 @@ def _find_order(
 ) -> tuple[Index, float]:
     """Find the order of the pads, for one rotation of the cube.
 
-    The search swaps two pads at a time, as long as the best swap reduces the misfit enough.
+    The search swaps two pads at a time, as long as the best swap reduces the misfit (root of the
+    unexplained fraction of the squared stresses on the pads) enough.
 
     Args:
         measured: Stresses on the pads in K presses (K, P), in Pa.
@@ -329,12 +330,15 @@ def _misfit(
     expected: Array,
     places: Index,
 ) -> Array:
-    """Compute the misfit of several orders of the pads, as the head of this file defines it.
+    """Compute the misfit of several orders of the pads, in which the wires may lead to them.
+
+    The misfit is the root of the fraction of the squared measured stresses that the expected ones
+    do not explain, with the best distance and force for each press.
 
     Args:
         measured: Stresses on the pads in K presses (K, P), in Pa.
         expected: Stresses expected for one rotation (K, G, P), in Pa, at G distances.
-        places: S orders of the pads (S, P).
+        places: S orders: the number of the pad to which each wire leads (S, P).
 
     Returns:
         Misfit of each order (S,).

@@ -229,7 +229,8 @@ def _read_reference(
             )
         return stamp_ns, loads_from_forces(modes, values, area)
 
-    # The amplitude of a mode with a gradient is the gradient times the half side of the cube.
+    # Columns after the stresses are gradients, in Pa/m. The amplitude of such a mode (linear stress
+    # field) is the gradient times half the side of the cube.
     values[:, len(STRESS) :] *= half_side
     shape = (len(values), modes.n_modes)
     state = np.zeros(shape)

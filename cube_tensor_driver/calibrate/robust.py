@@ -34,12 +34,12 @@ STAGES = {
     "huber": 1e-3,
     "tukey": 1e-9,
 }
-"""Stages of the fit in their order: least squares with equal weights, with Huber's weights, and
-with Tukey's weights. A stage ends when a step changes the parameters, relatively, by at most the
-number that stands with it.
+"""Stages of the fit in their order: least squares with equal weights ("plain"), with Huber's
+weights, and with Tukey's weights. A stage ends when a step changes the parameters by at most this
+fraction of their size.
 
 With Huber's weights the fit has a single minimum, with Tukey's it has several. So Huber's stage
-only has to lead near the right one.
+only has to lead near the right one, and its fraction is larger.
 """
 
 DIRECTION_TOLERANCE = 1e-6
@@ -108,7 +108,8 @@ def null_space(jacobian: Array) -> Array:
     scaled, _ = _scale_columns(jacobian)
     _, s, vt = np.linalg.svd(scaled, full_matrices=True)
     limit = DIRECTION_TOLERANCE * s[0]
-    # If no parameter changes a predicted value, s[0] is 0, and the rank is 0.
+    # If no parameter changes a predicted value, the largest singular value s[0] is 0, and so is the
+    # rank.
     rank = int(np.sum(s > limit))
     directions: Array = vt[rank:].T
     return directions
@@ -122,7 +123,7 @@ def find_undetermined(null: Array, count: int) -> Mask:
         count: Number of parameters to examine, from the first on.
 
     Returns:
-        Whether such a change changes the parameter (count,).
+        For each examined parameter, whether one of these changes alters it (count,).
     """
     part = np.linalg.norm(null[:count], axis=1)
     undetermined: Mask = part > DIRECTION_TOLERANCE
@@ -148,8 +149,8 @@ def robust_covariance(
     Returns:
         Covariance (C, C) of the parameters.
     """
-    # With u = (r / limit)², Tukey's psi is r (1 - u)². Setting u to 1 for outliers makes psi and
-    # its derivative 0 for them.
+    # Tukey's psi (residual times its weight) is r (1 - u)² with u = (r / TUKEY_LIMIT)². Setting u
+    # to 1 for outliers makes psi and its derivative 0 for them.
     is_inlier = np.abs(r) < TUKEY_LIMIT
     ratio = r / TUKEY_LIMIT
     u = np.where(is_inlier, ratio**2, 1)

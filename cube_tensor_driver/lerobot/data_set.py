@@ -22,7 +22,7 @@ from .topics import Topic
 from .windows import TACTILE, WINDOW_COLUMNS
 
 VERSION = "v3.0"
-"""Version of the format LeRobotDataset in which data sets are written."""
+"""Version of LeRobotDataset, the file format for robot learning in which data sets are written."""
 
 MAX_FILES_PER_CHUNK = 1000
 """Largest number of Parquet files in one folder (which LeRobot calls chunk) of a data set."""
@@ -58,7 +58,10 @@ _IMAGE = pyarrow.struct(
 
 
 class DataSet:
-    """A data set that is written episode after episode; a context manager that closes its files.
+    """A LeRobot data set (table of frames, which are time steps at a constant rate).
+
+    It is written episode after episode (an episode is one execution of a task), and is a context
+    manager that closes its files.
 
     Attributes:
         fps: Frames per second.
@@ -84,7 +87,7 @@ class DataSet:
         Args:
             folder: Folder of the data set.
             skin: Skin of all bags.
-            topics: Topics other than stress that become features, such as images.
+            topics: Topics other than stress that become features (columns), such as images.
             fps: Frames per second.
             depth: Number of samples of each cube that a frame has room for.
             frames: Total number of frames that will be written.
@@ -101,8 +104,8 @@ class DataSet:
         self._writer: Any = None
         self._file_number = 0
         # Integer columns beside the stress (stamps, status bits) have no statistics, because
-        # policies do not normalise them. Statistics of the stress have one row per place for a
-        # sample of a cube, all others one per frame.
+        # policies do not normalise them. Statistics of the stress have one row for each sample of a
+        # cube that the frames have room for, all others one per frame.
         samples = frames * depth * len(skin.cubes)
         self._statistic_rows = {TACTILE: samples, RESIDUAL: samples}
         others = [topic.key for topic in topics]
@@ -117,7 +120,7 @@ class DataSet:
         self.close_file()
 
     def new_statistics(self) -> dict[str, Statistics]:
-        """Return empty statistics of an episode, by the names of the features that have some."""
+        """Return empty statistics, by the names of the features (columns) that have statistics."""
         statistics = {}
         for key, rows in self._statistic_rows.items():
             statistics[key] = Statistics(rows)
@@ -127,7 +130,7 @@ class DataSet:
         self,
         columns: dict[str, AnyArray | list[bytes]],
     ) -> None:
-        """Write successive frames as one row group of the current Parquet file.
+        """Write successive frames (time steps) as one group of rows of the current Parquet file.
 
         Args:
             columns: By the names of the features (columns of the data set): arrays whose first
@@ -152,7 +155,7 @@ class DataSet:
         self.frames += len(table)
 
     def close_file(self) -> None:
-        """Complete the current Parquet file, if there is one; the next frames begin a new one."""
+        """Complete the current Parquet file, if there is one; frames that follow get a new file."""
         if self._writer is not None:
             self._writer.close()
             self._writer = None
@@ -169,10 +172,10 @@ class DataSet:
         episode: Episode,
         statistics: dict[str, Statistics],
     ) -> None:
-        """Add an episode, whose frames have all been written, to the table of episodes.
+        """Add an episode (one execution of a task) to the table of episodes.
 
         Args:
-            episode: The episode.
+            episode: The episode, whose frames have all been written.
             statistics: Statistics of the episode, by the names of the features.
         """
         frames = len(episode.counts)
@@ -269,7 +272,7 @@ class DataSet:
 
 
 def describe_skin(skin: Skin) -> dict[str, Any]:
-    """Describe the feature `observation.tactile`: components, units, and the cubes' poses."""
+    """Describe the feature `observation.tactile` (stress): components, units, and cubes' poses."""
     cubes = [
         {
             "name": cube.name,
@@ -338,7 +341,7 @@ def _column(values: AnyArray | list[bytes]) -> pyarrow.Array:
             one with more dimensions becomes nested lists.
     """
     if isinstance(values, list):
-        # If the path is None, LeRobot reads the image from the bytes.
+        # LeRobot reads an image from the bytes if it has no path to an image file.
         images = [{"bytes": image, "path": None} for image in values]
         return pyarrow.array(images, _IMAGE)
     flat = np.ascontiguousarray(values).reshape(-1)
@@ -361,7 +364,8 @@ def _task_table(tasks: list[str]) -> pyarrow.Table:
     Args:
         tasks: Texts of the tasks, by their indices.
     """
-    # Format of this metadata: https://pandas.pydata.org/docs/development/developer.html
+    # This metadata makes the texts the row labels in pandas. Its format is described in
+    # https://pandas.pydata.org/docs/development/developer.html
     label = {
         "name": "task",
         "field_name": "task",

@@ -38,12 +38,12 @@ class Exported:
     """Size of an exported data set, and of what was left out of it.
 
     Attributes:
-        episodes: Number of exported episodes.
-        frames: Number of exported frames.
+        episodes: Number of exported episodes (executions of a task).
+        frames: Number of exported frames (time steps).
         rows: Number of exported samples of cubes.
         depth: Number of samples of each cube that a frame has room for.
         usual: Number of samples of each cube in most frames.
-        features: Names of the features that come from topics other than stress.
+        features: Names of the features (columns) that come from topics other than stress.
         outside: Number of samples that lie in no episode.
         unknown: Number of samples of cubes that the skin does not have.
         empty: Number of episodes without a sample, which are not exported.
@@ -66,12 +66,14 @@ def export_lerobot(
     choices: Choices,
     report: Report,
 ) -> Exported:
-    """Write a data set for LeRobot. Its folder gets its final name only when it is complete.
+    """Write a LeRobot data set of some bags (recordings).
+
+    The folder gets its final name only when the data set is complete.
 
     Args:
         bags: Folders or files of bags.
         folder: Folder of the data set; it must be empty or not exist.
-        choices: Frame rate, tasks, topics and overrides that the user chose.
+        choices: Options that the user chose, such as frame rate, tasks and topics.
         report: Function that displays progress (see `plan.Report`).
 
     Raises:
@@ -87,7 +89,8 @@ def export_lerobot(
     topics = find_topics(bags, choices)
     frames = sum(len(each) for each in counts)
     depth = max(int(each.max()) for each in counts)
-    # The incomplete data set lies beside the final folder (same file system) to be renamed.
+    # The incomplete data set lies beside the final folder, so that it can be renamed: this works only
+    # within one file system.
     partial = folder.absolute()
     partial = partial.with_name(f"{partial.name}.partial")
     try:
@@ -138,7 +141,11 @@ def check_empty(folder: Path) -> None:
 
 
 class EpisodeWriter:
-    """Writes one episode of a data set: it collects rows of stress and writes complete frames."""
+    """Writes one episode (execution of a task) of a data set.
+
+    It collects rows of stress (one sample of one cube each) and writes frames (time steps of the
+    data set) when they are complete.
+    """
 
     def __init__(
         self,
@@ -151,8 +158,8 @@ class EpisodeWriter:
         Args:
             data_set: The data set to write into.
             episode: The episode, with its numbers of samples.
-            topics: Numbers and images on the topics other than stress, by the names of their
-                features.
+            topics: Numbers and images on the topics other than stress, by the names of the features
+                (columns of the data set) that they become.
         """
         self._data_set = data_set
         self._episode = episode
@@ -196,7 +203,8 @@ class EpisodeWriter:
         """Write successive frames with all of their features, and add them to the statistics.
 
         Args:
-            windows: Stress of these frames, as `Windows.complete` has just returned it.
+            windows: Arrays of the stress in these frames, as `Windows.complete` has just returned
+                them, by the names of the features (columns of the data set).
         """
         data_set, last = self._data_set, self._windows.done
         frames = len(windows[TACTILE])
@@ -218,7 +226,8 @@ class EpisodeWriter:
             columns[key] = numbers[:, np.newaxis]
         data_set.write(windows | columns)
 
-        # Places of a window without a sample are NaN, which the statistics leave out.
+        # A window has room for more samples than most frames have. What is left free is NaN, which
+        # the statistics leave out.
         components = windows[TACTILE].reshape(-1, len(COMPONENTS))
         residual = windows[RESIDUAL].reshape(-1, 1)
         self._statistics[TACTILE].add(components)
@@ -230,8 +239,8 @@ class EpisodeWriter:
             if isinstance(values, np.ndarray):
                 self._statistics[key].add(values)
                 continue
-            # Every stride-th frame of the episode is chosen. This block begins at frame `first`, so
-            # its first chosen frame has the index -first % stride in the block.
+            # Every stride-th frame of the episode is chosen. `values` begins with frame `first`, so
+            # its first chosen frame has the index -first % stride in it.
             for image in values[-first % stride :: stride]:
                 pixels = image_pixels(image)[::PIXEL_STRIDE, ::PIXEL_STRIDE]
                 # LeRobot normalises images of the shape (bands, height, width), to which statistics
@@ -281,9 +290,9 @@ def _write_bag(
 
     Args:
         data_set: The data set to write into.
-        plan: The bag and its episodes.
-        topics: Topics other than stress.
-        choices: Frame rate, tasks, topics and overrides that the user chose.
+        plan: The bag and its episodes (executions of a task).
+        topics: Topics other than stress that become features (columns) of the data set.
+        choices: Options that the user chose, such as the frame rate.
         report: Function that displays progress.
     """
     with Bag(plan.path) as bag:
@@ -298,7 +307,8 @@ def _write_bag(
             # All unfinished episodes are offered the rows, because rows of a hub whose connection
             # is slow can belong to an earlier episode than those of the other hubs.
             done += sum(writer.add(rows) for writer in waiting)
-            # Episodes lie one after the other in a data set, so only the first one is written.
+            # The frames of a data set lie episode after episode, so only the first unfinished one may
+            # be written.
             while waiting and waiting[0].write():
                 waiting.pop(0)
             report(done, total, f"exporting {plan.path}")
@@ -310,12 +320,14 @@ def _stress_rows(
     plan: BagPlan,
     choices: Choices,
 ) -> Iterator[StressRows]:
-    """Yield the reconstructed stress of a bag, without rows of cubes that the skin does not have.
+    """Yield the stress that is reconstructed from the frequencies in a bag.
+
+    Rows (samples of one cube) of cubes that the skin does not have are left out.
 
     Args:
         data_set: The data set, in which the calibrations are noted.
         plan: The bag.
-        choices: Topic of the frequencies, and overrides of calibrations and tare.
+        choices: Topic of the frequencies, and calibrations and tare that replace the recorded ones.
     """
     noted = data_set.calibrations
     with open_bag(plan.path, choices.frequencies) as source:
@@ -327,7 +339,8 @@ def _stress_rows(
                 continue
             calibrations = settings[segment.number].calibrations
             ids = [one.id for one in calibrations]
-            # Only changes are noted, because most data sets have the same calibrations throughout.
+            # The calibrations are noted only when they change, because in most data sets they are
+            # the same throughout.
             if not noted or noted[-1]["ids"] != ids:
                 since_ns = int(known.stamp_ns.min())
                 change = {

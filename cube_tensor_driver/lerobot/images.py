@@ -90,7 +90,8 @@ class ImageStream:
         Args:
             episode: Episode of the frames.
             first: Number of the first frame in the episode.
-            last: Number of the frame after the last one. Later calls must continue from here.
+            last: Number of the frame after the last one; the next call must begin with it, because
+                the bag is read only once.
 
         Raises:
             BagError: An image cannot be read, or has another shape than `shape`.
@@ -118,7 +119,7 @@ class ImageStream:
             self._next = next(self._unread, None)
         if message is not None:
             self._latest, shape = self._encode(message)
-            # LeRobot requires that all images of a feature have the same shape.
+            # LeRobot requires that all images of a feature (column) have the same shape.
             if shape != self.shape:
                 self._fail(f"an image of {shape} after ones of {self.shape}")
         return self._latest
@@ -141,7 +142,7 @@ class ImageStream:
             # Only uncompressed images state an encoding; compressed ones are image files already.
             is_raw = hasattr(message, "encoding")
             file = encode_raw(message) if is_raw else bytes(message.data)
-            # This reads only the header of the file, and decodes no pixels.
+            # Opening an image reads only the header of its file, and decodes no pixels.
             with Image.open(io.BytesIO(file)) as image:
                 bands = len(image.getbands())
                 return file, (image.height, image.width, bands)

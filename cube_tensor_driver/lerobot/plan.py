@@ -27,18 +27,20 @@ from ..core.errors import BagError
 from ..messages.codec import SECOND
 
 MARK_TYPE = "std_msgs/msg/String"
-"""Message type of marks: recorded texts that divide a bag into episodes. The text of a mark is the
-task of the episode that begins with it."""
+"""Message type of marks: recorded texts that divide a bag into episodes (executions of a task). The
+text of a mark is the task of the episode that begins with it."""
 
 MIN_NS = -(1 << 63)
-"""Smallest time in 64 bits, in ns: the begin of the single episode of a bag without marks."""
+"""Smallest time in 64 bits, in ns. A bag without marks (texts that begin an episode) has a single
+episode that begins at this time."""
 
 MAX_NS = (1 << 63) - 1
-"""Largest time in 64 bits, in ns: the end of the last episode of a bag."""
+"""Largest time in 64 bits, in ns: the end of the last episode (execution of a task) of a bag."""
 
 MAX_STAMP_RATIO = 10
-"""Largest allowed ratio of the time between the first and the last stamp of an episode to the
-duration of the recording. A larger ratio means that a clock was set, and is an error.
+"""Largest allowed ratio of the time between the first and the last stamp of an episode (execution
+of a task) to the duration of the recording. A larger ratio means that a clock was set, and is an
+error.
 
 The ratio can be above 1, because a bag may be recorded from a replay at several times its speed.
 """
@@ -72,10 +74,11 @@ class Choices:
         marks: Topic of the marks (texts that begin episodes); None: each bag is one episode.
         frequencies: Topic of the frequencies; None: that of the only skin in a bag.
         topics: Topics to add beside the stress; None: all with images or stamped numbers.
-        state: Topic that becomes the feature observation.state; None: the topic of joint states, if
-            there is only one.
-        action: Topic that becomes the feature action; None: the data set has no actions.
-        overrides: Calibrations and tare that replace those of the recordings.
+        state: Topic that becomes the feature (column) observation.state; None: the topic of joint
+            states, if there is only one.
+        action: Topic that becomes the feature action (commands to the robot); None: the data set
+            has no actions.
+        overrides: Calibrations and tare (frequencies without load) that replace the recorded ones.
     """
 
     fps: int
@@ -97,7 +100,8 @@ class Episode:
         begin_ns: Time at which frame 0 begins, in ns since the Unix epoch: the earliest stamp among
             the first samples that are counted.
         rows: Number of samples of all cubes.
-        counts: (frames, cubes) number of samples of each cube in each frame.
+        counts: (frames, cubes) number of samples of each cube in each frame (time step of the data
+            set).
     """
 
     def __init__(
@@ -145,10 +149,13 @@ class Episode:
         return frames
 
     def sample_frame_of(self, stamp_ns: Times) -> Index:
-        """Return the number of the frame (N,) to which the sample with each stamp (N,) belongs.
+        """Return the number of the frame (time step) to which the sample with each stamp belongs.
 
         Samples before `begin_ns` belong to frame 0: the samples of some hubs arrive later than the
         first counted sample, but were taken a little earlier.
+
+        Args:
+            stamp_ns: (N,) stamps, in ns since the Unix epoch.
         """
         return np.maximum(self.frame_of(stamp_ns), 0)
 
@@ -168,8 +175,8 @@ class Episode:
         stamp_ns = stamp_ns[inside]
         if not len(cube):
             return
-        # The first samples determine the begin of frame 0. Samples that are read later but have
-        # earlier stamps are put into frame 0.
+        # The first samples determine the begin of frame 0 (the first time step). Samples that are
+        # read later but have earlier stamps are put into it, too.
         if not self.rows:
             self.begin_ns = int(stamp_ns.min())
         frame = self.sample_frame_of(stamp_ns)
@@ -228,7 +235,7 @@ def plan_bag(
     choices: Choices,
     report: Report,
 ) -> BagPlan:
-    """Find the episodes of a bag and count their samples.
+    """Find the episodes (executions of a task) in a bag and count their samples.
 
     Args:
         path: Folder or file of the bag.
@@ -276,7 +283,8 @@ def plan_bag(
 
     covered_s = (last_ns - first_ns) / SECOND
     rate = _check_rate(source, samples, covered_s, choices.fps)
-    # Episodes without samples are left out; often one begins just before the recording ends.
+    # Episodes without samples are left out. Often the last one begins just before the end of the
+    # recording.
     used = [episode for episode in episodes if episode.rows]
     for episode in used:
         episode.finish()
@@ -368,7 +376,7 @@ def _marked_spans(
     bag: Bag,
     topic: str,
 ) -> list[tuple[int, int, str]]:
-    """Return the episodes into which marks divide a bag.
+    """Return the episodes (executions of a task) into which marks divide a bag.
 
     A mark is a recorded text. At the time of its recording it ends the episode before and begins a
     new one, whose task is the text. An empty text only ends the episode before.

@@ -63,7 +63,7 @@ class Topic:
         return self.msgtype in IMAGE_TYPES
 
     def describe(self, bag: Bag) -> None:
-        """Add the names of the numbers in a bag to `names`, or set the shape of the images."""
+        """Read the messages in a bag, to extend `names` or, for images, to set `shape`."""
         if not self.is_image:
             # Bags may contain different joints, so the feature gets the joints of all bags.
             names = dict.fromkeys(self.names)
@@ -74,7 +74,7 @@ class Topic:
             self.shape = ImageStream(bag, self.name).shape
 
     def open(self, bag: Bag) -> ImageStream | Signal:
-        """Read the numbers of a bag, or prepare to read its images.
+        """Read the topic's numbers in a bag, or prepare to read its images there.
 
         Images are read one by one when their frames are written, because a recording of images can
         be larger than the memory.
@@ -92,7 +92,7 @@ class Signal:
 
         Args:
             bag: Open bag.
-            topic: The topic, with the names of the numbers in all bags.
+            topic: The topic. Its `names` are those of the numbers in all bags of the data set.
 
         Raises:
             BagError: The bag is damaged, or a JointState has more or fewer values than joint names.
@@ -127,7 +127,7 @@ class Signal:
             (frames, numbers) values; NaN before the first message, and for numbers that the bag
             does not have.
         """
-        # A message belongs to the frame in which its stamp lies, as a sample of a cube does.
+        # A message belongs to the frame (time step) in which its stamp lies.
         frame_of_message = episode.frame_of(self._stamp_ns)
         frames = np.arange(first, last)
         row = np.searchsorted(frame_of_message, frames, side="right")
@@ -285,7 +285,8 @@ def _nested_paths(
         if node == Nodetype.NAME:
             yield from _nested_paths(bag, bag.fields(kind), f"{prefix}{name}.")
             continue
-        # The kind of a list is the node and kind of its elements, and its length.
+        # For a list of fixed length, `kind` consists of the node and kind of its elements, and the
+        # length.
         if node == Nodetype.ARRAY:
             node, kind = kind[0]
         if node != Nodetype.BASE:

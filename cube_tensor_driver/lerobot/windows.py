@@ -83,8 +83,8 @@ class Windows:
         while self.done < len(self._counts):
             block = self._counts[self.done : self.done + self._block]
             end = self.done + len(block)
-            # The first pass over the bag has counted the rows of every frame. A block is complete
-            # only when all of them are there, including those of hubs that deliver late.
+            # The first pass over the bag has counted the rows of every frame. A block of frames is
+            # complete only when all of them are there, including those of hubs that deliver late.
             expected = int(block.sum(dtype=np.int64))
             frames = [frame for frame, _ in self._waiting]
             ready = sum(np.count_nonzero(frame < end) for frame in frames)
@@ -128,7 +128,7 @@ class Windows:
         order = np.argsort(cell, kind="stable")
         cell = cell[order]
         # The last row of each cell gets the last entry of the window, so that the newest sample is
-        # always there; the rows before it get the entries before.
+        # always there. The rows before the last one get the entries before it.
         ends = np.cumsum(counts, dtype=np.intp)
         to_end = ends[cell] - np.arange(len(cell))
         place = (
