@@ -138,17 +138,19 @@ def draw_rod_shear(result: RodShear) -> Figure:
 @print_style()
 def draw_prototype(experiments: Sequence[Experiment]) -> Figure:
     """Draw P_normal, P_shear, P_grad over displacement, as the paper's Fig. 8 shows them."""
-    figure = Figure(figsize=(9, 3.1))
-    axes = figure.subplots(1, len(experiments), sharey=True)
-    for axis, experiment in zip(axes, experiments, strict=True):
+    figure = Figure(figsize=(9, 4.4))
+    axes = figure.subplots(2, len(experiments), sharex="col", sharey="row")
+    for (upper, lower), experiment in zip(axes.T, experiments, strict=True):
         x = 1e3 * experiment.displacement
-        signals = zip(SIGNAL_LABELS, ("o-", "s-", "^:"), experiment.prototype.T, strict=True)
-        for label, style, signal in signals:
-            axis.plot(x, 1e-3 * signal, style, color="black", mfc="white", ms=4, label=label)
-        upper = 1e-3 * experiment.upper[:, 1]
-        axis.plot(x, upper, color="black", lw=1, dashes=(2, 2), label=UPPER_LABEL)
-        axis.set(title=experiment.name, xlabel="displacement / mm")
-        axis.title.set_fontsize(8)
-    axes[0].set_ylabel(r"signal $\sum \pm\Delta f_i$ / kHz")
-    axes[0].legend(fontsize=8)
+        curves = dict(zip(SIGNAL_LABELS, 1e-3 * experiment.prototype.T, strict=True))
+        curves[UPPER_LABEL] = 1e-3 * experiment.upper[:, 1]
+        for number, (label, signal) in enumerate(curves.items()):
+            # P_normal is ten times as large as the others, which have an axis of their own.
+            axis = upper if number == 0 else lower
+            axis.plot(x, signal, label=label, **curve_style(number))
+        upper.set_title(experiment.name, fontsize=8)
+        lower.set_xlabel("displacement / mm")
+    for axis in axes[:, 0]:
+        axis.set_ylabel(r"$\sum \pm\Delta f_i$ / kHz")
+        axis.legend(fontsize=8, handlelength=3)
     return figure

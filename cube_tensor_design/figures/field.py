@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cube_tensor_driver.core.arrays import Array
-from cube_tensor_driver.views.figures.style import print_style
+from cube_tensor_driver.views.figures.style import curve_style, print_style
 
 from ..studies.field_study import FieldExample, FieldStudy
 from ..studies.traction_study import METHODS
@@ -74,7 +74,8 @@ def draw_traction(example: FieldExample) -> Figure:
         f"predicted: {100 * relative_rms(predicted, truth):.1f} %": predicted,
     }
     image = _draw_maps(axes.flat[4:], example, errors)
-    figure.colorbar(image, ax=axes[1, 1:], label="error and predicted deviation / kPa")
+    # A colour bar of the whole row keeps the columns of both rows aligned.
+    figure.colorbar(image, ax=axes[1], label="error and predicted\ndeviation / kPa")
     _add_legend(axes[0, 0])
     return figure
 
@@ -188,27 +189,15 @@ def draw_field_study(study: FieldStudy) -> Figure:
     titles = ("cubes that observe every gradient", "planar cubes")
     pitches = 1e3 * study.pitches
     for kind, (axis, title) in enumerate(zip(axes, titles, strict=True), 1):
-        for row, (width, marker) in enumerate(zip(study.widths, "os^Dv", strict=True)):
-            grey = str(0.7 * row / len(study.widths))
-            style: dict[str, Any] = {
-                "color": grey,
-                "marker": marker,
-                "ms": 4,
-                "lw": 1,
-            }
+        for row, width in enumerate(study.widths):
+            style = curve_style(row) | {"linestyle": "-"}
             errors = study.error[row]
-            axis.loglog(
-                pitches,
-                errors[:, 0],
-                ls="--",
-                mfc="none",
-                **style,
-            )
+            axis.loglog(pitches, errors[:, 0], **style | {"linestyle": "--"})
             axis.loglog(pitches, errors[:, kind], label=f"{1e3 * width:.0f} mm", **style)
         axis.set(xlabel="pitch of the cubes / mm", title=title)
         axis.set_xticks(pitches, [f"{pitch:.0f}" for pitch in pitches], minor=False)
         axis.minorticks_off()
-    # Both panels share the legend: their widths have the same greys and markers.
+    # Both panels share the legend: their widths have the same colours and markers.
     axes[0].set_ylabel("rms error / rms pressure")
     legend = "width of the contact\n(dashed: without gradients)"
     axes[0].legend(

@@ -51,6 +51,9 @@ def draw_pads(calibration: Calibration) -> Figure:
         axes[1, column].set_xlabel("$x\\,/\\,d_0$")
     for axis in axes[:, 0]:
         axis.set_ylabel("$z\\,/\\,d_0$")
+    # A colour bar of both rows keeps their columns aligned.
+    label = "stress of the pads / kPa, tension positive"
+    figure.colorbar(colours, ax=axes, label=label, aspect=40)
     return figure
 
 

@@ -58,7 +58,7 @@ VALUE_STYLE = "text-align:right;font-family:monospace"
 
 STYLE = (
     "<style>"
-    ".mantine-Notification-root {font-size: 0.8em; padding: 0.2em 0.6em}"
+    ".mantine-Notification-root {font-size: 0.8em; padding: 0.3em 0.6em 0.3em 1.6em}"
     "@media (max-width: 36em) {"
     ".mantine-Notification-description {display: none}"
     "[style*='width: 20em'] {width: 100vw !important}"

@@ -93,7 +93,7 @@ class FieldModel:
             traction = inverse.field(values).traction
             columns = np.stack([-traction[:, 2], np.hypot(*traction[:, :2].T)], axis=1)
             pressure, shear = self._interpolate(inverse.points, columns).T
-            return SurfaceField(pressure, shear, "on the surface, for a thick elastomer")
+            return SurfaceField(pressure, shear, "on the surface of a thick elastomer")
         between = self._surface.field(values)
         # A shear component that is unknown (NaN) counts as 0 in the magnitude.
         shear = np.linalg.norm(np.nan_to_num(between.shear), axis=1)

@@ -20,6 +20,8 @@ DEPTH_MM = 1e3 * SURFACE_DEPTH
 """Depth of the cubes' centres below the surface, in mm."""
 MARGIN_MM = 8.0
 """Width of the skin beside the two cubes, in mm."""
+MARGIN_IN = 0.15
+"""Width of the margin of the picture, in inches."""
 CENTRE_LINE: dict[str, Any] = {"color": "0.6", "lw": 0.6, "ls": ":"}
 """Style of a line through the centre of a cube."""
 
@@ -34,6 +36,7 @@ def draw_cube(calibration: Calibration) -> Figure:
     for axis in (left, right):
         axis.set_aspect("equal")
         axis.axis("off")
+    figure.set_layout_engine("constrained", h_pad=MARGIN_IN, w_pad=MARGIN_IN)
     return figure
 
 

@@ -16,10 +16,12 @@ from cube_tensor_driver.core.rows import StressRows
 from cube_tensor_driver.touch.surface import Surface
 from cube_tensor_driver.views.figures.style import print_style
 
-ARROW_KPA = 2.0
+ARROW_KPA = 1.0
 """Shear of the arrow in the key, in kPa."""
 ARROW_MM = 5.0
 """Length of that arrow, in mm."""
+COLOURS = "Wistia"
+"""Colour map of the pressure. All of its colours are so light that black arrows are seen."""
 SURFACE_SIDE = 6
 """Number of points along the side of a cube's patch."""
 
@@ -51,15 +53,16 @@ def draw_fingers(
         surface = Surface(parts[name], depth, side=SURFACE_SIDE)
         points[name] = surface.points
         pressures[name] = 1e-3 * surface.field(values[cubes]).pressure
-    # One scale for all fingers.
-    top = max(float(np.nanmax(pressure)) for pressure in pressures.values())
+    # One scale for all fingers. It does not begin at zero, because the pressure hardly varies.
+    values_kpa = np.concatenate(list(pressures.values()))
+    limits = float(np.nanmin(values_kpa)), float(np.nanmax(values_kpa))
 
     figure = Figure(figsize=(9, 4))
     robot, *axes = figure.subplots(1, 1 + len(fingers), width_ratios=[1.9] + [1.0] * len(fingers))
     robot.imshow(pixels)
     robot.set_axis_off()
     for axis, (name, cubes) in zip(axes, fingers.items(), strict=True):
-        image = _draw_pressure(axis, points[name], pressures[name], top)
+        image = _draw_pressure(axis, points[name], pressures[name], limits)
         _draw_shear(axis, parts[name], 1e-3 * values[cubes])
         axis.set(title=f"{name} finger\n\n", xlabel="$x$ / mm", aspect="equal")
         axis.grid(False)
@@ -72,9 +75,9 @@ def _draw_pressure(
     axis: Any,
     points: Array,
     pressure: Array,
-    top: float,
+    limits: tuple[float, float],
 ) -> Any:
-    """Draw the pressure (M,) in kPa at points (M, 3) in m, from 0 to `top` kPa."""
+    """Draw the pressure (M,) in kPa at points (M, 3) in m, in a colour scale with these limits."""
     # The points are a grid in the order of the cubes' patches, not of rows.
     across = points[:, 0].round(6)
     up = points[:, 2].round(6)
@@ -82,7 +85,9 @@ def _draw_pressure(
     shape = (-1, len(np.unique(across)))
     x = 1e3 * points[order, 0].reshape(shape)
     z = 1e3 * points[order, 2].reshape(shape)
-    image = axis.pcolormesh(x, z, pressure[order].reshape(shape), vmin=0, vmax=top)
+    image = axis.pcolormesh(
+        x, z, pressure[order].reshape(shape), vmin=limits[0], vmax=limits[1], cmap=COLOURS
+    )
     image.set_rasterized(True)
     return image
 
@@ -93,7 +98,7 @@ def _draw_shear(axis: Any, poses: CubePoses, kilopascal: Array) -> None:
     # The shear acts along the x and y axes of each cube.
     along = np.einsum("nik,nk->ni", poses.rotation[:, :, :2], shear)
     x, _, z = 1e3 * poses.position.T
-    axis.plot(x, z, "s", ms=3, mfc="none", mec="0.7", lw=0.5)
+    axis.plot(x, z, "s", ms=3, mfc="none", mec="0.4", lw=0.5)
     arrows = axis.quiver(
         x,
         z,
@@ -104,6 +109,9 @@ def _draw_shear(axis: Any, poses: CubePoses, kilopascal: Array) -> None:
         scale_units="xy",
         scale=ARROW_KPA / ARROW_MM,
         width=0.012,
+        clip_on=False,
     )
+    # Arrows may end outside of the axes, but must not change their size.
+    arrows.set_in_layout(False)
     label = f"shear {ARROW_KPA:g} kPa"
     axis.quiverkey(arrows, 0.5, 1.04, ARROW_KPA, label, color="black", labelpos="N")

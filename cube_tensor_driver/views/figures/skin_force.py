@@ -49,7 +49,6 @@ def draw_forces(
     panels["force"].legend(
         handles,
         labels,
-        title="lines: script, marks: measured",
         ncol=3,
         loc="lower left",
         bbox_to_anchor=(0, 1),
@@ -76,7 +75,8 @@ def draw_forces(
         ylabel="$x$ / mm",
         aspect="equal",
     )
-    path.set_title("path of the centre of pressure\n(grey: cubes; circles: measured)", fontsize=9)
+    title = "path of the centre of pressure\n(grey: cubes, line: load script,\ncircles: measured)"
+    path.set_title(title, fontsize=9)
     return figure
 
 
@@ -93,7 +93,14 @@ def _draw_components(
             color=color,
             lw=1,
             ls=dash,
+            label=f"${letter}$, load script",
         )
         panel.plot(
-            times, measured[:, axis], marker, color=color, mfc="none", ms=3, label=f"${letter}$"
+            times,
+            measured[:, axis],
+            marker,
+            color=color,
+            mfc="none",
+            ms=3,
+            label=f"${letter}$, measured",
         )
