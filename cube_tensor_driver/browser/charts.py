@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import viser
-from matplotlib.figure import Figure
 from viser import uplot
 
-from ..core.arrays import Array
 from ..core.modes import COMPONENTS, STRESS
-from ..views.figures.style import curve_style, png, print_style, symbol
+from ..views.figures.panels import Panel, draw_panels
+from ..views.figures.style import png, symbol
+from ..views.round_numbers import round_range
 from . import markup
 from .history import History
 
@@ -60,12 +60,6 @@ The first entry is the height below the time axis, the second the width beside t
 CHART_HEIGHT = 250
 """Height of a chart, in pixels."""
 
-NOISE_SHARE = 0.02
-"""Fraction of the largest absolute value in a chart up to which values are considered as noise.
-
-If the values on one side of zero are all noise, the axis ends at zero on that side.
-"""
-
 GROUPS = {
     "normal stress": ("xx", "yy", "zz"),
     "shear": ("yz", "zx", "xy"),
@@ -82,11 +76,6 @@ All values of a group have the same unit, because a chart has one value axis.
 
 FIRST_GROUPS = ("normal stress", "gradient of σzz")
 """Names, in `GROUPS`, of the values that the two charts show when the page opens."""
-
-
-Panel = tuple[str, Array, dict[str, Array]]
-"""A chart for a picture: label of its value axis; times (M,) in s before now; name of a line -> its
-values (M,), in the unit of the label."""
 
 
 class ChartLine(NamedTuple):
@@ -138,10 +127,19 @@ class Charts:
             )
             # Each chart takes two positions in the tab: its drop-down list and its plot.
             self.lists = [
-                gui.add_dropdown("plot", tuple(GROUPS), initial_value=group, order=1 + 2 * number)
+                gui.add_dropdown(
+                    "plot",
+                    tuple(GROUPS),
+                    initial_value=group,
+                    order=1 + 2 * number,
+                )
                 for number, group in enumerate(FIRST_GROUPS)
             ]
-            files = gui.add_button_group("save as", ("CSV", "PNG"), order=10)
+            files = gui.add_button_group(
+                "save as",
+                ("CSV", "PNG"),
+                order=10,
+            )
             zoom = "To zoom, pause the page and drag. A double click shows all again."
             gui.add_html(markup.box(zoom), order=11)
         self._plots: list[viser.GuiUplotHandle | None] = [None] * len(FIRST_GROUPS)
@@ -195,7 +193,13 @@ class Charts:
         grid: uplot.Axis_Grid = {"stroke": "#dee2e6", "width": 1}
         labels = ("time before now / s", lines[0].axis)
         axes = tuple(
-            uplot.Axis(stroke="#343a40", grid=grid, size=size, label=label, labelSize=18)
+            uplot.Axis(
+                stroke="#343a40",
+                grid=grid,
+                size=size,
+                label=label,
+                labelSize=18,
+            )
             for size, label in zip(AXIS_SIZES, labels, strict=True)
         )
         series = [
@@ -226,10 +230,18 @@ class Charts:
             return
         if kind == "CSV":
             content = csv_of(history, self._cubes, self._names)
-            client.send_file_download("skin.csv", content, save_immediately=True)
+            client.send_file_download(
+                "skin.csv",
+                content,
+                save_immediately=True,
+            )
         elif kind == "PNG":
             panels = [chart_panel(history, lines) for lines in self._lines if lines]
-            client.send_file_download("skin.png", png(draw_lines(panels)), save_immediately=True)
+            client.send_file_download(
+                "skin.png",
+                png(draw_panels(panels)),
+                save_immediately=True,
+            )
 
 
 def chart_lines(
@@ -281,7 +293,7 @@ def chart_properties(history: History, lines: Sequence[ChartLine]) -> dict[str, 
 
 
 def chart_panel(history: History, lines: Sequence[ChartLine]) -> Panel:
-    """Return what `draw_lines` needs to draw a chart into a picture."""
+    """Return what `draw_panels` needs to draw a chart into a picture."""
     # matplotlib sets the symbol of a component as mathematics; the page shows plain text.
     label = lines[0].axis.replace("σzz", symbol("zz"))
     values = {line.printed: history.of(line.cube, line.column) / line.size for line in lines}
@@ -292,7 +304,11 @@ def _scales(low: float, high: float) -> dict[str, uplot.Scale]:
     return {"x": TIME_SCALE, "y": uplot.Scale(auto=False, range=(low, high))}
 
 
-def csv_of(history: History, cubes: Sequence[int], names: Sequence[str]) -> bytes:
+def csv_of(
+    history: History,
+    cubes: Sequence[int],
+    names: Sequence[str],
+) -> bytes:
     """Return the values of some cubes as a CSV table in SI units, with one row per instant.
 
     Args:
@@ -318,45 +334,3 @@ def csv_of(history: History, cubes: Sequence[int], names: Sequence[str]) -> byte
     table.writerow(header)
     table.writerows([f"{value:.6g}" for value in row] for row in zip(*columns, strict=True))
     return text.getvalue().encode()
-
-
-@print_style()
-def draw_lines(panels: Sequence[Panel]) -> Figure:
-    """Draw panels one below the other over a common time axis.
-
-    Args:
-        panels: Label, times and values of each panel, as `chart_panel` returns them.
-    """
-    figure = Figure(figsize=(8, 3 * len(panels)))
-    axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
-    for axis, (label, times, lines) in zip(axes, panels, strict=True):
-        for number, (name, values) in enumerate(lines.items()):
-            axis.plot(times, values, label=name, **curve_style(number) | {"marker": ""})
-        axis.set_ylabel(label)
-        axis.legend(
-            loc="center left",
-            bbox_to_anchor=(1.0, 0.5),
-            fontsize=8,
-            handlelength=3,
-        )
-    axes[-1].set_xlabel("time before now / s")
-    return figure
-
-
-def round_range(low: float, high: float) -> tuple[float, float]:
-    """Return the range of an axis that contains zero and the values from `low` to `high`.
-
-    Its ends are multiples of a step, which is half of 1, 2, 5 or 10 times a power of ten. The range
-    therefore changes seldom while the values change. A side on which no value exceeds `NOISE_SHARE`
-    of the largest one ends at zero.
-    """
-    size = max(-low, high, 1e-9)
-    # One noisy value below zero would add a whole step of empty space below positive values.
-    low, high = (end if abs(end) > NOISE_SHARE * size else 0.0 for end in (low, high))
-    power = 10.0 ** np.floor(np.log10(size))
-    # Without the tolerance, rounding could give a size of exactly 1, 2 or 5 the next larger step.
-    min_step = size * (1 - 1e-9)
-    step = power * next(factor for factor in (1, 2, 5, 10) if factor * power >= min_step) / 2
-    n_below = np.floor(min(low, 0) / step)
-    n_above = np.ceil(max(high, 0) / step)
-    return float(n_below * step), float(n_above * step)

@@ -55,7 +55,13 @@ class ServiceCalls:
             text = f"{what}: no node that can do it is running"
             self._say(f"{what} is not possible", text, "red")
             return
-        self._open.append(_Call(what, client.call_async(request), time.monotonic()))
+        self._open.append(
+            _Call(
+                what,
+                client.call_async(request),
+                time.monotonic(),
+            )
+        )
 
     def update(self) -> None:
         """Show a note for each call of a service that was answered or has timed out.
@@ -76,7 +82,11 @@ class ServiceCalls:
 
     def _report(self, what: str, answer: Any) -> None:
         if answer.success:
-            self._say(f"{what} is done", f"{what} done: {answer.message}", "green")
+            self._say(
+                f"{what} is done",
+                f"{what} done: {answer.message}",
+                "green",
+            )
         else:
             text = f"{what} refused, nothing was changed: {answer.message}"
             self._say(f"{what} was refused", text, "red")
@@ -100,7 +110,12 @@ class ReplayClient:
         self._services = services
         self._say = say
         self._client = node.create_client(SteerReplay, "player/steer")
-        node.create_subscription(ReplayState, "player/state", self._receive, 1)
+        node.create_subscription(
+            ReplayState,
+            "player/state",
+            self._receive,
+            1,
+        )
         self._received_s = -np.inf
         self._wanted_position: float | None = None
         self._wanted_s = -np.inf
@@ -152,7 +167,11 @@ class ReplayClient:
         if self.state is None or not self._client.service_is_ready():
             if now_s > self._wanted_s + MAX_ANSWER_S:
                 self._wanted_position = None
-                self._say("No jump is possible", "jump: no replay is running", "red")
+                self._say(
+                    "No jump is possible",
+                    "jump: no replay is running",
+                    "red",
+                )
             return False
 
         # The slider may still have the length of the bag that was replayed before this one.

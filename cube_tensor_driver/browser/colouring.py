@@ -47,17 +47,31 @@ class Colouring(NamedTuple):
             last_top: Upper end in the picture before, in SI units; an automatic range falls slowly
                 from it.
         """
-        pressure, sigma = scan.field.pressure, scan.field.sigma
-        above = None
-        if sigma is not None:
-            # `surface.middle` contains, for each cube, the index of the point nearest to it.
-            above = np.stack([pressure, sigma], axis=1)[surface.middle]
         cubes = quantity.of(scan.values, scan.residual)
+        # `surface.middle` contains, for each cube, the index of the point nearest to it.
+        middle = scan.field.pressure[surface.middle]
+        sigma = scan.field.sigma
+        above = None if sigma is None else np.stack([middle, sigma[surface.middle]], axis=1)
         if quantity is DEVIATION and above is not None:
             cubes = above[:, 1]
-        field = _field_values(scan, surface, quantity, cubes)
-        top = fixed_top or scene.automatic(quantity, np.concatenate([cubes, field]), last_top)
+        # For other quantities, each point has the value of the cube around which it lies.
+        field = {
+            QUANTITIES["pressure"].label: scan.field.pressure,
+            QUANTITIES["shear"].label: scan.field.shear,
+            DEVIATION.label: sigma,
+        }.get(quantity.label)
+        if field is None:
+            field = cubes[surface.cube]
+        top = fixed_top or scene.automatic(
+            quantity,
+            np.concatenate([cubes, field]),
+            last_top,
+        )
         return cls(quantity, cubes, field, top, above)
+
+    def colours(self, values: Array) -> Array:
+        """Return the colours (N, 3), from 0 to 1, of values (N,) in SI units; NaN is grey."""
+        return scene.colours(self.quantity, values, self.top)
 
     def text(self, cube: int) -> str:
         """Return the value of a cube as text with its unit.
@@ -73,29 +87,3 @@ class Colouring(NamedTuple):
             return value
         surface = markup.surface_pressure(*self.above[cube])
         return f"pressure {surface}" if self.quantity is DEVIATION else f"{value}, {surface}"
-
-
-def _field_values(
-    scan: Scan,
-    surface: Surface,
-    quantity: Quantity,
-    cubes: Array,
-) -> Array:
-    """Return the values (M,) at the points of the surface, in SI units.
-
-    The field contains pressure, shear and perhaps a standard deviation. For other quantities each
-    point has the value of the cube around which it lies.
-
-    Args:
-        scan: The instant that is drawn.
-        surface: Its M points.
-        quantity: The quantity that the colours show.
-        cubes: (N,) values at the cubes, in SI units.
-    """
-    if quantity is QUANTITIES["pressure"]:
-        return scan.field.pressure
-    if quantity is QUANTITIES["shear"]:
-        return scan.field.shear
-    if quantity is DEVIATION and scan.field.sigma is not None:
-        return scan.field.sigma
-    return cubes[surface.cube]

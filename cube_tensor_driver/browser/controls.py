@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
 import viser
@@ -16,25 +15,17 @@ from .surface_field import DEVIATION
 SLIDER_STEP_S = 0.1
 """Step, in seconds, between two positions of the slider that sets the time within a replay."""
 
-PART_LABELS = {
+PARTS = {
     "field": "field between the cubes",
     "traction": "traction arrows",
     "gradient": "gradient arrows",
     "principal": "principal stresses",
     "names": "names of cubes",
 }
-"""Name of a field of `Shown` -> text of the check box that shows or hides this part of the view."""
+"""Part of the 3-D view -> text of the check box that shows or hides it."""
 
-
-@dataclass
-class Shown:
-    """Which parts of the 3-D view are drawn; `PART_LABELS` describes the parts."""
-
-    field: bool = True
-    traction: bool = True
-    gradient: bool = True
-    principal: bool = False
-    names: bool = False
+FIRST_PARTS = {"field", "traction", "gradient"}
+"""Those of `PARTS` that are shown when the page opens."""
 
 
 class ReplayPosition(Protocol):
@@ -62,7 +53,12 @@ class ColourControls:
     def __init__(self, gui: viser.GuiApi) -> None:
         labels = [quantity.label for quantity in QUANTITIES.values()]
         self.list = gui.add_dropdown("colour", labels)
-        self._range = gui.add_number("top (0: auto)", 0.0, min=0.0, step=0.1)
+        self._range = gui.add_number(
+            "top (0: auto)",
+            0.0,
+            min=0.0,
+            step=0.1,
+        )
         self.legend = gui.add_html("")
 
     @property
@@ -79,20 +75,9 @@ class ColourControls:
         return value * self.quantity.size if math.isfinite(value) and value > 0 else 0.0
 
 
-def add_part_controls(gui: viser.GuiApi, shown: Shown) -> None:
-    """Add a check box for each part of the 3-D view, which shows or hides this part.
-
-    Args:
-        gui: The controls of one browser.
-        shown: Which parts are drawn; a click on a check box sets the field of its part.
-    """
-    for field in fields(Shown):
-        _add_check_box(gui, shown, field.name)
-
-
-def _add_check_box(gui: viser.GuiApi, shown: Shown, name: str) -> None:
-    box = gui.add_checkbox(PART_LABELS[name], getattr(shown, name))
-    box.on_update(lambda _: setattr(shown, name, bool(box.value)))
+def add_part_controls(gui: viser.GuiApi) -> dict[str, viser.GuiCheckboxHandle]:
+    """Add a check box for each of `PARTS`, and return them by the name of the part."""
+    return {name: gui.add_checkbox(text, name in FIRST_PARTS) for name, text in PARTS.items()}
 
 
 class ReplayControls:
@@ -112,7 +97,13 @@ class ReplayControls:
         self.is_held = False
         with gui.add_folder("replay", visible=False) as self._folder:
             self._position = gui.add_html("")
-            self._slider = gui.add_slider("time / s", 0.0, 1.0, SLIDER_STEP_S, 0.0)
+            self._slider = gui.add_slider(
+                "time / s",
+                0.0,
+                1.0,
+                SLIDER_STEP_S,
+                0.0,
+            )
             self._button = gui.add_button("stop the replay")
         self._drawn = 0.0
         self._button.on_click(lambda _: hold())

@@ -40,7 +40,12 @@ MISSING_TOKEN = (
 """Text that a browser shows if its request contains neither the token nor the cookie with it."""
 
 
-def refusal(host: str, origin: str | None, *, local: bool = True) -> str:
+def refusal(
+    host: str,
+    origin: str | None,
+    *,
+    local: bool = True,
+) -> str:
     """Return why a request is refused, or an empty text if it is accepted.
 
     Args:
@@ -69,7 +74,11 @@ def check_host(host: str) -> None:
         ConfigError: This machine does not have the address.
     """
     try:
-        for family, kind, _, _, address in socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM):
+        for family, kind, _, _, address in socket.getaddrinfo(
+            host,
+            0,
+            type=socket.SOCK_STREAM,
+        ):
             with socket.socket(family, kind) as probe:
                 probe.bind(address)
     except (OSError, UnicodeError) as error:

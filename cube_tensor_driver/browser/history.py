@@ -40,7 +40,11 @@ class History:
             cubes: Number of cubes.
             length: Maximum number of instants that are kept.
         """
-        self._values = np.full((length, cubes, len(self.COLUMNS)), np.nan, np.float32)
+        self._values = np.full(
+            (length, cubes, len(self.COLUMNS)),
+            np.nan,
+            np.float32,
+        )
         self._times = np.full(length, np.nan)
         self.count = 0
 

@@ -179,7 +179,11 @@ def newtons(contact: Contact) -> str:
     return f"{contact.normal_force:.2f} N{shear}"
 
 
-def headline(scan: Scan, paused: bool, recording: bool) -> str:
+def headline(
+    scan: Scan,
+    paused: bool,
+    recording: bool,
+) -> str:
     """Return the first line of the page as HTML: state, live cubes, sampling rate, force.
 
     Args:
@@ -214,7 +218,11 @@ def action_line(action: str) -> str:
     return box(escape(action)) if action else ""
 
 
-def legend(quantity: scene.Quantity, top: float, field: SurfaceField) -> str:
+def legend(
+    quantity: scene.Quantity,
+    top: float,
+    field: SurfaceField,
+) -> str:
     """Return the legend of a quantity as HTML: a bar of its colours with numbers and unit.
 
     Args:
@@ -226,7 +234,18 @@ def legend(quantity: scene.Quantity, top: float, field: SurfaceField) -> str:
     if quantity is DEVIATION and field.sigma is None:
         return box(NO_DEVIATION)
     values = np.linspace(-top if quantity.signed else 0, top, LEGEND_STEPS)
-    colours = (255 * scene.colours(quantity, values, top)).astype(int).tolist()
+    colours = (
+        (
+            255
+            * scene.colours(
+                quantity,
+                values,
+                top,
+            )
+        )
+        .astype(int)
+        .tolist()
+    )
     stops = ",".join(f"rgb({red},{green},{blue})" for red, green, blue in colours)
     middle = (LEGEND_STEPS - 1) // 2
     ticks = "".join(f"<span>{value / quantity.size:.3g}</span>" for value in values[::middle])
@@ -235,7 +254,12 @@ def legend(quantity: scene.Quantity, top: float, field: SurfaceField) -> str:
     return box(bar + _div(TICKS_STYLE, ticks) + _div("text-align:center", meaning))
 
 
-def explanation(bar: float, stress: float, gradient: float, field: SurfaceField) -> str:
+def explanation(
+    bar: float,
+    stress: float,
+    gradient: float,
+    field: SurfaceField,
+) -> str:
     """Return HTML that explains the symbols of the 3-D view and the lengths of its arrows.
 
     Args:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ import viser
 from ..views.scene import Quantity
 from . import markup
 from .charts import Charts
-from .controls import ColourControls, ReplayControls, ReplayPosition, Shown, add_part_controls
+from .controls import ColourControls, ReplayControls, ReplayPosition, add_part_controls
 from .history import History
 from .markup import PageStatus
 from .scan import Scan
@@ -69,6 +69,13 @@ RECORD = "record"
 STOP = "stop recording"
 TARE = "tare"
 CLEAR_TARE = "undo tare"
+HOLD = "hold the replay"
+JUMP = "jump"
+
+Act = Callable[..., None]
+"""Function that a page calls, in threads of viser, when its user wants something. Its arguments are
+`TARE`, `CLEAR_TARE`, `RECORD`, `STOP`, `HOLD` (pauses a replay or lets it go on) or `JUMP`, and for
+the latter a position in the replay, in s after the start of the bag. It returns at once."""
 
 NOTE_S = 8.0
 """Time, in seconds, for which the page shows a note about an action of the user."""
@@ -98,30 +105,11 @@ class Layout:
         self.distance = max(MIN_CAMERA_DISTANCE, distance)
 
 
-@dataclass(frozen=True)
-class Buttons:
-    """Functions that the buttons of the page call, in threads of viser. They return at once.
-
-    Attributes:
-        tare: Takes the present load as zero load.
-        clear_tare: Undoes all tares.
-        record: Begins a recording, or ends the present one.
-        hold: Stops the replay, or lets it continue.
-        jump: Lets the replay jump to a position, in s after the start of the bag.
-    """
-
-    tare: Callable[[], None]
-    clear_tare: Callable[[], None]
-    record: Callable[[], None]
-    hold: Callable[[], None]
-    jump: Callable[[float], None]
-
-
 class Page:
     """The page that shows a skin in one browser, with the settings of that browser's user."""
 
     def __init__(
-        self, client: viser.ClientHandle, layout: Layout, skin: ShownSkin, buttons: Buttons
+        self, client: viser.ClientHandle, layout: Layout, skin: ShownSkin, act: Act
     ) -> None:
         self._client, self._layout, self._skin = client, layout, skin
         self._scan: Scan | None = None
@@ -130,19 +118,12 @@ class Page:
         self._ranges = self._ranges_before = Ranges()
         self._quantity: Quantity | None = None
         self._cube = skin.scene.first_cube
-        self._shown = Shown()
         self._noted = ""
         self._sent: dict[tuple[str, str], Any] = {}
         set_up(client, layout, skin.name)
         self._objects = skin.scene.add_to(client.scene, self._choose)
-        self._make_controls(client.gui, buttons)
+        self._make_controls(client.gui, act)
         self._make_panel(client.gui)
-
-    def close(self) -> None:
-        """Remove all objects of the scene and all controls from the browser."""
-        self._client.scene.remove_click_callback()
-        self._client.scene.reset()
-        self._client.gui.reset()
 
     def show_replay(self, replay: ReplayPosition | None) -> None:
         """Show position and state of a replay.
@@ -152,7 +133,12 @@ class Page:
         """
         self._replay.show(replay)
 
-    def show(self, scan: Scan, history: History, status: PageStatus) -> None:
+    def show(
+        self,
+        scan: Scan,
+        history: History,
+        status: PageStatus,
+    ) -> None:
         """Show a scan; a paused page shows what it has shown, with the choices of its user.
 
         Args:
@@ -169,7 +155,11 @@ class Page:
         shown_history = self._history or history
         choices = self._choices(shown_history, status)
         update, self._ranges = build_update(
-            self._skin, self._scan or scan, shown_history, choices, self._ranges_before
+            self._skin,
+            self._scan or scan,
+            shown_history,
+            choices,
+            self._ranges_before,
         )
         self.send(update, choices)
 
@@ -204,7 +194,7 @@ class Page:
             quantity=quantity,
             fixed_top=self._colours.fixed_top,
             cube=self._cube,
-            shown=self._shown,
+            parts={name for name, box in self._parts.items() if box.value},
             charts=self._charts.choose(history, self._cube),
             is_paused=self._paused or self._replay.is_held,
             is_recording=status.recording,
@@ -219,27 +209,38 @@ class Page:
             self._noted = status.action
             self._action.content = markup.action_line(status.action)
             self._client.add_notification(
-                status.title, status.action, auto_close_seconds=NOTE_S, color=status.colour
+                status.title,
+                status.action,
+                auto_close_seconds=NOTE_S,
+                color=status.colour,
             )
 
-    def _make_controls(self, gui: viser.GuiApi, buttons: Buttons) -> None:
+    def _make_controls(self, gui: viser.GuiApi, act: Act) -> None:
         """Add the controls to the main panel, from top to bottom.
 
         Args:
             gui: The controls of one browser.
-            buttons: Functions that the buttons call.
+            act: Function that is called when the user wants something.
         """
         objects = self._objects
         # A style sheet applies to the whole page, wherever it is inserted.
         gui.add_html(markup.STYLE)
         objects["headline"] = gui.add_html("")
-        self._make_buttons(gui, buttons)
+        self._make_buttons(gui, act)
         self._action = gui.add_html("")
-        self._replay = ReplayControls(gui, buttons.hold, buttons.jump)
+        self._replay = ReplayControls(
+            gui,
+            partial(act, HOLD),
+            partial(act, JUMP),
+        )
         self._colours = ColourControls(gui)
         objects["colour"], objects["legend"] = self._colours.list, self._colours.legend
         names = self._skin.names
-        self._cube_list = gui.add_dropdown("cube", names, initial_value=names[self._cube])
+        self._cube_list = gui.add_dropdown(
+            "cube",
+            names,
+            initial_value=names[self._cube],
+        )
 
         @self._cube_list.on_update
         def _(_: object) -> None:
@@ -251,7 +252,7 @@ class Page:
             objects["numbers"] = gui.add_html("")
         with gui.add_folder("what is drawn"):
             objects["meaning"] = gui.add_html("")
-            add_part_controls(gui, self._shown)
+            self._parts = add_part_controls(gui)
         with gui.add_folder("health"):
             objects["health"] = gui.add_html("")
 
@@ -269,30 +270,22 @@ class Page:
         if self._layout.is_folded:
             panel.minimize()
 
-    def _make_buttons(self, gui: viser.GuiApi, buttons: Buttons) -> None:
+    def _make_buttons(self, gui: viser.GuiApi, act: Act) -> None:
         self._view = gui.add_button_group("view", (PAUSE, RECORD))
         zero = gui.add_button_group(
-            "zero", (TARE, CLEAR_TARE), hint="tare takes the present load as zero load"
+            "zero",
+            (TARE, CLEAR_TARE),
+            hint="tare takes the present load as zero load",
         )
-        actions: dict[str, Callable[[], None]] = {
-            PAUSE: self._toggle_pause,
-            GO_ON: self._toggle_pause,
-            RECORD: buttons.record,
-            STOP: buttons.record,
-            TARE: buttons.tare,
-            CLEAR_TARE: buttons.clear_tare,
-        }
 
         @self._view.on_click
         @zero.on_click
         def _(event: viser.GuiEvent[Any]) -> None:
-            # A browser may send any text; one that is not the text of a button does nothing.
-            action = actions.get(str(event.target.value))
-            if action is not None:
-                action()
-
-    def _toggle_pause(self) -> None:
-        self._paused = not self._paused
+            label = str(event.target.value)
+            if label in (PAUSE, GO_ON):
+                self._paused = not self._paused
+            elif label in (RECORD, STOP, TARE, CLEAR_TARE):  # a browser may send any text
+                act(label)
 
     def _choose(self, cube: int) -> None:
         # viser's handle has a setter for the value, which its type annotations do not declare.
@@ -306,24 +299,35 @@ def is_same(one: Any, other: Any) -> bool:
     return bool(np.array_equal(one, other))
 
 
-class WaitingPage:
-    """The page that a browser shows while no skin is published."""
+def show_waiting(
+    client: viser.ClientHandle,
+    layout: Layout,
+    text: str,
+) -> None:
+    """Show a text in a browser while no skin is published."""
+    # viser draws a green tick before the title while the browser is connected.
+    set_up(client, layout, "cube_tensor_driver")
+    client.gui.add_html(markup.STYLE + markup.box(text))
+    client.scene.add_label(
+        "/waiting",
+        "Waiting for a skin …",
+        anchor="center-center",
+        font_screen_scale=1.6,
+    )
 
-    def __init__(self, client: viser.ClientHandle, layout: Layout, text: str) -> None:
-        # viser draws a green tick before the title while the browser is connected.
-        set_up(client, layout, "cube_tensor_driver")
-        self._text = client.gui.add_html(markup.STYLE + markup.box(text))
-        self._label = client.scene.add_label(
-            "/waiting", "Waiting for a skin …", anchor="center-center", font_screen_scale=1.6
-        )
 
-    def close(self) -> None:
-        """Remove the two texts of this page from the browser."""
-        self._text.remove()
-        self._label.remove()
+def clear(client: viser.ClientHandle) -> None:
+    """Remove all objects of the scene and all controls from a browser."""
+    client.scene.remove_click_callback()
+    client.scene.reset()
+    client.gui.reset()
 
 
-def set_up(client: viser.ClientHandle, layout: Layout, name: str) -> None:
+def set_up(
+    client: viser.ClientHandle,
+    layout: Layout,
+    name: str,
+) -> None:
     """Set the colours, the main panel and the camera of a browser.
 
     Args:
@@ -338,7 +342,14 @@ def set_up(client: viser.ClientHandle, layout: Layout, name: str) -> None:
         control_width="medium",
         brand_color=BRAND_COLOUR,
     )
-    client.scene.set_background_image(np.full((1, 1, 3), BACKGROUND, np.uint8), "png")
+    client.scene.set_background_image(
+        np.full(
+            (1, 1, 3),
+            BACKGROUND,
+            np.uint8,
+        ),
+        "png",
+    )
     client.gui.set_panel_label(name)
     client.gui.main_panel.dock_right()
 

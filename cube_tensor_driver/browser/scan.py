@@ -88,7 +88,12 @@ class ScanSynchronizer:
         self._contacts: dict[int, list[Contact]] = {}
         self._clouds: dict[int, Array] = {}
 
-    def add_rows(self, stamp_ns: int, rows: StressRows, now: float) -> None:
+    def add_rows(
+        self,
+        stamp_ns: int,
+        rows: StressRows,
+        now: float,
+    ) -> None:
         """Add the rows of a `stress` message.
 
         Args:
@@ -134,7 +139,11 @@ class ScanSynchronizer:
         self.cloud = self._clouds.get(stamp_ns)
 
 
-def _add_result(results: dict[int, Any], stamp_ns: int, result: Any) -> None:
+def _add_result(
+    results: dict[int, Any],
+    stamp_ns: int,
+    result: Any,
+) -> None:
     """Store a result under its stamp, and forget the oldest of more than `MAX_RESULTS`."""
     # A stamp that was present, as after a jump of a replay, becomes the newest one.
     results.pop(stamp_ns, None)

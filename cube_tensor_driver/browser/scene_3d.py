@@ -21,10 +21,7 @@ from ..core.latest_stress import DOUBTFUL, FAULTY, STALE
 from ..core.poses import CubePoses, quaternions
 from ..touch.surface import Contact, Surface
 from ..views import scene
-from ..views.scene import QUANTITIES, Quantity
-from .colouring import Colouring
-from .controls import Shown
-from .meshes import (
+from ..views.meshes import (
     COLOUR_STEPS,
     CUBE,
     CUBE_EDGES,
@@ -38,6 +35,9 @@ from .meshes import (
     rods,
     step_colours,
 )
+from ..views.round_numbers import round_down
+from ..views.scene import QUANTITIES
+from .colouring import Colouring
 from .scan import Scan
 
 Properties = dict[str, Any]
@@ -106,6 +106,27 @@ MESH_COLOURS: dict[str, Colour] = {
 }
 """Name of a mesh whose shape changes with the scan -> its colour."""
 
+PART_OF_MESH = {
+    "traction": "traction",
+    "gradient": "gradient",
+    "tension": "principal",
+    "compression": "principal",
+}
+"""Name of a mesh that the user can hide -> the part of the view (`PARTS` in controls.py) to which
+it belongs."""
+
+ArrowLines = Callable[[CubePoses, Array, float], Array]
+"""Function of poses of N cubes, their values (N, 15) and a length per SI unit that returns tails
+and tips (N, 2, 3) of arrows."""
+
+TRACTION_LENGTH = 1.8
+"""Length of the longest arrow of traction (force per area on the upper face of a cube), relative to
+the unit length `Placement.arrow`."""
+
+GRADIENT_LENGTH = 1.2
+"""Length of the longest arrow of the gradient of pressure, relative to the unit length
+`Placement.arrow`."""
+
 MIN_RING = 0.01 * SPAN
 """Minimum radius of the ring around a contact, in units of the scene."""
 
@@ -150,7 +171,11 @@ class Placement:
         centre = (low + high) / 2
         unit = SPAN / ((high - low).max() + poses.pitch)
         pitch = poses.pitch * unit
-        scaled = CubePoses((poses.position - centre) * unit, poses.rotation, poses.half_side * unit)
+        scaled = CubePoses(
+            (poses.position - centre) * unit,
+            poses.rotation,
+            poses.half_side * unit,
+        )
         return cls(scaled, centre, unit, pitch, max(pitch, MIN_ARROW_UNIT))
 
     def point(self, position: Array) -> Array:
@@ -183,7 +208,12 @@ class Scene:
             power of ten that is at most a quarter of the skin's length.
     """
 
-    def __init__(self, names: Sequence[str], poses: CubePoses, surface: Surface) -> None:
+    def __init__(
+        self,
+        names: Sequence[str],
+        poses: CubePoses,
+        surface: Surface,
+    ) -> None:
         """Compute the geometry.
 
         Args:
@@ -195,7 +225,11 @@ class Scene:
         placement = Placement.of(poses)
         self._names, self._placement = names, placement
         self._is_solid = len(names) <= MAX_SOLID_CUBES
-        self._squares = _make_squares(placement, surface, with_cubes=not self._is_solid)
+        self._squares = _make_squares(
+            placement,
+            surface,
+            with_cubes=not self._is_solid,
+        )
         # The points of the field are drawn at the lower faces of the cubes, so contacts are too.
         self._contact_depth = surface.depth * placement.unit + placement.poses.half_side.mean()
         self._low = placement.point(surface.points).min(axis=0)
@@ -221,7 +255,12 @@ class Scene:
             self._add_edges(api)
         meshes = {f"field/{step}": DARK for step in range(COLOUR_STEPS + 1)} | MESH_COLOURS
         objects: dict[str, Any] = {
-            name: _add_mesh(api, name, colour) for name, colour in meshes.items()
+            name: _add_mesh(
+                api,
+                name,
+                colour,
+            )
+            for name, colour in meshes.items()
         }
         if self._is_solid:
             objects["cubes"] = self._add_cubes(api)
@@ -232,13 +271,23 @@ class Scene:
             start, direction = np.array(event.ray_origin), np.array(event.ray_direction)
             # viser reports a click as a ray from the camera through the point that was clicked.
             placement = self._placement
-            cube = hit(placement.poses.position, placement.pitch, start, direction)
+            cube = hit(
+                placement.poses.position,
+                placement.pitch,
+                start,
+                direction,
+            )
             if cube is not None:
                 pick(cube)
 
         return objects
 
-    def ranges(self, scan: Scan, colour: float, before: Ranges) -> Ranges:
+    def ranges(
+        self,
+        scan: Scan,
+        colour: float,
+        before: Ranges,
+    ) -> Ranges:
         """Return the automatic ranges of a picture.
 
         Args:
@@ -246,17 +295,27 @@ class Scene:
             colour: Value at the upper end of the colour scale, in SI units.
             before: Ranges of the picture of the scan before.
         """
-        longest = [
-            scene.automatic(style.quantity, style.measured(scan.values, scan.residual), last)
-            for style, last in ((TRACTION, before.traction), (GRADIENT, before.gradient))
-        ]
-        return Ranges(colour, *longest)
+        traction = scan.values[:, 2:5]
+        gradient = QUANTITIES["gradient"].of(scan.values, scan.residual)
+        return Ranges(
+            colour=colour,
+            traction=scene.automatic(
+                QUANTITIES["shear"],
+                traction,
+                before.traction,
+            ),
+            gradient=scene.automatic(
+                QUANTITIES["gradient"],
+                gradient,
+                before.gradient,
+            ),
+        )
 
     def draw(
         self,
         scan: Scan,
         colouring: Colouring,
-        shown: Shown,
+        parts: set[str],
         chosen: int,
         ranges: Ranges,
     ) -> Update:
@@ -265,15 +324,28 @@ class Scene:
         Args:
             scan: The instant.
             colouring: The values that are drawn as colours.
-            shown: Which parts are drawn.
+            parts: Those of `PARTS` (controls.py) that are drawn.
             chosen: Index of the chosen cube.
             ranges: Upper ends of the ranges of colours and arrows.
         """
-        update = self._colours(colouring, shown.field)
-        update["names"] = {"visible": shown.names}
-        update["traction"] = self._arrows(TRACTION, scan.values, ranges.traction, shown.traction)
-        update["gradient"] = self._arrows(GRADIENT, scan.values, ranges.gradient, shown.gradient)
-        update |= self._crosses(scan.values, ranges.traction, shown.principal)
+        update = self._colours(colouring, "field" in parts)
+        update["names"] = {"visible": "names" in parts}
+        meshes = {
+            "traction": self._arrows(
+                scene.traction_arrows,
+                scan.values,
+                self._traction(ranges),
+            ),
+            "gradient": self._arrows(
+                scene.gradient_arrows,
+                scan.values,
+                self._gradient(ranges),
+            ),
+            **self._crosses(scan.values, ranges.traction),
+        }
+        for name, mesh in meshes.items():
+            is_drawn = PART_OF_MESH[name] in parts
+            update[name] = _properties(mesh if is_drawn else NO_MESH)
         for state in FAULT_COLOURS:
             update[f"fault {state}"] = self._fault_crosses(scan.health, state)
         update["chosen"] = self._chosen_cube(chosen)
@@ -290,11 +362,16 @@ class Scene:
             Traction (force per area on the upper face of a cube), in Pa; gradient of the pressure
             along the skin, in Pa/m.
         """
-        bar = self.bar * self._placement.unit / self._placement.arrow
-        return (
-            bar * ranges.traction / TRACTION.full_length,
-            bar * ranges.gradient / GRADIENT.full_length,
-        )
+        bar = self.bar * self._placement.unit
+        return bar / self._traction(ranges), bar / self._gradient(ranges)
+
+    def _traction(self, ranges: Ranges) -> float:
+        """Return the length of the arrows of traction, in units of the scene per Pa."""
+        return TRACTION_LENGTH * self._placement.arrow / ranges.traction
+
+    def _gradient(self, ranges: Ranges) -> float:
+        """Return the length of the arrows of the gradient, in units of the scene per Pa/m."""
+        return GRADIENT_LENGTH * self._placement.arrow / ranges.gradient
 
     def _colours(self, colouring: Colouring, with_field: bool) -> Update:
         """Return the properties of the cubes and of the field."""
@@ -302,37 +379,49 @@ class Scene:
         values, visible = colouring.field, np.full(len(colouring.field), with_field)
         update: Update = {}
         if self._is_solid:
-            colours = scene.colours(quantity, colouring.cubes, top)
-            update["cubes"] = {"batched_colors": linear_light(colours)}
+            colours = linear_light(colouring.colours(colouring.cubes))
+            update["cubes"] = {"batched_colors": colours}
         else:
             values = np.append(values, colouring.cubes)
             visible = np.append(visible, np.full(len(colouring.cubes), True))
 
         meshes = self._squares.paint(quantity, values, top, visible)
         colours_of_steps = step_colours(quantity).tolist()
-        for step, (mesh, colour) in enumerate(zip(meshes, colours_of_steps, strict=True)):
+        for step, (mesh, colour) in enumerate(
+            zip(
+                meshes,
+                colours_of_steps,
+                strict=True,
+            )
+        ):
             update[f"field/{step}"] = _properties(mesh) | {"color": tuple(colour)}
         return update
 
     def _arrows(
-        self, style: ArrowStyle, values: Array, longest: float, visible: bool
-    ) -> Properties:
-        """Return the properties of a mesh of arrows.
+        self,
+        lines: ArrowLines,
+        values: Array,
+        length: float,
+    ) -> Mesh:
+        """Return the mesh of an arrow on the upper face of each cube.
 
         Args:
-            style: Meaning and appearance of the arrows.
+            lines: Function that returns tails and tips of the arrows.
             values: (N, 15) 6 stress components in Pa and 9 gradients in Pa/m, in the frames of the
                 cubes.
-            longest: Value, in SI units, that an arrow of full length stands for.
-            visible: Whether the arrows are drawn.
+            length: Length of the arrows, in units of the scene per SI unit of the values.
         """
-        if not visible:
-            return _properties(NO_MESH)
-        unit = self._placement.arrow
-        lines = style.lines(self._placement.poses, values, style.full_length * unit / longest)
-        return _properties(arrows(lines, unit))
+        placement = self._placement
+        return arrows(
+            lines(
+                placement.poses,
+                values,
+                length,
+            ),
+            placement.arrow,
+        )
 
-    def _crosses(self, values: Array, longest: float, visible: bool) -> Update:
+    def _crosses(self, values: Array, longest: float) -> dict[str, Mesh]:
         """Return the meshes of the principal stresses: a cross of three lines above each cube.
 
         Each line lies along a principal direction; its colour tells tension from compression.
@@ -342,24 +431,34 @@ class Scene:
                 cubes.
             longest: Stress, in Pa, whose line is as long as the pitch (distance of neighbouring
                 cubes).
-            visible: Whether the crosses are drawn.
         """
         placement, pitch = self._placement, self._placement.pitch
-        lines, is_tension = scene.principal_crosses(placement.poses, values, pitch / longest)
+        lines, is_tension = scene.principal_crosses(
+            placement.poses,
+            values,
+            pitch / longest,
+        )
         # `scene.principal_crosses` returns crosses centred on the upper faces; this lifts them.
-        lift = _above(placement, CROSS_HEIGHT, pitch) - _above(placement, 1.0)
+        lift = _above(
+            placement,
+            CROSS_HEIGHT,
+            pitch,
+        ) - _above(placement, 1.0)
         lines = lines + lift[:, None, None]
-        is_drawn = np.full(is_tension.shape, visible)
         return {
-            "tension": _properties(rods(lines[is_drawn & is_tension], 0.02 * pitch)),
-            "compression": _properties(rods(lines[is_drawn & ~is_tension], 0.02 * pitch)),
+            "tension": rods(lines[is_tension], 0.02 * pitch),
+            "compression": rods(lines[~is_tension], 0.02 * pitch),
         }
 
     def _fault_crosses(self, health: AnyArray, state: int) -> Properties:
         """Return the mesh of a cross over each cube that has this health."""
         chosen = np.flatnonzero(health == state)
         poses = CubePoses(*(column[chosen] for column in self._placement.poses))
-        lines = scene.fault_crosses(poses, health[chosen]).reshape(-1, 2, 3)
+        lines = scene.fault_crosses(poses, health[chosen]).reshape(
+            -1,
+            2,
+            3,
+        )
         return _properties(rods(lines, 0.03 * self._placement.pitch))
 
     def _chosen_cube(self, cube: int) -> Properties:
@@ -394,7 +493,12 @@ class Scene:
         bar.vertices, bar.faces = vertices, faces
         middle = tuple((start + end) / 2 - np.array([0, 0.03 * SPAN, 0]))
         text = f"{1e3 * self.bar:g} mm"
-        api.add_label("/bar/label", text, position=middle, anchor="top-center")
+        api.add_label(
+            "/bar/label",
+            text,
+            position=middle,
+            anchor="top-center",
+        )
 
         corner, axis = np.array([high[0] - 0.05 * SPAN, y, z]), 0.1 * SPAN
         api.add_frame(
@@ -406,7 +510,12 @@ class Scene:
         )
         for name, direction in zip("xyz", np.eye(3), strict=True):
             position = tuple(1.3 * axis * direction)
-            api.add_label(f"/axes/{name}", name, position=position, anchor="center-center")
+            api.add_label(
+                f"/axes/{name}",
+                name,
+                position=position,
+                anchor="center-center",
+            )
 
     def _add_cubes(self, api: viser.SceneApi) -> Any:
         poses = self._placement.poses
@@ -416,7 +525,11 @@ class Scene:
             quaternions(poses.rotation),
             poses.position,
             batched_scales=poses.half_side,
-            batched_colors=np.full((len(poses.position), 3), 200, np.uint8),
+            batched_colors=np.full(
+                (len(poses.position), 3),
+                200,
+                np.uint8,
+            ),
             flat_shading=True,
             # By default viser simplifies distant meshes, but a cube cannot have fewer triangles.
             lod="off",
@@ -429,7 +542,15 @@ class Scene:
         edges = np.einsum("nij,eaj->neai", poses.rotation, CUBE_EDGES)
         lines = poses.position[:, None, None] + poses.half_side[:, None, None, None] * edges
         api.add_line_segments(
-            "/edges", lines.reshape(-1, 2, 3), EDGE_COLOUR, thickness=1.5, thickness_units="screen"
+            "/edges",
+            lines.reshape(
+                -1,
+                2,
+                3,
+            ),
+            EDGE_COLOUR,
+            thickness=1.5,
+            thickness_units="screen",
         )
 
     def _add_names(self, api: viser.SceneApi) -> Any:
@@ -441,55 +562,29 @@ class Scene:
         poses = self._placement.poses
         front = poses.rotation @ np.array([0.0, -1.2, -1.0]) * poses.half_side[:, None]
         points = poses.position + front
-        for number, (name, point) in enumerate(zip(self._names, points, strict=True)):
+        for number, (name, point) in enumerate(
+            zip(
+                self._names,
+                points,
+                strict=True,
+            )
+        ):
             path, position = f"/names/{number}", tuple(point)
-            api.add_label(path, name, position=position, anchor="top-center", font_screen_scale=0.8)
+            api.add_label(
+                path,
+                name,
+                position=position,
+                anchor="top-center",
+                font_screen_scale=0.8,
+            )
         return frame
 
 
-def round_down(length: float) -> float:
-    """Return the largest number of the form 1, 2 or 5 times a power of ten that is at most
-    `length`, which must be positive."""
-    power = 10.0 ** np.floor(np.log10(length))
-    # Without the tolerance, rounding could reduce a length of exactly 1, 2 or 5.
-    limit = length * (1 + 1e-9)
-    return float(power * max(factor for factor in (1, 2, 5) if factor * power <= limit))
-
-
-@dataclass(frozen=True)
-class ArrowStyle:
-    """Meaning and appearance of a set of arrows, one per cube.
-
-    Attributes:
-        full_length: Length of the longest arrow, relative to the unit length `Placement.arrow`.
-        quantity: Quantity whose `min_top` limits the automatic range of the lengths from below.
-        measured: Function of values (N, 15) and residual (N,) that returns the values, in SI
-            units, that the automatic range follows.
-        lines: Function of poses, values (N, 15) and a scale in length per SI unit that returns
-            tails and tips (N, 2, 3).
-    """
-
-    full_length: float
-    quantity: Quantity
-    measured: Callable[[Array, Array], Array]
-    lines: Callable[[CubePoses, Array, float], Array]
-
-
-TRACTION = ArrowStyle(
-    full_length=1.8,
-    quantity=QUANTITIES["shear"],
-    measured=lambda values, residual: values[:, 2:5],
-    lines=scene.traction_arrows,
-)
-GRADIENT = ArrowStyle(
-    full_length=1.2,
-    quantity=QUANTITIES["gradient"],
-    measured=QUANTITIES["gradient"].of,
-    lines=scene.gradient_arrows,
-)
-
-
-def _make_squares(placement: Placement, surface: Surface, with_cubes: bool) -> SquareLayer:
+def _make_squares(
+    placement: Placement,
+    surface: Surface,
+    with_cubes: bool,
+) -> SquareLayer:
     """Return the squares of the field, and of the upper faces of the cubes if they are no solids.
 
     Args:
@@ -515,7 +610,11 @@ def _properties(mesh: Mesh) -> Properties:
     return {"vertices": vertices, "faces": faces}
 
 
-def _above(placement: Placement, factor: float, unit: float | None = None) -> Array:
+def _above(
+    placement: Placement,
+    factor: float,
+    unit: float | None = None,
+) -> Array:
     """Return one point above the centre of each cube (N, 3), in units of the scene.
 
     Args:
@@ -536,10 +635,18 @@ def _set_up_lights(api: viser.SceneApi) -> None:
     api.configure_default_lights(enabled=False)
     api.configure_environment_map(None)
     api.add_light_ambient("/light/all", intensity=AMBIENT_LIGHT)
-    api.add_light_directional("/light/above", intensity=DIRECT_LIGHT, position=(-0.4, -0.6, 1.0))
+    api.add_light_directional(
+        "/light/above",
+        intensity=DIRECT_LIGHT,
+        position=(-0.4, -0.6, 1.0),
+    )
 
 
-def _add_mesh(api: viser.SceneApi, name: str, colour: Colour) -> viser.MeshHandle:
+def _add_mesh(
+    api: viser.SceneApi,
+    name: str,
+    colour: Colour,
+) -> viser.MeshHandle:
     return api.add_mesh_simple(
         f"/{name}", *NO_MESH, color=colour, flat_shading=True, side="double", **NO_SHADOWS
     )
@@ -551,5 +658,9 @@ def linear_light(colours: Array) -> NDArray[np.uint8]:
     The browser interprets the colours of batched meshes as linear intensities of light. The
     conversion is the transfer function of sRGB (IEC 61966-2-1).
     """
-    linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
+    linear = np.where(
+        colours <= 0.04045,
+        colours / 12.92,
+        ((colours + 0.055) / 1.055) ** 2.4,
+    )
     return (255 * linear).astype(np.uint8)

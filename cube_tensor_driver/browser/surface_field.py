@@ -74,7 +74,11 @@ class FieldModel:
         self._surface = surface
         self._interpolation: _Interpolation | None = None
         worker = ThreadPoolExecutor(1)
-        self.prepared: Future[SurfaceInverse] = worker.submit(_make_inverse, surface, calibrations)
+        self.prepared: Future[SurfaceInverse] = worker.submit(
+            _make_inverse,
+            surface,
+            calibrations,
+        )
         worker.shutdown(wait=False)
 
     def compute(self, values: Array, cloud: Array | None) -> SurfaceField:
@@ -87,17 +91,30 @@ class FieldModel:
         """
         if cloud is not None and len(cloud):
             pressure, shear, sigma = self._interpolate(cloud[:, :3], cloud[:, 3:]).T
-            return SurfaceField(pressure, shear, "on the surface, from the node contacts", sigma)
+            return SurfaceField(
+                pressure,
+                shear,
+                "on the surface, from the node contacts",
+                sigma,
+            )
         if self.prepared.done() and self.prepared.exception() is None:
             inverse = self.prepared.result()
             traction = inverse.field(values).traction
             columns = np.stack([-traction[:, 2], np.hypot(*traction[:, :2].T)], axis=1)
             pressure, shear = self._interpolate(inverse.points, columns).T
-            return SurfaceField(pressure, shear, "on the surface of a thick elastomer")
+            return SurfaceField(
+                pressure,
+                shear,
+                "on the surface of a thick elastomer",
+            )
         between = self._surface.field(values)
         # A shear component that is unknown (NaN) counts as 0 in the magnitude.
         shear = np.linalg.norm(np.nan_to_num(between.shear), axis=1)
-        return SurfaceField(between.pressure, shear, "between the cubes, at their depth")
+        return SurfaceField(
+            between.pressure,
+            shear,
+            "between the cubes, at their depth",
+        )
 
     def _interpolate(self, points: Array, columns: Array) -> Array:
         # The points of a skin do not move, so the weights of the interpolation are computed once.
@@ -109,7 +126,12 @@ class FieldModel:
 def _make_inverse(surface: Surface, calibrations: Sequence[Calibration]) -> SurfaceInverse:
     by_pad = noise_of_all_pads(calibrations)
     layer = Layer(np.inf, POISSONS_RATIO)
-    return SurfaceInverse.from_poses(surface.poses, by_pad, layer, surface.depth)
+    return SurfaceInverse.from_poses(
+        surface.poses,
+        by_pad,
+        layer,
+        surface.depth,
+    )
 
 
 class _Interpolation:
@@ -139,4 +161,10 @@ class _Interpolation:
 
         The result is NaN where one of the nearest values is NaN.
         """
-        return np.asarray(np.einsum("pk,pkc->pc", self._weight, columns[self._nearest]))
+        return np.asarray(
+            np.einsum(
+                "pk,pkc->pc",
+                self._weight,
+                columns[self._nearest],
+            )
+        )

@@ -13,7 +13,6 @@ from ..views.scene import QUANTITIES, Quantity
 from . import markup
 from .charts import GROUPS, ChartLine, chart_properties
 from .colouring import Colouring
-from .controls import Shown
 from .history import History
 from .scan import Scan
 from .scene_3d import Ranges, Scene, Update
@@ -74,7 +73,7 @@ class Choices(NamedTuple):
         quantity: The quantity that the colours show.
         fixed_top: Upper end of the colour scale, in SI units; 0: it follows the values.
         cube: Index of the chosen cube.
-        shown: Which parts of the 3-D view are drawn.
+        parts: Those of `PARTS` (of the 3-D view) that are drawn.
         charts: Lines of each chart.
         is_paused: Whether the page or the replay is stopped.
         is_recording: Whether a bag is being recorded.
@@ -83,7 +82,7 @@ class Choices(NamedTuple):
     quantity: Quantity
     fixed_top: float
     cube: int
-    shown: Shown
+    parts: set[str]
     charts: tuple[tuple[ChartLine, ...], ...]
     is_paused: bool = False
     is_recording: bool = False
@@ -105,13 +104,27 @@ def build_update(
         Name of an object on the page -> its properties; upper ends of the ranges in this picture.
     """
     cube = choices.cube
-    colouring = Colouring.of(scan, skin.surface, choices.quantity, choices.fixed_top, before.colour)
+    colouring = Colouring.of(
+        scan,
+        skin.surface,
+        choices.quantity,
+        choices.fixed_top,
+        before.colour,
+    )
     ranges = skin.scene.ranges(scan, colouring.top, before)
-    update = skin.scene.draw(scan, colouring, choices.shown, cube, ranges)
+    update = skin.scene.draw(scan, colouring, choices.parts, cube, ranges)
 
     texts = {
-        "headline": markup.headline(scan, choices.is_paused, choices.is_recording),
-        "legend": markup.legend(choices.quantity, colouring.top, scan.field),
+        "headline": markup.headline(
+            scan,
+            choices.is_paused,
+            choices.is_recording,
+        ),
+        "legend": markup.legend(
+            choices.quantity,
+            colouring.top,
+            scan.field,
+        ),
         "meaning": markup.explanation(skin.scene.bar, *skin.scene.per_bar(ranges), scan.field),
         "numbers": markup.numbers(scan, cube),
         "health": markup.conditions(skin.names, scan),
@@ -123,7 +136,11 @@ def build_update(
     return update | _options(history, scan, choices), ranges
 
 
-def _options(history: History, scan: Scan, choices: Choices) -> Update:
+def _options(
+    history: History,
+    scan: Scan,
+    choices: Choices,
+) -> Update:
     """Return the entries of the drop-down lists: only what can be shown of this skin.
 
     The standard deviation of the pressure stays in the list of colours while it is chosen, so that

@@ -17,6 +17,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +50,7 @@ from .clients import ReplayClient, ServiceCalls
 from .gate import LOCAL_HOSTS, check_host, guarded_server
 from .history import History
 from .markup import PageStatus
-from .page import Buttons, Layout, Page, WaitingPage
+from .page import CLEAR_TARE, HOLD, JUMP, TARE, Layout, Page, clear, show_waiting
 from .scan import Links, Scan, ScanSynchronizer
 from .update import ShownSkin
 
@@ -103,13 +104,25 @@ class Viewer:
         self._depth = depth
         self._node = rclpy.create_node("view")
         self._callback_errors = CallbackErrors(self._node)
-        self._subscriber = SkinSubscriber(self._node, self._show_skin, self._receive_stress)
-        self._subscribe(DiagnosticArray, "/diagnostics", self._receive_diagnostics)
+        self._subscriber = SkinSubscriber(
+            self._node,
+            self._show_skin,
+            self._receive_stress,
+        )
+        self._subscribe(
+            DiagnosticArray,
+            "/diagnostics",
+            self._receive_diagnostics,
+        )
         self._tare = self._node.create_client(Tare, "reconstruction/tare")
         self._clear_tare = self._node.create_client(Trigger, "reconstruction/clear_tare")
         self._status = PageStatus()
         self._services = ServiceCalls(self._status.say)
-        self._replay = ReplayClient(self._node, self._services, self._status.say)
+        self._replay = ReplayClient(
+            self._node,
+            self._services,
+            self._status.say,
+        )
         self._subscribe(SkinContacts, "contacts", self._receive_contacts)
         self._subscribe(PointCloud2, "traction", self._receive_traction)
         self._recorder = BagRecorder(recordings)
@@ -118,7 +131,7 @@ class Viewer:
         self._shown: ShownSkin | None = None
         self._scans = ScanSynchronizer(0)
         self._history = History(0, 1)
-        self._pages: dict[int, Page | WaitingPage] = {}
+        self._pages: dict[int, Page] = {}
         self._layouts: dict[int, Layout] = {}
         # viser calls both functions in threads of its own, so they only put actions into the queue.
         put = self._actions.put
@@ -180,13 +193,18 @@ class Viewer:
         """
         names = [cube.name for cube in skin.info.cubes]
         calibrations = cube_calibrations(skin.info)
-        self._shown = ShownSkin(skin.info.name, names, skin.poses, calibrations, self._depth)
+        self._shown = ShownSkin(
+            skin.info.name,
+            names,
+            skin.poses,
+            calibrations,
+            self._depth,
+        )
         self._scans = ScanSynchronizer(len(names))
         self._history = History(len(names), round(HISTORY_S / PICTURE_PERIOD_S))
-        for page in self._pages.values():
-            page.close()
         self._pages.clear()
         for client in self._server.get_clients().values():
+            clear(client)
             self._open_page(client)
 
     def _open_page(self, client: viser.ClientHandle) -> None:
@@ -202,9 +220,13 @@ class Viewer:
         size = client.camera.image_width, client.camera.image_height
         layout = self._layouts.setdefault(client.client_id, Layout(*size))
         if self._shown is None:
-            self._pages[client.client_id] = WaitingPage(client, layout, markup.waiting(_domain()))
+            show_waiting(client, layout, markup.waiting(_domain()))
             return
-        page = Page(client, layout, self._shown, self._buttons())
+
+        def act(*arguments: Any) -> None:
+            self._actions.put(partial(self._act, *arguments))
+
+        page = Page(client, layout, self._shown, act)
         page.show_replay(self._replay.state)
         self._pages[client.client_id] = page
 
@@ -212,21 +234,22 @@ class Viewer:
         self._pages.pop(client_id, None)
         self._layouts.pop(client_id, None)
 
-    def _buttons(self) -> Buttons:
-        def tare() -> None:
+    def _act(self, action: str, position: float = 0.0) -> None:
+        """Do what the user of a page wants; the arguments are those of `Act`."""
+        if action == TARE:
             self._services.ask("tare", self._tare, Tare.Request())
-
-        def clear_tare() -> None:
-            self._services.ask("undo tare", self._clear_tare, Trigger.Request())
-
-        put = self._actions.put
-        return Buttons(
-            tare=lambda: put(tare),
-            clear_tare=lambda: put(clear_tare),
-            record=lambda: put(self._toggle_recording),
-            hold=lambda: put(self._replay.toggle_hold),
-            jump=lambda position: put(lambda: self._replay.jump_to(position)),
-        )
+        elif action == CLEAR_TARE:
+            self._services.ask(
+                "undo tare",
+                self._clear_tare,
+                Trigger.Request(),
+            )
+        elif action == HOLD:
+            self._replay.toggle_hold()
+        elif action == JUMP:
+            self._replay.jump_to(position)
+        else:
+            self._toggle_recording()
 
     def _update(self, skin: ShownSkin) -> None:
         """Show the newest scan in all browsers."""
@@ -251,7 +274,7 @@ class Viewer:
         scan = make_scan(skin, scans, health, tuple(self._links.values()))
         connected = self._server.get_clients()
         for client_id, page in self._pages.items():
-            if isinstance(page, Page) and client_id in connected:
+            if client_id in connected:
                 if not self._replay.is_jumping:
                     page.show_replay(self._replay.state)
                 page.show(scan, self._history, self._status)
@@ -260,23 +283,45 @@ class Viewer:
         status = self._status
         code = self._recorder.ended_by_itself()
         if code is not None:
-            status.say("The recording ended", f"recording ended by itself with code {code}", "red")
+            status.say(
+                "The recording ended",
+                f"recording ended by itself with code {code}",
+                "red",
+            )
         status.recording = self._recorder.recording
 
     def _toggle_recording(self) -> None:
         if self._recorder.recording:
             self._recorder.end()
-            self._status.say("Recorded", f"recorded to {self._recorder.path}", "green")
+            self._status.say(
+                "Recorded",
+                f"recorded to {self._recorder.path}",
+                "green",
+            )
             return
         try:
             self._recorder.start()
         except ConfigError as error:
-            self._status.say("The recording did not start", str(error), "red")
+            self._status.say(
+                "The recording did not start",
+                str(error),
+                "red",
+            )
             return
         self._status.say("Recording", f"recording to {self._recorder.path}")
 
-    def _subscribe(self, kind: type, topic: str, receive: Callable[[Any], None]) -> None:
-        self._node.create_subscription(kind, topic, self._callback_errors.catch(receive), 10)
+    def _subscribe(
+        self,
+        kind: type,
+        topic: str,
+        receive: Callable[[Any], None],
+    ) -> None:
+        self._node.create_subscription(
+            kind,
+            topic,
+            self._callback_errors.catch(receive),
+            10,
+        )
 
     def _receive_stress(self, stamp_ns: int, rows: StressRows) -> None:
         self._scans.add_rows(stamp_ns, rows, self._subscriber.now())
@@ -297,7 +342,12 @@ class Viewer:
                 self._links[status.name] = f"{name}: {status.message}", status.level[0]
 
 
-def make_scan(skin: ShownSkin, scans: ScanSynchronizer, health: Index, links: Links) -> Scan:
+def make_scan(
+    skin: ShownSkin,
+    scans: ScanSynchronizer,
+    health: Index,
+    links: Links,
+) -> Scan:
     """Return the present instant, with field and contacts.
 
     Contacts that the node `contacts` does not find are found here, by interpolation between the
@@ -330,7 +380,11 @@ def _domain() -> str:
     return os.environ.get("ROS_DOMAIN_ID") or "0"
 
 
-def _serve(host: str, port: int, token: str) -> viser.ViserServer:
+def _serve(
+    host: str,
+    port: int,
+    token: str,
+) -> viser.ViserServer:
     """Start the web server of viser.
 
     Args:
@@ -349,7 +403,12 @@ def _serve(host: str, port: int, token: str) -> viser.ViserServer:
     try:
         # viser prints the address of the page without the token, which would not work.
         with contextlib.redirect_stdout(io.StringIO()), guarded_server(token):
-            return viser.ViserServer(host, port, label="cube_tensor_driver", verbose=False)
+            return viser.ViserServer(
+                host,
+                port,
+                label="cube_tensor_driver",
+                verbose=False,
+            )
     except OSError as error:
         raise ConfigError(f"--port {port}: {error.strerror}; take another one") from None
 
@@ -377,7 +436,14 @@ def run_view(
     stop = stop_event()
     start_ros()
     try:
-        with contextlib.closing(Viewer(host, port, depth, recordings)) as viewer:
+        with contextlib.closing(
+            Viewer(
+                host,
+                port,
+                depth,
+                recordings,
+            )
+        ) as viewer:
             print(f"{viewer.url}  (Ctrl-C ends it)", flush=True)
             viewer.spin(stop)
     finally:

@@ -101,13 +101,24 @@ def _length(*names: str) -> Callable[[Array, Array], Array]:
         parts = values[:, columns]
         is_observed = np.isfinite(parts)
         # An unobserved component counts as 0; if all are unobserved, the magnitude is NaN.
-        length = np.linalg.norm(np.where(is_observed, parts, 0), axis=1)
+        length = np.linalg.norm(
+            np.where(
+                is_observed,
+                parts,
+                0,
+            ),
+            axis=1,
+        )
         return np.where(is_observed.any(axis=1), length, np.nan)
 
     return of
 
 
-def _stress(label: str, of: Callable[[Array, Array], Array], signed: bool = False) -> Quantity:
+def _stress(
+    label: str,
+    of: Callable[[Array, Array], Array],
+    signed: bool = False,
+) -> Quantity:
     return Quantity(
         label,
         unit="kPa",
@@ -129,7 +140,14 @@ QUANTITIES = {
         signed=False,
         of=_length("zz_x", "zz_y"),
     ),
-    **{name: _stress(f"σ{name}", _component(name), signed=True) for name in STRESS},
+    **{
+        name: _stress(
+            f"σ{name}",
+            _component(name),
+            signed=True,
+        )
+        for name in STRESS
+    },
     "residual": Quantity(
         "residual",
         unit="σ",
@@ -142,7 +160,11 @@ QUANTITIES = {
 """Name -> quantity, for all quantities that markers (RViz) and the page can show in colours."""
 
 
-def automatic(quantity: Quantity, values: Array, last_top: float = 0.0) -> float:
+def automatic(
+    quantity: Quantity,
+    values: Array,
+    last_top: float = 0.0,
+) -> float:
     """Return the upper end, in SI units, of an automatic range of colours or arrow lengths.
 
     It follows a rise of the values at once, and a fall slowly (factor `RANGE_DECAY` per picture).
@@ -153,10 +175,18 @@ def automatic(quantity: Quantity, values: Array, last_top: float = 0.0) -> float
         last_top: Upper end of the range in the picture before, in SI units.
     """
     finite = np.abs(values[np.isfinite(values)])
-    return max(quantity.min_top, RANGE_DECAY * last_top, float(finite.max(initial=0.0)))
+    return max(
+        quantity.min_top,
+        RANGE_DECAY * last_top,
+        float(finite.max(initial=0.0)),
+    )
 
 
-def colours(quantity: Quantity, values: Array, top: float) -> Array:
+def colours(
+    quantity: Quantity,
+    values: Array,
+    top: float,
+) -> Array:
     """Return the colours (N, 3) of values: red, green and blue from 0 to 1.
 
     Args:
@@ -181,7 +211,11 @@ def _colour_table(hexes: str) -> Array:
     return np.array([tuple(bytes.fromhex(text)) for text in hexes.split()]) / 255
 
 
-def traction_arrows(poses: CubePoses, values: Array, length: float) -> Array:
+def traction_arrows(
+    poses: CubePoses,
+    values: Array,
+    length: float,
+) -> Array:
     """Return one arrow per cube for the traction σ·n on its upper face (+z).
 
     An arrow points in the direction in which the load pushes or pulls. If it presses, it ends on
@@ -205,7 +239,11 @@ def traction_arrows(poses: CubePoses, values: Array, length: float) -> Array:
     return np.stack([tail, tail + arrow], axis=1)
 
 
-def gradient_arrows(poses: CubePoses, values: Array, length: float) -> Array:
+def gradient_arrows(
+    poses: CubePoses,
+    values: Array,
+    length: float,
+) -> Array:
     """Return one arrow per cube, on its upper face (+z), in the direction in which pressure grows.
 
     Args:
@@ -221,12 +259,20 @@ def gradient_arrows(poses: CubePoses, values: Array, length: float) -> Array:
     # Pressure is −σzz, so it grows in the direction opposite to the gradient of σzz.
     columns = [COMPONENTS.index("zz_x"), COMPONENTS.index("zz_y")]
     gradient = -np.nan_to_num(values[:, columns]) * length
-    arrow = np.einsum("nij,nj->ni", poses.rotation[:, :, :2], gradient)
+    arrow = np.einsum(
+        "nij,nj->ni",
+        poses.rotation[:, :, :2],
+        gradient,
+    )
     tail = poses.position + poses.rotation[:, :, 2] * (1.15 * poses.half_side[:, None])
     return np.stack([tail, tail + arrow], axis=1)
 
 
-def principal_crosses(poses: CubePoses, values: Array, length: float) -> tuple[Array, Mask]:
+def principal_crosses(
+    poses: CubePoses,
+    values: Array,
+    length: float,
+) -> tuple[Array, Mask]:
     """Return three lines per cube along its principal stresses, centred on its upper face.
 
     Components that are not observed count as 0, so a planar cube shows the principal stresses in
@@ -266,7 +312,11 @@ def fault_crosses(poses: CubePoses, health: AnyArray) -> Array:
     diagonals = [[[-1, -1, 0], [1, 1, 0]], [[-1, 1, 0], [1, -1, 0]]]
     has_fault = (health != FINE)[:, None, None, None]
     # The crosses lie a little above the upper face, so that the face does not hide them.
-    corner = np.where(has_fault, CROSS_SIZE * np.array(diagonals), 0.0)
+    corner = np.where(
+        has_fault,
+        CROSS_SIZE * np.array(diagonals),
+        0.0,
+    )
     corner += np.array([0, 0, CROSS_HEIGHT])
     scaled = corner * poses.half_side[:, None, None, None]
     in_parent = np.einsum("nij,nabj->nabi", poses.rotation, scaled)
@@ -287,7 +337,16 @@ def heads(arrows: Array, normal: Array) -> Array:
     back = BARB_LENGTH * (tail - tip)
     # For an arrow along the normal the cross product would be 0. A small vector in another
     # direction, added to the normal, prevents that.
-    across = np.cross(back, normal + 1e-3 * np.roll(normal, 1, axis=1))
+    across = np.cross(
+        back,
+        normal
+        + 1e-3
+        * np.roll(
+            normal,
+            1,
+            axis=1,
+        ),
+    )
     size = np.linalg.norm(across, axis=1, keepdims=True)
     half_width = 0.5 * np.linalg.norm(back, axis=1, keepdims=True)
     across *= half_width / np.where(size > 0, size, 1)

@@ -18,13 +18,15 @@ from PIL import Image
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from cube_tensor_driver.browser.charts import csv_of, draw_lines, round_range
+from cube_tensor_driver.browser.charts import csv_of
 from cube_tensor_driver.browser.controls import ColourControls
 from cube_tensor_driver.browser.gate import check_host, guarded_server, refusal
 from cube_tensor_driver.browser.history import History
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.core.modes import COMPONENTS
+from cube_tensor_driver.views.figures.panels import draw_panels
 from cube_tensor_driver.views.figures.style import png
+from cube_tensor_driver.views.round_numbers import round_range
 from cube_tensor_driver.views.scene import QUANTITIES
 
 HERE = "127.0.0.1"
@@ -151,7 +153,7 @@ def test_saved_tables_and_pictures_hold_what_the_cubes_showed() -> None:
         ["0", "-4000", "2e+06", "1.25"],
     ]
     panels = [("normal stress / kPa", history.times, {"c1": history.of(1, zz) / 1e3})]
-    (axis,) = (figure := draw_lines(panels)).axes
+    (axis,) = (figure := draw_panels(panels)).axes
     assert (axis.get_xlabel(), axis.get_ylabel()) == ("time before now / s", "normal stress / kPa")
     np.testing.assert_allclose(axis.lines[0].get_xydata(), [[-1, -2], [-0.5, -3], [0, -4]])
     with Image.open(io.BytesIO(png(figure))) as picture:

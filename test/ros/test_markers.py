@@ -278,8 +278,7 @@ def test_arrays_of_serialised_markers_are_where_other_nodes_read_them(name):
 
 
 def test_rods_lie_around_their_lines_with_the_radii_asked_for():
-    pytest.importorskip("viser", reason="needs viser: run this with ./cube test")
-    from cube_tensor_driver.browser.meshes import PRISM_SIDES, rods
+    from cube_tensor_driver.views.meshes import PRISM_SIDES, rods
 
     lines = np.random.default_rng(3).normal(size=(7, 2, 3))
     lines[0, 1] = lines[0, 0] + [0, 0, 2.0]  # along an axis
@@ -301,8 +300,7 @@ def test_rods_lie_around_their_lines_with_the_radii_asked_for():
 
 
 def test_a_click_finds_the_cube_in_front():
-    pytest.importorskip("viser", reason="needs viser: run this with ./cube test")
-    from cube_tensor_driver.browser.meshes import hit
+    from cube_tensor_driver.views.meshes import hit
 
     around = 2 * np.pi * np.arange(24) / 24
     ring = np.stack([0 * around, np.cos(around), np.sin(around)], axis=1)

@@ -192,8 +192,7 @@ def test_what_no_surface_is(depth, side):
 
 
 def test_the_view_s_image_of_the_field_has_each_point_s_colour_where_the_point_is():
-    pytest.importorskip("viser", reason="needs viser: run this with ./cube test")
-    from cube_tensor_driver.browser.top_view import Raster
+    from cube_tensor_driver.views.raster import Raster
 
     place = np.array([0.2, -0.1, 0.4])
     skin = flat(5, 3, 0.01)
@@ -215,9 +214,8 @@ def test_the_view_s_image_of_the_field_has_each_point_s_colour_where_the_point_i
 
 
 def test_the_view_s_squares_have_the_colour_of_their_value():
-    pytest.importorskip("viser", reason="needs viser: run this with ./cube test")
-    from cube_tensor_driver.browser.meshes import COLOUR_STEPS, colour_steps, step_colours
     from cube_tensor_driver.views import scene
+    from cube_tensor_driver.views.meshes import COLOUR_STEPS, colour_steps, step_colours
 
     for name in ("pressure", "zz"):
         quantity = scene.QUANTITIES[name]

@@ -36,7 +36,12 @@ def draw_layout(layout: Layout) -> Figure:
     # distance of their centres, which hides the wrong ones.
     axes: Any = figure.add_subplot(projection="3d", computed_zorder=False)
     _draw_edges(axes)
-    for name, centre, normal in zip(layout.pads, layout.positions, layout.normals, strict=True):
+    for name, centre, normal in zip(
+        layout.pads,
+        layout.positions,
+        layout.normals,
+        strict=True,
+    ):
         _draw_pad(axes, name, centre, normal, layout.pad_size)
     # matplotlib needs the direction of view as two angles.
     elevation = np.degrees(np.arctan2(_VIEW[2], np.hypot(*_VIEW[:2])))

@@ -44,7 +44,12 @@ def draw_forces(
     # The time axis begins at 0 with the first measurement.
     times = seconds - seconds.min()
     _draw_components(panels["force"], times, force, measured_force)
-    _draw_components(panels["centre"], times, MM * centre, MM * measured_centre)
+    _draw_components(
+        panels["centre"],
+        times,
+        MM * centre,
+        MM * measured_centre,
+    )
     handles, labels = panels["force"].get_legend_handles_labels()
     panels["force"].legend(
         handles,
@@ -55,12 +60,25 @@ def draw_forces(
     )
     panels["force"].set(ylabel="force on the skin / N")
     panels["centre"].set(
-        xlabel="time / s", ylabel="centre of pressure / mm", xlim=panels["force"].get_xlim()
+        xlabel="time / s",
+        ylabel="centre of pressure / mm",
+        xlim=panels["force"].get_xlim(),
     )
 
     path = panels["path"]
-    path.plot(MM * cubes[:, 1], MM * cubes[:, 0], "s", color="0.8", ms=3)
-    path.plot(MM * centre[:, 1], MM * centre[:, 0], color="black", lw=1)
+    path.plot(
+        MM * cubes[:, 1],
+        MM * cubes[:, 0],
+        "s",
+        color="0.8",
+        ms=3,
+    )
+    path.plot(
+        MM * centre[:, 1],
+        MM * centre[:, 0],
+        color="black",
+        lw=1,
+    )
     measured = MM * measured_centre
     path.plot(
         measured[:, 1],

@@ -133,7 +133,11 @@ def draw_series(series: TimeSeries, title: str) -> Figure:
     """
     series = _with_breaks(series)
     figure = Figure(figsize=(8, 9))
-    top, stress_axes, gradient_axes, bottom = figure.subplots(4, 1, sharex=True)
+    top, stress_axes, gradient_axes, bottom = figure.subplots(
+        4,
+        1,
+        sharex=True,
+    )
     seconds, n_stress = series.seconds, len(STRESS)
 
     change_percent = 100 * (series.frequency / series.rest - 1)
@@ -142,10 +146,20 @@ def draw_series(series: TimeSeries, title: str) -> Figure:
 
     symbols = [symbol(name) for name in COMPONENTS]
     stress_kpa = series.values[:, :n_stress] * 1e-3
-    _draw_columns(stress_axes, seconds, stress_kpa, symbols[:n_stress])
+    _draw_columns(
+        stress_axes,
+        seconds,
+        stress_kpa,
+        symbols[:n_stress],
+    )
     stress_axes.set(ylabel="stress / kPa (tension: +)")
     gradient_kpa_per_mm = series.values[:, n_stress:] * 1e-6
-    _draw_columns(gradient_axes, seconds, gradient_kpa_per_mm, symbols[n_stress:])
+    _draw_columns(
+        gradient_axes,
+        seconds,
+        gradient_kpa_per_mm,
+        symbols[n_stress:],
+    )
     gradient_axes.set(ylabel="gradient / (kPa/mm)")
 
     bottom.plot(

@@ -185,7 +185,11 @@ class LiveTable:
         """
         # Tension is positive in the stress tensor, so the pressure is −σzz.
         pressure = np.nan_to_num(-self._values[:, COMPONENTS.index("zz")])
-        self._peak = max(self._peak * PEAK_DECAY, float(pressure.max()), MIN_PEAK)
+        self._peak = max(
+            self._peak * PEAK_DECAY,
+            float(pressure.max()),
+            MIN_PEAK,
+        )
         shown = np.arange(len(pressure))
         caption = None
         if len(shown) > max_rows:
@@ -202,7 +206,14 @@ class LiveTable:
             # measured until it fits.
             table = self._table(form, shown, pressure)
             table.caption = caption
-            if Measurement.get(self._console, options, table).maximum <= width:
+            if (
+                Measurement.get(
+                    self._console,
+                    options,
+                    table,
+                ).maximum
+                <= width
+            ):
                 break
         return table
 
@@ -248,7 +259,11 @@ class LiveTable:
             label, unit = name, "kPa"
             if is_gradient(name):
                 label, unit = f"∂{name[:2]}/∂{name[3]}", "kPa/mm"
-            table.add_column(f"{label}\n{unit}", justify="right", min_width=7)
+            table.add_column(
+                f"{label}\n{unit}",
+                justify="right",
+                min_width=7,
+            )
         if form.has_residual:
             table.add_column("residual", justify="right")
         table.add_column("Hz", justify="right", min_width=4)

@@ -14,7 +14,12 @@ BAR_WIDTH = 20
 """Width of a progress bar, in characters; the name of the step takes the rest of the line."""
 
 
-def say(text: str, style: str = "", *, stderr: bool = False) -> None:
+def say(
+    text: str,
+    style: str = "",
+    *,
+    stderr: bool = False,
+) -> None:
     """Print a line as it is: square brackets are no markup, and long lines are not broken.
 
     Args:
@@ -80,7 +85,11 @@ def progress_bar() -> Iterator[Callable[[float, float, str], None]]:
     with bar:
         task = bar.add_task("starting", total=1.0)
 
-        def report(done: float, total: float, what: str) -> None:
+        def report(
+            done: float,
+            total: float,
+            what: str,
+        ) -> None:
             bar.update(
                 task,
                 completed=done,

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.arrays import Array, Index, Mask
-from ..views import scene
-from ..views.scene import Quantity
+from . import scene
+from .scene import Quantity
 
 Mesh = tuple[NDArray[Any], NDArray[Any]]
 """A triangle mesh: positions of V vertices (V, 3), and three vertex indices per triangle (F, 3)."""
@@ -77,7 +77,11 @@ _SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
 _SQUARE_FACES = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
 
 
-def rods(lines: Array, start_radius: float, end_radius: float | None = None) -> Mesh:
+def rods(
+    lines: Array,
+    start_radius: float,
+    end_radius: float | None = None,
+) -> Mesh:
     """Return one mesh of prisms along lines, without the faces at their ends.
 
     Args:
@@ -136,13 +140,21 @@ def arrows(lines: Array, unit: float) -> Mesh:
     tail, tip = lines[:, 0], lines[:, 1]
     neck = tip - (tip - tail) * np.minimum(HEAD_LENGTH * unit / length, 1)
     shafts = rods(np.stack([tail, neck], axis=1), SHAFT_RADIUS * unit)
-    heads = rods(np.stack([neck, tip], axis=1), HEAD_RADIUS * unit, 0.0)
+    heads = rods(
+        np.stack([neck, tip], axis=1),
+        HEAD_RADIUS * unit,
+        0.0,
+    )
     vertices = np.concatenate([shafts[0], heads[0]])
     faces = np.concatenate([shafts[1], heads[1] + len(shafts[0])])
     return vertices, faces
 
 
-def ring_lines(centre: Array, normal: Array, radius: float) -> Array:
+def ring_lines(
+    centre: Array,
+    normal: Array,
+    radius: float,
+) -> Array:
     """Return the lines (48, 2, 3) of a ring, each with its start and its end.
 
     Args:
@@ -207,7 +219,12 @@ class SquareLayer:
     than the cubes.
     """
 
-    def __init__(self, points: Array, rotation: Array, side: Array) -> None:
+    def __init__(
+        self,
+        points: Array,
+        rotation: Array,
+        side: Array,
+    ) -> None:
         """Compute the corners of the squares.
 
         Args:
@@ -217,10 +234,20 @@ class SquareLayer:
             side: (M,) length of the sides of each square, in units of the scene.
         """
         offset = side[:, None, None] * _SQUARE
-        corners = points[:, None] + np.einsum("mij,mqj->mqi", rotation[:, :, :2], offset)
+        corners = points[:, None] + np.einsum(
+            "mij,mqj->mqi",
+            rotation[:, :, :2],
+            offset,
+        )
         self._corners = corners.astype(np.float32)
 
-    def paint(self, quantity: Quantity, values: Array, top: float, visible: Mask) -> list[Mesh]:
+    def paint(
+        self,
+        quantity: Quantity,
+        values: Array,
+        top: float,
+        visible: Mask,
+    ) -> list[Mesh]:
         """Return one mesh for each colour of `step_colours`, with the squares of this colour.
 
         Args:
@@ -229,7 +256,15 @@ class SquareLayer:
             top: Value at the upper end of the colour scale, in SI units.
             visible: (M,) whether each square is drawn.
         """
-        steps = np.where(visible, colour_steps(quantity, values, top), -1)
+        steps = np.where(
+            visible,
+            colour_steps(
+                quantity,
+                values,
+                top,
+            ),
+            -1,
+        )
         return [self._mesh(np.flatnonzero(steps == step)) for step in range(COLOUR_STEPS + 1)]
 
     def _mesh(self, chosen: Index) -> Mesh:
@@ -240,7 +275,11 @@ class SquareLayer:
         return self._corners[chosen].reshape(-1, 3), faces.reshape(-1, 3)
 
 
-def colour_steps(quantity: Quantity, values: Array, top: float) -> Index:
+def colour_steps(
+    quantity: Quantity,
+    values: Array,
+    top: float,
+) -> Index:
     """Return the index (M,) of the colour of each value; `COLOUR_STEPS` for NaN.
 
     Args:
@@ -250,7 +289,11 @@ def colour_steps(quantity: Quantity, values: Array, top: float) -> Index:
     """
     bottom = -top if quantity.signed else 0.0
     share = (np.nan_to_num(values) - bottom) / (top - bottom)
-    step = np.clip(share * COLOUR_STEPS, 0, COLOUR_STEPS - 1).astype(int)
+    step = np.clip(
+        share * COLOUR_STEPS,
+        0,
+        COLOUR_STEPS - 1,
+    ).astype(int)
     return np.where(np.isfinite(values), step, COLOUR_STEPS)
 
 
@@ -258,4 +301,11 @@ def step_colours(quantity: Quantity) -> NDArray[np.uint8]:
     """Return the colours of a `SquareLayer` (COLOUR_STEPS + 1, 3) in sRGB; the last is for NaN."""
     middle = (np.arange(COLOUR_STEPS) + 0.5) / COLOUR_STEPS
     values = np.append(2 * middle - 1 if quantity.signed else middle, np.nan)
-    return np.round(255 * scene.colours(quantity, values, 1.0)).astype(np.uint8)
+    return np.round(
+        255
+        * scene.colours(
+            quantity,
+            values,
+            1.0,
+        )
+    ).astype(np.uint8)

@@ -1,0 +1,53 @@
+"""Round numbers for axes and scale bars."""
+
+from __future__ import annotations
+
+import numpy as np
+
+NOISE_SHARE = 0.02
+"""Fraction of the largest absolute value in a chart up to which values are considered as noise.
+
+If the values on one side of zero are all noise, the axis ends at zero on that side.
+"""
+
+
+def round_down(length: float) -> float:
+    """Return the largest number of the form 1, 2 or 5 times a power of ten that is at most
+    `length`, which must be positive."""
+    power = 10.0 ** np.floor(np.log10(length))
+    # Without the tolerance, rounding could reduce a length of exactly 1, 2 or 5.
+    limit = length * (1 + 1e-9)
+    return float(power * max(factor for factor in (1, 2, 5) if factor * power <= limit))
+
+
+def round_range(low: float, high: float) -> tuple[float, float]:
+    """Return the range of an axis that contains zero and the values from `low` to `high`.
+
+    Its ends are multiples of a step, which is half of 1, 2, 5 or 10 times a power of ten. The range
+    therefore changes seldom while the values change. A side on which no value exceeds `NOISE_SHARE`
+    of the largest one ends at zero.
+    """
+    size = max(-low, high, 1e-9)
+    # One noisy value below zero would add a whole step of empty space below positive values.
+    low, high = (end if abs(end) > NOISE_SHARE * size else 0.0 for end in (low, high))
+    power = 10.0 ** np.floor(np.log10(size))
+    # Without the tolerance, rounding could give a size of exactly 1, 2 or 5 the next larger step.
+    min_step = size * (1 - 1e-9)
+    step = power * next(factor for factor in (1, 2, 5, 10) if factor * power >= min_step) / 2
+    n_below = np.floor(min(low, 0) / step)
+    n_above = np.ceil(max(high, 0) / step)
+    return float(n_below * step), float(n_above * step)
+
+
+def round_ticks(
+    low: float,
+    high: float,
+    step: float,
+) -> list[float]:
+    """Return the numbers on an axis: all multiples of `step` from `low` to `high`.
+
+    They are rounded to six significant digits.
+    """
+    first, last = np.ceil(low / step), np.floor(high / step)
+    numbers = np.arange(first, last + 1)
+    return [float(f"{number * step:.6g}") for number in numbers]
