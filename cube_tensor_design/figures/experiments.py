@@ -141,13 +141,12 @@ def draw_prototype(experiments: Sequence[Experiment]) -> Figure:
     figure = Figure(figsize=(9, 4.4))
     axes = figure.subplots(2, len(experiments), sharex="col", sharey="row")
     for (upper, lower), experiment in zip(axes.T, experiments, strict=True):
-        x = 1e3 * experiment.displacement
-        curves = dict(zip(SIGNAL_LABELS, 1e-3 * experiment.prototype.T, strict=True))
-        curves[UPPER_LABEL] = 1e-3 * experiment.upper[:, 1]
-        for number, (label, signal) in enumerate(curves.items()):
-            # P_normal is ten times as large as the others, which have an axis of their own.
-            axis = upper if number == 0 else lower
-            axis.plot(x, signal, label=label, **curve_style(number))
+        normal, shear, gradient = experiment.prototype.T
+        names = (*SIGNAL_LABELS[1:], UPPER_LABEL)
+        curves = (shear, gradient, experiment.upper[:, 1])
+        # P_normal is some thirty times as large as the others, which have an axis of their own.
+        draw_curves(upper, experiment.displacement, {SIGNAL_LABELS[0]: normal})
+        draw_curves(lower, experiment.displacement, dict(zip(names, curves, strict=True)))
         upper.set_title(experiment.name, fontsize=8)
         lower.set_xlabel("displacement / mm")
     for axis in axes[:, 0]:
