@@ -245,3 +245,9 @@ def stamped(cube, frequency, pad_fault, stamp_ns, temperature=None) -> Frequency
     return FrequencyRows.of(
         cube, frequency, pad_fault=pad_fault, stamp_ns=stamp_ns, temperature=known
     )
+
+
+def check(health, rows: FrequencyRows) -> tuple[np.ndarray, np.ndarray]:
+    """Masks and status of rows, which update the health."""
+    stress = health.pipeline.process(rows, watch=health)
+    return stress.left_out, stress.status

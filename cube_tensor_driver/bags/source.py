@@ -12,7 +12,6 @@ import numpy as np
 from ..config.skin import Skin
 from ..core.arrays import Times
 from ..core.errors import BagError
-from ..core.pattern import count_repeats
 from ..core.rows import FrequencyRows
 from ..messages.codec import Decoded
 from ..messages.types import FREQUENCIES
@@ -122,9 +121,10 @@ class BagSource:
             ends = np.flatnonzero(has_other_cubes | has_other_info) + 1
             bounds = [0, *ends.tolist(), len(messages)]
             for begin, end in pairwise(bounds):
-                # Messages are reconstructed together only if each consists of whole scans (the same
-                # cubes in the same order); otherwise the results can differ from those one by one.
-                step = end - begin if count_repeats(cube[begin]) else 1
+                # A scan ends where the cube number does not rise. Messages are reconstructed
+                # together only if their scans stay apart, so that the health finds the same scans.
+                are_apart = len(cube[begin]) and cube[begin, 0] <= cube[begin, -1]
+                step = end - begin if are_apart else 1
                 for first in range(begin, end, step):
                     chosen = slice(first, first + step)
                     part = messages.select(chosen)

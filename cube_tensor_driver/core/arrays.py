@@ -45,3 +45,17 @@ def pad_table(
     for row, value in zip(table, values, strict=True):
         row[: len(value)] = value
     return table
+
+
+def multiply(left: AnyArray, right: AnyArray) -> AnyArray:
+    """Multiply row vectors or matrices (..., n) by matrices (..., n, m), with the same bits
+    everywhere.
+
+    The terms are added in their order. The `@` of numpy (BLAS) adds them in an order that depends
+    on the processor.
+    """
+    shape = np.broadcast_shapes(left.shape[:-1], right.shape[:-2] or (1,))
+    product: AnyArray = np.zeros((*shape, right.shape[-1]), right.dtype)
+    for term in range(left.shape[-1]):
+        product += left[..., term, None] * right[..., term, :]
+    return product

@@ -1,12 +1,12 @@
 """Inversion of a response by weighted least squares, and the residual that shows broken pads.
 
 The pads measure the stresses v = A s, where A is the response (pads x modes) and the state s holds
-the amplitudes of the modes. With W = diag(1 / noise) and the singular value decomposition
-W A = U1 S V1', of which only singular values above `RANK_TOLERANCE` of the largest are kept:
+the amplitudes of the modes. With W = diag(1 / noise), and the columns of Q an orthonormal basis of
+those of W A, without remainders below `RANK_TOLERANCE` of the longest column:
 
-    components    T V1 S^-1 U1' W v           T takes a state to components, see Modes.components
-    covariance    T V1 S^-2 V1' T'
-    chi-square    |U2' W v|^2                 U2 completes U1 to a basis of the pads; its number of
+    components    H W v,   H = T (W A)^+      T takes a state to components, see Modes.components
+    covariance    H H'
+    chi-square    |N' W v|^2                  N completes Q to a basis of the pads; its number of
                                               columns is the number of degrees of freedom
 
 Source: Kiyota & Shinoda, eqs. 2 to 5, are the closed forms for one layout; docs/physics.md corrects
@@ -23,15 +23,16 @@ from typing import Any
 
 import numpy as np
 
-from .arrays import Array, Index, Mask
+from .arrays import Array, Index, Mask, multiply
 from .modes import Modes
 from .symmetry import Structure
 
 RANK_TOLERANCE = 1e-4
-"""Smallest singular value, relative to the largest, that is used to invert the response of a cube.
+"""Smallest part of a mode's response that is used to invert the response of a cube: the part that
+modes with a stronger response do not explain, relative to the strongest response.
 
 The response (pads x modes) is first divided by the noise of the pads. The pads respond so little to
-a combination of modes with a smaller singular value that its amplitude would be mostly noise.
+a combination of modes with a smaller part that its amplitude would be mostly noise.
 """
 
 LEAK_TOLERANCE = 1e-3
@@ -168,17 +169,16 @@ def make_estimator(
     # Dividing by the noise (standard deviation) of each pad gives all pads the standard deviation
     # 1, so that the sum of the squared residuals is chi-square.
     whitened = response[np.ix_(present, kept)] / noise[present, None]
-    # The full matrix u is needed. Its last columns are orthogonal to the response of every mode
-    # (linear stress field), so only noise and faults have a part along them: the residual.
-    u, s, vt = np.linalg.svd(whitened, full_matrices=True)
-    rank = 0
-    if s.size and s[0] > 0:
-        rank = int(np.sum(s > RANK_TOLERANCE * s[0]))
-    v1 = vt[:rank].T
+    seen = _orthonormalise(whitened, len(present), RANK_TOLERANCE)
+    rank = seen.shape[1]
+    # Orthonormalising the rows of R = Q' W A takes Q' along to G, with (W A)^+ = V G.
+    reduced = multiply(seen.T, whitened)
+    both = _orthonormalise(np.concatenate([reduced.T, seen]), len(kept))
+    v, g = both[: len(kept)], both[len(kept) :].T
 
     kept_targets = targets[:, kept]
-    projected = (kept_targets @ v1) @ v1.T
-    unseen = np.linalg.norm(kept_targets - projected, axis=1)
+    on_seen = multiply(kept_targets, v)
+    unseen = np.linalg.norm(kept_targets - multiply(on_seen, v.T), axis=1)
     # Neglected modes are assumed to be zero and not measured, so a target with a part along them
     # counts as not observed.
     neglected_targets = np.delete(targets, kept, axis=1)
@@ -187,16 +187,20 @@ def make_estimator(
     observed = (size > 0) & (unseen + neglected <= LEAK_TOLERANCE * size)
 
     # `half` maps pad stresses divided by their noise to targets. Those stresses have the variance
-    # 1, so half @ half.T is the covariance of the targets.
-    half = kept_targets @ v1 / s[:rank]
+    # 1, so half half' is the covariance of the targets.
+    half = multiply(on_seen, g)
     matrix = np.zeros((n_targets, n_pads))
-    matrix[:, present] = half @ u[:, :rank].T / noise[present]
+    matrix[:, present] = half / noise[present]
     matrix[~observed] = np.nan
-    covariance = half @ half.T
+    covariance: Array = multiply(half, half.T)
     covariance[~observed] = np.nan
     covariance[:, ~observed] = np.nan
+    # Only noise and faults have a part along combinations of pads that are orthogonal to the
+    # response of every mode (linear stress field): the residual.
+    unexplained = np.eye(len(present)) - multiply(seen, seen.T)
     null = np.zeros((len(present) - rank, n_pads))
-    null[:, present] = u[:, rank:].T / noise[present]
+    residual = _orthonormalise(unexplained, len(present), count=len(null))
+    null[:, present] = residual.T / noise[present]
     return Estimator(
         matrix=matrix,
         observed=observed,
@@ -206,6 +210,47 @@ def make_estimator(
         rank=rank,
         noise=noise,
     )
+
+
+def _orthonormalise(
+    vectors: Array,
+    length: int,
+    tolerance: float = 0.0,
+    count: int | None = None,
+) -> Array:
+    """Combine columns to orthonormal ones, the longest remainder first (Gram-Schmidt).
+
+    LAPACK's decompositions would do it, but their last bits depend on the processor. Here, sums
+    have a fixed order.
+
+    Args:
+        vectors: Columns (n, m).
+        length: Number of the first rows in which the results are orthonormal. The other rows are
+            combined in the same way.
+        tolerance: Smallest length of a remainder that is used, relative to the longest column.
+        count: Number of columns to return at most; by default the rank.
+
+    Returns:
+        Columns (n, r).
+    """
+    remainder = np.array(vectors)
+    result = np.zeros((len(remainder), 0))
+    limit = 0.0
+    for _ in range(min(length, remainder.shape[1]) if count is None else count):
+        sizes = np.sqrt((remainder[:length] ** 2).sum(axis=0))
+        longest = int(np.argmax(sizes))
+        limit = limit or tolerance * sizes[longest]
+        if sizes[longest] <= limit:
+            break
+        chosen = remainder[:, longest]
+        # Rounding errors of the earlier steps are removed by projecting once more.
+        overlap = (result[:length] * chosen[:length, None]).sum(axis=0)
+        chosen = chosen - (result * overlap).sum(axis=1)
+        chosen = chosen / np.sqrt((chosen[:length] ** 2).sum())
+        overlap = (remainder[:length] * chosen[:length, None]).sum(axis=0)
+        remainder = remainder - chosen[:, None] * overlap
+        result = np.column_stack([result, chosen])
+    return result
 
 
 def summarize_response(
@@ -301,18 +346,20 @@ def chi2_limit(dof: int, probability: float) -> float:
     Args:
         dof: Number of degrees of freedom; the result is NaN if it is 0.
         probability: Probability of a larger chi-square.
+
+    Returns:
+        The value to 10 digits, because the last bits of logarithms depend on the processor.
     """
     if dof < 1:
         return math.nan
     low, high = 0.0, 1.0
     while chi2_tail(high, dof) > probability:
         high *= 2
-    # Each bisection halves the interval, and a float has 53 bits of precision. So a hundred of them
-    # find the value to its last bit.
-    for _ in range(100):
+    # Each bisection halves the interval, and a float has 53 bits of precision.
+    for _ in range(60):
         centre = (low + high) / 2
         if chi2_tail(centre, dof) > probability:
             low = centre
         else:
             high = centre
-    return high
+    return float(f"{high:.10g}")

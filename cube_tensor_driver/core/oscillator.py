@@ -126,6 +126,23 @@ def highest_frequency(rest_frequency: ArrayLike, beta: ArrayLike) -> Array:
         return highest
 
 
+def rest_ratio(coefficients: Array, change: Array) -> Array:
+    """Compute the ratio 1 + sum_d c_d t^d of the rest frequencies of pads at two temperatures.
+
+    Horner's scheme needs no powers, whose last bits depend on the processor.
+
+    Args:
+        coefficients: Coefficients c_d (..., D, P), in 1/K^d, the linear term first.
+        change: Difference t of the temperatures (...), in K.
+    """
+    t = change[..., None]
+    total = np.zeros((*change.shape, coefficients.shape[-1]))
+    for d in reversed(range(coefficients.shape[-2])):
+        total = (total + coefficients[..., d, :]) * t
+    ratio: Array = 1 + total
+    return ratio
+
+
 @dataclass(frozen=True, eq=False)
 class TemperatureModel:
     """Polynomial of the rest frequency over temperature, relative to the reference temperature.
@@ -166,13 +183,8 @@ class TemperatureModel:
     def factor(self, temperature: ArrayLike) -> Array:
         """Compute the ratio (N, P) of the rest frequencies at temperatures T (N,), in °C, to those
         at the reference temperature."""
-        degree = self.coefficients.shape[1]
-        t = np.asarray(temperature, dtype=float)
-        difference = t[..., None] - self.reference
-        powers = difference[..., None] ** np.arange(1, degree + 1)
-        change = np.sum(self.coefficients * powers, axis=-1)
-        factor: Array = 1 + change
-        return factor
+        change = np.asarray(temperature, dtype=float) - self.reference
+        return rest_ratio(self.coefficients.T, change)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the model as a table of numbers and lists, which `from_dict` reads."""

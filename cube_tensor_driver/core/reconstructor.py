@@ -117,29 +117,28 @@ class Reconstructor:
         self.health.refresh()
         self.rest_changes += 1
 
-    def process(self, rows: FrequencyRows, recorded: RecordedHealth | None = None) -> StressRows:
+    def process(
+        self,
+        rows: FrequencyRows,
+        recorded: RecordedHealth | None = None,
+        out: StressRows | None = None,
+    ) -> StressRows:
         """Reconstruct the stress of rows.
 
         Args:
             rows: Rows of one scan, or of several scans one after the other.
             recorded: Health of the pads from a recording. For the rows for which it is known, it
                 replaces the health that is found now.
+            out: Rows to write into, such as the memory of a message; None makes new ones.
 
         Raises:
             LayoutError: The rows have cubes or pads that the skin does not have. Every other
                 problem of a row becomes a bit of its status.
         """
         windows = self.health.closed
-        # The health of the pads is updated before the stress is computed, so that a broken
-        # pad is left out of the very row (sample of one cube) that shows it.
-        left_out, pad_status = self.health.update(rows)
-        if recorded is not None:
-            left_out = np.where(recorded.known, recorded.left_out, left_out)
-            pad_status = np.where(recorded.known, recorded.status, pad_status)
-        stress = self.pipeline.process(rows, left_out)
-        self.health.count_residuals(rows.cube, stress.status)
-        stress.status[:] |= pad_status
-
+        # The health of the pads is updated with each row before its stress is computed, so that a
+        # broken pad is left out of the very row (sample of one cube) that shows it.
+        stress = self._process(rows, recorded, out, self.health)
         # Drift is tracked after the rows are computed, so that the same rest frequencies hold for
         # all of them.
         has_closed_window = self.health.closed != windows
@@ -152,16 +151,28 @@ class Reconstructor:
     def process_known(self, rows: FrequencyRows, recorded: RecordedHealth) -> StressRows:
         """Reconstruct the stress of rows from a recording that states the health of their pads.
 
-        The pads are not examined again, which saves two fifths of the time that reading and
-        reconstructing a bag takes.
+        The pads are not examined again, which saves time.
 
         Args:
             rows: Rows of one scan, or of several scans one after the other.
             recorded: Recorded health, known for every row.
         """
-        stress = self.pipeline.process(rows, recorded.left_out)
-        stress.status[:] |= recorded.status
-        return stress
+        return self._process(rows, recorded, None, None)
+
+    def _process(
+        self,
+        rows: FrequencyRows,
+        recorded: RecordedHealth | None,
+        out: StressRows | None,
+        health: Health | None,
+    ) -> StressRows:
+        """Compute stress, and update the health if it is given; arguments as of `process`."""
+        out = self.pipeline.make_rows(rows) if out is None else out
+        left_out = known = None
+        if recorded is not None:
+            left_out, known = recorded.left_out, recorded.known
+            out.status[:] = recorded.status
+        return self.pipeline.process(rows, left_out, watch=health, known=known, out=out)
 
     def covariance(self, cube: int, left_out: int = 0) -> Array:
         """Return the covariance (15, 15) of a cube's components due to the noise of its pads.

@@ -130,8 +130,8 @@ def test_health_goes_by_cube_and_stamp(bag):
         assert ((health.status & STUCK != 0) == (later.cube == 3)).all()
 
 
-def test_cubes_that_are_no_repeated_pattern_come_message_by_message(tmp_path):
-    """Hubs at different rates: a message has cubes 0, 1, 0."""
+def test_messages_whose_scans_would_join_come_one_by_one(tmp_path):
+    """A message has cubes 1, 2, 0: joined, 0 1 2 of two messages would be a scan."""
     skin = read_skin(SKIN)
     pipeline = Pipeline([cube.calibration for cube in skin.cubes], np.float32)
     store = typestore()
@@ -142,12 +142,12 @@ def test_cubes_that_are_no_repeated_pattern_come_message_by_message(tmp_path):
         writer.write("/info", START_NS, bytes(store.serialize_cdr(info, INFO)))
         for k in range(6):
             stamp_ns = START_NS + 10_000_000 * k
-            raw = frequencies_of(k, stamp_ns, loads(pipeline, 0.01 * k)[[0, 1, 0]])
-            raw.cube[:] = [0, 1, 0] if k < 4 else [4, 5, 6]
+            raw = frequencies_of(k, stamp_ns, loads(pipeline, 0.01 * k)[[1, 2, 0]])
+            raw.cube[:] = [1, 2, 0] if k < 4 else [4, 5, 6]
             data = bytes(store.serialize_cdr(raw, FREQUENCIES))
             writer.write("/frequencies", stamp_ns, data)
     with open_bag(tmp_path / "bag") as source:
-        assert [rows.cube.tolist() for rows in source] == [[0, 1, 0]] * 4 + [[4, 5, 6] * 2]
+        assert [rows.cube.tolist() for rows in source] == [[1, 2, 0]] * 4 + [[4, 5, 6] * 2]
 
 
 def test_what_is_wrong_is_said(bag, tmp_path):

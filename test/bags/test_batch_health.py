@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from conftest import stamped
+from conftest import check, stamped
 from cube_tensor_driver.core.calibration import illustrative
 from cube_tensor_driver.core.health.health import Health
 from cube_tensor_driver.core.pipeline import Pipeline
@@ -31,18 +31,19 @@ def test_many_at_once_is_one_by_one_to_the_bit(kinds, faults):
     temperature = np.full((count, n), np.nan, np.float32)
     single, many = Health(pipeline), Health(pipeline)
     expected = [
-        single.update(stamped(cube, *one))
+        check(single, stamped(cube, *one))
         for one in zip(frequency, pad_fault, stamp_ns, temperature, strict=True)
     ]
     found = [
-        many.update(
+        check(
+            many,
             stamped(
                 np.tile(cube, len(part)),
                 frequency[part].reshape(-1, pipeline.n_pads),
                 pad_fault[part].ravel(),
                 stamp_ns[part].ravel(),
                 temperature[part].ravel(),
-            )
+            ),
         )
         for part in np.array_split(np.arange(count), 9)
     ]

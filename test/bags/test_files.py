@@ -42,9 +42,9 @@ from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.config.yaml import parse_yaml, read_yaml, write_yaml
 from cube_tensor_driver.core.errors import BagError
 from cube_tensor_driver.core.oscillator import pad_frequency
-from cube_tensor_driver.core.pipeline import PAD_FAULT, Pipeline
+from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rows import FrequencyRows, StressRows
-from cube_tensor_driver.core.status import STAMP, STUCK
+from cube_tensor_driver.core.status import PAD_FAULT, STAMP, STUCK
 from cube_tensor_driver.messages.types import FREQUENCIES, INFO, STRESS
 
 SKIN = package_data() / "config" / "skin_demo.yaml"

@@ -2,17 +2,15 @@
 
 import dataclasses
 import sys
-import tracemalloc
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 
-from conftest import samples, stamped
+from conftest import samples
 from cube_tensor_driver.core.calibration import illustrative
 from cube_tensor_driver.core.errors import CalibrationError, CubeError, LayoutError
 from cube_tensor_driver.core.estimator import make_estimator
-from cube_tensor_driver.core.health.health import Health
 from cube_tensor_driver.core.oscillator import TemperatureModel, pad_frequency, pad_stress
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rows import StressRows
@@ -387,20 +385,3 @@ def test_no_loop_over_rows():
         return python_calls(lambda: pipeline.process(samples(cube, f)))
 
     assert calls(1200) < 1.1 * calls(120)
-
-
-def test_messages_of_ever_other_cubes_fill_no_memory():
-    """Stalls make messages of parts of the skin: what is kept of their columns is bounded, in both
-    that keep it."""
-    pipeline = Pipeline([illustrative("planar")] * 200)
-    health = Health(pipeline)
-    held = []
-    tracemalloc.start()
-    for number in range(100):
-        cube = np.arange(number, number + 100, dtype=np.uint16)
-        f, none = np.full((100, 8), 1e5, np.float32), np.zeros(100, np.uint32)
-        health.update(stamped(cube, f, none, np.full(100, 10**18 + 1000 * number)))
-        pipeline.process(samples(cube, f, none))
-        held.append(tracemalloc.get_traced_memory()[0])
-    tracemalloc.stop()
-    assert held[-1] - held[20] < 0.2 * (held[20] - held[0]), held[::20]

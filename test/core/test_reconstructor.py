@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from conftest import stamped
+from conftest import check, stamped
 from cube_tensor_driver.core.calibration import illustrative
-from cube_tensor_driver.core.health.statistics import WindowStatistics
+from cube_tensor_driver.core.health.health import Health
+from cube_tensor_driver.core.health.statistics import clear_sums
+from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.reconstructor import Reconstructor, RecordedHealth
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.core.status import PAD_FAULT, SHORT, STAMP, STUCK
@@ -17,15 +19,15 @@ CALIBRATION = illustrative("planar")
 def test_noise_of_a_window_is_the_deviation_of_white_noise():
     """Of 32,000 pads with 100 rows: 3.2 million differences leave 0.1 %."""
     cubes, rows, deviation = 4000, 100, 0.8
-    statistics = WindowStatistics(np.full((cubes, 8), 1e5))
-    statistics.bound[:] = (60 * deviation) ** 2
+    health = Health(Pipeline([CALIBRATION] * cubes, np.float32))
     random = np.random.default_rng(1)
     f = (1e5 + deviation * random.standard_normal((rows + 3, cubes, 8))).astype(np.float32)
-    stamp_ns = np.repeat(4_000_000 * np.arange(1, rows + 4)[:, None], cubes, axis=1)
-    statistics.add(slice(0, cubes), f[:3], stamp_ns[:3])
-    statistics.clear()
-    statistics.add(slice(0, cubes), f[3:], stamp_ns[3:])
-    noise = np.sqrt(np.mean(statistics.window().noise ** 2))
+    cube = np.arange(cubes, dtype=np.uint16)
+    for row in range(rows + 3):
+        check(health, stamped(cube, f[row], 0, 4_000_000 * (row + 1)))
+        if row == 2:
+            clear_sums(health.sums)
+    noise = np.sqrt(np.mean(health.window().noise ** 2))
     # float32 rounds 1e5 Hz to 1/128 Hz, which adds 0.005 % here
     np.testing.assert_allclose(noise, deviation, rtol=4e-3)
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from conftest import samples, stamped
+from conftest import check, samples, stamped
 from cube_tensor_driver.config.tare import read_tare, remove_tare, tare_path, write_tare
 from cube_tensor_driver.core.calibration import illustrative
 from cube_tensor_driver.core.errors import ConfigError, TareError
@@ -55,7 +55,7 @@ class Skin:
                 None if temperature is None else np.tile(temperature, scans),
             )
             windows = self.health.closed
-            self.health.update(rows)
+            check(self.health, rows)
             if time_constant and self.health.closed != windows:
                 self.tracker.step(time_constant)
             self.seconds += scans / RATE
@@ -161,8 +161,9 @@ def test_a_cube_that_is_silent_is_refused_and_bad_pads_keep_their_rest():
         skin.tare()
     for _ in range(3 * RATE):
         f = pads()[:1].astype(np.float32)
-        skin.health.update(
-            stamped(np.arange(1), f, np.zeros(1, np.uint32), np.array([round(skin.seconds * 1e9)]))
+        check(
+            skin.health,
+            stamped(np.arange(1), f, np.zeros(1, np.uint32), np.array([round(skin.seconds * 1e9)])),
         )
         skin.seconds += 1 / RATE
     with pytest.raises(TareError, match="cube b: no data"):
@@ -193,7 +194,7 @@ def test_the_gap_of_one_cube_is_refused_where_the_others_go_on():
             stamp_ns = np.full(2, round(skin.seconds * 1e9))
             frequency = pads()[[0, 2]].astype(np.float32)
             cubes = np.array([0, 2])
-            skin.health.update(stamped(cubes, frequency, np.zeros(2, np.uint32), stamp_ns))
+            check(skin.health, stamped(cubes, frequency, np.zeros(2, np.uint32), stamp_ns))
             skin.seconds += 1 / RATE
 
     play_without_b(0.4)

@@ -248,14 +248,27 @@ def _transpose(gradient: Any) -> Any:
     return matrices.transpose(0, 2, 1).reshape(-1, 9)
 
 
+def _flag_nothing(
+    original: Any,
+    pipeline: Any,
+    rows: FrequencyRows,
+    *_: Any,
+    **options: Any,
+) -> Any:
+    return original(pipeline, rows, np.zeros(len(rows), np.uint32), out=options["out"])
+
+
 def _flag_sound_pad(
     original: Any,
-    health: Any,
+    pipeline: Any,
     rows: FrequencyRows,
-) -> tuple[Any, Any]:
-    left_out, status = original(health, rows)
+    left_out: Any = None,
+    **options: Any,
+) -> Any:
+    stress = original(pipeline, rows, left_out, **options)
     flagged = rows.cube == NOISY_CUBE
-    return left_out | flagged.astype(np.uint32), status | (flagged * np.uint16(NOISY))
+    changed = original(pipeline, rows, stress.left_out | flagged.astype(np.uint32))
+    return replace(changed, status=changed.status | stress.status | flagged * np.uint16(NOISY))
 
 
 def _never_release(
@@ -264,10 +277,10 @@ def _never_release(
     found: Any,
     came: Any,
 ) -> None:
-    # `_recent` holds the conditions of the last windows, the newest first. They must not age.
-    kept = conditions._recent[0] | found
+    # `_earlier` holds the conditions of the last windows, the newest first. They must not age.
+    kept = conditions.state | found
     original(conditions, found, came)
-    conditions._recent[0] |= kept
+    conditions._earlier[0] |= kept
 
 
 def _use_bad_pads(
@@ -275,10 +288,11 @@ def _use_bad_pads(
     pipeline: Any,
     rows: FrequencyRows,
     left_out: Any = None,
+    **options: Any,
 ) -> Any:
     wrong = original(pipeline, rows, np.zeros(len(rows), np.uint32))
     # Only the components are wrong: the row still states that pads are left out.
-    right = original(pipeline, rows, left_out)
+    right = original(pipeline, rows, left_out, **options)
     return replace(right, stress=wrong.stress, gradient=wrong.gradient)
 
 

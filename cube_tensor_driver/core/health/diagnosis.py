@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..arrays import Array, Index, Mask, PadMasks, Real, StatusBits
+from ..arrays import Array, Index, Mask, Real, StatusBits
+from ..kernel.contract import HealthState
+from ..kernel.rows import pack_bits
 from ..status import DRIFT, LEFT_OUT, NOISY, OPEN, RANGE, SHORT, STUCK
 from .statistics import Window
 
@@ -83,35 +85,23 @@ The shift is measured from the mean frequency at the time at which the cube came
 class Conditions:
     """Present conditions (such as open, stuck or noisy) of all pads of a skin.
 
-    A condition ends when `HOLD_WINDOWS` successive windows were without it.
-
-    Attributes:
-        state: Conditions of each pad (cubes, P), bits of `status.py`.
-        mask: Bit masks of the pads that are not used, because of their conditions (cubes,).
-        status: Conditions that any pad of a cube has (cubes,), bits of `status.py`.
+    A condition ends when `HOLD_WINDOWS` successive windows were without it. The kernel adds the
+    conditions that single rows show in the present window, to `HealthState.found` and to the mask
+    and status of the cube.
     """
 
-    def __init__(self, n_cubes: int, n_pads: int) -> None:
-        # Row 0 holds the conditions found in the present window, the next rows those of the windows
-        # before it.
-        shape = (n_cubes, n_pads)
-        self._recent = np.zeros((HOLD_WINDOWS, *shape), np.uint16)
-        self._since_collected = np.zeros(shape, np.uint16)
-        pads = np.arange(n_pads, dtype=np.uint32)
-        self._pad_bit = np.uint32(1) << pads
-        self._combine()
+    def __init__(self, sums: HealthState) -> None:
+        self._sums = sums
+        # Row 0 holds the conditions found in the window before the present one, the next rows those
+        # of the windows before it.
+        self._earlier = np.zeros((HOLD_WINDOWS, *sums.found.shape), np.uint16)
+        self._since_collected = np.zeros_like(sums.found)
 
-    def add(self, cube: Index, bits: StatusBits) -> None:
-        """Add conditions that were just found, in the window that has not ended.
-
-        Args:
-            cube: Numbers of the cubes (n,).
-            bits: Conditions of their pads (n, P), bits of `status.py`.
-        """
-        # A permanently broken pad brings the same bits with every row, so usually nothing changes.
-        if (bits & ~self._recent[0][cube]).any():
-            np.bitwise_or.at(self._recent[0], cube, bits)
-            self._combine()
+    @property
+    def state(self) -> StatusBits:
+        """Conditions of each pad (cubes, P), bits of `status.py`."""
+        state: StatusBits = np.bitwise_or.reduce(self._earlier, axis=0) | self._sums.found
+        return state
 
     def end_window(self, found: StatusBits, has_rows: Mask) -> None:
         """Add the conditions that the statistics of a window show, and start the next window.
@@ -120,26 +110,22 @@ class Conditions:
             found: Conditions found in the window that ends (cubes, P).
             has_rows: Whether a cube had rows in this window (cubes,).
         """
-        self._recent[0] |= found
-        self._combine()
+        present = self._sums.found
+        present |= found
+        self._since_collected |= self.state
         # A cube without rows keeps its conditions, because nothing shows that its pads recovered.
-        self._recent[1:, has_rows] = self._recent[:-1, has_rows]
-        self._recent[0, has_rows] = 0
+        self._earlier[1:, has_rows] = self._earlier[:-1, has_rows]
+        self._earlier[0, has_rows] = present[has_rows]
+        present[has_rows] = 0
+        state = self.state
+        self._sums.cubes["mask"] = pack_bits(state & LEFT_OUT > 0)
+        self._sums.cubes["status"] = np.bitwise_or.reduce(state, axis=1)
 
     def collect(self) -> StatusBits:
         """Return all conditions (cubes, P) that a pad had at any time since the last call."""
         found: StatusBits = self._since_collected | self.state
         self._since_collected = np.zeros_like(found)
         return found
-
-    def _combine(self) -> None:
-        """Compute the present conditions and masks from those of the recent windows."""
-        self.state: StatusBits = np.bitwise_or.reduce(self._recent, axis=0)
-        self._since_collected |= self.state
-        is_left_out = self.state & LEFT_OUT > 0
-        bits = is_left_out * self._pad_bit
-        self.mask: PadMasks = bits.sum(axis=1, dtype=np.uint32)
-        self.status: StatusBits = np.bitwise_or.reduce(self.state, axis=1)
 
 
 class PadDiagnosis:

@@ -151,8 +151,9 @@ class Reconstruction(CubeNode):
             with self._lock:
                 recorded = self._recorded
                 health = recorded.health_at(rows, self._reconstructor) if recorded else None
+                out = self._publisher.make_rows(rows, frame_id)
                 # The lock keeps a tare from changing the rest frequencies during the computation.
-                stress = self._reconstructor.process(rows, health)
+                stress = self._reconstructor.process(rows, health, out)
                 if self._reconstructor.rest_changes != self._published_rest_changes:
                     self._publish_info()
         except CubeError as error:

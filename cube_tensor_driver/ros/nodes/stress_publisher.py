@@ -20,7 +20,7 @@ from ...config.skin import Skin
 from ...core.arrays import Array
 from ...core.forces import Forces
 from ...core.reconstructor import Reconstructor
-from ...core.rows import StressRows
+from ...core.rows import FrequencyRows, StressRows
 from ...core.status import INVALID
 from ...core.tensor import contact_wrench
 from ...messages.codec import stress_codec
@@ -92,6 +92,19 @@ class StressPublisher:
         )
         node.own(node.create_timer(LISTENERS_PERIOD_S, self._cubes.find_listeners))
 
+    def make_rows(self, rows: FrequencyRows, frame_id: bytes) -> StressRows:
+        """Return rows to be filled by the caller; their memory is that of the next message.
+
+        Args:
+            rows: Rows of frequencies, from which cube, sequence number and time stamp are taken.
+            frame_id: Frame id of the message, encoded and with a closing zero byte.
+        """
+        out = self._buffer(frame_id, len(rows)).rows
+        out.cube[:] = rows.cube
+        out.sequence[:] = rows.sequence
+        out.stamp_ns[:] = rows.stamp_ns
+        return out
+
     def publish(
         self,
         stress: StressRows,
@@ -106,7 +119,8 @@ class StressPublisher:
             frame_id: Frame id of the message, encoded and with a closing zero byte.
         """
         message = self._buffer(frame_id, len(stress))
-        message.fill(stress)
+        if stress is not message.rows:
+            message.fill(stress)
         self._publisher.publish(message.data(stamp_ns))
         self._cubes.publish(stress)
         if self._forces is not None:

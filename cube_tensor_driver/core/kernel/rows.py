@@ -1,0 +1,332 @@
+"""The kernel in numpy: the specification to read, and the kernel where no C compiler was.
+
+The rows of one scan (at most one row of each cube) are processed together; the kernel in C takes
+one row after the other. Both give the same bits on every processor, because each operation is one
+of + - * / sqrt, which IEEE 754 rounds correctly, and the terms of a sum are added in a fixed order.
+A matrix product of numpy (BLAS) would choose the order by processor and shape.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..arrays import AnyArray, Array, Index, Mask, Real, Single, Times, multiply
+from ..health.statistics import GAP_NS, MAX_JITTER_RATIO
+from ..modes import COMPONENTS, STRESS
+from ..oscillator import rest_ratio
+from ..status import (
+    INVALID,
+    OPEN,
+    PAD_FAULT,
+    RANGE,
+    REPORTED,
+    RESIDUAL,
+    SHORT,
+    STAMP,
+    TEMPERATURE,
+)
+from .contract import (
+    DONE,
+    NEEDS_WINDOW,
+    PAD_QUANTITIES,
+    UNKNOWN_CUBE,
+    Columns,
+    HealthState,
+    Numbers,
+    Results,
+    Tables,
+)
+
+N_COMPONENTS = len(COMPONENTS)
+
+MAX_ROWS = 4096
+"""Maximum number of rows that are processed together where their health is not found, so that one
+matrix for each of them fits into memory."""
+
+
+def run(
+    start: int,
+    n_residuals: int,
+    tables: Tables,
+    health: HealthState | None,
+    columns: Columns,
+    results: Results,
+) -> tuple[int, int]:
+    """Process rows, scan by scan; `run.run` states arguments and results."""
+    n_cubes = len(tables.calibration)
+    if health is not None and (columns.cube[start:] >= n_cubes).any():
+        return start, UNKNOWN_CUBE
+    # A scan begins where the cube number does not rise.
+    begins_scan = np.ones(len(columns.cube) + 1, bool)
+    begins_scan[1:-1] = columns.cube[1:] <= columns.cube[:-1]
+    while start < len(columns.cube):
+        end = start + MAX_ROWS
+        if health is not None:
+            end = start + 1 + int(np.argmax(begins_scan[start + 1 :]))
+        scan = slice(start, end)
+        if health is not None and begins_scan[start] and not _is_in_window(health, columns, scan):
+            return start, NEEDS_WINDOW
+        with np.errstate(all="ignore"):
+            start, request = _process(scan, n_residuals, tables, health, columns, results)
+        if request != DONE:
+            return start, request
+    return start, DONE
+
+
+def apply_law(tables: Tables, cube: Index, frequency: Real, temperature: Real) -> tuple[Real, Mask]:
+    """Apply the pad law v = (f - f0) / (f_highest - f), with f0 and f_highest at a temperature.
+
+    Args:
+        tables: Tables of the skin.
+        cube: Numbers of the cubes (N,).
+        frequency: Frequencies f (N, P), in Hz.
+        temperature: Temperatures (N,), in °C; NaN where they are unknown.
+
+    Returns:
+        Pad stresses divided by the stiffness E (1 + beta) / beta (N, P), 0 for bad pads, and
+        whether the frequency lies in the range of the law, 0 < f < f_highest (N, P).
+    """
+    factor = temperature_factor(tables, tables.calibration[cube], temperature)
+    rest = (tables.rest[cube] * factor).astype(frequency.dtype)
+    highest = (tables.highest[cube] * factor).astype(frequency.dtype)
+    below = highest - frequency
+    # NaN fails both comparisons.
+    is_good = (frequency > 0) & (below > 0)
+    v = np.where(is_good, (frequency - rest) / below, 0)
+    return v, is_good
+
+
+def temperature_factor(tables: Tables, calibration: Numbers, temperature: Real) -> Array:
+    """Return the ratio of rest frequencies at temperatures to those at the reference (N, P).
+
+    It is 1 without a temperature model, and for an unknown temperature.
+
+    Args:
+        tables: Tables of the skin.
+        calibration: Numbers of the calibrations (N,).
+        temperature: Temperatures (N,), in °C; NaN where they are unknown.
+    """
+    change = temperature.astype(float) - tables.reference[calibration]
+    known_change = np.where(np.isfinite(change), change, 0)
+    return rest_ratio(tables.coefficients[calibration], known_change)
+
+
+def mask_bits(tables: Tables, calibration: Numbers, mask: AnyArray) -> Mask:
+    """Return whether the cube has a pad and its bit in a mask is set (N, P).
+
+    Args:
+        tables: Tables of the skin.
+        calibration: Numbers of the calibrations (N,).
+        mask: Bit masks of pads (N,).
+    """
+    pads = np.arange(tables.rest.shape[1])
+    exists = pads < tables.pads[calibration][:, None]
+    is_set: Mask = mask[:, None] >> pads & 1 > 0
+    return exists & is_set
+
+
+def pack_bits(bits: Mask) -> Times:
+    """Convert truth values (..., count) to bit masks (...); value p becomes bit p of a mask."""
+    weights = np.int64(1) << np.arange(bits.shape[-1])
+    masks: Times = (bits * weights).sum(axis=-1)
+    return masks
+
+
+def _is_in_window(health: HealthState, columns: Columns, scan: slice) -> bool:
+    begin_ns, end_ns, _ = health.window_ns.tolist()
+    newest_ns = int(columns.stamp_ns[scan].max())
+    health.window_ns[2] = newest_ns
+    return bool(begin_ns <= newest_ns < end_ns)
+
+
+def _process(
+    scan: slice,
+    n_residuals: int,
+    tables: Tables,
+    health: HealthState | None,
+    columns: Columns,
+    results: Results,
+) -> tuple[int, int]:
+    """Process the rows of one scan up to the first whose table is missing.
+
+    Args:
+        scan: The rows.
+        n_residuals: Number of outputs that are residuals.
+        tables: Tables of the skin.
+        health: State of the health, or None.
+        columns: Rows to process.
+        results: Rows to write.
+
+    Returns:
+        As `run`.
+    """
+    rows, out = columns.select(scan), results.select(scan)
+    is_unknown = rows.cube >= len(tables.calibration)
+    cube = np.where(is_unknown, 0, rows.cube).astype(np.intp)
+    calibration = tables.calibration[cube]
+    if health is not None:
+        _check_pads(tables, health, rows, cube)
+        state = health.cubes[cube]
+        is_known = np.zeros(len(cube), bool) if rows.known is None else rows.known
+        out.left_out[:] = np.where(is_known, out.left_out, rows.pad_fault | state["mask"])
+        out.status[:] = np.where(is_known, out.status, state["status"])
+
+    v, is_good = apply_law(tables, cube, rows.frequency, rows.temperature)
+    is_bad = mask_bits(tables, calibration, out.left_out) | _lack(tables, calibration, is_good)
+    bad = np.where(is_unknown, 0, pack_bits(is_bad))
+    v[is_bad] = 0
+    table, request = _find_tables(tables, calibration, bad)
+    end = len(table)
+
+    outputs = multiply(v[:end], tables.matrix[table])
+    outputs[is_unknown[:end]] = np.nan
+    squares = np.zeros(end, outputs.dtype)
+    for column in range(N_COMPONENTS, N_COMPONENTS + n_residuals):
+        squares += outputs[:, column] * outputs[:, column]
+    residual = np.sqrt(squares)
+    is_over_limit = residual > tables.limit[table]
+    observed = np.where(is_unknown[:end], 0, tables.observed[table])
+    is_thermal = ~np.isnan(tables.reference[calibration]) & ~is_unknown
+    is_cold = is_thermal & ~np.isfinite(rows.temperature)
+
+    out.stress[:end] = outputs[:, : len(STRESS)]
+    out.gradient[:end] = outputs[:, len(STRESS) : N_COMPONENTS]
+    out.residual[:end] = residual
+    out.observed[:end] = observed
+    out.left_out[:end] |= bad[:end].astype(np.uint32)
+    out.status[:end] |= rows.doubt[:end] & np.uint16(STAMP)
+    for bit, condition in (
+        (PAD_FAULT, bad[:end] != 0),
+        (RESIDUAL, is_over_limit),
+        (INVALID, observed == 0),
+        (TEMPERATURE, is_cold[:end]),
+    ):
+        out.status[:end] |= condition * np.uint16(bit)
+    if health is not None:
+        _add_to_window(health, rows, cube[:end], is_over_limit)
+    return scan.start + end, request
+
+
+def _lack(tables: Tables, calibration: Numbers, is_good: Mask) -> Mask:
+    """Return whether the cube has a pad and the pad is not good (N, P)."""
+    all_pads = np.full(len(calibration), 0xFFFFFFFF)
+    return mask_bits(tables, calibration, all_pads) & ~is_good
+
+
+def _find_tables(tables: Tables, calibration: Numbers, bad: Times) -> tuple[Numbers, int]:
+    """Find the tables of rows, up to the first row whose table is missing.
+
+    Args:
+        tables: Tables of the skin.
+        calibration: Numbers of the calibrations of the rows (N,).
+        bad: Bit masks of the bad pads (N,).
+
+    Returns:
+        Numbers of the tables, and the key of the missing table, or `DONE`.
+    """
+    key = calibration.astype(np.int64) << 32 | bad
+    place = np.searchsorted(tables.keys, key)
+    place = np.minimum(place, len(tables.keys) - 1)
+    table = np.where(bad == 0, calibration, tables.numbers[place])
+    missing = np.flatnonzero((bad != 0) & (tables.keys[place] != key))
+    if not len(missing):
+        return table, DONE
+    first = int(missing[0])
+    return table[:first], int(key[first])
+
+
+def _check_pads(tables: Tables, health: HealthState, rows: Columns, cube: Index) -> None:
+    """Add the conditions OPEN, SHORT, RANGE and REPORTED of pads that the rows show.
+
+    Args:
+        tables: Tables of the skin.
+        health: State of the health, which is changed.
+        rows: Rows of one scan.
+        cube: Numbers of their cubes, to index with.
+    """
+    f = rows.frequency.astype(np.float32)
+    low, high, open_from = (health.pads(name)[cube] for name in ("low", "high", "open"))
+    calibration = tables.calibration[cube]
+    is_impossible = _lack(tables, calibration, (f > low) & (f < high))
+    bits = np.where(f >= open_from, OPEN, RANGE)
+    bits = np.where(f > 0, bits, SHORT)  # NaN is no frequency, too
+    bits = np.where(is_impossible, bits, 0)
+    # The device may set the bit of a pad that the cube does not have.
+    bits = bits | mask_bits(tables, calibration, rows.pad_fault) * REPORTED
+    bits = bits.astype(np.uint16)
+    health.found[cube] |= bits
+    health.cubes["status"][cube] |= np.bitwise_or.reduce(bits, axis=1)
+    health.cubes["mask"][cube] |= pack_bits(bits > 0).astype(np.uint32)
+
+
+def _add_to_window(health: HealthState, rows: Columns, cube: Index, is_over_limit: Mask) -> None:
+    """Add rows of one scan to the sums of the present window; `statistics.py` has the equations.
+
+    Args:
+        health: State of the health, which is changed.
+        rows: Rows of one scan; those after the last cube are left out.
+        cube: Numbers of the cubes, to index with.
+        is_over_limit: Whether the residual of a row is above its limit.
+    """
+    ratio, weight = _measure_pace(health, rows, cube)
+    f = rows.frequency[: len(cube)].astype(np.float32)
+    pads = {name: health.pads(name) for name in PAD_QUANTITIES}
+    difference = f - pads["last"][cube]
+    second = difference - ratio * pads["difference"][cube]
+    squares = second * second * weight
+    pads["second_squares"][cube] += squares
+    pads["bounded_squares"][cube] += np.minimum(squares, pads["bound"][cube])
+    pads["first_squares"][cube] += difference * difference
+    pads["sum"][cube] += f - pads["base"][cube]
+    # fmin and fmax ignore NaN, which stands for a sample in which the pad had no frequency.
+    pads["lowest"][cube] = np.fmin(pads["lowest"][cube], f)
+    pads["highest"][cube] = np.fmax(pads["highest"][cube], f)
+    pads["difference"][cube] = difference
+    pads["last"][cube] = f
+
+    health.cubes["temperature"][cube] = rows.temperature[: len(cube)]
+    health.cubes["rows"][cube] += 1
+    health.cubes["over_limit"][cube] += is_over_limit
+
+
+def _measure_pace(health: HealthState, rows: Columns, cube: Index) -> tuple[Single, Single]:
+    """Compute ratios and weights for second differences from the intervals between rows.
+
+    The ratio r of two successive intervals makes the second difference of a linear drift vanish,
+    and the weight w gives it the variance of the noise; `statistics.py` has the formulas.
+
+    Args:
+        health: State of the health, whose times are changed.
+        rows: Rows of one scan; those after the last cube are left out.
+        cube: Numbers of the cubes, to index with.
+
+    Returns:
+        Ratios r and weights w (n, 1), to apply to all pads of a row.
+    """
+    state = health.cubes
+    stamp_ns = rows.stamp_ns[: len(cube)]
+    is_doubtful = rows.doubt[: len(cube)] & STAMP > 0
+    between = stamp_ns - state["time_ns"][cube]
+    before = state["interval_ns"][cube]
+    # An interval that begins or ends with a doubtful time stamp is unknown.
+    now = np.where(is_doubtful | (state["is_doubtful"][cube] > 0), 0, between)
+    state["time_ns"][cube] = stamp_ns
+    state["interval_ns"][cube] = now
+    state["is_doubtful"][cube] = is_doubtful
+
+    # Time that went back counts as a gap, too. The interval between the last row of a window and
+    # the first row of the next one is the gap before the next window, not within it.
+    is_gap = (between < 0) | (between >= GAP_NS)
+    is_first = state["rows"][cube] == 0
+    within = state["gap_within"][cube]
+    is_longest = is_gap & ~is_first & (np.abs(between) > np.abs(within))
+    state["gap_before"][cube] = np.where(is_gap & is_first, between, state["gap_before"][cube])
+    state["gap_within"][cube] = np.where(is_longest, between, within)
+
+    shorter, longer = np.minimum(now, before), np.maximum(now, before)
+    is_known = (shorter > 0) & (longer < GAP_NS)
+    is_even = longer < MAX_JITTER_RATIO * shorter
+    safe_before = np.where(is_known, before, 1)
+    ratio = np.where(is_known & ~is_even, now / safe_before, 1.0)
+    weight = is_known * 6 / (1 + (1 + ratio) * (1 + ratio) + ratio * ratio)
+    return ratio[:, None].astype(np.float32), weight[:, None].astype(np.float32)

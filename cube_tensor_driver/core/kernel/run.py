@@ -1,0 +1,44 @@
+"""The choice between the kernel in C and the one in numpy."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from . import rows
+from .contract import Columns, HealthState, Results, Tables
+
+try:
+    from ... import _scan as native
+except ImportError:
+    native = None  # type: ignore[assignment]
+
+_NO_HEALTH = (None,) * len(HealthState._fields)
+
+
+def run(
+    start: int,
+    n_residuals: int,
+    tables: Tables,
+    health: HealthState | None,
+    columns: Columns,
+    results: Results,
+) -> tuple[int, int]:
+    """Process rows, from one on, until the kernel has a request.
+
+    Args:
+        start: Number of the first row to process.
+        n_residuals: Number of outputs of the matrices that are residuals.
+        tables: Tables of the skin.
+        health: State of the health, which is changed; None: health is not asked for.
+        columns: Rows to process.
+        results: Rows to write.
+
+    Returns:
+        Number of the first row that is not processed, and the request: `DONE`, `NEEDS_WINDOW`,
+        `UNKNOWN_CUBE`, or the key (see `Tables.keys`) of a table that must be added.
+    """
+    if native is None:
+        return rows.run(start, n_residuals, tables, health, columns, results)
+    is_double = columns.frequency.dtype == np.float64
+    state = health or _NO_HEALTH
+    return native.run(start, n_residuals, is_double, *tables, *state, *columns, *results)
