@@ -75,14 +75,37 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    from cube_tensor_driver.config.output_files import write_json
+    from cube_tensor_driver.views.terminal.interrupt import ends_at_once
+    from cube_tensor_driver.views.terminal.output import progress_bar
+
+    from ..fem.fem import Response, compute_response
     from ..fem.model import read_model
+    from ..studies.surface_study import study_surface
 
     model = read_model(options.model)
     _check_output(options, model)
-    if options.surface:
-        _run_surface(options, model)
+    body, layout = model.body, model.layout
+    place = " on rigid ground" if options.surface else ""
+    symmetry = "" if options.surface else f", symmetry {model.symmetry}"
+    print(f"{describe(body, layout)}{place}; {layout.n_pads} pads{symmetry}", flush=True)
+    result: Response | SurfaceStudy
+    # A factorisation in C does not notice Ctrl-C by itself.
+    with ends_at_once(), progress_bar() as report:
+        if options.surface:
+            result = study_surface(body, layout, options.meshes, model.neglect, report)
+        else:
+            result = compute_response(body, layout, model.symmetry, options.meshes, report)
+    if options.json is not None:
+        write_json(options.json, result.to_dict())
+    if isinstance(result, Response):
+        show_response(result)
     else:
-        _run_response(options, model)
+        show_surface(result)
+    if options.figures is not None:
+        _draw(result, options.figures)
+    if options.output is not None:
+        _write(options, model, result)
     return 0
 
 
@@ -108,60 +131,26 @@ def _check_output(options: argparse.Namespace, model: Model) -> None:
         )
 
 
-def _run_response(options: argparse.Namespace, model: Model) -> None:
-    """Compute, show and write the response matrix."""
-    from cube_tensor_driver.config.output_files import write_json
-    from cube_tensor_driver.views.terminal.interrupt import ends_at_once
-    from cube_tensor_driver.views.terminal.output import progress_bar
-
-    from ..fem.fem import compute_response
-
-    layout = model.layout
-    symmetry = model.symmetry
-    text = describe(model.body, layout)
-    print(f"{text}; {layout.n_pads} pads, symmetry {symmetry}", flush=True)
-    # A factorisation in C does not notice Ctrl-C by itself.
-    with ends_at_once(), progress_bar() as report:
-        result = compute_response(model.body, layout, symmetry, options.meshes, report)
-    show_response(result)
-    if options.json is not None:
-        write_json(options.json, result.to_dict())
-    if options.figures is not None:
-        _draw_response(result, options.figures)
-    if options.output is not None:
-        _write_calibration(options, model, result)
-
-
-def _run_surface(options: argparse.Namespace, model: Model) -> None:
-    """Compute, show and write the influence functions and what the cube measures under loads."""
-    from cube_tensor_driver.config.output_files import write_json
-    from cube_tensor_driver.mechanics.influence_file import write_influence
+def _draw(result: Response | SurfaceStudy, folder: Path) -> None:
+    """Draw influence functions, or convergence, response and the loads of a layout in a plane."""
     from cube_tensor_driver.views.figures.style import save
-    from cube_tensor_driver.views.terminal.interrupt import ends_at_once
-    from cube_tensor_driver.views.terminal.output import progress_bar
 
-    from ..figures.response import draw_influence
-    from ..studies.surface_study import study_surface
+    from ..fem.fem import Response
+    from ..figures.deformation import draw_loads
+    from ..figures.response import draw_convergence, draw_influence, draw_response
+    from ..paper.experiments import mode_deformations
 
-    body = model.body
-    layout = model.layout
-    print(
-        f"{describe(body, layout)} on rigid ground; {layout.n_pads} pads",
-        flush=True,
-    )
-    with ends_at_once(), progress_bar() as report:
-        study = study_surface(body, layout, options.meshes, model.neglect, report)
-    show_surface(study)
-    if options.json is not None:
-        write_json(options.json, study.to_dict())
-    if options.figures is not None:
-        options.figures.mkdir(parents=True, exist_ok=True)
-        picture = draw_influence(study.influence, layout, body.side / 2)
-        save(picture, options.figures / "influence.png")
-        print(f"picture in {options.figures}")
-    if options.output is not None:
-        write_influence(options.output, study.influence, _command(options))
-        print(f"wrote {options.output}")
+    folder.mkdir(parents=True, exist_ok=True)
+    body, layout = result.body, result.layout
+    if isinstance(result, Response):
+        save(draw_convergence(result), folder / "convergence.png")
+        save(draw_response(result), folder / "response.png")
+        if layout.planar:
+            save(draw_loads(layout, mode_deformations(body, layout)), folder / "loads.png")
+    else:
+        influence = draw_influence(result.influence, layout, body.side / 2)
+        save(influence, folder / "influence.png")
+    print(f"pictures in {folder}")
 
 
 def describe(body: Body, layout: Layout) -> str:
@@ -197,21 +186,21 @@ def _command(options: argparse.Namespace) -> str:
     return shlex.join(words)
 
 
-def _draw_response(result: Response, folder: Path) -> None:
-    """Draw convergence and response, and the loads of a layout in a plane."""
-    from cube_tensor_driver.views.figures.style import save
+def _write(
+    options: argparse.Namespace,
+    model: Model,
+    result: Response | SurfaceStudy,
+) -> None:
+    """Write the calibration, or the influence functions."""
+    from cube_tensor_driver.mechanics.influence_file import write_influence
 
-    from ..figures.deformation import draw_loads
-    from ..figures.response import draw_convergence, draw_response
-    from ..paper.experiments import mode_deformations
+    from ..fem.fem import Response
 
-    folder.mkdir(parents=True, exist_ok=True)
-    save(draw_convergence(result), folder / "convergence.png")
-    save(draw_response(result), folder / "response.png")
-    if result.layout.planar:
-        deformations = mode_deformations(result.body, result.layout)
-        save(draw_loads(result.layout, deformations), folder / "loads.png")
-    print(f"pictures in {folder}")
+    if isinstance(result, Response):
+        _write_calibration(options, model, result)
+    else:
+        write_influence(options.output, result.influence, _command(options))
+        print(f"wrote {options.output}")
 
 
 def _write_calibration(

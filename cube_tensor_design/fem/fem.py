@@ -312,7 +312,7 @@ def pad_stresses(
         forces: Returns, for a parity, the nodal forces (dofs, n) of that part of the loads.
         report: Called as report(what) before every solve.
     """
-    stresses: Array | float = 0.0
+    stresses: Any = 0.0
     for parity in each_parity(solid, report):
         load = forces(parity)
         part = np.zeros((layout.n_pads, load.shape[1]))
@@ -323,7 +323,7 @@ def pad_stresses(
             reactions = solid.body @ solid.solve(parity, load[:, used])
             part[:, used] = weights @ reactions
         stresses = stresses + part
-    return np.asarray(stresses)
+    return stresses
 
 
 def each_parity(solid: Solid, report: Callable[[str], None]) -> Iterator[Parity]:

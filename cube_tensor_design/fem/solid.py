@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -175,7 +175,7 @@ class Solid:
         mesh = self.basis.mesh
         edges = mesh.boundary_facets()
         centres = mesh.p[:, mesh.facets[:, edges]].mean(axis=1)
-        total: Array | float = 0.0
+        total: Any = 0.0
         for axis, sign in itertools.product(range(self.dim), (1, -1)):
             end = (sign * mesh.p[axis]).max()
             if end < SAME_COORDINATE:
@@ -191,7 +191,7 @@ class Solid:
             # The components of one node are neighbours among the unknowns.
             by_node = forces.reshape(face.N, -1, self.dim).swapaxes(1, 2)
             total = total + by_node.reshape(self.basis.N, -1)
-        return np.asarray(total)
+        return total
 
     def solve(self, parity: Parity, forces: Array) -> Array:
         """Return the displacements (dofs, n) under nodal forces (dofs, n) of one parity."""
@@ -250,7 +250,7 @@ class Solid:
 
         On the surface of the cube, they are the forces of the cube.
         """
-        return np.asarray(self.body @ u)
+        return self.body @ u
 
     def pad_weights(self, layout: Layout, parity: Parity) -> Array:
         """Return weights (P, dofs); weights @ reactions is the mean normal stress of each pad."""
@@ -282,7 +282,7 @@ class Solid:
             return held | _is_at(x[-1], x[-1].min())
         if self.is_rigid:
             in_cube = np.all(np.abs(x) < 1.0 + SAME_COORDINATE, axis=0)
-            return np.asarray(held | in_cube)
+            return held | in_cube
 
         def admits(*odd: int) -> bool:
             """Return whether a motion that is odd along these axes has the parity."""

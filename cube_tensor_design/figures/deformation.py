@@ -209,7 +209,7 @@ def _contour_levels(limit: float) -> Array:
     steps = np.multiply.outer([1, 2, 3, 5], powers).ravel()
     # Four steps should be about the range of the colours on one side of zero.
     step = steps[np.argmin(np.abs(np.log(4 * steps / limit)))]
-    return np.asarray(step * (np.arange(-5, 5) + 0.5))
+    return step * (np.arange(-5, 5) + 0.5)
 
 
 def _draw_arrows(

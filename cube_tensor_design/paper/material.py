@@ -42,10 +42,10 @@ class Material:
         if not self.finite:
             strain = _strain(f)
             volume_part = self.lam / 2 * trace(strain) ** 2
-            return np.asarray(volume_part + self.mu * ddot(strain, strain))
+            return volume_part + self.mu * ddot(strain, strain)
         log = np.log(det(f))
         distortion = self.mu / 2 * (ddot(f, f) - 2 - 2 * log)
-        return np.asarray(distortion + self.lam / 2 * log**2)
+        return distortion + self.lam / 2 * log**2
 
     def stress(self, f: Array) -> Array:
         """Return the first Piola-Kirchhoff stress P = dW/dF (2, 2, E, Q), in Pa.
@@ -54,10 +54,10 @@ class Material:
         """
         if not self.finite:
             strain = _strain(f)
-            return np.asarray(self.lam * trace(strain) * _ONE + 2 * self.mu * strain)
+            return self.lam * trace(strain) * _ONE + 2 * self.mu * strain
         inverse = transpose(inv(f))
         pressure_part = self.lam * np.log(det(f)) * inverse
-        return np.asarray(self.mu * (f - inverse) + pressure_part)
+        return self.mu * (f - inverse) + pressure_part
 
     def cauchy(self, f: Array) -> Array:
         """Return the true stress P Fᵀ / J (2, 2, E, Q), in Pa: the force over the deformed area.
@@ -65,7 +65,7 @@ class Material:
         A linear material does not distinguish it from P.
         """
         p = self.stress(f)
-        return np.asarray(mul(p, transpose(f)) / det(f)) if self.finite else p
+        return mul(p, transpose(f)) / det(f) if self.finite else p
 
     def moduli(self, f: Array) -> Array:
         """Return dP_ij/dF_kl (2, 2, 2, 2, E, Q), in Pa; Q is 1 for a linear material."""
@@ -78,8 +78,8 @@ class Material:
         crossed = np.swapaxes(outer, 1, 3)
         # The derivative of F^-T by F is -crossed.
         shear_part = self.mu * identity + (self.mu - self.lam * log) * crossed
-        return np.asarray(shear_part + self.lam * outer)
+        return shear_part + self.lam * outer
 
 
 def _strain(f: Array) -> Array:
-    return np.asarray((f + transpose(f)) / 2 - _ONE)
+    return (f + transpose(f)) / 2 - _ONE

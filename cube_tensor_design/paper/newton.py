@@ -130,9 +130,9 @@ class _Search:
             jump: (dofs,) change of the prescribed unknowns.
         """
         free = self._free
-        right: Array = -(state.force + matrix @ jump)[free]
+        right = -(state.force + matrix @ jump)[free]
         inner = matrix[free][:, free]
-        change: Array = jump.copy()
+        change = jump.copy()
         if self._held is None or self._row is None:
             change[free] = factors(inner).solve(right)
             return change

@@ -112,8 +112,7 @@ class RodContact:
         """Return the nodal forces (dofs,) at displacements u (dofs,)."""
         at = self._penetration(u)
         pressure = self._stiffness * at.p * at.dp
-        force = _PUSH.assemble(self._facets, pressure=pressure, slope=at.slope)
-        return np.asarray(force)
+        return _PUSH.assemble(self._facets, pressure=pressure, slope=at.slope)
 
     def tangent(self, u: Array, curved: bool = True) -> sp.csr_matrix:
         """Return the derivative of the nodal forces, sparse (dofs, dofs).

@@ -53,7 +53,7 @@ class Section:
     def deformation(self, u: Array) -> Array:
         """Return F = 1 + grad u (2, 2, E, Q)."""
         gradient = (self._gradient @ u).reshape(2, 2, *self.basis.dx.shape)
-        return np.asarray(gradient + np.eye(2)[:, :, None, None])
+        return gradient + np.eye(2)[:, :, None, None]
 
     def balance(self, u: Array) -> Balance | None:
         """Return nodal forces and energy; None when an element is inside out."""
@@ -74,7 +74,7 @@ class Section:
             elements: (E,) which elements count.
         """
         volume = self.basis.dx * np.reshape(elements, (-1, 1))
-        return np.asarray((stress * volume).ravel() @ self._gradient)
+        return (stress * volume).ravel() @ self._gradient
 
     def tangent(self, u: Array) -> sp.csr_matrix:
         """Return the derivative of the nodal forces by u, sparse (dofs, dofs).

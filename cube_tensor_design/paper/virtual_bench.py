@@ -287,7 +287,7 @@ class VirtualBench:
         mesh = self.section.mesh
 
         def is_at_height(x: Array) -> Mask:
-            return np.asarray(np.abs(x[1] - z) < SURFACE_TOLERANCE)
+            return np.abs(x[1] - z) < SURFACE_TOLERANCE
 
         facets = mesh.facets_satisfying(is_at_height, boundaries_only=True)
         return skfem.FacetBasis(mesh, self.section.basis.elem, facets=facets, intorder=8)

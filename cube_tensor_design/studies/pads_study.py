@@ -87,7 +87,7 @@ class LayerBench(TractionBench):
         influence = self._true.at(place.reshape(-1, 2))[self._pads]
         influence = influence.reshape(-1, len(rotation), len(sources), 3)
         # The pads p of cube n add up the point forces s.
-        return np.asarray(np.einsum("pnsi,nsi->np", influence, local_forces))
+        return np.einsum("pnsi,nsi->np", influence, local_forces)
 
 
 def coarse_influence() -> Influence:

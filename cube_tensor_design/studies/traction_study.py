@@ -265,7 +265,7 @@ class TractionBench:
         by_axis = to_matrix(field[:, 6:].reshape(-1, 6, 3).swapaxes(1, 2))
         gradient = rotate_gradient(np.moveaxis(by_axis, 1, -1), to_cube)
         state = calibration.modes.state(stress, calibration.half_side * gradient)
-        return np.asarray(state @ calibration.response.T)
+        return state @ calibration.response.T
 
     def measured(
         self,
@@ -473,19 +473,12 @@ def flat_punch(
         centre: (2,) in m.
         order: Number of rings; each has four times as many points.
     """
-    nodes, weight = np.polynomial.legendre.leggauss(order)
-    # With s = sqrt(1 - r^2 / a^2) the traction is uniform in s.
-    s = (nodes + 1) / 2
-    r = radius * np.sqrt(1 - s**2)
-    count = 4 * order
-    angle = 2 * np.pi * np.arange(count) / count
-    x = np.outer(r, np.cos(angle)).ravel()
-    y = np.outer(r, np.sin(angle)).ravel()
-    sources = np.zeros((len(x), 3))
-    sources[:, 0] = centre[0] + x
-    sources[:, 1] = centre[1] + y
-    shares = np.repeat(weight / 2 / count, count)
-    return sources, shares[:, None] * np.asarray(force)
+    sources, forces = contact.hertz(radius, force, centre, order)
+    # The rings are Gauss points of s = sqrt(1 - r^2 / a^2), in which Hertz's traction is 3 s^2 and
+    # that of the punch is uniform.
+    r_square = ((sources[:, :2] - centre) ** 2).sum(axis=1)
+    s_square = 1 - r_square / radius**2
+    return sources, forces / (3 * s_square[:, None])
 
 
 def traction_study(

@@ -10,7 +10,6 @@ import numpy as np
 
 from cube_tensor_driver.config.grid import grid
 from cube_tensor_driver.config.yaml import write_yaml
-from cube_tensor_driver.core.arrays import AnyArray
 from cube_tensor_driver.core.errors import CubeError
 from cube_tensor_driver.simulation.sample_log import CUBE_RANGE, SampleTable
 from cube_tensor_hub.firmware import build
@@ -95,7 +94,7 @@ def read_samples(path: Path, load: HubLoad) -> SampleTable:
     start_ns = int(np.frombuffer(data, np.int64, 1)[0])
     # The program may have been ended while it wrote the last record.
     count = (len(data) - START_TIME_BYTES) // SAMPLE_RECORD.itemsize
-    taken: AnyArray = np.frombuffer(data, SAMPLE_RECORD, count, START_TIME_BYTES)
+    taken = np.frombuffer(data, SAMPLE_RECORD, count, START_TIME_BYTES)
     return SampleTable(
         start_time_ns=start_ns,
         link=taken["hub"].astype(np.int64),

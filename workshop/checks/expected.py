@@ -192,8 +192,7 @@ class ExpectedReadings:
         }
         if len(instants) != 1:
             return None
-        held: Array = self._millihertz[instants.pop(), cubes] * MILLIHERTZ
-        return held
+        return self._millihertz[instants.pop(), cubes] * MILLIHERTZ
 
     def find_samples(self, rows: FrequencyRows) -> Index:
         """Find the sample of each row (N,), or `NO_MATCH` for what no hub took.
@@ -280,5 +279,4 @@ def _is_at_edge(fault: HubFault, time_ns: Index) -> Mask:
     """Find the times (N,) close to the begin or the end of a fault."""
     from_begin_ns = np.abs(time_ns - fault.begin_ns)
     from_end_ns = np.abs(time_ns - fault.end_ns)
-    is_at_edge: Mask = np.minimum(from_begin_ns, from_end_ns) < EDGE_NS
-    return is_at_edge
+    return np.minimum(from_begin_ns, from_end_ns) < EDGE_NS

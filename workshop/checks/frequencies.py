@@ -89,7 +89,7 @@ def _differs(rows: FrequencyRows, readings: Readings) -> Mask:
     differs_in_pad = ~agree(rows.frequency, readings.frequency) | differs_in_fault
     # The temperature changes together with the readings, so all pads are certain or none is.
     differs_in_temperature = ~agree(rows.temperature, readings.temperature)
-    differs: Mask = (certain & differs_in_pad).any(axis=1)
+    differs = (certain & differs_in_pad).any(axis=1)
     differs |= certain.all(axis=1) & differs_in_temperature
     # Doubtful stamps are the only condition that a row of frequencies may have.
     differs |= rows.status & ~np.uint16(STAMP) != 0
@@ -102,7 +102,7 @@ def _may_be_missing(run: Run) -> Mask:
     They were damaged, their link was cut, the driver was stopped, or a message did not arrive here.
     """
     record, samples = run.record, run.samples
-    explained: Mask = samples.is_damaged.copy()
+    explained = samples.is_damaged.copy()
     # A sample that is held back by a fault goes out together with the next one.
     explained[:-1] |= samples.is_damaged[1:]
     explained |= samples.is_near_fault(CUT_FAULTS, IN_FLIGHT_S, RECOVERY_S)

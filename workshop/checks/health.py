@@ -134,8 +134,7 @@ def _is_flagged(
 ) -> Mask:
     """Find the rows (N,) that leave the pad out and name its condition."""
     is_left_out = rows.left_out >> np.uint32(pad) & 1 == 1
-    is_flagged: Mask = is_left_out & (rows.status & bit != 0)
-    return is_flagged
+    return is_left_out & (rows.status & bit != 0)
 
 
 class _Evidence:

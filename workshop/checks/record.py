@@ -61,8 +61,7 @@ class Span:
         begin_ns = self.begin_ns - round(NS_PER_S * before_s)
         end_ns = self.end_ns + round(NS_PER_S * after_s)
         time_ns = np.asarray(time_ns)
-        contains: Mask = (time_ns >= begin_ns) & (time_ns < end_ns)
-        return contains
+        return (time_ns >= begin_ns) & (time_ns < end_ns)
 
     def overlaps(self, other: Span, margin_s: float) -> bool:
         """Return whether another span is less than a margin away."""

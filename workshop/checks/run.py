@@ -31,7 +31,7 @@ def find_matched(index: Index) -> Index:
 
 def agree(found: Real, wanted: Real, allowed: Real | float = 0.0) -> Mask:
     """Compare with a tolerance, 0 for equal bits; NaN (not known) agrees with NaN alone."""
-    near: Mask = np.abs(found - wanted) <= allowed
+    near = np.abs(found - wanted) <= allowed
     return near | (np.isnan(found) & np.isnan(wanted))
 
 

@@ -118,5 +118,4 @@ def _join_keys(
     number: AnyArray,
 ) -> AnyArray:
     """Join the columns that identify a sample in one integer each; numbers stay below 2**40."""
-    key: AnyArray = (link << 52) | (boot << 40) | number
-    return key
+    return (link << 52) | (boot << 40) | number

@@ -230,8 +230,7 @@ class _Reference:
         ]
         # The shape is stated because there may be no rows.
         table = np.array(rows).reshape(-1, len(self._range))
-        deviations: Array = table[which.ravel()]
-        return deviations
+        return table[which.ravel()]
 
     def _deviation_of(self, cube: int, left_out: int) -> Array:
         if (cube, left_out) not in self._deviations:

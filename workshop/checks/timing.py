@@ -53,8 +53,7 @@ def measure_stamp_errors(run: Run) -> Array:
     chosen = chosen[run.sample[chosen] != NO_MATCH]
     chosen = chosen[settled[run.sample[chosen]]]
     taken_ns = samples.time_ns[run.sample[chosen]]
-    error_ms: Array = (rows.stamp_ns[chosen] - taken_ns) * MS_PER_NS
-    return error_ms
+    return (rows.stamp_ns[chosen] - taken_ns) * MS_PER_NS
 
 
 def measure_reconnects(run: Run, frequencies: FrequencyFindings) -> list[float]:
