@@ -300,6 +300,30 @@ def test_a_usage_error_is_short_and_needs_no_environment(arguments, said):
     assert done.stderr.count("\n") <= 2 and "usage" not in done.stderr
 
 
+@pytest.mark.parametrize("words", ["--help", "urdf {skin}", "layout planar --figure {figure}"])
+def test_a_full_disk_is_one_line(words, tmp_path):
+    skin, figure = ROOT / "config" / "skin_demo.yaml", tmp_path / "planar.png"
+    command = [sys.executable, "-m", "cube_tensor_driver.cli"]
+    command += words.format(skin=skin, figure=figure).split()
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert (done.returncode, done.stderr) == (1, "cube: stdout: No space left on device\n")
+
+
+def test_set_up_reports_its_progress_without_a_terminal(tmp_path, capsys):
+    lock = tmp_path / "lock"
+    lock.write_text("".join(f"wheel{number}==1\n" for number in range(60)))
+    with environment.show_pip_progress(lock) as on_line:
+        for number in range(60):
+            on_line(f"Collecting wheel{number}")
+        on_line("Installing collected packages")
+    assert capsys.readouterr().err.splitlines() == [
+        "cube: 25 of 60 wheels",
+        "cube: 50 of 60 wheels",
+        "cube: installing them",
+    ]
+
+
 @pytest.mark.parametrize("words", ["--help", "urdf {skin}"])
 def test_a_reader_that_has_enough_is_no_error(words, tmp_path):
     skin = tmp_path / "skin.yaml"
@@ -307,6 +331,9 @@ def test_a_reader_that_has_enough_is_no_error(words, tmp_path):
     command = f"{sys.executable} -m cube_tensor_driver.cli {words.format(skin=skin)} | head -c 5"
     done = subprocess.run(["bash", "-c", command], **CAPTURED)
     assert len(done.stdout) == 5 and not done.stderr
+    # The exit code of a program that SIGPIPE has ended, as other programs are.
+    command = command.partition("|")[0] + "| true; exit ${PIPESTATUS[0]}"
+    assert subprocess.run(["bash", "-c", command], **CAPTURED).returncode in (0, 141)
 
 
 def test_exec_becomes_the_command():

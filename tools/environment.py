@@ -57,6 +57,10 @@ not."""
 BUILD_INPUTS = ("msg", "srv", "native", "CMakeLists.txt", "package.xml")
 """Files and folders that need a build after every change."""
 
+WHEELS_PER_LINE = 25
+"""Number of wheels (packages) after which the set-up reports its progress if stderr is no terminal,
+such as a log file."""
+
 REQUIRED_MODULES = {
     "rclpy": "rclpy",
     "numpy": "python3-numpy",
@@ -301,7 +305,10 @@ def is_made_here(venv: Path) -> bool:
 
 @contextlib.contextmanager
 def show_pip_progress(lock: Path) -> Iterator[Callable[[str], None]]:
-    """Yield a function for every line of pip's output; it counts the wheels on a terminal."""
+    """Yield a function for every line of pip's output; it counts the wheels.
+
+    On a terminal one line is updated, elsewhere there is a line for every `WHEELS_PER_LINE` wheels.
+    """
     terminal = sys.stderr.isatty()
     total = len(re.findall(r"^[a-z0-9].*==", lock.read_text(), re.MULTILINE))
     seen = 0
@@ -309,6 +316,8 @@ def show_pip_progress(lock: Path) -> Iterator[Callable[[str], None]]:
     def show(text: str) -> None:
         if terminal:
             print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
+        elif text and seen % WHEELS_PER_LINE == 0:
+            print_status(text.strip())
 
     def on_line(line: str) -> None:
         nonlocal seen, total
@@ -319,6 +328,7 @@ def show_pip_progress(lock: Path) -> Iterator[Callable[[str], None]]:
             seen += 1
             show(f"      {seen} of {total} wheels")
         elif line.startswith("Installing "):
+            seen = 0
             show("      installing them")
 
     try:

@@ -1,10 +1,11 @@
 """`python -m cube_tensor_driver.cli`: what `./cube` runs."""
 
+import errno
 import os
 import signal
 import sys
 
-from .main import INTERRUPTED, interrupt_again, main
+from .main import BROKEN_PIPE, INTERRUPTED, interrupt_again, main
 
 if __name__ == "__main__":
     sys.unraisablehook = interrupt_again
@@ -13,14 +14,21 @@ if __name__ == "__main__":
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         code = main()
-        # If the reader has closed the pipe, this raises BrokenPipeError, which is handled below.
+        # If stdout cannot be written, this raises OSError, which is handled below.
         sys.stdout.flush()
     except KeyboardInterrupt:
         # `main` handles Ctrl-C while the command runs; here it came while arguments were parsed.
         code = INTERRUPTED
-    except BrokenPipeError:
-        # The reader of the output has closed the pipe, as in ./cube urdf skin.yaml | head. Python
+    except OSError as error:
+        # Errors of files are CubeErrors, which `main` handles, so this one is of stdout. Python
         # flushes stdout once more when it ends; without this redirection that would fail again.
+        if error.errno not in (errno.EPIPE, errno.ENOSPC):
+            raise
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 1
+        if error.errno == errno.EPIPE:
+            # The reader has closed the pipe, as in ./cube urdf skin.yaml | head.
+            code = BROKEN_PIPE
+        else:
+            print(f"cube: stdout: {error.strerror}", file=sys.stderr)
     sys.exit(code)

@@ -69,6 +69,7 @@ def write_grid(options: argparse.Namespace) -> int:
         ConfigError: The file exists already, or `./cube config check` would find a mistake in it.
     """
     from ..config.grid import grid
+    from ..config.pose_check import MAX_SPACED_CUBES, pose_doubts
     from ..config.skin import check_skin_data
     from ..config.yaml import write_yaml
     from ..core.errors import ConfigError
@@ -87,9 +88,12 @@ def write_grid(options: argparse.Namespace) -> int:
         rate=options.rate,
         port=options.port,
     )
-    # Only a few cubes are checked, because checking all cubes of a large grid would take longer
+    # Of a large grid only a few cubes are checked, because checking all of them would take longer
     # than writing the file.
-    _, mistakes = check_skin_data(ends_of_links(skin), options.output.parent)
+    part = skin if len(skin["cubes"]) <= MAX_SPACED_CUBES else ends_of_links(skin)
+    checked, mistakes = check_skin_data(part, options.output.parent)
+    if checked is not None:
+        mistakes = list(pose_doubts(checked))
     if mistakes:
         raise ConfigError(f"grid: {mistakes[0]}")
     size = f"{options.nx} x {options.ny} cubes, {1e3 * options.pitch:g} mm apart"

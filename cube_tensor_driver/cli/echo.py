@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import sys
 from typing import TYPE_CHECKING
 
@@ -21,29 +20,21 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Print messages until Ctrl-C, or until the reader of the output closes the pipe.
-
-    Returns:
-        0, because both are normal ends.
-    """
+    """Print messages until Ctrl-C, which is the normal end."""
     from ..config.output_files import to_json
     from ..config.yaml import to_yaml
     from ..ros.commands.echo import StressReading, listen
 
-    try:
-        for items in listen(options.topic, options.once):
-            for item in items:
-                if isinstance(item, StressReading):
-                    print(reading_json(item) if options.json else reading_line(item))
-                elif options.json:
-                    print(to_json(item))
-                else:
-                    print(f"{to_yaml(item)}---")
-            # Without this, Python would hold messages back if stdout is a pipe.
-            sys.stdout.flush()
-    except BrokenPipeError:
-        # Python flushes stdout once more when it ends; without this redirection that would fail.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    for items in listen(options.topic, options.once):
+        for item in items:
+            if isinstance(item, StressReading):
+                print(reading_json(item) if options.json else reading_line(item))
+            elif options.json:
+                print(to_json(item))
+            else:
+                print(f"{to_yaml(item)}---")
+        # Without this, Python would hold messages back if stdout is a pipe.
+        sys.stdout.flush()
     return 0
 
 
@@ -67,7 +58,7 @@ def reading_line(reading: StressReading) -> str:
         parts += [*gradient[:-1], f"{gradient[-1]} Pa/m"]
     if not math.isnan(reading.residual):
         parts.append(f"residual {reading.residual:.2f}")
-    parts.append(", ".join(status_words(reading.status)) or "fine")
+    parts.append(", ".join(status_words(reading.status)) or "ok")
     return "  ".join(parts)
 
 

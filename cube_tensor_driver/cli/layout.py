@@ -78,6 +78,7 @@ def run(options: argparse.Namespace) -> int:
     if options.json is not None:
         write_json(options.json, result)
     save(draw_layout(layout), options.figure)
+    print(f"wrote {' and '.join(str(path) for path in (options.figure, options.json) if path)}")
     return 0
 
 

@@ -26,6 +26,10 @@ PROGRAM = "./cube"
 INTERRUPTED = 130
 """Exit code after Ctrl-C: by the convention of shells, 128 plus the number of the signal SIGINT."""
 
+BROKEN_PIPE = 141
+"""Exit code if the reader of stdout has closed the pipe: 128 plus the number of the signal SIGPIPE,
+by which other programs end then."""
+
 RESEND_S = 0.01
 """Time, in seconds, from a Ctrl-C that Python has lost until SIGINT is sent again."""
 

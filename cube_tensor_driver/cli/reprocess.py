@@ -90,7 +90,6 @@ def run(options: argparse.Namespace) -> int:
         CubeError: The options cannot be used. In this case no bag was reprocessed.
     """
     from rich.console import Console
-    from rich.progress import Progress
 
     from ..bags.reprocess.all_bags import (
         make_jobs,
@@ -101,6 +100,7 @@ def run(options: argparse.Namespace) -> int:
         write_recipe,
     )
     from ..core.errors import CubeError
+    from ..views.terminal.output import progress_bar
 
     overrides, contacts = overrides_of(options), contacts_of(options)
     jobs = make_jobs(options.bags, options.output, options.format, overrides, contacts)
@@ -114,18 +114,17 @@ def run(options: argparse.Namespace) -> int:
 
     # Each bag is one job, so more processes than bags would be useless.
     processes = useful_workers(options.jobs, len(waiting))
-    bar = Progress(console=console, disable=not waiting)
-    task = bar.add_task("reprocessing", total=len(waiting))
     failed = 0
     try:
-        with workers(processes, options.scheduler) as executor, bar:
-            for job, result in reprocess_all(waiting, executor):
+        with workers(processes, options.scheduler) as executor, progress_bar() as report:
+            results = reprocess_all(waiting, executor)
+            for done, (job, result) in enumerate(results, 1):
+                report(done, len(waiting), "reprocessing")
                 if isinstance(result, CubeError):
                     failed += 1
                     console.print(f"cube: {result}", style="red", markup=False)
                 else:
                     console.print(result_line(job.output, result))
-                bar.advance(task)
     finally:
         # The folder of a bag that was interrupted must not look like a complete result.
         remove_without_results(options.output)

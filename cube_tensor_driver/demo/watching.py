@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from contextlib import ExitStack
@@ -276,7 +277,8 @@ class SkinWatcher:
             self._check_alone()
 
     def note_address(self) -> None:
-        """Write the URL of the browser view into the title of the table.
+        """Write the URL of the browser view into the title of the table, and print it on its own if
+        no table is drawn on a terminal.
 
         Raises:
             ChildError: The view did not print its URL within `MAX_START_S`.
@@ -285,6 +287,8 @@ class SkinWatcher:
         self._observer.spin(MAX_START_S, lambda: "http://" in self._children.log("view"))
         address = self._children.wait_for_line("view", "http://", 0.0).split()[0]
         self._table.note = f"\n{address} shows it"
+        if not self._table.is_on_terminal:
+            print(f"{address} shows the skin", file=sys.stderr, flush=True)
 
     def measure(
         self, verification: LoadVerification, duration: float, log: Path

@@ -347,4 +347,5 @@ def test_the_live_table_of_a_narrow_terminal_keeps_the_state(width):
     text, rows = live_table(width)
     assert "…" not in text and all(len(line) <= width for line in text.splitlines())
     assert "state" in text and all("ok" in row and "1.00" in row for row in rows)
+    assert "too narrow for pressure, " in " ".join(text.split())
     assert all("-123.00" in row for row in rows)

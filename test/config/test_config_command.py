@@ -64,6 +64,8 @@ def test_a_large_grid_is_written_checked_and_drawn_as_frames(tmp_path):
         (["--nx", 1, "--ny", 1, "--layout", "banana"], 1, "'banana'"),
         (["--nx", 1, "--ny", 1, "--name", "a skin"], 1, "name: found 'a skin', allowed: a name"),
         (["--nx", 1, "--ny", 1, "--rate", 1e9], 2, "is not a rate from 0.1 to 10000"),
+        (["--nx", 4, "--ny", 4, "--pitch", 12], 1, "divide by 1000 what was typed in mm"),
+        (["--nx", 64, "--ny", 64, "--pitch", 12], 1, "divide by 1000 what was typed in mm"),
         (["--nx", 1, "--ny", 1, "--port", "socket://host"], 1, "write socket://host:port"),
     ],
 )

@@ -437,7 +437,7 @@ def test_a_line_says_when_a_cube_breaks_and_when_it_is_fine_again():
         said.append(words.statuses({})[1])
     pad = CALIBRATION.layout.pads[5]
     assert said[1] == [(f"cube c02: pad {pad} short", True)]
-    assert [line for lines in said[2:] for line in lines] == [("cube c02: fine", False)]
+    assert [line for lines in said[2:] for line in lines] == [("cube c02: ok", False)]
     assert not said[0]
 
 
@@ -466,4 +466,4 @@ def test_a_start_is_quiet_and_a_cube_that_stays_away_is_not():
     late = [(f"cube {skin.cubes[-1].name}: missing: no row yet, see its link", True)]
     assert step(MIN_UPDATES_TO_LOG + 1, n - 1) == late
     assert not step(MIN_UPDATES_TO_LOG + 2, n - 1)
-    assert step(MIN_UPDATES_TO_LOG + 3, n) == [(f"cube {skin.cubes[-1].name}: fine", False)]
+    assert step(MIN_UPDATES_TO_LOG + 3, n) == [(f"cube {skin.cubes[-1].name}: ok", False)]

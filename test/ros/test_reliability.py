@@ -211,7 +211,7 @@ def test_a_broken_pad_is_named_left_out_and_taken_back(stage):
     assert np.isnan(raw[-1].frequency[2])
     stage.pads = loaded(5000.0)
     stage.diagnostics.clear()
-    stage.wait(lambda: stage.says("fine"))
+    stage.wait(lambda: stage.says(": ok"))
     stage.zz()
     assert decoded(stage.stress[-1]).rows.status[0] == 0
     assert f"pad {pad} short" in stage.children.log("reconstruction")

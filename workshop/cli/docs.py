@@ -31,8 +31,7 @@ def run(options: argparse.Namespace) -> int:
         "docs",
         str(options.output.resolve()),
     ]
-    return subprocess.run(
-        [sys.executable, "-m", *command],
-        cwd=ROOT,
-        check=False,
-    ).returncode
+    code = subprocess.run([sys.executable, "-m", *command], cwd=ROOT, check=False).returncode
+    if code == 0:
+        print(f"wrote {options.output / 'index.html'}")
+    return code

@@ -329,7 +329,10 @@ def _apply_check(
     row, pad = np.unravel_index(np.argmax(excess), excess.shape)
     cube = int(chosen[row])
     pad_name = pipeline.calibrations[cube].layout.pads[pad]
+    value = check.values[row, pad]
+    # Above 100, the form .3g has an exponent.
+    shown = f"{value:.0f}" if value > 100 else f"{value:.3g}"
     raise TareError(
-        f"cube {names[cube]}: pad {pad_name} {check.problem}: {check.values[row, pad]:.3g} "
-        f"{check.unit}, the limit is {check.limit:g}; {check.fix}"
+        f"cube {names[cube]}: pad {pad_name} {check.problem}: {shown} {check.unit}, "
+        f"the limit is {check.limit:g}; {check.fix}"
     )

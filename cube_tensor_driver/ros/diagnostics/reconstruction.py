@@ -166,10 +166,10 @@ class CubeHealth:
         changes: LogChanges = []
         for number in sorted({*words, *self._reported}):
             cube = self._skin.cubes[number]
-            text = words.get(number, "fine")
+            text = words.get(number, "ok")
             level = int(levels[number]) if number in words else 0
             is_starting = self._updates <= MIN_UPDATES_TO_LOG and text == MISSING
-            if text != self._logged.get(number, "fine") and not is_starting:
+            if text != self._logged.get(number, "ok") and not is_starting:
                 self._logged[number] = text
                 changes.append((f"cube {cube.name}: {text}", level > 0))
             uid = cube.uid or uids.get(number, 0)

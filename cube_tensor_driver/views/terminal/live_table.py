@@ -137,6 +137,11 @@ class LiveTable:
                 self._console.line()
 
     @property
+    def is_on_terminal(self) -> bool:
+        """Whether the table is drawn on a terminal, where it is updated."""
+        return self._live is not None and self._console.is_terminal
+
+    @property
     def seen(self) -> int:
         """Number of cubes from which at least one tensor has arrived."""
         return int(np.count_nonzero(self._count))
@@ -191,12 +196,14 @@ class LiveTable:
             MIN_PEAK,
         )
         shown = np.arange(len(pressure))
-        caption = None
+        notes = []
         if len(shown) > max_rows:
             by_size = np.argsort(-np.abs(pressure), kind="stable")
             # Sorting the indices keeps the rows in the order of the skin file.
             shown = np.sort(by_size[:max_rows])
-            caption = f"the {max_rows} cubes under the greatest normal stress of {len(pressure)}"
+            notes.append(
+                f"the {max_rows} cubes under the greatest normal stress of {len(pressure)}"
+            )
 
         components = [name for name in SHOWN if np.isfinite(self._component(name)).any()]
         options = self._console.options.update(max_width=UNLIMITED_WIDTH)
@@ -205,15 +212,12 @@ class LiveTable:
             # The width of the table depends on its content, so it is made in each layout and
             # measured until it fits.
             table = self._table(form, shown, pressure)
-            table.caption = caption
-            if (
-                Measurement.get(
-                    self._console,
-                    options,
-                    table,
-                ).maximum
-                <= width
-            ):
+            left_out = [] if form.has_bar else ["pressure"]
+            left_out += map(_label, components[len(form.components) :])
+            left_out += [] if form.has_residual else ["residual"]
+            too_narrow = [f"too narrow for {', '.join(left_out)}"] if left_out else []
+            table.caption = "; ".join([*notes, *too_narrow])
+            if Measurement.get(self._console, options, table).maximum <= width:
                 break
         return table
 
@@ -256,14 +260,8 @@ class LiveTable:
         if form.has_bar:
             table.add_column("pressure", width=BAR_WIDTH)
         for name in form.components:
-            label, unit = name, "kPa"
-            if is_gradient(name):
-                label, unit = f"∂{name[:2]}/∂{name[3]}", "kPa/mm"
-            table.add_column(
-                f"{label}\n{unit}",
-                justify="right",
-                min_width=7,
-            )
+            unit = "kPa/mm" if is_gradient(name) else "kPa"
+            table.add_column(f"{_label(name)}\n{unit}", justify="right", min_width=7)
         if form.has_residual:
             table.add_column("residual", justify="right")
         table.add_column("Hz", justify="right", min_width=4)
@@ -292,6 +290,11 @@ class LiveTable:
 def is_gradient(component: str) -> bool:
     """Return whether a component is a gradient, such as zz_x, the derivative of zz along x."""
     return "_" in component
+
+
+def _label(component: str) -> str:
+    """Return the heading of the column of a component, such as zz or ∂zz/∂x."""
+    return f"∂{component[:2]}/∂{component[3]}" if is_gradient(component) else component
 
 
 def _in_kpa(component: str, value: float) -> str:
