@@ -20,6 +20,7 @@
 
 #define READ_CHUNK 65536
 #define MAX_USUAL 64         /* samples in one usual read of one link */
+#define MAX_LATE_ROUNDS 16   /* reads of one link by a host that is behind, before it handles them */
 #define WAIT_STEP_NS 200000L /* between two looks for the samples of other links */
 
 /* ------------------------------------------------------------------------------ Decoder ------- */
@@ -245,13 +246,15 @@ typedef struct {
     int64_t stamps_ns[MAX_USUAL];
 } Link;
 
-static void read_link(Link *link, int fd) {
+static void read_link(Link *link, struct pollfd *polled) {
     do {
-        link->result = read(fd, link->decoder->input, READ_CHUNK);
+        link->result = read(polled->fd, link->decoder->input, READ_CHUNK);
     } while (link->result < 0 && errno == EINTR);
     if (link->result < 0)
         link->result = -errno;
     link->was_read = link->result != -EAGAIN;
+    if (link->was_read && link->result <= 0)
+        polled->fd = -1; /* it has ended, and poll would return at once for it again */
 }
 
 /* Decodes what was read, and takes the samples where all frames are usual ones. */
@@ -352,7 +355,7 @@ static bool read_round(
     for (Py_ssize_t i = 0; i < count; i++) {
         links[i].was_read = false;
         if (polled[i].revents != 0)
-            read_link(&links[i], polled[i].fd);
+            read_link(&links[i], &polled[i]);
     }
     Py_END_ALLOW_THREADS
     /* The clock is read between reading and decoding, so that the time is that of the bytes. */
@@ -372,25 +375,31 @@ static bool read_round(
     return true;
 }
 
-/* Waits for data, and then up to gather_ns until `expected` links have delivered frames. */
+/* Reads what is there, and waits up to gather_ns until `expected` links have delivered frames. A
+ * host that is behind does not wait, but reads all that has come. */
 static bool read_rounds(
     PyObject *result, Link *links, struct pollfd *polled, Py_ssize_t count, PyObject *clock,
     bool is_late, Py_ssize_t expected, int64_t gather_ns) {
     int64_t begin_ns = steady_ns();
-    for (;;) {
+    for (int round = 1;; round++) {
         if (!read_round(result, links, polled, count, clock, is_late))
             return false;
         Py_ssize_t delivered = 0;
         for (Py_ssize_t i = 0; i < count; i++)
             delivered += links[i].has_frames;
-        if (is_late || delivered == 0 || delivered >= expected ||
-            steady_ns() - begin_ns >= gather_ns)
+        bool is_waiting = 0 < delivered && delivered < expected;
+        if (is_late ? round == MAX_LATE_ROUNDS
+                    : !is_waiting || steady_ns() - begin_ns >= gather_ns)
             return true;
         struct timespec step = {.tv_nsec = WAIT_STEP_NS};
+        int ready;
         Py_BEGIN_ALLOW_THREADS
-        nanosleep(&step, NULL);
-        poll(polled, (nfds_t)count, 0);
+        if (!is_late)
+            nanosleep(&step, NULL);
+        ready = poll(polled, (nfds_t)count, 0);
         Py_END_ALLOW_THREADS
+        if (is_late && ready == 0)
+            return true;
     }
 }
 

@@ -13,6 +13,7 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 from ..core.errors import LinkError
 from ..core.rows import FrequencyRows
@@ -42,6 +43,10 @@ MAX_EVENTS = 100
 MIN_LAG_S = 0.05
 """Shortest time, in s, by which reading was behind (data of links waited) at which lost samples are
 put down to this host. The buffers of a serial port hold about that much."""
+OVERLOAD_S = 0.5
+"""Time, in s, for which reading must have been behind before scans (one sample of every cube) are
+dropped because this host is too slow. After a shorter pause it catches up by itself. Dropping ends
+when none was needed for as long."""
 
 
 @dataclass(frozen=True)
@@ -158,6 +163,7 @@ class LiveLinks:
         self._lock = threading.RLock()
         self._step_ns = 0
         self._errors = 0
+        self._overloaded_until = 0.0  # monotonic time, in s
         self._reader: Reader | None = None
 
     def start(self) -> None:
@@ -268,17 +274,32 @@ class LiveLinks:
         Returns:
             Whether they are. If not, they must be added to the scans.
         """
-        whole = self._scans.order_whole(usual, self._scans_per_call, self._max_scans)
-        if whole is None:
-            return False
-        self._rows.received += len(whole.cubes)
-        try:
-            rows = self._scans.build_whole(whole, self._make_rows)
-            self._on_rows(rows)
-            self._rows.delivered += len(rows)
-        except Exception as error:  # noqa: BLE001  (later rows must still be delivered)
-            self._count_error(error)
-        return True
+        scans = self._scans.order_whole(usual, self._scans_per_call, self._max_scans)
+        self._rows.received += sum(len(part.cubes) for part in scans)
+        if self._is_overloaded():
+            self._count_overload(sum(len(part.cubes) for part in scans[:-1]))
+            scans = scans[-1:]
+        for part in scans:
+            self._give_rows(partial(self._scans.build_whole, part, self._make_rows))
+        return bool(scans)
+
+    def _is_overloaded(self) -> bool:
+        """Return whether this host is too slow, so that scans must be dropped.
+
+        Whole scans are dropped, the oldest first, so that those that are delivered are complete and
+        late by a few sample periods at most. If the kernel or the hubs dropped samples instead, at
+        random, scans would have gaps and cost more time than complete ones.
+        """
+        now = time.monotonic()
+        if self._reader is not None and self._reader.behind_s > OVERLOAD_S:
+            self._overloaded_until = now + OVERLOAD_S
+        return now < self._overloaded_until
+
+    def _count_overload(self, n_rows: int) -> None:
+        """Count rows (samples of cubes) dropped because this host is too slow."""
+        if n_rows:
+            self._rows.overload += n_rows
+            self._overloaded_until = time.monotonic() + OVERLOAD_S
 
     def _add_usual(self, usual: UsualSamples) -> None:
         """Add samples that are counted and stamped already to the scans."""
@@ -417,14 +438,24 @@ class LiveLinks:
         A scan (one sample of every cube) that holds no cube of the skin has no rows and is
         discarded.
         """
+        if self._is_overloaded():
+            self._count_overload(self._scans.drop_oldest(self._max_scans))
         while self._scans.is_complete(self._scans_per_call):
-            try:
-                rows = self._scans.build(self._make_rows, self._max_scans)
-                if rows is not None:
-                    self._on_rows(rows)
-                    self._rows.delivered += len(rows)
-            except Exception as error:  # noqa: BLE001  (later rows must still be delivered)
-                self._count_error(error)
+            self._give_rows(partial(self._scans.build, self._make_rows, self._max_scans))
+
+    def _give_rows(self, build: Callable[[], FrequencyRows | None]) -> None:
+        """Call `on_rows` with the rows (samples of cubes) that a function builds, if there are any.
+
+        Args:
+            build: Function that removes scans from those that wait and returns their rows.
+        """
+        try:
+            rows = build()
+            if rows is not None:
+                self._on_rows(rows)
+                self._rows.delivered += len(rows)
+        except Exception as error:  # noqa: BLE001  (later rows must still be delivered)
+            self._count_error(error)
 
     def _count_error(self, error: Exception) -> None:
         """Count and log an error, and count the rows (samples of cubes) that it has lost."""

@@ -163,8 +163,9 @@ class LinkSource:
         """Return the numbers of rows, and the state, notes and counters of each link.
 
         Every received row is counted once: given to the consumer, waiting for it, dropped because
-        the consumer was too slow, a duplicate, lost by an error of the driver, or left out because
-        the skin does not have the cube or has it with another number of pads. The notes of a link
+        the consumer was too slow, dropped because this host cannot read so many, a duplicate, lost
+        by an error of the driver, or left out because the skin does not have the cube or has it
+        with another number of pads. The notes of a link
         include the problems since the last call.
         """
         counts = self._links.row_counts()
@@ -185,6 +186,7 @@ class LinkSource:
                 "rows of unknown cubes": counts.unknown_cube,
                 "rows with another number of pads": counts.wrong_pads,
                 "rows that came twice": counts.duplicate,
+                "rows dropped by a slow host": counts.overload,
                 "rows lost by errors": counts.lost,
                 "rows unaccounted": counts.unaccounted,
                 "links": links,

@@ -3,18 +3,24 @@ and a restart."""
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from test_clock import EPOCH_NS
 
 from cube_tensor_driver.core.status import STAMP
+from cube_tensor_driver.device import chain
 from cube_tensor_driver.device.chain import LiveLinks
 from cube_tensor_driver.device.clock.hub_clock import HubClock
+from cube_tensor_driver.device.links.intake import UsualSamples
 from cube_tensor_driver.device.links.link import LinkConfig
 from cube_tensor_driver.device.links.reader import LinkFrames
 from cube_tensor_driver.device.scans.cube_table import CubeAddress
 from cube_tensor_driver.device.scans.sequence import Arrival, SampleAccount
-from cube_tensor_driver.device.wire.protocol import Ack, Command, Hello, Sample, Stats
+from cube_tensor_driver.device.wire import native
+from cube_tensor_driver.device.wire.decoder import PythonDecoder
+from cube_tensor_driver.device.wire.protocol import Ack, Command, Hello, Sample, Stats, encode
 
 PERIOD_US = 1000
 
@@ -227,3 +233,82 @@ def test_the_doubt_after_a_step_waits_for_reads_in_time(link) -> None:
     assert values["clock resets"] == 0
     assert {status for number, status in link.rows if number < 1000 or number > 1400} == {0}
     assert {status for _, status in link.rows} <= {0, STAMP}
+
+
+class SlowHost:
+    """A host in simulated time, with two links of a cube each at 1 kHz.
+
+    Every callback costs 0.5 ms, and every scan that it delivers `scan_ms`; what the links send
+    meanwhile waits for the next callback.
+    """
+
+    def __init__(self, monkeypatch, scan_ms: float, as_usual: bool) -> None:
+        self.now_s, self.scan_ms, self.as_usual = 0.0, scan_ms, as_usual
+        self.done = 0
+        self.ages_s: list[float] = []
+        self.numbers: list[int] = []
+        cubes = [CubeAddress(f"c{link}", link, 0, None, 2) for link in (0, 1)]
+        configs = [LinkConfig(f"l{link}", "/dev/none") for link in (0, 1)]
+        self.live = LiveLinks(configs, cubes, self._take)
+        self.live._reader = SimpleNamespace(behind_s=0.0)
+        monkeypatch.setattr(chain.time, "monotonic", lambda: self.now_s)
+        for link in (0, 1):
+            one = Hello(link + 1, 1, 2, PERIOD_US, np.array([link + 1], "<u8"))
+            self.live.receive([LinkFrames(link, 0, [one])])
+
+    def _take(self, rows) -> None:
+        self.now_s += 1e-3 * self.scan_ms * len(rows) / 2
+        self.ages_s += (self.now_s - 1e-9 * rows.stamp_ns).tolist()
+        self.numbers += rows.sequence[::2].tolist()
+
+    def run(self, n_scans: int) -> None:
+        in_time_s = self.now_s
+        while self.done < n_scans:
+            waiting = range(self.done, min(n_scans, int(1e3 * self.now_s)))
+            if not waiting:
+                self.now_s = 1e-3 * (self.done + 1)
+                in_time_s = self.now_s
+                continue
+            self.live._reader.behind_s = self.now_s - in_time_s
+            self.done = waiting.stop
+            self.now_s += 0.5e-3
+            self._give([sample(number, 1000 * number + 1) for number in waiting])
+        assert self.live.row_counts().unaccounted == 0
+
+    def _give(self, samples: list[Sample]) -> None:
+        stamps_ns = [1000 * one.device_us for one in samples]
+        if not self.as_usual:
+            arrival_ns = stamps_ns[-1]
+            self.live.receive([LinkFrames(i, arrival_ns, samples, 0, True) for i in (0, 1)])
+            return
+        decoded = [PythonDecoder().feed(encode(one))[0].raw for one in samples]
+        links = [link for link in (0, 1) for _ in samples]
+        self.live.receive([], UsualSamples(links, 2 * decoded, 2 * stamps_ns))
+
+
+@pytest.mark.parametrize("as_usual", [True, False])
+@pytest.mark.parametrize(("scan_ms", "share"), [(0.8, 1.0), (1.1, 0.82), (2.0, 0.47)])
+def test_a_host_that_is_too_slow_loses_what_exceeds_its_capacity(
+    monkeypatch, as_usual, scan_ms, share
+) -> None:
+    """Of 4 scans it delivers 4 * scan_ms + 0.5 ms later the next 4: at 1 kHz this share. They are
+    whole and late by a few periods, after the first half second."""
+    if as_usual and native.wire is None:
+        pytest.skip("was not compiled")
+    host = SlowHost(monkeypatch, scan_ms, as_usual)
+    host.run(4000)
+    counts = host.live.row_counts()
+    assert counts.delivered + counts.overload == 2 * 4000
+    assert counts.delivered / 8000 == pytest.approx(share, abs=0.1 * share)
+    assert (counts.overload > 0) == (share < 1)
+    assert host.numbers == sorted(set(host.numbers)), "scans have rows of both links"
+    assert np.percentile(host.ages_s[len(host.ages_s) // 2 :], 99) < 20e-3
+
+
+def test_a_short_pause_of_the_host_loses_nothing(monkeypatch) -> None:
+    host = SlowHost(monkeypatch, 0.5, False)
+    host.run(100)
+    host.now_s += 0.4
+    host.run(2000)
+    counts = host.live.row_counts()
+    assert (counts.overload, counts.delivered) == (0, 2 * 2000)

@@ -92,6 +92,7 @@ class Reader:
         links: The links, in the order of the argument.
         failure: Exception that ended the thread; None while it runs or if it ended by `close`.
         callback_errors: Number of exceptions that the callbacks have raised.
+        behind_s: Time, in s, for which data have always been waiting to be read.
 
     Raises:
         LinkError: With the kind `bad_port`: a port is neither a device path nor a TCP address.
@@ -110,6 +111,7 @@ class Reader:
         tracks = [LinkTrack() for _ in links] if tracks is None else tracks
         self.links = [Link(config, track) for config, track in zip(links, tracks, strict=True)]
         self.callback_errors = 0
+        self.behind_s = 0.0
         self.failure: Exception | None = None
         self._sessions = [
             Session(link, period_us, clock_ns, partial(self._call, on_state, i))
@@ -236,11 +238,12 @@ class Reader:
             )
             awake_at = time.monotonic()
             if is_late:
-                self._lag_s = max(self._lag_s, awake_at - in_time_at)
+                self.behind_s = awake_at - in_time_at
             else:
                 # A wait ends within a tick, unless this thread or machine stood still.
-                self._lag_s = max(self._lag_s, awake_at - now - TICK_S)
+                self.behind_s = max(0.0, awake_at - now - TICK_S)
                 in_time_at = awake_at
+            self._lag_s = max(self._lag_s, self.behind_s)
             received, failed = self._handle_reads(reads, is_late)
             if received or usual.links:
                 self._call(self._on_frames, received, usual)

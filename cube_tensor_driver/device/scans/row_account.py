@@ -23,6 +23,7 @@ class RowCounts:
         unaccounted: Received rows that are in none of the other numbers and do not wait for the
             rest of their scan. It is 0 unless the driver has a defect.
         duplicate: Rows left out because they had come before.
+        overload: Rows dropped because this host is too slow.
         lost: Rows lost by an exception in the driver or in the callback.
         lost_reason: Text of the last such exception; empty if there was none.
     """
@@ -32,6 +33,7 @@ class RowCounts:
     wrong_pads: int = 0
     unaccounted: int = 0
     duplicate: int = 0
+    overload: int = 0
     lost: int = 0
     lost_reason: str = ""
 
@@ -46,12 +48,14 @@ class RowAccount:
         received: Number of rows received; the caller increases it.
         delivered: Number of rows delivered; the caller increases it.
         duplicate: Number of rows that had come before; the caller increases it.
+        overload: Number of rows dropped because this host is too slow; the caller increases it.
     """
 
     def __init__(self, scans: ScanBuilder) -> None:
         self.received = 0
         self.delivered = 0
         self.duplicate = 0
+        self.overload = 0
         self._scans = scans
         self._unaccounted = 0
         self._lost = 0
@@ -70,6 +74,7 @@ class RowAccount:
             wrong_pads=self._scans.cubes.wrong_pads,
             unaccounted=self._unaccounted,
             duplicate=self.duplicate,
+            overload=self.overload,
             lost=self._lost,
             lost_reason=self._lost_reason,
         )
@@ -103,6 +108,6 @@ class RowAccount:
     def _missing(self) -> int:
         """Return how many received rows were neither delivered, left out nor lost, nor wait."""
         cubes = self._scans.cubes
-        left_out = cubes.unknown_cube + cubes.wrong_pads + self.duplicate
+        left_out = cubes.unknown_cube + cubes.wrong_pads + self.duplicate + self.overload
         accounted = self.delivered + left_out + self._lost + self._scans.rows_waiting()
         return self.received - accounted

@@ -55,7 +55,7 @@ def empty_rows(n_rows: int, n_pads: int) -> FrequencyRows:
 
 
 class WholeScans(NamedTuple):
-    """Successive scans with the whole sample of every link that delivers.
+    """Successive scans with one sample of every link that delivers, all cubes of its hub in each.
 
     Attributes:
         cubes: Index in the skin of the cube of each row (N,).
@@ -229,35 +229,42 @@ class ScanBuilder:
         usual: UsualSamples,
         n_scans: int,
         max_scans: int,
-    ) -> WholeScans | None:
+    ) -> list[WholeScans]:
         """Return samples as whole scans if every link that delivers has given as many of them.
 
-        Then they need not be added and built one by one. None is returned if they are no whole
-        scans, or if other samples wait.
+        Then they need not be added and built one by one. If they are no whole scans, or if other
+        samples wait, the list is empty.
 
         Args:
             usual: The samples, each with all cubes of its hub.
             n_scans: Number of scans to wait for.
-            max_scans: Largest number of scans.
+            max_scans: Largest number of scans in one item of the list.
         """
         live = sorted(self._live)
-        count = len(usual.links) // max(1, len(live))
-        if self._pending or self._deferred or not n_scans <= count <= max_scans:
-            return None
+        width = len(live)
+        count = len(usual.links) // max(1, width)
+        if self._pending or self._deferred or count < n_scans:
+            return []
         raws, stamps_ns = usual.raws, usual.stamps_ns
         if usual.links != live:
             by_link = sorted(range(len(raws)), key=usual.links.__getitem__)
             if [usual.links[i] for i in by_link] != [link for link in live for _ in range(count)]:
-                return None
+                return []
             order = [i for scan in range(count) for i in by_link[scan::count]]
             raws = [raws[i] for i in order]
             stamps_ns = [stamps_ns[i] for i in order]
         cubes = self.cubes.find_all(live)
         if cubes is None or max(stamps_ns) - min(stamps_ns) > MAX_SPAN_NS:
-            return None
-        for link, stamp_ns in zip(live, stamps_ns[-len(live) :], strict=True):
+            return []
+        for link, stamp_ns in zip(live, stamps_ns[-width:], strict=True):
             self._built_ns[link] = stamp_ns
-        return WholeScans(np.tile(cubes, count) if count > 1 else cubes, raws, stamps_ns)
+        scans = []
+        # The last item is the fullest one, because a host that is too slow drops the others.
+        for end in range(count, 0, -max_scans):
+            begin = max(0, end - max_scans)
+            part = slice(begin * width, end * width)
+            scans.append(WholeScans(np.tile(cubes, end - begin), raws[part], stamps_ns[part]))
+        return scans[::-1]
 
     def build_whole(self, scans: WholeScans, make_rows: MakeRows) -> FrequencyRows:
         """Convert whole scans to rows.
@@ -271,6 +278,19 @@ class ScanBuilder:
         rows.status[:] = 0
         _place(rows, scans.raws, scans.stamps_ns)
         return rows
+
+    def drop_oldest(self, n_kept: int) -> int:
+        """Drop the oldest pending scans (one sample of each link) because this host is too slow.
+
+        Args:
+            n_kept: Number of scans to keep.
+
+        Returns:
+            Number of rows (samples of cubes) dropped.
+        """
+        n_dropped = max(0, len(self._pending) - n_kept)
+        parts = [part for scan in self._remove_scans(n_dropped) for part in scan.values()]
+        return sum(len(part.cubes) for part in parts)
 
     def rows_waiting(self) -> int:
         """Return how many rows (samples of cubes) were added, but not yet built or left out."""
@@ -293,20 +313,21 @@ class ScanBuilder:
             n_scans = max_scans
             self._holds_back = False
 
-        # The scans are removed first. If an error is raised below, the next call does not meet the
-        # same scans and the same error again.
+        parts: list[_SampleRows] = []
+        for scan in self._remove_scans(n_scans):
+            parts += (scan[link] for link in sorted(scan) if len(scan[link].cubes))
+        return parts
+
+    def _remove_scans(self, n_scans: int) -> list[dict[int, _SampleRows]]:
+        """Remove the oldest pending scans (one sample of each link), and return them."""
         scans = self._pending[:n_scans]
         del self._pending[:n_scans]
         del self._pending_ns[:n_scans]
         self._n_pending = [max(0, count - n_scans) for count in self._n_pending]
-
-        parts: list[_SampleRows] = []
         for scan in scans:
-            for link in sorted(scan):
-                self._built_ns[link] = scan[link].stamp_ns
-                if len(scan[link].cubes):
-                    parts.append(scan[link])
-        return parts
+            for link, part in scan.items():
+                self._built_ns[link] = part.stamp_ns
+        return scans
 
     def _holds_late_sample(self, missing: set[int]) -> bool:
         """Return whether the pending scan holds a sample that came after its own scan was built.

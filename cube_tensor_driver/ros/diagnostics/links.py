@@ -60,12 +60,20 @@ def _rows_status(
     elif counts.lost > before.lost:
         level = DiagnosticStatus.ERROR
         text = f"{counts.lost - before.lost} rows lost by an error: {counts.lost_reason}"
+    elif counts.overload > before.overload:
+        dropped = counts.overload - before.overload
+        level = DiagnosticStatus.WARN
+        text = (
+            f"{dropped} of {dropped + counts.delivered - before.delivered} rows dropped since the "
+            "last report: the host is too slow: lower the rate"
+        )
     values = {
         "rows published": counts.delivered,
         "rows per second": counts.delivered - before.delivered,
         "rows of unknown cubes": counts.unknown_cube,
         "rows with another number of pads": counts.wrong_pads,
         "rows that came twice": counts.duplicate,
+        "rows dropped by a slow host": counts.overload,
         "rows lost by errors": counts.lost,
         "rows unaccounted": counts.unaccounted,
     }
