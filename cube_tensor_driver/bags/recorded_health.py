@@ -7,6 +7,7 @@ windows began. Therefore it is read from the recorded stress when that stress is
 
 from __future__ import annotations
 
+import itertools
 from collections import deque
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -44,6 +45,8 @@ class _StressBatch(NamedTuple):
         stamp_ns: (N,) stamp of the sample, in ns since the Unix epoch.
         left_out: (N,) bit p is set if pad p was not used.
         status: (N,) status bits, restricted to `HEALTH_BITS`.
+        first_ns: Earliest of the stamps, in ns since the Unix epoch.
+        last_ns: Latest of the stamps, in ns since the Unix epoch.
     """
 
     cube: AnyArray
@@ -51,14 +54,8 @@ class _StressBatch(NamedTuple):
     stamp_ns: Times
     left_out: PadMasks
     status: StatusBits
-
-    def overlaps(self, begin_ns: int, end_ns: int) -> bool:
-        """Return whether a row of this batch can have a stamp from `begin_ns` to `end_ns`.
-
-        Both are in ns since the Unix epoch.
-        """
-        first_ns, last_ns = self.stamp_ns.min(), self.stamp_ns.max()
-        return bool(first_ns <= end_ns and last_ns >= begin_ns)
+    first_ns: int
+    last_ns: int
 
 
 class RecordedHealthReader:
@@ -125,21 +122,27 @@ class RecordedHealthReader:
             self._unread = self._read()
         self._last_wanted_ns = end_ns
         oldest_ns = begin_ns - MAX_DISORDER_NS
-        while self._batches and self._batches[0].stamp_ns.max() < oldest_ns:
+        while self._batches and self._batches[0].last_ns < oldest_ns:
             self._batches.popleft()
 
-        for kept in tuple(self._batches):
-            if kept.overlaps(begin_ns, end_ns):
-                yield kept
-        while self._newest_ns < end_ns + MAX_DISORDER_NS:
+        kept = tuple(self._batches)
+        for batch in itertools.chain(kept, self._read_until(end_ns + MAX_DISORDER_NS)):
+            if batch.first_ns <= end_ns and batch.last_ns >= begin_ns:
+                yield batch
+
+    def _read_until(self, limit_ns: int) -> Iterator[_StressBatch]:
+        """Read further batches into the memory until one has a stamp from `limit_ns` on.
+
+        Args:
+            limit_ns: Stamp, in ns since the Unix epoch.
+        """
+        while self._newest_ns < limit_ns:
             batch = next(self._unread, None)
             if batch is None:
                 return
-            newest_ns = int(batch.stamp_ns.max())
-            self._newest_ns = max(self._newest_ns, newest_ns)
+            self._newest_ns = max(self._newest_ns, batch.last_ns)
             self._batches.append(batch)
-            if batch.overlaps(begin_ns, end_ns):
-                yield batch
+            yield batch
 
     def _read(self) -> Iterator[_StressBatch]:
         """Yield the recorded columns of stress that state the health of the pads, batch by batch.
@@ -150,7 +153,9 @@ class RecordedHealthReader:
         for columns in self._bag.stress_columns(self._topic, names):
             stamp_ns, cube, sequence, left_out, status = columns
             if len(cube):
-                yield _StressBatch(cube, sequence, stamp_ns, left_out, status & HEALTH_BITS)
+                first_ns, last_ns = int(stamp_ns.min()), int(stamp_ns.max())
+                health = status & HEALTH_BITS
+                yield _StressBatch(cube, sequence, stamp_ns, left_out, health, first_ns, last_ns)
 
 
 def _copy_matching(
