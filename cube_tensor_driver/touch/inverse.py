@@ -297,7 +297,7 @@ class SurfaceInverse:
         """Compute the standard deviations of the field that is computed from a residual.
 
         Args:
-            residual: Values (cubes, C) in Pa minus the response to the contacts (`ContactModel`).
+            residual: Values (cubes, C) in Pa minus the response to the contacts (contact tracker).
             scaled: Values (cubes, C) in Pa as from `scaled`. Errors of the pads' gains are
                 proportional to them.
         """

@@ -11,10 +11,6 @@ AMPLITUDE = 20e3
 """Prior standard deviation of the pressure on the surface, in Pa, before any value is measured. The
 value is the pressure of a firm touch."""
 
-_EXTRA_VARIANCES = (1e-6, 1e-3, 1e-2, 1e-1)
-"""Factors, tried one after the other, by which `make_positive_definite` increases the variances of
-a covariance matrix until a Cholesky factor of it exists: 1e-3 adds a thousandth."""
-
 
 def covariance_matrix(
     kernels: Kernels,
@@ -56,21 +52,3 @@ def covariance_matrix(
     own = pairs[first == second]
     matrix[cube, :, cube] = (own + own.swapaxes(1, 2)) / 2
     return matrix.reshape(n * width, -1)
-
-
-def make_positive_definite(covariance: Array) -> Array:
-    """Increase the variances of a covariance matrix until it is positive definite.
-
-    `Kernels` sets the covariance of cubes that are far apart to zero, and a matrix that is cut off
-    in this way may have negative eigenvalues. If even the largest of `_EXTRA_VARIANCES` does not
-    suffice, the matrix with this increase is returned nevertheless.
-    """
-    variances = np.diag(np.diag(covariance))
-    for share in _EXTRA_VARIANCES:
-        increased = covariance + share * variances
-        try:
-            np.linalg.cholesky(increased)
-        except np.linalg.LinAlgError:
-            continue
-        break
-    return np.asarray(increased)

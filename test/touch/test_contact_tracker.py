@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from scipy.linalg import cho_solve
 
 from cube_tensor_design.studies.traction_study import CUBES, Setting, TractionBench
 from cube_tensor_driver.core.modes import STRESS, to_matrix
@@ -14,16 +11,10 @@ from cube_tensor_driver.core.poses import CubePoses
 from cube_tensor_driver.core.tensor import rotate_gradient, rotate_stress, rotation_from_rpy
 from cube_tensor_driver.mechanics import contact
 from cube_tensor_driver.mechanics.layer import Layer
-from cube_tensor_driver.touch.inverse import SurfaceInverse, TractionField
-from cube_tensor_driver.touch.prior import covariance_matrix
-from cube_tensor_driver.touch.tracker.contact_fit import (
-    STEPS_NEW,
-    ContactFit,
-    Observations,
-    fit_contacts,
-)
-from cube_tensor_driver.touch.tracker.contact_model import ContactModel, HertzContact
+from cube_tensor_driver.touch.inverse import SurfaceInverse
 from cube_tensor_driver.touch.tracker.contact_tracker import ContactTracker
+from cube_tensor_driver.touch.tracker.local_values import LocalValues
+from cube_tensor_driver.touch.tracker.region_fit import RegionFit
 
 DEPTH, PITCH, COUNT, LEAST = 4e-3, 12e-3, 7, 300.0
 PADS_NOISE = np.where(np.arange(15) < len(STRESS), 3.0, 3.0 / 2e-3)
@@ -77,7 +68,7 @@ def test_a_contact_between_wide_pitches_has_its_force_and_place(
     for centre in random.uniform(-PITCH / 2, PITCH / 2, (3, 2)):
         force = np.array([0.6, -0.3, -3.0])
         (found,) = ContactTracker(inverse, LEAST).update(
-            noisy(load(inverse, width, centre, force), random)
+            noisy(load(inverse, width, centre, force), random), max_work=np.inf
         )
         assert np.linalg.norm(found.force - force) < force_limit * 3
         assert np.linalg.norm(found.position[:2] - centre) < place_limit
@@ -109,13 +100,10 @@ def test_the_noise_of_a_cube_is_how_its_values_scatter_with_the_gains_and_the_co
     count = len(bench.poses.position)
     pads = bench.pads_in(np.repeat(field, count, axis=0))
     drawn = [bench.inverse.scaled(bench.measured(pads, random)) for _ in range(12)]
-    values = np.concatenate(drawn)
-    cube, n = np.arange(1), values.shape[1]
-    observations = Observations(
-        bench.inverse, values[:1], np.eye(n), cube, np.zeros((1, 2)), np.zeros(1)
-    )
-    root = np.linalg.inv(np.linalg.cholesky(observations.noise))
-    found = np.linalg.eigvalsh(root @ np.cov(values.T) @ root.T)
+    local = LocalValues(bench.inverse, 0, np.arange(1), drawn[0])
+    values = np.array([local.whiten(one[None]) for one in np.concatenate(drawn)])
+    n = values.shape[1]
+    found = np.linalg.eigvalsh(np.cov(values.T))
     # Marchenko and Pastur: the least and greatest of a sample covariance that is right
     spread = np.sqrt(n / len(values))
     assert 0.9 * (1 - spread) ** 2 < found[0] and found[-1] < 1.1 * (1 + spread) ** 2
@@ -141,66 +129,6 @@ def test_where_nothing_is_left_the_field_is_as_unsure_as_noise_and_gains_make_it
         assert np.sqrt((stated[points] ** 2).mean()) == pytest.approx(seen, rel=limit)
 
 
-def fitted_scan(inverse, values) -> tuple[Observations, ContactFit]:
-    """One contact and the cubes around the one in the middle."""
-    x, y = inverse.poses.position[:, :2].T
-    cubes = np.flatnonzero(np.maximum(abs(x), abs(y)) < 2.5 * PITCH)
-    place, angle = inverse.unroll(COUNT**2 // 2, cubes)
-    variant = inverse.variant[cubes]
-    prior = covariance_matrix(inverse.kernels, inverse.columns, place, angle, variant)
-    observations = Observations(inverse, inverse.scaled(values)[cubes], prior, cubes, place, angle)
-    return observations, fit_contacts(
-        observations, np.array([[2e-3, 1e-3]]), np.array([4e-3]), 200.0, STEPS_NEW
-    )
-
-
-def test_covariance_of_a_contact_is_that_of_all_its_unknowns_together(inverse):
-    """Force, place, size and shapes solved for at once: the shapes are no noise then."""
-    values = noisy(ball(inverse, 8e-3, (2e-3, 1e-3), (0.6, 0.3, -3.0)), np.random.default_rng(8))
-    observations, fitted = fitted_scan(inverse, values)
-    jacobian = np.concatenate([fitted.jacobian, fitted.shapes], axis=1)
-    rest = fitted.residual_scale**2 * observations.prior + observations.noise
-    prior = np.diag(
-        fitted.normal_matrix - fitted.jacobian.T @ cho_solve(fitted.factor, fitted.jacobian)
-    )
-    every = np.diag([*prior, 1, 1, 1]) + jacobian.T @ np.linalg.solve(rest, jacobian)
-    expected = np.linalg.inv(every)
-    scale = np.sqrt(np.diag(expected))
-    np.testing.assert_allclose(
-        fitted.covariance(0) / np.outer(scale, scale),
-        expected / np.outer(scale, scale),
-        atol=1e-4,  # of the prior's precision, that is a small difference
-    )
-
-
-def test_what_is_unsure_of_a_contact_is_unsure_of_the_pressure(inverse):
-    """Against contacts drawn from the covariance; the shapes have a test of their own."""
-    random, model = np.random.default_rng(6), ContactModel(inverse)
-    place, force = np.array([1e-3, 2e-3]), np.array([0.6, 0.3, -3.0])
-    disc = HertzContact(0, COUNT**2 // 2, place, 6e-3, force, 1.0)
-    root = np.zeros((9, 9))
-    root[:6, :6] = random.standard_normal((6, 6)) * np.array([[0.02] * 3 + [5e-5] * 2 + [0.01]]).T
-    disc.covariance = root @ root.T
-    stated = np.sqrt(model.pressure_variance([disc]))
-    nothing = TractionField(np.zeros((len(inverse.points), 3)), np.zeros(len(inverse.points)))
-    drawn = []
-    for change in random.standard_normal((400, 9)) @ root.T:
-        moved = replace(
-            disc,
-            force=force + change[:3],
-            place=place + change[3:5],
-            size=6e-3 * np.exp(change[5]),
-        )
-        field = model.add_contacts(nothing, model.depth_pressure([moved]), [moved])
-        drawn.append([field.pressure, field.depth_pressure])
-    seen = np.std(drawn, axis=0).T
-    # 400 draws leave 4 % open; at the rim the pressure is no straight line of the radius.
-    for part, limit in zip((0, 1), (0.15, 0.1), strict=True):
-        strong = seen[:, part] > 0.3 * seen[:, part].max()
-        assert strong.sum() > 5
-        np.testing.assert_allclose(stated[strong, part], seen[strong, part], rtol=limit)
-
-
 def test_a_contact_that_moves_on_to_a_turned_cube_is_as_unsure_as_one_that_begins_there(inverse):
     """Shapes turn with the cube, too, twice as fast as places and forces."""
     poses, force = inverse.poses, np.array([0.6, 0.3, -3.0])
@@ -221,11 +149,13 @@ def test_a_contact_that_moves_on_to_a_turned_cube_is_as_unsure_as_one_that_begin
     moved, begun = ContactTracker(turned, LEAST), ContactTracker(turned, LEAST)
     for x in (5.9e-3, 5.98e-3, 5.99e-3, 6.01e-3):
         there = values((x, 2e-3))
-        moved.update(there)
-    begun.update(there)
-    stated, expected = moved.deviation(there).pressure, begun.deviation(there).pressure
-    strong = expected > 0.1 * expected.max()
-    np.testing.assert_allclose(stated[strong], expected[strong], rtol=0.02)
+        (one,) = moved.update(there, max_work=np.inf)
+    (other,) = begun.update(there, max_work=np.inf)
+    # The two fits began at different places, and the values have no noise.
+    for name in ("force_uncertainty", "shear_uncertainty", "position_uncertainty"):
+        assert getattr(one, name) == pytest.approx(getattr(other, name), rel=0.1)
+    np.testing.assert_allclose(one.force, force, atol=0.01)
+    assert one.id == 0
 
 
 def test_two_balls_that_touch_are_one_contact_with_the_force_and_place_of_both(inverse):
@@ -234,7 +164,7 @@ def test_two_balls_that_touch_are_one_contact_with_the_force_and_place_of_both(i
     for centre in np.array([[5e-3, 4e-3], [-2e-3, 6e-3]]):
         apart = 1.25e-3 * np.array([0.6, 0.8])
         values = sum(ball(inverse, 2.5e-3, centre + sign * apart, force) for sign in (-1, 1))
-        (found,) = ContactTracker(inverse, LEAST).update(noisy(values, random))
+        (found,) = ContactTracker(inverse, LEAST).update(noisy(values, random), max_work=np.inf)
         assert found.normal_force == pytest.approx(3, rel=0.02)
         assert abs(found.normal_force - 3) < 4 * found.force_uncertainty
         assert np.linalg.norm(found.position[:2] - centre) < 0.1e-3
@@ -249,11 +179,13 @@ def test_two_balls_beside_each_other_without_a_valley_are_told_apart_by_likeliho
     for _ in range(2):
         values = ball(inverse, 12e-3, centre + apart, (0, 0, -2.0))
         values += ball(inverse, 10e-3, centre - apart, (0, 0.3, -1.0))
-        strong, weak = tracker.update(noisy(values, random))
+        strong, weak = tracker.update(noisy(values, random), max_work=np.inf)
         for found, force, sign in ((strong, 2, 1), (weak, 1, -1)):
             assert found.normal_force == pytest.approx(force, rel=0.05)
             assert np.linalg.norm(found.position[:2] - centre - sign * apart) < 0.3e-3
-    (one,) = ContactTracker(inverse, LEAST).update(flat_punch(inverse, 20e-3, centre, (0, 0, -3.0)))
+    (one,) = ContactTracker(inverse, LEAST).update(
+        flat_punch(inverse, 20e-3, centre, (0, 0, -3.0)), max_work=np.inf
+    )
     assert one.normal_force == pytest.approx(3, rel=0.1)
 
 
@@ -265,7 +197,7 @@ def test_planar_cubes_six_depths_apart_tell_on_which_side_of_their_row_a_contact
     for centre, width in (((11.7, -4.4), 5e-3), ((6, 9), 5e-3), ((-0.5, 2.5), 2e-3)):
         centre = 1e-3 * np.array(centre)
         values = bench.values(width, force, centre, random)
-        (found,) = ContactTracker(bench.inverse, LEAST).update(values)
+        (found,) = ContactTracker(bench.inverse, LEAST).update(values, max_work=np.inf)
         assert np.linalg.norm(found.position[:2] - centre) < 0.3e-3
         assert found.position_uncertainty < 0.3e-3
 
@@ -280,7 +212,7 @@ def test_a_contact_midway_between_planar_cubes_is_not_looked_for_beside_another_
     centre, angle = np.array([random.uniform(-4e-3, 4e-3), -11.7e-3]), random.uniform(0, 6.28)
     force = np.array([0.9 * np.cos(angle), 0.9 * np.sin(angle), -3.0])
     (found,) = ContactTracker(bench.inverse, LEAST).update(
-        bench.values(2e-3, force, centre, random)
+        bench.values(2e-3, force, centre, random), max_work=np.inf
     )
     assert abs(found.normal_force - 3) < 4 * found.force_uncertainty < 0.1
     assert np.linalg.norm(found.position[:2] - centre) < 0.2e-3
@@ -293,9 +225,9 @@ def test_the_size_of_a_flat_punch_settles():
     random = np.random.default_rng(11)
     load, centre = bench.load(random)
     (found,) = ContactTracker(bench.inverse, LEAST).update(
-        bench.values(10e-3, load, centre, random)
+        bench.values(10e-3, load, centre, random), max_work=np.inf
     )
-    assert abs(found.normal_force - 3) < 4 * found.force_uncertainty < 0.05
+    assert abs(found.normal_force - 3) < 4 * found.force_uncertainty < 0.08
 
 
 def test_a_fit_from_the_wrong_side_of_a_cube_gets_to_a_contact_half_a_pitch_away():
@@ -308,7 +240,7 @@ def test_a_fit_from_the_wrong_side_of_a_cube_gets_to_a_contact_half_a_pitch_away
         centre, angle = np.array([4.02e-3 * side, y]), random.uniform(0, 6.28)
         force = np.array([0.9 * np.cos(angle), 0.9 * np.sin(angle), -3.0])
         (found,) = ContactTracker(bench.inverse, LEAST).update(
-            bench.values(5e-3, force, centre, random)
+            bench.values(5e-3, force, centre, random), max_work=np.inf
         )
         assert np.linalg.norm(found.position[:2] - centre) < 4 * found.position_uncertainty
 
@@ -320,7 +252,7 @@ def test_a_force_between_two_likely_ones_is_as_uncertain(seed):
     bench = TractionBench(Setting(cubes=CUBES[2]), side=1)
     force, centre = np.array([0.638, -0.635, -3.0]), np.array([3.8e-3, -0.6e-3])
     values = bench.values(10e-3, force, centre, np.random.default_rng(seed))
-    (found,) = ContactTracker(bench.inverse, LEAST).update(values)
+    (found,) = ContactTracker(bench.inverse, LEAST).update(values, max_work=np.inf)
     assert abs(found.normal_force - 3) < 4 * found.force_uncertainty < 0.1
     assert np.abs(found.position[:2] - centre).max() < 4 * found.position_uncertainty
 
@@ -337,7 +269,9 @@ def test_many_contacts_in_a_row(count):
     long = SurfaceInverse.from_poses(poses, by_pad, Layer(), DEPTH)
     places = [((k - (count - 1) / 2) * 40e-3 + 1e-3, 2e-3) for k in range(count)]
     values = noisy(sum(ball(long, 6e-3, place, force) for place in places), random)
-    found = sorted(ContactTracker(long, LEAST).update(values), key=lambda one: one.position[0])
+    found = sorted(
+        ContactTracker(long, LEAST).update(values, max_work=np.inf), key=lambda one: one.position[0]
+    )
     assert len(found) == count
     for one, place in zip(found, places, strict=True):
         assert np.linalg.norm(one.force - force) < 0.02 * 3
@@ -352,20 +286,20 @@ def test_two_contacts_one_and_a_half_pitches_apart_are_told_apart_and_keep_their
         moved = second + 1e-3 * step * np.array([0.0, 1.0])
         values = ball(inverse, 5e-3, first, (0, 0, -2.0))
         values += ball(inverse, 5e-3, moved, (0, 0.3, -3.0))
-        strong, weak = tracker.update(noisy(values, random))
+        strong, weak = tracker.update(noisy(values, random), max_work=np.inf)
         assert strong.normal_force == pytest.approx(3, rel=0.05)
         assert weak.normal_force == pytest.approx(2, rel=0.05)
         assert np.linalg.norm(strong.position[:2] - moved) < 0.3e-3
         assert np.linalg.norm(weak.position[:2] - first) < 0.3e-3
         ids.add((strong.id, weak.id))
     assert len(ids) == 1
-    assert tracker.update(np.zeros_like(values)) == []
+    assert tracker.update(np.zeros_like(values), max_work=np.inf) == []
 
 
 def test_the_field_of_a_contact_is_its_pressure(inverse):
     centre = np.array([6e-3, 6e-3])  # in the middle between four cubes
     tracker = ContactTracker(inverse, LEAST)
-    tracker.update(ball(inverse, 8e-3, centre, (0, 0, -3.0)))
+    tracker.update(ball(inverse, 8e-3, centre, (0, 0, -3.0)), max_work=np.inf)
     fine = (np.arange(20) - 9.5) / 20 * inverse.spacing
     x, y = (inverse.points[:, k, None, None] - centre[k] for k in (0, 1))
     r = np.hypot(x + fine[:, None], y + fine)
@@ -381,6 +315,106 @@ def test_cubes_that_fail_beside_a_contact_and_a_skin_without_values(inverse):
     values = ball(inverse, 8e-3, np.array([2e-3, 1e-3]), (0, 0, -3.0))
     values[[COUNT**2 // 2, 3]] = np.nan
     values[COUNT**2 // 2 + 1, 6:] = np.nan
-    (found,) = tracker.update(values)
+    (found,) = tracker.update(values, max_work=np.inf)
     assert found.normal_force == pytest.approx(3, rel=0.05)
-    assert tracker.update(np.full_like(values, np.nan)) == []
+    assert tracker.update(np.full_like(values, np.nan), max_work=np.inf) == []
+
+
+def ellipse(length, width) -> np.ndarray:
+    """Hertz's pressure on an ellipse along x, as point forces (L, 3): position and share of 1 N."""
+    sources, forces = contact.hertz(1.0, (0, 0, 1), (0, 0), order=16)
+    return np.column_stack([sources[:, 0] * length / 2, sources[:, 1] * width / 2, forces[:, 2]])
+
+
+def bar(length, width) -> np.ndarray:
+    """Uniform along x, semi-elliptic across: an edge or a rod."""
+    x, along = np.polynomial.legendre.leggauss(int(length / 0.5e-3))
+    angle = np.arange(1, 9) * np.pi / 9
+    across = np.sin(angle) ** 2 / (np.sin(angle) ** 2).sum()
+    x, y = np.meshgrid(x * length / 2, np.cos(angle) * width / 2, indexing="ij")
+    return np.column_stack([x.ravel(), y.ravel(), np.outer(along / 2, across).ravel()])
+
+
+def values_under(bench, shape, centre, force, random) -> np.ndarray:
+    """Through the whole chain, from point forces on a half space."""
+    sources = np.column_stack([shape[:, :2] + centre, np.zeros(len(shape))])
+    below = bench.poses.position - [0, 0, bench.setting.depth]
+    fields = contact.field(below, sources, shape[:, 2:] * np.asarray(force), bench.setting.poisson)
+    field = np.concatenate([part.reshape(len(below), -1) for part in fields], axis=1)
+    return bench.measured(bench.pads_in(field), random)
+
+
+SHAPES = [
+    (ellipse(16e-3, 8e-3), CUBES[0], 8e-3, 0.005),
+    (bar(24e-3, 2e-3), CUBES[0], 8e-3, 0.005),
+    (bar(40e-3, 3e-3), CUBES[0], 12e-3, 0.01),
+    (bar(40e-3, 3e-3), CUBES[1], 8e-3, 0.01),
+]
+
+
+@pytest.mark.parametrize(("shape", "cubes", "pitch", "limit"), SHAPES)
+def test_fingertips_edges_and_rods_have_their_force_and_place(shape, cubes, pitch, limit):
+    """Round contacts forced on them were off by a third to a half of the force."""
+    bench = TractionBench(Setting(cubes=cubes, pitch=pitch, depth=4.5e-3), side=2)
+    random = np.random.default_rng(12)
+    for angle in (0.3, 2.0):
+        turned = shape @ rotation_from_rpy(0, 0, angle).T * [1, 1, 0] + shape * [0, 0, 1]
+        centre = pitch * (random.random(2) - 0.5)
+        values = values_under(bench, turned, centre, (0.6, -0.6, -3.0), random)
+        found = ContactTracker(bench.inverse, LEAST).update(values, max_work=np.inf)
+        force = sum(one.normal_force for one in found)
+        place = sum(one.normal_force * one.position[:2] for one in found) / force
+        assert force == pytest.approx(3, rel=limit)
+        assert np.linalg.norm(place - centre) < 0.2e-3
+        assert np.linalg.norm(sum(one.force[:2] for one in found) - [0.6, -0.6]) < 0.03
+        assert abs(force - 3) < 4 * np.linalg.norm([one.force_uncertainty for one in found])
+
+
+@pytest.mark.parametrize(("outside", "limit"), [(0.5, 0.01), (1.0, 0.03)])
+def test_beyond_the_outermost_cubes_the_stated_deviation_grows(outside, limit):
+    """There the field is not computed; without nodes there, the force was off by 30 %."""
+    bench = TractionBench(Setting(), side=2)
+    random = np.random.default_rng(4)
+    edge = np.abs(bench.poses.position[:, 0]).max()
+    stated = []
+    for x in (0.0, edge + outside * 8e-3):
+        values = bench.values(5e-3, np.array([0.6, 0.3, -3.0]), np.array([x, 2e-3]), random)
+        (found,) = ContactTracker(bench.inverse, LEAST).update(values, max_work=np.inf)
+        assert abs(found.normal_force - 3) < min(4 * found.force_uncertainty, 3 * limit)
+        assert np.linalg.norm(found.position[:2] - [x, 2e-3]) < 0.2e-3
+        stated.append(found.force_uncertainty)
+    assert stated[1] > 1.5 * stated[0]
+
+
+def test_what_a_scan_has_no_time_for_is_done_in_the_next_ones(monkeypatch):
+    """Sixteen balls at once: each scan makes two or three fits, and everybody keeps its id."""
+    bench = TractionBench(Setting(), side=2)
+    places = [(x, y) for x in (-27e-3, -9e-3, 9e-3, 27e-3) for y in (-27e-3, -9e-3, 9e-3, 27e-3)]
+    random, ball_shape = np.random.default_rng(2), ellipse(5e-3, 5e-3)
+    shape = np.concatenate([ball_shape + np.array([*place, 0]) for place in places])
+    values = values_under(bench, shape, (0, 0), (0.0, 0.3, -1.5), random)
+    tracker, made = ContactTracker(bench.inverse, LEAST), []
+    monkeypatch.setattr(RegionFit, "__init__", counted(RegionFit.__init__, made))
+    first = tracker.update(values)
+    assert len(first) == 16 and 1 <= len(made) <= 4
+    for one in first:
+        assert one.normal_force == pytest.approx(1.5, rel=0.3)
+        assert abs(one.normal_force - 1.5) < 4 * one.force_uncertainty
+    for _ in range(40):
+        before = len(made)
+        found = tracker.update(values)
+        assert len(made) - before <= 4
+    assert {one.id for one in found} == {one.id for one in first}
+    for one in found:
+        assert one.normal_force == pytest.approx(1.5, rel=0.01)
+        assert min(np.hypot(*(one.position[:2] - place)) for place in places) < 0.1e-3
+
+
+def counted(function, calls):
+    """The function, which also appends to `calls`."""
+
+    def call(*args):
+        calls.append(1)
+        return function(*args)
+
+    return call

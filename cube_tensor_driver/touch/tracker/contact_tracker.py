@@ -1,78 +1,112 @@
-"""Contact tracker: finds contacts from the values of all cubes, follows them from scan to scan.
+"""Contact tracker: finds contacts in the traction on the surface, follows them from scan to scan.
 
-A Gaussian prior that is the same everywhere on the surface cannot describe that contacts are
-narrow. Therefore, the traction is modelled as the sum of Hertz contacts and of a residual field, a
-Gaussian process for what the contacts do not explain. contact_model.py computes the response to the
-contacts, contact_fit.py fits them, contact_estimate.py computes force and position with standard
-deviations, contact_selection.py decides how many contacts there are, and contact_split.py tests
-whether one contact is really two.
+In every scan (set of values of all cubes), the linear inverse gives the field of the pressure,
+whose connected regions are contacts (pressure_regions.py). The traction in each region is then
+fitted to the values of the cubes around it (region_fit.py), with a prior that is zero outside the
+region. Force, position, moment and area are integrals of this fit (contact_estimate.py).
+
+Fits take a few milliseconds, so their number per scan is limited. As long as the region stays the
+same, its fit only needs a matrix product for new values. A region that has no fit yet is reported
+with the integrals of the field, which are less exact.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass
+from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import block_diag
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from ...core.arrays import Array, Index
 from ..inverse import FieldDeviation, SurfaceInverse, TractionField
-from ..prior import AMPLITUDE, covariance_matrix, make_positive_definite
-from .contact_estimate import ContactEstimate, estimate_contact
-from .contact_fit import (
-    STEPS_NEW,
-    STEPS_TRACKED,
-    USUAL_SIZE,
-    ContactFit,
-    Observations,
-    fit_contacts,
-)
-from .contact_model import ContactModel, HertzContact
-from .contact_selection import detect_contact, find_pair_to_merge, prune_contacts
-from .contact_split import split_contact
+from .contact_estimate import ContactEstimate
+from .fitted_field import add_fits, fit_variances
+from .local_values import LocalValues
+from .pressure_regions import PressureRegions
+from .region_fit import MIN_FACING, RegionFit
 
-CUBES_PER_CONTACT = 16
-"""Number of cubes from whose values a contact is fitted: those nearest to it."""
+MAX_CUBES = 48
+"""Largest number of cubes from whose values a region is fitted. Regions that need more are not
+fitted."""
 
-MAX_CONTACTS = 10
-"""Largest number of contacts tracked at the same time on one skin."""
+CUBE_REACH_PITCHES = (2.0, 1.0)
+"""Distances from the region, divided by the pitch (distance of neighbouring cubes), within which
+cubes take part in its fit. The second one serves if the first one gives too many cubes."""
 
-MAX_CONTACTS_PER_FIT = 4
-"""Largest number n of contacts that are fitted jointly; the time of a fit grows with n^3."""
+NEIGHBOUR_REACH_PITCHES = 3.0
+"""Distance from the region, divided by the pitch (distance of neighbouring cubes), within which
+other contacts take part in its fit."""
 
-JOINT_FIT_PITCHES = 4.0
-"""Distance of two contacts, divided by the pitch (distance of neighbouring cubes), below which they
-are fitted jointly, because many of their nearest cubes are the same."""
+MAX_NEIGHBOUR_NODES = 30
+"""Largest number of nodes (small contacts) that represent other contacts in the fit of a region."""
 
-LARGE_RESIDUAL = 0.02
-"""Residual scale (standard deviation of the pressure that the contacts do not explain), divided by
-`AMPLITUDE`, above which a fit counts as possibly wrong and is repeated from other starts."""
+MAX_REGIONS = 32
+"""Largest number of regions of contact on one skin; those with the largest pressure are kept."""
 
-WIDE_SIZE = 2.5
-"""Start radius, divided by the depth of the cubes' centres, with which the fit of a contact is
-repeated if it leaves a large residual. The true contact may be too wide to be found from the usual,
-smaller start radius (`USUAL_SIZE`)."""
+MAX_WORK_PER_SCAN = 100
+"""Number of nodes (small contacts that make up the traction of a region) after which no further fit
+is made or improved in the same scan. It bounds the time of a scan; what remains is done in the next
+scans."""
 
-POSITION_TOLERANCE_PITCHES = 0.005
-"""Standard deviation of the positions at which fits from different starts end, divided by the pitch
-(distance of neighbouring cubes). Above it, the position of the contact counts as ambiguous, and the
-other starts are tried again in the next scan."""
+MAX_PIECES_OF_WORK = 12
+"""Largest number of times that the fit of a region is improved in one scan, on average."""
 
-RESTART_CUBES = 4
-"""Number of cubes around which a new contact is fitted again if its first fit leaves a large
-residual (`LARGE_RESIDUAL`). The cubes nearest to the position found by this fit are chosen."""
+MAX_CHANGE = 0.25
+"""Relative change of the largest pressure of a region, or of the set of its points, after which the
+region is fitted again. The fit depends on the pressure, because errors of the pads' gains are
+proportional to it."""
 
-START_SCALE = 0.05 * AMPLITUDE
-"""Start value, in Pa, of the residual scale (standard deviation of the pressure that the contacts
-do not explain) in the fit of a new contact."""
+MAX_CHANGE_HERTZ = 0.6
+"""Like `MAX_CHANGE`, for regions whose Hertz contacts follow the bodies that press."""
 
-_MIN_VALUES_PER_CONTACT = 6
-"""Smallest number of known values (of the cubes near the contacts) per contact for a fit. It is the
-number of a contact's parameters: force (3), centre (2) and radius."""
+MAX_MISFIT_GROWTH = 1.3
+"""Factor by which the misfit (squared deviation of the values from the fit, divided by that of
+their noise) grows before a region is fitted again. It grows when a contact moves."""
 
-_CORNERS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
-"""Signs (4, 2) of x and y for the four mirror images of a position about the axes of a cube."""
+MATCH_PITCHES = 1.0
+"""Largest distance that a contact moves between two scans, divided by the pitch (distance of
+neighbouring cubes). A contact farther away from all previous ones is a new one."""
+
+COARSE_DEVIATION = 0.1
+"""Standard deviation of the force, divided by the force, of a contact that is not fitted yet.
+Beside other contacts, the integral of the field also replaces a fit that is less certain than this.
+The errors of integrals of the field are 1 to 9 % for balls, punches and rods at pitches of two and
+three depths."""
+
+
+class Work(IntEnum):
+    """What is done next for a region of contact, the most urgent first."""
+
+    FIT = 0
+    MOVE = 1
+    SHARPEN = 2
+    NONE = 3
+
+
+@dataclass
+class _Region:
+    """A region of contact in the newest scan.
+
+    Attributes:
+        points: Indices (n,) of its points of the surface.
+        peak: Largest pressure in Pa at the depth of the cubes.
+        near: Numbers of the other regions that take part in its fit.
+        others: Indices of the points of these regions that take part in its fit.
+        fit: Fit of the region, if there is one.
+        response: Values (cubes, C) in Pa that the fit explains.
+        is_tried: Whether a new fit was tried in this scan.
+    """
+
+    points: Index
+    peak: float
+    near: list[int]
+    others: Index
+    fit: RegionFit | None
+    response: Array | float = 0.0
+    is_tried: bool = False
 
 
 class TrackedContact(NamedTuple):
@@ -87,7 +121,7 @@ class TrackedContact(NamedTuple):
         normal_force: Normal force in N, positive for a body that presses on the skin.
         shear_force: Length of the tangential force in N.
         moment: Moment of the traction about the normal through `position`, in N m.
-        area: Area of the Hertz contact that fits best, in m^2.
+        area: Area of the elliptic Hertz contact with the same second moments of pressure, in m^2.
         position_uncertainty: Standard deviation of the position along each axis, in m.
         force_uncertainty: Standard deviation of the normal force, in N.
         shear_uncertainty: Standard deviation of `shear_force`, in N.
@@ -111,494 +145,366 @@ class TrackedContact(NamedTuple):
 
 
 class ContactTracker:
-    """Follows the contacts of a skin from scan to scan (a scan is one set of values of all cubes).
-
-    Attributes:
-        field: Traction on the surface in the newest scan, contacts included; 0 before the first
-            scan.
-    """
+    """Follows the contacts of a skin from scan to scan (set of values of all cubes)."""
 
     def __init__(self, inverse: SurfaceInverse, min_pressure: float) -> None:
         """Create a tracker without contacts.
 
         Args:
             inverse: Computes the traction on the surface of this skin.
-            min_pressure: Smallest pressure of a new contact at the depth of the cubes, in Pa.
+            min_pressure: Smallest pressure of a contact at the depth of the cubes, in Pa.
         """
         self._inverse = inverse
-        self._min_pressure = min_pressure
-        self._model = ContactModel(inverse)
-        self._contacts: list[HertzContact] = []
-        self._results: dict[int, TrackedContact] = {}
+        self._pressure_regions = PressureRegions(inverse, min_pressure)
+        normals = inverse.poses.rotation[:, :, 2]
+        self._above_cubes = cKDTree(inverse.poses.position + inverse.depth * normals)
+        self._fits: list[RegionFit] = []
+        self._known = np.zeros((0, 3))
+        self._ids: list[int] = []
         self._next_id = 0
-        self._priors: dict[tuple[int, ...], Array] = {}
-        n_points = len(inverse.points)
-        self.field = TractionField(np.zeros((n_points, 3)), np.zeros(n_points))
-        self._residual = np.full(
-            (len(inverse.poses.position), len(inverse.columns)),
-            np.nan,
-        )
+        n_values = (len(inverse.poses.position), len(inverse.columns))
+        self._scaled = np.full(n_values, np.nan)
 
-    def update(self, values: Array) -> list[TrackedContact]:
-        """Fit the contacts to the newest values, and find, merge and remove contacts.
-
-        The computing time is bounded by `MAX_CONTACTS` and by the number of steps of each fit.
+    def update(self, values: Array, max_work: float = MAX_WORK_PER_SCAN) -> list[TrackedContact]:
+        """Find the contacts in the newest values.
 
         Args:
             values: Components (cubes, 15) in Pa and Pa/m, NaN where unknown.
+            max_work: Number of nodes (see `MAX_WORK_PER_SCAN`) after which no further fit is
+                improved in this scan. Infinite: all fits are improved as far as possible.
 
         Returns:
             Contacts, strongest first.
         """
-        model = self._model
-        y = self._inverse.scaled(values)
-        self._results = {}
-        self._fit(y, self._contacts, STEPS_TRACKED)
-        self._contacts = prune_contacts(model, self._contacts, self._min_pressure)
+        scaled = self._inverse.scaled(values)
+        self._scaled = scaled
+        field = self._inverse.field_of_scaled(scaled)
+        pressure = field.depth_pressure
+        regions = self._find_regions(pressure, scaled)
+        for region in regions:
+            self._update_response(region, regions)
+        self._update_fits(regions)
+        self._improve_fits(regions, pressure, max_work)
+        if any(region.is_tried for region in regions) and len(regions) > 1:
+            # The other fits now know the response to the new ones.
+            self._update_fits(regions)
+        self._fits = [region.fit for region in regions if region.fit is not None]
 
-        # Merge or add one contact at a time until the residual shows no further one.
-        tried: list[Array] = []
-        for _ in range(MAX_CONTACTS + 1):
-            self._residual = y - model.response(self._contacts)
-            residual = self._inverse.field_of_scaled(self._residual)
-            pressure = residual.depth_pressure + model.depth_pressure(self._contacts)
-            self.field = model.add_contacts(residual, pressure, self._contacts)
+        contacts = []
+        coarse = []
+        for number, region in enumerate(regions):
+            estimates = [] if region.fit is None else region.fit.estimate_contacts()
+            if region.fit is None or (region.near and not all(map(_is_certain, estimates))):
+                coarse.append(number)
+            else:
+                contacts += [self._to_parent_frame(one, region.fit) for one in estimates]
+        if coarse:
+            contacts += self._integrate_field(regions, coarse, field)
+        return self._number_contacts([one for one in contacts if one.normal_force > 0])
 
-            pair = find_pair_to_merge(model, self._contacts, pressure)
-            if pair is not None:
-                # The older contact keeps its id and replaces both contacts in a new fit.
-                older, younger = pair
-                self._contacts.remove(younger)
-                self._fit(y, [older], STEPS_NEW)
-                continue
+    @property
+    def field(self) -> TractionField:
+        """Traction on the surface in the newest scan, contacts included.
 
-            point = detect_contact(
-                model,
-                self._contacts,
-                residual.depth_pressure,
-                pressure,
-                tried,
-                self._min_pressure,
-            )
-            if point is None or len(self._contacts) >= MAX_CONTACTS:
-                break
-            tried.append(self._inverse.points[point])
-            # The neighbours are fitted again, because so far they were fitted to values to which
-            # the new contact contributes.
-            contact = self._start_contact(point)
-            neighbours = self._neighbours(contact, self._contacts)
-            self._contacts.append(contact)
-            self._fit(y, [contact, *neighbours], STEPS_NEW)
-            self._contacts = prune_contacts(model, self._contacts, self._min_pressure)
-
-        fitted = [one.id for one in self._contacts if one.id in self._results]
-        results = [self._results[number] for number in fitted]
-        return sorted(results, key=lambda contact: -contact.normal_force)
+        It is computed when it is read, which takes several milliseconds for each contact.
+        """
+        residual = self._scaled - sum(fit.respond() for fit in self._fits)
+        return add_fits(self._inverse, self._inverse.field_of_scaled(residual), self._fits)
 
     def deviation(self, values: Array) -> FieldDeviation:
         """Compute the standard deviations of `field`.
 
-        Each variance is the sum of two: that of the residual field (traction that the contacts do
-        not explain) and the variance that the uncertain parameters of the contacts cause.
+        Each variance is the sum of that of the residual field (traction that the fits do not
+        explain) and that of the fits.
 
         Args:
             values: Components (cubes, 15) in Pa and Pa/m that the last `update` was called with.
         """
-        scaled = self._inverse.scaled(values)
-        residual = self._inverse.residual_deviation(self._residual, scaled)
-        contact_variance = self._model.pressure_variance(self._contacts)
-        variance = np.stack(residual, axis=1) ** 2 + contact_variance
+        inverse = self._inverse
+        residual = self._scaled - sum(fit.respond() for fit in self._fits)
+        deviation = inverse.residual_deviation(residual, inverse.scaled(values))
+        variance = np.stack(deviation, axis=1) ** 2 + fit_variances(inverse, self._fits)
         return FieldDeviation(*np.sqrt(variance).T)
 
-    def _start_contact(self, point: int) -> HertzContact:
-        """Create a contact with force 0 and the usual radius, from which its fit starts.
+    def _find_regions(self, pressure: Array, scaled: Array) -> list[_Region]:
+        """Find the regions of the newest scan, and their fits among those of the previous scan.
 
         Args:
-            point: Index of the surface point (in `SurfaceInverse.points`) at its centre.
+            pressure: Pressure (M,) in Pa at the depth of the cubes.
+            scaled: Values (cubes, C) in Pa.
         """
-        inverse = self._inverse
-        home = int(inverse.cube[point])
-        offset = inverse.points[point] - inverse.poses.position[home]
-        local = inverse.poses.rotation[home].T @ offset
-        return HertzContact(
-            id=self._take_id(),
-            home=home,
-            place=local[:2],
-            size=USUAL_SIZE * inverse.depth,
-            force=np.zeros(3),
-            residual_scale=START_SCALE,
-        )
+        available = [fit for fit in self._fits if fit.values.is_valid(scaled)]
+        found = self._pressure_regions.find(pressure)[:MAX_REGIONS]
+        distances = self._region_distances(found)
+        regions = []
+        for number, points in enumerate(found):
+            # The fit of a region is the one with which it has most points in common.
+            overlaps = [np.isin(points, fit.points).sum() for fit in available]
+            best = int(np.argmax(overlaps)) if overlaps else -1
+            fit = available.pop(best) if overlaps and overlaps[best] > 0 else None
+            near, others = self._choose_neighbours(found, number, distances[number])
+            regions.append(_Region(points, float(pressure[points].max()), near, others, fit))
+        return regions
 
-    def _take_id(self) -> int:
-        """Return a number (id) for a new contact, which no contact of this tracker had before."""
-        self._next_id += 1
-        return self._next_id - 1
+    def _region_distances(self, found: list[Index]) -> Array:
+        """Return the smallest distance (n, n) in m of the points of each pair of regions."""
+        if not found:
+            return np.zeros((0, 0))
+        first = np.cumsum([0, *(len(one) for one in found[:-1])])
+        points = self._inverse.points[np.concatenate(found)]
+        rows = np.minimum.reduceat(cdist(points, points), first, axis=0)
+        return np.asarray(np.minimum.reduceat(rows, first, axis=1))
 
-    def _neighbours(self, contact: HertzContact, others: list[HertzContact]) -> list[HertzContact]:
-        """Return the contacts among `others` that should be fitted jointly with a contact.
-
-        These are the contacts at distances below `JOINT_FIT_PITCHES` pitches (distances of
-        neighbouring cubes) from `contact`, the nearest first.
-        """
-        centre = self._model.centre(contact)
-        centres = [self._model.centre(one) for one in others]
-        distances = [float(np.linalg.norm(one - centre)) for one in centres]
-        reach = JOINT_FIT_PITCHES * self._inverse.pitch
-        return [others[k] for k in np.argsort(distances) if distances[k] < reach]
-
-    def _fit(
-        self,
-        y: Array,
-        contacts: list[HertzContact],
-        steps: int,
-    ) -> None:
-        """Fit some contacts in groups of neighbours; the tracker's other contacts do not change.
+    def _choose_neighbours(
+        self, found: list[Index], number: int, distances: Array
+    ) -> tuple[list[int], Index]:
+        """Choose the regions that take part in the fit of one region.
 
         Args:
-            y: Values (cubes, C) in Pa as from `SurfaceInverse.scaled`.
-            contacts: Contacts to fit, which are changed.
-            steps: Number of Gauss-Newton steps, as in `fit_contacts`.
-        """
-        remaining = list(contacts)
-        while remaining:
-            first = remaining.pop(0)
-            group = [first, *self._neighbours(first, remaining)[: MAX_CONTACTS_PER_FIT - 1]]
-            # Contacts are compared by identity: `==` would compare all attributes, arrays included.
-            members = {id(one) for one in group}
-            remaining = [one for one in remaining if id(one) not in members]
-            others = [one for one in self._contacts if id(one) not in members]
-            self._fit_group(y - self._model.response(others), group, steps)
-
-    def _fit_group(
-        self,
-        y: Array,
-        contacts: list[HertzContact],
-        steps: int,
-    ) -> None:
-        """Fit contacts jointly and store the results in the contacts and in `_results`.
-
-        For the fit, the skin is laid flat in the x-y plane of the cube nearest to the first contact
-        (flattened skin), because the response of the elastic layer holds for a plane.
-
-        Args:
-            y: Values (cubes, C) in Pa minus the response to all contacts that are not fitted here.
-            contacts: Contacts to fit, which are changed.
-            steps: Number of Gauss-Newton steps, as in `fit_contacts`.
-        """
-        inverse = self._inverse
-        home = contacts[0].home
-        near = [self._model.nearest_cubes(contact, CUBES_PER_CONTACT) for contact in contacts]
-        cubes = np.unique(np.concatenate(near))
-        place, angle = inverse.unroll(home, cubes)
-        prior = self._prior(cubes, place, angle)
-        observations = Observations(inverse, y[cubes], prior, cubes, place, angle)
-        if observations.size < _MIN_VALUES_PER_CONTACT * len(contacts):
-            for contact in contacts:
-                # Too few values are known for a fit. `prune_contacts` removes contacts without
-                # force.
-                contact.force = np.zeros(3)
-            return
-
-        # Centres of the contacts on the skin laid flat around the home cube of the first contact.
-        homes = np.array([contact.home for contact in contacts])
-        origins, angles = inverse.unroll(home, homes)
-        rotations = _plane_rotations(angles)
-        places = np.array([contact.place for contact in contacts])
-        centres = origins + np.einsum("jab,jb->ja", rotations, places)
-        sizes = np.array([contact.size for contact in contacts])
-        scale = max(contact.residual_scale for contact in contacts)
-        fit = fit_contacts(observations, centres, sizes, scale, steps)
-        for j, contact in enumerate(contacts):
-            fit = self._refit_from_other_starts(
-                observations,
-                fit,
-                contact,
-                j,
-                origins[j],
-                rotations[j],
-            )
-        fit = self._split_contacts(observations, fit, contacts)
-
-        for j, contact in enumerate(contacts):
-            self._store_fit(contact, fit, j, cubes, place, angle)
-            estimate = estimate_contact(observations, fit, j)
-            # `place_ambiguity` is the sum of the variances along x and y; each gets half of it.
-            estimate = estimate._replace(
-                place_variance=estimate.place_variance + contact.place_ambiguity / 2,
-                force_variance=estimate.force_variance + contact.force_ambiguity,
-            )
-            result = self._to_parent_frame(contact.id, estimate, cubes, place, angle)
-            self._results[contact.id] = result
-
-    def _refit_from_other_starts(
-        self,
-        observations: Observations,
-        fit: ContactFit,
-        contact: HertzContact,
-        j: int,
-        origin: Array,
-        rotation: Array,
-    ) -> ContactFit:
-        """Restart the fit of one contact from other positions and radii, keep the most likely fit.
-
-        Gauss-Newton can end in a local optimum: a wide contact looks like a narrow one with a large
-        residual, and beside a cube that does not observe all components, mirrored positions have
-        almost the same response. So a fit with a large residual is restarted with a wide radius,
-        and a contact that is new or was ambiguous is restarted at the mirrored positions. If cubes
-        are far apart, the largest pressure may be found above the wrong cube. Therefore, a new
-        contact with a large residual is restarted around other cubes, too.
-
-        Args:
-            observations: Known values of the cubes, their noise and prior covariance.
-            fit: Fit from the usual start.
-            contact: Contact to fit again; its `place_ambiguity` and `force_ambiguity` (variances
-                over the fits from all starts) are changed.
-            j: Index of this contact in `fit`.
-            origin: Position (2,) in m of the contact's home (nearest cube) on the flattened skin.
-            rotation: Rotation (2, 2) from the frame of the home to the flattened skin.
+            found: Indices of the points of all regions.
+            number: Index of the region in this list.
+            distances: Distances (n,) of all regions from this one, in m.
 
         Returns:
-            The most likely of all these fits, which has the smallest `ContactFit.score`.
+            Indices of the other regions near this one, and their points that take part in the fit,
+            at most `MAX_NEIGHBOUR_NODES`.
         """
-        fits = [fit]
+        reach = NEIGHBOUR_REACH_PITCHES * self._inverse.pitch
+        near = [k for k in np.flatnonzero(distances < reach).tolist() if k != number]
+        # If there are too many points, only every second, third, ... of a region takes part.
+        count = sum(len(found[k]) for k in near)
+        step = -(-count // MAX_NEIGHBOUR_NODES) or 1
+        return near, np.concatenate([np.zeros(0, np.intp), *(found[k][::step] for k in near)])
 
-        def start_at(centre: Array, size: float) -> None:
-            centres = fit.centres.copy()
-            sizes = fit.sizes.copy()
-            centres[j] = centre
-            sizes[j] = size
-            fits.append(fit_contacts(observations, centres, sizes, START_SCALE, STEPS_NEW))
+    def _without_others(self, region: _Region, regions: list[_Region]) -> Array:
+        """Return the values (cubes, C) minus the response to regions that do not take part in a
+        fit."""
+        rest = self._scaled
+        for number, other in enumerate(regions):
+            if other is not region and number not in region.near:
+                rest = rest - other.response
+        return rest
 
-        # A fit from another start takes long. It is not repeated in every scan for a contact whose
-        # residual was large before, unless its position is ambiguous.
-        limit = LARGE_RESIDUAL * AMPLITUDE
-        depth = self._inverse.depth
-        was_ambiguous = contact.place_ambiguity > 0
-        if fit.residual_scale > limit and (was_ambiguous or contact.residual_scale <= limit):
-            start_at(fit.centres[j], WIDE_SIZE * depth)
+    def _update_fits(self, regions: list[_Region]) -> None:
+        """Compute all fits for the newest values, minus the response to the other regions."""
+        for region in regions:
+            if region.fit is not None:
+                region.fit.update(self._without_others(region, regions))
+                self._update_response(region, regions)
 
-        if was_ambiguous and not observations.sees_all:
-            # Starts at the mirror images of the position about the axes of the contact's cube, and,
-            # for a new contact with a large residual, of other cubes.
-            best = min(fits, key=lambda one: one.score)
-            offset = np.abs(rotation.T @ (best.centres[j] - origin))
-            offset = np.maximum(offset, self._inverse.pitch / 4)
-            homes = [origin]
-            if best.residual_scale > limit and np.isinf(contact.place_ambiguity):
-                distance = np.linalg.norm(observations.place - best.centres[j], axis=1)
-                homes = list(observations.place[np.argsort(distance)[:RESTART_CUBES]])
-            for home in homes:
-                for corner in _CORNERS:
-                    start_at(home + rotation @ (corner * offset), USUAL_SIZE * depth)
-
-        # Variance of position and force over all fits, weighted with their evidence.
-        best = min(fits, key=lambda one: one.score)
-        # The score is -2 ln of the evidence, so this is the evidence relative to the best fit.
-        weight = np.exp([(best.score - one.score) / 2 for one in fits])
-        weight /= weight.sum()
-        shifts = [one.centres[j] - best.centres[j] for one in fits]
-        place_squares = [(shift**2).sum() for shift in shifts]
-        force_changes = [one.forces[j] - best.forces[j] for one in fits]
-        force_squares = [change**2 for change in force_changes]
-        contact.force_ambiguity = weight @ force_squares
-        ambiguity = float(weight @ place_squares)
-        tolerance = POSITION_TOLERANCE_PITCHES * self._inverse.pitch
-        contact.place_ambiguity = ambiguity if ambiguity > tolerance**2 else 0.0
-        return best
-
-    def _split_contacts(
-        self,
-        observations: Observations,
-        fit: ContactFit,
-        contacts: list[HertzContact],
-    ) -> ContactFit:
-        """Test contacts with a large residual and split those that are really two contacts.
-
-        A test takes long. So a contact is tested again only when its residual has become twice as
-        large as at the last test.
+    def _improve_fits(self, regions: list[_Region], pressure: Array, max_work: float) -> None:
+        """Improve the fits of regions, the most urgent first, until the budget is spent.
 
         Args:
-            observations: Known values of the cubes, their noise and prior covariance.
-            fit: Joint fit of the contacts.
-            contacts: Contacts of the fit, in its order. The second contact of each split is
-                appended to this list and to the tracker's contacts.
+            regions: Regions, whose fits are changed.
+            pressure: Pressure (M,) in Pa at the depth of the cubes.
+            max_work: Work after which no further fit is improved.
+        """
+        spent = 0
+        for _ in range(MAX_PIECES_OF_WORK * len(regions)):
+            # Among equally urgent regions, the one that has waited longest comes first.
+            order = [(self._next_work(one), -one.fit.waited if one.fit else 0) for one in regions]
+            region = regions[min(range(len(regions)), key=order.__getitem__)]
+            work = min(order)[0]
+            if spent >= max_work or work == Work.NONE:
+                break
+            if region.fit is None or work == Work.FIT:
+                region.fit = self._fit_region(region, regions, pressure)
+                region.is_tried = True
+                spent += 0 if region.fit is None else len(region.fit.nodes.places)
+            else:
+                spent += region.fit.improve()
+            self._update_response(region, regions)
+
+    def _update_response(self, region: _Region, regions: list[_Region]) -> None:
+        """Compute the response to a fit, if there are other regions, which need it."""
+        if region.fit is not None and len(regions) > 1:
+            region.response = region.fit.respond()
+
+    def _next_work(self, region: _Region) -> Work:
+        """Return what is to be done next for a region."""
+        fit = region.fit
+        if fit is None:
+            return Work.NONE if region.is_tried else Work.FIT
+        changes = (
+            abs(region.peak / fit.peak - 1),
+            _difference(region.points, fit.points),
+            _difference(region.others, fit.others),
+        )
+        limit = MAX_CHANGE if fit.hertz is None else MAX_CHANGE_HERTZ
+        if max(changes) > limit:
+            return Work.FIT
+        if fit.is_moving:
+            return Work.MOVE
+        if fit.misfit_growth > MAX_MISFIT_GROWTH:
+            return Work.FIT
+        return Work.NONE if fit.is_final else Work.SHARPEN
+
+    def _fit_region(
+        self, region: _Region, regions: list[_Region], pressure: Array
+    ) -> RegionFit | None:
+        """Fit the traction in one region.
+
+        Args:
+            region: The region.
+            regions: All regions.
+            pressure: Pressure (M,) in Pa at the depth of the cubes.
 
         Returns:
-            Fit of all contacts in the list; `fit` itself if no contact was split.
+            The fit; None if the region is too wide, or if no value around it is known.
         """
-        limit = LARGE_RESIDUAL * AMPLITUDE
-        for j, contact in enumerate(list(contacts)):
-            if fit.residual_scale <= limit:
-                contact.split_tested_at = 0.0
-                continue
-            has_doubled = fit.residual_scale > 2 * contact.split_tested_at
-            if not has_doubled or len(self._contacts) >= MAX_CONTACTS:
-                continue
+        inverse = self._inverse
+        points = inverse.points[region.points]
+        weights = pressure[region.points]
+        distance = np.linalg.norm(points - weights @ points / weights.sum(), axis=1)
+        home = int(inverse.cube[region.points[np.argmin(distance)]])
+        normals = inverse.poses.rotation[:, :, 2]
+        for reach in CUBE_REACH_PITCHES:
+            found = self._above_cubes.query_ball_point(points, reach * inverse.pitch)
+            cubes = np.unique(np.concatenate(found).astype(np.intp))
+            cubes = cubes[normals[cubes] @ normals[home] > MIN_FACING]
+            # The coarse nodes of other regions do not explain the values of the cubes below them.
+            above = self._above_cubes.data[cubes]
+            if len(region.others):
+                to_others = cdist(above, inverse.points[region.others]).min(axis=1)
+                cubes = cubes[cdist(above, points).min(axis=1) < to_others]
+            if len(cubes) <= MAX_CUBES:
+                break
+        else:
+            return None
+        if not np.isfinite(self._scaled[cubes]).any():
+            return None
+        values = LocalValues(inverse, home, cubes, self._scaled)
+        rest = self._without_others(region, regions)
+        return RegionFit(inverse, region.points, region.others, region.peak, values, rest)
 
-            contact.split_tested_at = fit.residual_scale
-            two = split_contact(observations, fit, j, START_SCALE, limit)
-            if two is not None:
-                fit = two
-                contact.was_split = True
-                twin = replace(contact, id=self._take_id())
-                contacts.append(twin)
-                self._contacts.append(twin)
-        return fit
-
-    def _store_fit(
-        self,
-        contact: HertzContact,
-        fit: ContactFit,
-        j: int,
-        cubes: Index,
-        place: Array,
-        angle: Array,
-    ) -> None:
-        """Store the result of a fit in a contact, in the frame of the cube that is now nearest.
+    def _integrate_field(
+        self, regions: list[_Region], coarse: list[int], field: TractionField
+    ) -> list[TrackedContact]:
+        """Estimate contacts by integrals of the field over their regions.
 
         Args:
-            contact: Contact to change.
-            fit: Result of the fit.
-            j: Index of the contact in the fit.
-            cubes: Indices (n,) of the cubes whose values were fitted.
-            place: Positions (n, 2) of these cubes in m on the flattened skin, the plane in which
-                the skin is laid out for the fit.
-            angle: Rotations (n,) of these cubes about z (normal of the skin), in rad.
+            regions: All regions.
+            coarse: Numbers of the regions whose contacts are to be estimated.
+            field: Traction on the surface.
         """
-        nearest, to_home = _nearest_home(fit.centres[j], place, angle)
-        in_plane = to_home[:2, :2]
-        contact.home = int(cubes[nearest])
-        contact.place = in_plane @ (fit.centres[j] - place[nearest])
-        contact.size = float(fit.sizes[j])
-        contact.force = to_home @ fit.forces[j]
-        contact.residual_scale = fit.residual_scale
+        inverse = self._inverse
+        # The field of a narrow contact spreads beyond its region. Each point within a pitch belongs
+        # to the nearest region.
+        tree = cKDTree(inverse.points[np.concatenate([one.points for one in regions])])
+        numbers = np.repeat(np.arange(len(regions)), [len(one.points) for one in regions])
+        distance, nearest = tree.query(inverse.points)
+        owner = np.where(distance < inverse.pitch, numbers[nearest], -1)
+        force = inverse.area * field.traction
+        return [
+            self._sum_points(np.flatnonzero(owner == number), force, len(regions[number].points))
+            for number in coarse
+        ]
 
-        # The coefficients of the two elongation shapes (x, diagonal) rotate by twice the angle,
-        # because an ellipse looks the same after a rotation by 180°.
-        double = (to_home @ to_home)[:2, :2]
-        rotation = block_diag(to_home, in_plane, 1.0, double, 1.0)
-        place_ambiguities = [contact.place_ambiguity / 2] * 2
-        ambiguities = np.diag(
-            [
-                *contact.force_ambiguity,
-                *place_ambiguities,
-                *np.zeros(4),
-            ]
+    def _sum_points(self, own: Index, force: Array, count: int) -> TrackedContact:
+        """Return the contact that consists of some points of the surface.
+
+        Args:
+            own: Indices (n,) of the points.
+            force: Force (M, 3) in N on the square of each point, in the frame of its cube.
+            count: Number of points with significant pressure.
+        """
+        inverse = self._inverse
+        rotation = inverse.poses.rotation[inverse.cube[own]]
+        pressing = -force[own, 2]
+        normal_force = float(pressing.sum())
+        divisor = max(normal_force, 1e-12)
+        normal = pressing @ rotation[:, :, 2] / divisor
+        normal /= max(np.linalg.norm(normal), 1e-12)
+        shear = np.einsum("nij,nj->i", rotation[:, :, :2], force[own, :2])
+        area = count * inverse.area
+        deviation = COARSE_DEVIATION * abs(normal_force)
+        return TrackedContact(
+            id=-1,
+            position=pressing @ inverse.points[own] / divisor,
+            normal=normal,
+            force=shear - normal * normal_force,
+            normal_force=normal_force,
+            shear_force=float(np.linalg.norm(shear)),
+            moment=0.0,
+            area=area,
+            position_uncertainty=COARSE_DEVIATION * inverse.pitch,
+            force_uncertainty=deviation,
+            shear_uncertainty=deviation,
+            moment_uncertainty=deviation * float(np.sqrt(area)),
+            area_uncertainty=area,
         )
-        contact.covariance = rotation @ (fit.covariance(j) + ambiguities) @ rotation.T
 
-    def _to_parent_frame(
-        self,
-        number: int,
-        estimate: ContactEstimate,
-        cubes: Index,
-        place: Array,
-        angle: Array,
-    ) -> TrackedContact:
+    def _to_parent_frame(self, estimate: ContactEstimate, fit: RegionFit) -> TrackedContact:
         """Convert an estimate from the flattened skin to the skin's parent frame.
 
-        The flattened skin is the plane in which the skin was laid out for the fit.
-
         Args:
-            number: Number (id) of the contact.
             estimate: Force and position of the contact, with variances, on the flattened skin.
-            cubes: Indices (n,) of the cubes whose values were fitted.
-            place: Positions (n, 2) of these cubes on the flattened skin, in m.
-            angle: Rotations (n,) of these cubes about z, in rad.
+            fit: Fit of the region of the contact.
         """
         inverse = self._inverse
-        nearest, to_home = _nearest_home(estimate.place, place, angle)
-        home = int(cubes[nearest])
-        rotation = inverse.poses.rotation[home]
-        local = to_home[:2, :2] @ (estimate.place - place[nearest])
-        offset = np.array([*local, inverse.depth])
-        position = inverse.poses.position[home] + rotation @ offset
-        force = to_home @ estimate.force
-        shear = float(np.hypot(force[0], force[1]))
+        around = fit.values
+        nearest = int(np.argmin(np.linalg.norm(around.place - estimate.place, axis=1)))
+        cosine = np.cos(around.angle[nearest])
+        sine = np.sin(around.angle[nearest])
+        to_cube = np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1.0]])
+        cube = around.cubes[nearest]
+        rotation = inverse.poses.rotation[cube]
+        local = to_cube[:2, :2] @ (estimate.place - around.place[nearest])
+        position = inverse.poses.position[cube] + rotation @ np.array([*local, inverse.depth])
+
+        shear = float(np.linalg.norm(estimate.force[:2]))
         # The variance of the length of the shear force is the variance along its direction.
         direction = estimate.force[:2] / max(shear, 1e-300)
-        shear_variance = direction**2 @ estimate.force_variance[:2]
+        shear_variance = direction @ estimate.force_covariance[:2, :2] @ direction
         return TrackedContact(
-            id=number,
+            id=-1,
             position=position,
             normal=rotation[:, 2].copy(),
-            force=rotation @ force,
-            normal_force=float(-force[2]),
+            force=rotation @ to_cube @ estimate.force,
+            normal_force=float(-estimate.force[2]),
             shear_force=shear,
             moment=estimate.moment,
             area=estimate.area,
             position_uncertainty=float(np.sqrt(estimate.place_variance.mean())),
-            force_uncertainty=float(np.sqrt(estimate.force_variance[2])),
+            force_uncertainty=float(np.sqrt(estimate.force_covariance[2, 2])),
             shear_uncertainty=float(np.sqrt(shear_variance)),
             moment_uncertainty=float(np.sqrt(estimate.moment_variance)),
-            area_uncertainty=estimate.area_uncertainty,
+            area_uncertainty=float(np.sqrt(estimate.area_variance)),
         )
 
-    def _prior(
-        self,
-        cubes: Index,
-        place: Array,
-        angle: Array,
-    ) -> Array:
-        """Return the prior covariance of the values of some cubes, from memory if possible.
-
-        The flattened skin is the plane in which the skin is laid out for a fit.
-
-        Args:
-            cubes: Indices (n,) of the cubes.
-            place: Positions (n, 2) of the cubes on the flattened skin, in m.
-            angle: Rotations (n,) of the cubes about z, in rad.
+    def _number_contacts(self, contacts: list[TrackedContact]) -> list[TrackedContact]:
+        """Give each contact the id of the nearest contact of the previous scan, or a new one.
 
         Returns:
-            Covariance (n C, n C) for a surface pressure of variance 1 Pa^2.
+            The contacts with their ids, the one with the largest normal force first.
         """
-        inverse = self._inverse
-        # The last covariances are kept, because computing one takes longer than a fit and a contact
-        # rarely moves to other cubes.
-        variant = inverse.variant[cubes]
-        key = (*cubes.tolist(), *variant.tolist())
-        if key not in self._priors:
-            if len(self._priors) >= 2 * MAX_CONTACTS:
-                oldest = next(iter(self._priors))
-                self._priors.pop(oldest)
-            covariance = covariance_matrix(inverse.kernels, inverse.columns, place, angle, variant)
-            self._priors[key] = make_positive_definite(covariance)
-        return self._priors[key]
+        positions = np.array([one.position for one in contacts]).reshape(-1, 3)
+        distance = cdist(positions, self._known)
+        ids = [-1] * len(contacts)
+        for flat in np.argsort(distance, axis=None).tolist():
+            row, column = np.unravel_index(flat, distance.shape)
+            if distance[row, column] > MATCH_PITCHES * self._inverse.pitch:
+                break
+            if ids[row] < 0 and self._ids[column] not in ids:
+                ids[row] = self._ids[column]
+        for row, number in enumerate(ids):
+            if number < 0:
+                ids[row] = self._next_id
+                self._next_id += 1
+        self._known, self._ids = positions, ids
+        numbered = [one._replace(id=k) for one, k in zip(contacts, ids, strict=True)]
+        return sorted(numbered, key=lambda contact: -contact.normal_force)
 
 
-def _plane_rotations(angle: Array) -> Array:
-    """Return the matrices (J, 2, 2) of rotations in the plane by J angles (J,) in rad."""
-    cosine = np.cos(angle)
-    sine = np.sin(angle)
-    first_row = np.stack([cosine, -sine], axis=-1)
-    second_row = np.stack([sine, cosine], axis=-1)
-    return np.stack([first_row, second_row], axis=-2)
+def _is_certain(estimate: ContactEstimate) -> bool:
+    """Return whether an estimate is more exact than the integral of the field."""
+    variance = estimate.force_covariance[2, 2]
+    return bool(variance < (COARSE_DEVIATION * estimate.force[2]) ** 2)
 
 
-def _nearest_home(
-    centre: Array,
-    place: Array,
-    angle: Array,
-) -> tuple[int, Array]:
-    """Find the cube nearest to a position on the flattened skin (laid out in a plane for a fit).
-
-    Args:
-        centre: Position (2,) on the flattened skin, in m.
-        place: Positions (n, 2) of the cubes on the flattened skin, in m.
-        angle: Rotations (n,) of the cubes about z, in rad.
-
-    Returns:
-        Index of the cube in `place`, and the rotation (3, 3) from the axes of the flattened skin to
-        the frame of this cube.
-    """
-    distance = np.linalg.norm(place - centre, axis=1)
-    nearest = int(np.argmin(distance))
-    c = np.cos(angle[nearest])
-    s = np.sin(angle[nearest])
-    return nearest, np.array(
-        [
-            [c, s, 0],
-            [-s, c, 0],
-            [0, 0, 1.0],
-        ]
-    )
+def _difference(first: Index, second: Index) -> float:
+    """Return the number of elements that only one of two sets has, divided by that of both."""
+    one = set(first.tolist())
+    other = set(second.tolist())
+    return len(one ^ other) / max(len(one | other), 1)

@@ -1,0 +1,87 @@
+"""Traction on the whole skin: that of the fitted regions, and of the residual field around them."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ...core.arrays import Array, Index
+from ...mechanics.contact import hertz
+from ...mechanics.layer import FIELD
+from ..inverse import SurfaceInverse, TractionField
+from .local_values import unroll_points
+from .region_fit import RegionFit
+
+_NODE_RINGS = 4
+"""Number of rings of point forces by which the pressure of a node is distributed over the
+points."""
+
+
+def add_fits(
+    inverse: SurfaceInverse, residual: TractionField, fits: list[RegionFit]
+) -> TractionField:
+    """Add the traction of fits to the residual field, which the fits do not explain.
+
+    The traction of a fit is averaged over the square that each point represents, so that the sum
+    over all points times the area of a square is the force.
+    """
+    traction = residual.traction.copy()
+    pressure = residual.depth_pressure.copy()
+    for fit in fits:
+        forces = fit.nodes.posterior.forces
+        points, share, below, rotation = _distribute(inverse, fit)
+        local = np.einsum("mab,bm->ma", rotation, forces @ share.T)
+        traction[points] += local / inverse.area
+        pressure[points] += below @ forces.ravel()
+    return TractionField(traction, pressure)
+
+
+def fit_variances(inverse: SurfaceInverse, fits: list[RegionFit]) -> Array:
+    """Compute the variances of the pressure of some fits.
+
+    Returns:
+        Variances (M, 2) in Pa^2 at the points of the surface: of the pressure on the surface, and
+        of the pressure at the depth of the cubes' centres.
+    """
+    total = np.zeros((len(inverse.points), 2))
+    for fit in fits:
+        root = fit.nodes.posterior.root
+        points, share, below, _ = _distribute(inverse, fit)
+        on_surface = share @ root[2] / inverse.area
+        at_depth = below @ root.reshape(-1, root.shape[2])
+        total[points, 0] += (on_surface**2).sum(axis=1)
+        total[points, 1] += (at_depth**2).sum(axis=1)
+    return total
+
+
+def _distribute(inverse: SurfaceInverse, fit: RegionFit) -> tuple[Index, Array, Array, Array]:
+    """Return the effect of the nodes of a fit at the m points of the surface around it.
+
+    Returns:
+        Indices (m,) of the points; shares (m, q) of the force of each node that act on the square
+        of each point; pressure (m, 3 q) in Pa/N at the cubes' depth, for forces along x of all
+        nodes, then y, then z; and rotations (m, 3, 3) from the home cube to the cube of each point.
+    """
+    points = np.flatnonzero(np.isin(inverse.cube, fit.values.cubes))
+    place = unroll_points(inverse, fit.home, points)
+    offsets, weights = hertz(fit.nodes.size, (0, 0, 1), order=_NODE_RINGS)
+    samples = (fit.nodes.places[:, None] + offsets[:, :2]).reshape(-1, 2)
+    # Forces beyond the border of the skin act on no point.
+    distance, nearest = cKDTree(place).query(samples, distance_upper_bound=inverse.spacing)
+    share = np.zeros((len(points), len(fit.nodes.places)))
+    node = np.repeat(np.arange(len(fit.nodes.places)), len(offsets))
+    weight = np.tile(weights[:, 2], len(fit.nodes.places))
+    on_skin = np.isfinite(distance)
+    np.add.at(share, (nearest[on_skin], node[on_skin]), weight[on_skin])
+
+    from_nodes = (place[:, None] - fit.nodes.places).reshape(-1, 2)
+    below = -inverse.kernels.field(from_nodes, fit.nodes.size)[:, FIELD.index("zz")]
+    below = below.reshape(len(points), -1, 3).swapaxes(1, 2).reshape(len(points), -1)
+
+    _, angle = inverse.unroll(fit.home, inverse.cube[points])
+    rotation = np.zeros((len(points), 3, 3))
+    rotation[:, 0, 0] = rotation[:, 1, 1] = np.cos(angle)
+    rotation[:, 0, 1] = np.sin(angle)
+    rotation[:, 1, 0] = -rotation[:, 0, 1]
+    rotation[:, 2, 2] = 1.0
+    return points, share, below, rotation

@@ -1,0 +1,244 @@
+"""Fit of Hertz contacts, which replaces the traction on the nodes of a region where it is likelier.
+
+A ball presses as a Hertz contact: force, centre and radius describe it with a few numbers, which
+the values of the cubes determine better than the forces of many nodes, above all where the cubes
+are far apart. The contacts start at force, place and area of the fit on nodes (node_fit.py), and
+Gauss-Newton steps find the parameters x with the greatest posterior. With the derivatives J of the
+whitened values by the parameters, the whitened residual r, and the prior precision P about x0::
+
+    (J' J + P) change = J' r - P (x - x0),    covariance t (J' J + P)^-1
+
+A shape is a deviation of a contact from a circular Hertz contact. The shapes move pressure within a
+contact without changing its force and position: two make the contact longer along x or along a
+diagonal, the third one (flatness) moves pressure between centre and rim.
+
+Source: K. L. Johnson, Contact Mechanics (1985), 4.2 (Hertz); D. J. C. MacKay, Bayesian
+interpolation, Neural Computation 4 (1992) 415 (evidence).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...core.arrays import Array
+from ...mechanics.kernels import DISC_SIZES
+from .contact_estimate import ContactEstimate
+from .node_fit import NodeFit
+
+SIZE_DEVIATION = 1.0
+"""Prior standard deviation of the natural logarithm of the radius of a contact, whose prior mean is
+`USUAL_SIZE`."""
+
+USUAL_SIZE = 0.8
+"""Prior mean (of the logarithm) of the radius of a contact, divided by the depth of the cubes'
+centres below the surface."""
+
+MAX_START_SIZE = 2.0
+"""Largest radius at the start of a fit, divided by the depth of the cubes' centres. From a radius
+that is much too large, Gauss-Newton steps do not find their way to a small one."""
+
+FORCE_DEVIATION = 1e2
+"""Prior standard deviation of each component of the force of a contact, in N; the prior mean is 0.
+The value is so large that the prior does not influence the fitted force."""
+
+SHAPE_DEVIATIONS = np.array([0.7, 0.7, 1.0])
+"""Prior standard deviations of the coefficients of the three shapes (deviations from a circular
+Hertz contact): elongation along x, elongation along a diagonal, flatness. For comparison, two balls
+side by side have an elongation of 1.1, a rigid flat punch has a flatness of 1."""
+
+SHAPE_SHIFT = 0.5
+"""Shift, divided by the contact's radius, of the contacts from which an elongation shape is made:
+contacts shifted along an axis minus contacts shifted across it."""
+
+SHAPE_WIDENING = 0.2
+"""Change of the natural logarithm of the radius that gives the narrower and the wider contact of
+the flatness shape. This shape is a contact minus a mixture of a narrower and a wider one."""
+
+SETTLED_STEP = 0.02
+"""Size of a Gauss-Newton step below which a fit has converged. The size is the larger one of two
+numbers: the shift of a contact divided by the depth of the cubes' centres, and the change of the
+natural logarithm of its radius."""
+
+_MAX_STEP = 0.5
+"""Largest Gauss-Newton step: shift of a contact divided by the depth of the cubes' centres, and
+change of the natural logarithm of its radius."""
+
+_DIFFERENCE_STEP = 1 / 50
+"""Step of the numerical derivatives with respect to the centre of a contact, divided by the depth
+of the cubes' centres below the surface."""
+
+_N_PARAMETERS = 9
+"""Number of parameters of a contact: force f_x, f_y, f_z, centre c_x, c_y, logarithm ln a of the
+radius, and the coefficients of three shapes, divided by `SHAPE_DEVIATIONS`."""
+
+_STENCIL = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], float)
+"""Shifts (5, 2) of a contact for numerical derivatives by its centre, in units of the step: none,
+then both directions along x and along y."""
+
+_DIAGONALS = np.array([[1, 1], [-1, -1], [1, -1], [-1, 1]]) / np.sqrt(2)
+"""Unit vectors (4, 2): both directions along one diagonal of the x-y plane, then along the other
+one."""
+
+_SHAPE_STENCIL = np.concatenate([_STENCIL[1:], _DIAGONALS])
+"""Unit vectors (8, 2) along which contacts are shifted to make the two elongation shapes: both
+directions along x, y and the two diagonals."""
+
+
+class HertzFit:
+    """Hertz contacts in place of the nodes of a region, one for each contact of the region.
+
+    Attributes:
+        centres: Centres (J, 2) of the contacts in m, on the skin laid flat.
+        log_sizes: Logarithms (J,) of the radii in m.
+        forces: Forces (J, 3) in N.
+        score: -2 ln of the evidence (Laplace approximation), comparable with that of the region.
+        last_step: Size of the last step: shift divided by the depth of the cubes' centres, or
+            change of the logarithm of the radius.
+    """
+
+    def __init__(self, region: NodeFit, starts: list[ContactEstimate], depth: float) -> None:
+        """Start at the contacts that the fit on nodes found.
+
+        Args:
+            region: Fit on nodes.
+            starts: Its contacts.
+            depth: Distance from the centres of the cubes to the surface, in m.
+        """
+        self._region = region
+        self._depth = depth
+        self.centres = np.array([one.place for one in starts])
+        sizes = np.minimum(np.sqrt([one.area / np.pi for one in starts]), MAX_START_SIZE * depth)
+        # `Kernels` interpolates responses between the second and the third last radius of its
+        # table.
+        self._log_range = np.log(DISC_SIZES[[1, -3]] * depth)
+        self.log_sizes = np.clip(np.log(sizes), *self._log_range)
+        self.forces = np.array([one.force for one in starts])
+        precision = np.array([FORCE_DEVIATION**-2] * 3 + [depth**-2] * 2 + [SIZE_DEVIATION**-2])
+        own = np.tile([*precision, 1.0, 1.0, 1.0], len(starts))
+        self._others = region.response_to_others()
+        self._precision = np.concatenate([own, np.ones(self._others.shape[1])])
+        self.score = np.inf
+        self.last_step = np.inf
+        self._linearise()
+
+    def fit(self, white: Array, steps: int) -> None:
+        """Make Gauss-Newton steps until they are small.
+
+        Args:
+            white: Whitened values (n C,) as from `LocalValues.whiten`.
+            steps: Largest number of steps.
+        """
+        self.step(white)
+        for _ in range(steps):
+            if self.last_step < SETTLED_STEP:
+                break
+            self.follow(white)
+
+    def follow(self, white: Array) -> None:
+        """Linearise at the parameters that the last step has found, and make another step.
+
+        Args:
+            white: Whitened values (n C,).
+        """
+        self.forces, self.centres = self.found_forces, self.found_centres
+        self.log_sizes = self.found_sizes
+        self._linearise()
+        self.step(white)
+
+    def _linearise(self) -> None:
+        """Compute the derivatives of the whitened values at the present parameters."""
+        columns = []
+        model = 0.0
+        for centre, log_size, force in zip(self.centres, self.log_sizes, self.forces, strict=True):
+            derivatives = self._derivatives(centre, np.exp(log_size), force)
+            model = model + derivatives[:, :3] @ force
+            columns.append(derivatives)
+        self._jacobian = np.concatenate([*columns, self._others], axis=1)
+        self._model = model
+        matrix = self._jacobian.T @ self._jacobian + np.diag(self._precision)
+        self._inverse = np.linalg.inv(matrix)
+        scaled = matrix / np.sqrt(np.outer(self._precision, self._precision))
+        self._log_determinant = float(np.linalg.slogdet(scaled)[1])
+
+    def step(self, white: Array) -> None:
+        """Change the parameters by one Gauss-Newton step, and compute the evidence.
+
+        Args:
+            white: Whitened values (n C,) as from `LocalValues.whiten`.
+        """
+        count = len(self.centres)
+        residual = white - self._model
+        deviation = np.zeros(len(self._precision))
+        usual = np.log(USUAL_SIZE * self._depth)
+        deviation[5 : _N_PARAMETERS * count : _N_PARAMETERS] = self.log_sizes - usual
+        right = self._jacobian.T @ residual - self._precision * deviation
+        change = self._inverse @ right
+        penalty = deviation @ (self._precision * deviation)
+        chi_squared = float(residual @ residual + penalty - right @ change)
+        known = self._region.values.count
+        self.misfit = max(chi_squared / known, 1.0)
+        self.score = chi_squared / self.misfit + known * np.log(self.misfit)
+        self.score += self._log_determinant
+
+        own = change[: _N_PARAMETERS * count].reshape(count, _N_PARAMETERS)
+        shift = np.clip(own[:, 3:5], -_MAX_STEP * self._depth, _MAX_STEP * self._depth)
+        growth = np.clip(own[:, 5], -_MAX_STEP, _MAX_STEP)
+        largest_shift = float(np.abs(shift).max()) / self._depth
+        self.last_step = max(largest_shift, float(np.abs(growth).max()))
+        self.found_forces = self.forces + own[:, :3]
+        self.found_centres = self.centres + shift
+        self.found_sizes = np.clip(self.log_sizes + growth, *self._log_range)
+
+    def estimate(self, j: int, nodes: ContactEstimate) -> ContactEstimate:
+        """Return the estimate of contact j, with the moment of the fit on nodes.
+
+        Args:
+            j: Index of the contact.
+            nodes: Estimate of the same contact by the fit on nodes.
+        """
+        first = _N_PARAMETERS * j
+        covariance = self.misfit * self._inverse[first : first + 6, first : first + 6]
+        area = float(np.pi * np.exp(2 * self.found_sizes[j]))
+        return nodes._replace(
+            force=self.found_forces[j],
+            force_covariance=covariance[:3, :3],
+            place=self.found_centres[j],
+            place_variance=np.diag(covariance)[3:5],
+            area=area,
+            area_variance=float((2 * area) ** 2 * covariance[5, 5]),
+        )
+
+    def _derivatives(self, centre: Array, size: float, force: Array) -> Array:
+        """Compute the derivatives of the whitened values by the parameters of one contact.
+
+        Returns:
+            Derivatives (n C, 9). The first three columns are the response to unit forces.
+        """
+        step = _DIFFERENCE_STEP * self._depth
+        offsets = np.concatenate([step * _STENCIL, SHAPE_SHIFT * size * _SHAPE_STENCIL])
+        moved = self._respond(centre + offsets, size)
+        narrower = self._respond(centre[None], size * np.exp(-SHAPE_WIDENING))[:, :, 0] @ force
+        wider = self._respond(centre[None], size * np.exp(SHAPE_WIDENING))[:, :, 0] @ force
+        response = moved[:, :, 0]
+        under_force = np.einsum("dak,a->kd", moved, force)
+
+        by_centre = (under_force[[1, 3]] - under_force[[2, 4]]) / (2 * step)
+        by_log_size = (wider - narrower) / (2 * SHAPE_WIDENING)
+        # Change of the response by an elongated contact: contacts shifted along an axis, minus
+        # contacts shifted across it.
+        axes = under_force[5:].reshape(4, 2, -1).sum(axis=1) / 4
+        # Change of the response by a flatter pressure: the contact minus a mixture of a narrower
+        # and a wider contact. The share of the wider one is chosen so that the second moment of the
+        # pressure about the centre stays the same.
+        shrink = np.exp(-2 * SHAPE_WIDENING)
+        grow = np.exp(2 * SHAPE_WIDENING)
+        share = (1 - shrink) / (grow - shrink)
+        flatness = under_force[0] - (share * wider + (1 - share) * narrower)
+        shapes = np.stack([axes[0] - axes[1], axes[2] - axes[3], flatness])
+        slopes = [by_centre, by_log_size[None], SHAPE_DEVIATIONS[:, None] * shapes]
+        return np.concatenate([response, *(one.T for one in slopes)], axis=1)
+
+    def _respond(self, centres: Array, size: float) -> Array:
+        """Return the whitened response (n C, 3, K) to forces of 1 N on K contacts."""
+        _, white = self._region.values.respond(centres, size)
+        return np.asarray(white.reshape(len(white), 3, -1))

@@ -1,0 +1,264 @@
+"""Posterior of the traction in one region of contact, from the values of the cubes around it.
+
+The traction is different from zero only in the region, which the field of the inverse problem shows
+(pressure_regions.py). This knowledge makes integrals over the region far more exact than those of
+the field, whose prior is the same everywhere. The traction is the sum of small Hertz contacts on a
+grid of nodes. With the forces f of the nodes (N), the whitened response B of the cubes to them, and
+the whitened values w, which have noise of variance 1, the posterior is that of a Gaussian process::
+
+    w = B f + e,    f ~ N(0, s^2 K),    e ~ N(0, t)
+    mean f = s^2 K B' W w,    covariance t (s^2 K - s^4 K B' W B K),    W = (1 + s^2 B K B')^-1
+
+K is the covariance of the nodes for a pressure of 1 Pa^2. The scale s is that with the greatest
+evidence; the misfit t, never below 1, is the factor by which the values deviate more than their
+noise explains, so that an imperfect model increases the stated deviations. An eigenvalue
+decomposition of K^1/2' B' B K^1/2 gives all of this for every s at once.
+
+Neighbouring contacts act on the same cubes. They take part with coarse nodes of their own.
+
+Source: C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learning (2006), 2.2 and
+5.4.1 (evidence).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.distance import cdist
+
+from ...core.arrays import Array, Index
+from ...mechanics.kernels import SHEAR_RATIO
+from ..inverse import SurfaceInverse
+from ..prior import AMPLITUDE
+from ..surface import square_points
+from .local_values import LocalValues, unroll_points
+from .pressure_regions import split_peaks
+
+NODE_STEP = 0.4
+"""Distance of neighbouring nodes (small contacts that make up the traction), divided by the depth
+of the cubes' centres. With 0.6, the traction of a narrow contact cannot be represented exactly
+enough, and forces are off by 0.5 % instead of 0.1 %."""
+
+MAX_NODES = 80
+"""Largest number of nodes (small contacts that make up the traction) of a fit, whose time grows
+with its third power. The nodes of larger regions lie farther apart."""
+
+BORDER_REACH_PITCHES = 1.5
+"""Distance from the region, divided by the pitch (distance of neighbouring cubes), up to which
+nodes are placed beyond the border of the skin, where no field is computed."""
+
+ENVELOPE_FLOOR = 0.03
+"""Smallest prior standard deviation of a node (small contact that makes up the traction), divided
+by that of the strongest node."""
+
+MIN_SCORE_GAIN = 1.0
+"""Smallest decrease of -2 ln(evidence) for which a narrower prior is used."""
+
+_NODE_RADIUS = 0.9
+"""Radius of the Hertz contact of a node, divided by the distance of neighbouring nodes."""
+
+_PEAK_WIDTH = 0.5
+"""Standard deviation of the Gaussian that smooths the pressure in which the peaks of a region are
+counted, divided by the depth of the cubes' centres."""
+
+_POINT_MARGIN = 0.75
+"""Distance from a point of the surface within which nodes belong to this point, divided by the
+distance of neighbouring points. Half of the diagonal of a point's square is 0.71."""
+
+_LENGTHS = np.array([0.2, 0.8, 3.0])
+"""Correlation lengths of the pressure in a contact, divided by the depth of the cubes' centres: for
+narrow, medium and wide contacts."""
+
+_SHARES = np.array([0.4, 0.4, 0.2])
+"""Shares of the variance of the pressure that have the correlation lengths `_LENGTHS`."""
+
+_SCALES = AMPLITUDE * np.geomspace(0.01, 100, 41)
+"""Standard deviations of the pressure, in Pa, of which the one with the greatest evidence is
+used."""
+
+_DEVIATIONS = np.array([SHEAR_RATIO, SHEAR_RATIO, 1.0])
+"""Prior standard deviations of the traction along x, y and z, divided by that of the pressure."""
+
+
+class Posterior(NamedTuple):
+    """Posterior of the forces of q nodes.
+
+    Attributes:
+        forces: Forces (3, q) of the nodes along x, y and z, in N.
+        root: Square root (3, q, n) of their covariance, in N.
+        score: -2 ln of the evidence, up to a constant.
+    """
+
+    forces: Array
+    root: Array
+    score: float
+
+
+class NodeFit:
+    """Traction in one region on a grid of nodes (small Hertz contacts).
+
+    Attributes:
+        places: Positions (q, 2) of the nodes in m, on the skin laid flat.
+        step: Distance of neighbouring nodes in m.
+        size: Radius of the Hertz contact of a node in m.
+        response: Values (n, C, 3 q) in Pa/N of the cubes around the region, for forces along x of
+            all nodes, then along y, then along z.
+        values: Values of these cubes.
+        posterior: Posterior of the forces for the newest values.
+        misfit: Factor t by which the values deviate more than their noise explains.
+        is_sharp: Whether a narrower prior has no greater evidence.
+        labels: Number (q,) of the contact to which each node belongs.
+    """
+
+    posterior: Posterior
+    misfit: float
+    labels: Index
+
+    def __init__(
+        self, inverse: SurfaceInverse, points: Index, others: Index, values: LocalValues
+    ) -> None:
+        """Compute the response of the cubes to the nodes.
+
+        Args:
+            inverse: Poses, points, noise and kernels of the skin.
+            points: Indices of the points of the surface that form the region.
+            others: Indices of the points of other regions near this one.
+            values: Values of the cubes around the region.
+        """
+        self.values = values
+        around = np.flatnonzero(np.isin(inverse.cube, values.cubes))
+        region = unroll_points(inverse, values.home, points)
+        self.places, self.step = _place_nodes(
+            region, unroll_points(inverse, values.home, around), inverse
+        )
+        self.size = _NODE_RADIUS * self.step
+        far = unroll_points(inverse, values.home, others)
+
+        # Prior covariance for a pressure of variance 1 Pa^2. Nodes of other contacts are
+        # independent.
+        q = len(self.places)
+        self._squares = cdist(self.places, self.places, "sqeuclidean")
+        exponents = self._squares / (2 * (_LENGTHS[:, None, None] * inverse.depth) ** 2)
+        self._covariance = np.zeros((q + len(far), q + len(far)))
+        self._covariance[:q, :q] = self.step**4 * np.tensordot(_SHARES, np.exp(-exponents), 1)
+        other = np.arange(q, q + len(far))
+        self._covariance[other, other] = inverse.area**2
+
+        self.response, white = values.respond(self.places, self.size)
+        self._white_response = white.reshape(len(white), 3, q)
+        if len(far):
+            _, white = values.respond(far, _NODE_RADIUS * inverse.spacing)
+            parts = [self._white_response, white.reshape(len(white), 3, -1)]
+            self._white_response = np.concatenate(parts, axis=2)
+        self._peak_width = _PEAK_WIDTH * inverse.depth
+        self.is_sharp = False
+        self._decomposition = self._decompose(np.ones(q))
+
+    def solve(self, white: Array) -> None:
+        """Compute the posterior for new values of the same cubes.
+
+        Args:
+            white: Values (n C,) divided by their noise, as from `LocalValues.whiten`.
+        """
+        design, eigenvalues, vectors, basis = self._decomposition
+        projected = vectors.T @ (design.T @ white)
+        ratio = _SCALES[:, None] ** 2
+        explained = (ratio * projected**2 / (1 + ratio * eigenvalues)).sum(axis=1)
+        chi_squared = np.maximum(white @ white - explained, 0)
+        count = self.values.count
+        misfit = np.maximum(chi_squared / count, 1.0)
+        scores = np.log1p(ratio * eigenvalues).sum(axis=1)
+        scores += chi_squared / misfit + count * np.log(misfit)
+
+        best = int(np.argmin(scores))
+        self._scale = float(_SCALES[best])
+        self.misfit = float(misfit[best])
+        gain = 1 / (eigenvalues + self._scale**-2)
+        q = len(self.places)
+        forces = (basis @ (gain * projected)).reshape(3, -1)[:, :q]
+        root = (basis * np.sqrt(gain * self.misfit)).reshape(3, -1, len(gain))[:, :q]
+        self.posterior = Posterior(forces, root, float(scores[best]))
+
+    def sharpen(self, white: Array) -> None:
+        """Fit again with a prior that is narrower where the posterior is small.
+
+        Args:
+            white: Values (n C,) divided by their noise.
+        """
+        before = self.posterior, self.misfit, self._scale, self._decomposition
+        square = self.posterior.forces[2] ** 2 + (self.posterior.root[2] ** 2).sum(axis=1)
+        smoothing = np.exp(-self._squares / (2 * self.step**2))
+        envelope = np.sqrt(smoothing @ square / smoothing.sum(axis=1))
+        self._decomposition = self._decompose(np.maximum(envelope / envelope.max(), ENVELOPE_FLOOR))
+        self.solve(white)
+        if self.posterior.score > before[0].score - MIN_SCORE_GAIN:
+            self.posterior, self.misfit, self._scale, self._decomposition = before
+            self.is_sharp = True
+        self.label_peaks()
+
+    def label_peaks(self) -> None:
+        """Assign the nodes to the peaks of the pressure, each of which is a contact."""
+        smoothing = np.exp(-self._squares / (2 * self._peak_width**2))
+        pressure = -smoothing @ self.posterior.forces[2]
+        root = smoothing @ self.posterior.root[2]
+        self.labels = split_peaks(pressure, root, self._squares < (1.5 * self.step) ** 2)
+
+    def response_to_others(self) -> Array:
+        """Return the response (n C, 3 m) to the nodes of other contacts, per prior deviation."""
+        q = len(self.places)
+        deviation = self._scale * np.sqrt(np.diag(self._covariance)[q:])
+        scaled = self._white_response[:, :, q:] * deviation * _DEVIATIONS[:, None]
+        return np.asarray(scaled.reshape(len(scaled), -1))
+
+    def _decompose(self, envelope: Array) -> tuple[Array, Array, Array, Array]:
+        """Compute the eigenvalues and eigenvectors from which every posterior follows.
+
+        Args:
+            envelope: Prior standard deviation (q,) of each node, relative to each other.
+
+        Returns:
+            With the unknowns in which the prior is the identity: whitened response (n C, 3 q),
+            eigenvalues (3 q,) and eigenvectors (3 q, 3 q) of its square, and the matrix (3 q, 3 q)
+            from the eigenvectors to the forces of the nodes.
+        """
+        full = np.ones(len(self._covariance))
+        full[: len(envelope)] = envelope
+        covariance = self._covariance * np.outer(full, full)
+        # This tiny increase of the diagonal makes up for rounding errors.
+        covariance[np.diag_indices(len(full))] *= 1 + 1e-8
+        root = np.linalg.cholesky(covariance)
+        white = self._white_response
+        parts = [white[:, axis] @ (root * _DEVIATIONS[axis]) for axis in range(3)]
+        design = np.concatenate(parts, axis=1)
+        eigenvalues, vectors = np.linalg.eigh(design.T @ design)
+        by_axis = vectors.reshape(3, len(full), -1)
+        basis = (root @ by_axis) * _DEVIATIONS[:, None, None]
+        return design, np.maximum(eigenvalues, 0), vectors, basis.reshape(3 * len(full), -1)
+
+
+def _place_nodes(region: Array, around: Array, inverse: SurfaceInverse) -> tuple[Array, float]:
+    """Place nodes (small contacts) on a region, and beyond the border of the skin next to it.
+
+    Args:
+        region: Positions (n, 2) of the points of the region in m, on the skin laid flat.
+        around: Positions (m, 2) of all points around the region.
+        inverse: Pitch and spacing of the points.
+
+    Returns:
+        Positions (q, 2) of at most `MAX_NODES` nodes in m, and their distance in m.
+    """
+    reach = BORDER_REACH_PITCHES * inverse.pitch
+    margin = _POINT_MARGIN * inverse.spacing
+    middle = region.mean(axis=0)
+    extent = np.abs(region - middle).max() + reach
+    step = NODE_STEP * inverse.depth
+    while True:
+        nodes = middle + square_points(step, 2 * int(np.ceil(extent / step)) + 1)
+        to_region = cdist(nodes, region).min(axis=1)
+        nodes, to_region = nodes[to_region < reach], to_region[to_region < reach]
+        is_outside = cdist(nodes, around).min(axis=1) > margin
+        nodes = nodes[(to_region < margin) | is_outside]
+        if len(nodes) <= MAX_NODES:
+            return nodes, step
+        step *= np.sqrt(1.02 * len(nodes) / MAX_NODES)

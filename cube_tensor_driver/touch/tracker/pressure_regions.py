@@ -1,0 +1,135 @@
+"""Connected regions of significant pressure on a skin, and the parts of a region that are contacts.
+
+The pressure is that at the depth of the cubes' centres, below the points of the surface.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from ...core.arrays import Array, Index, Mask
+from ..inverse import SurfaceInverse
+
+DETECTION_FRACTION = 0.2
+"""Pressure above which a point belongs to a contact, divided by the largest pressure on the skin.
+An absolute threshold applies in addition."""
+
+RELEASE_FRACTION = 0.75
+"""Factor of both thresholds for points that belonged to a contact in the previous scan, so that
+noise does not change the regions in every scan."""
+
+JOIN_PITCHES = 1.25
+"""Largest distance of two regions, divided by the pitch (distance of neighbouring cubes), at which
+they are treated as one, because the same cubes measure both."""
+
+MAX_JOINED_CUBES = 12
+"""Largest number of cubes below a region that is joined of several ones. Beyond it, they stay
+apart, so that each one can be fitted."""
+
+VALLEY = 0.8
+"""Lowest pressure between two peaks, divided by the pressure at the lower peak, below which the
+peaks are two contacts."""
+
+MIN_FALL = 4.0
+"""Smallest fall of the pressure between two contacts, divided by its standard deviation."""
+
+MIN_PEAK = 0.2
+"""Smallest peak of a contact, divided by the largest peak of its region."""
+
+
+class PressureRegions:
+    """Finds connected regions of significant pressure in every scan."""
+
+    def __init__(self, inverse: SurfaceInverse, min_pressure: float) -> None:
+        """Find the pairs of neighbouring points.
+
+        Args:
+            inverse: Points of the surface.
+            min_pressure: Smallest pressure of a contact at the depth of the cubes, in Pa.
+        """
+        self._min_pressure = min_pressure
+        # A distance of 1.5 includes diagonal neighbours.
+        tree = cKDTree(inverse.points)
+        self._pairs = tree.query_pairs(1.5 * inverse.spacing, output_type="ndarray")
+        self._wide_pairs = tree.query_pairs(JOIN_PITCHES * inverse.pitch, output_type="ndarray")
+        self._cube = inverse.cube
+        self._inside = np.zeros(len(inverse.points), bool)
+
+    def find(self, pressure: Array) -> list[Index]:
+        """Find the regions in the newest scan.
+
+        Args:
+            pressure: Pressure (M,) in Pa at the depth of the cubes, below all points.
+
+        Returns:
+            Indices of the points of each region, the region with the largest pressure first.
+        """
+        largest = float(pressure.max(initial=0.0))
+        threshold = max(self._min_pressure, DETECTION_FRACTION * largest)
+        self._inside = pressure > np.where(self._inside, RELEASE_FRACTION, 1.0) * threshold
+        inside = np.flatnonzero(self._inside)
+        if not len(inside):
+            return []
+
+        wide = self._connect(self._wide_pairs)
+        narrow = self._connect(self._pairs)
+        regions = []
+        for label in np.unique(wide):
+            is_own = wide == label
+            if len(np.unique(self._cube[inside[is_own]])) <= MAX_JOINED_CUBES:
+                regions.append(inside[is_own])
+            else:
+                regions += [inside[narrow == one] for one in np.unique(narrow[is_own])]
+        return sorted(regions, key=lambda region: -float(pressure[region].max()))
+
+    def _connect(self, pairs: Index) -> Index:
+        """Return the number (n,) of the connected component of each of the n points in contact.
+
+        Args:
+            pairs: Indices (pairs, 2) of the points that are connected if both are in contact.
+        """
+        joined = pairs[self._inside[pairs].all(axis=1)]
+        place = np.cumsum(self._inside) - 1
+        size = int(place[-1]) + 1
+        graph = coo_matrix((np.ones(len(joined)), place[joined].T), shape=(size, size))
+        return np.asarray(connected_components(graph, directed=False)[1])
+
+
+def split_peaks(pressure: Array, root: Array, is_neighbour: Mask) -> Index:
+    """Assign the nodes of a region to the peaks of the pressure that are separated by valleys.
+
+    Args:
+        pressure: Pressure (q,) at the nodes.
+        root: Square root (q, n) of its covariance.
+        is_neighbour: Whether two nodes are neighbours (q, q).
+
+    Returns:
+        Number (q,) of the peak of each node, from 0 on, the highest peak first.
+    """
+    owner = np.full(len(pressure), -1)
+    peaks: list[int] = []
+    limit = MIN_PEAK * float(pressure.max())
+    # From the highest node down, each one joins the peak of its neighbours. Where two peaks meet,
+    # the pressure of the node is the lowest one between them.
+    for node in np.argsort(-pressure).tolist():
+        around = np.unique(owner[is_neighbour[node]])
+        around = around[around >= 0]
+        if not len(around):
+            if pressure[node] < limit and peaks:
+                continue
+            around = np.array([len(peaks)])
+            peaks.append(node)
+        first = int(around[0])
+        owner[node] = first
+        for other in around[1:].tolist():
+            peak = peaks[other]
+            fall = pressure[peak] - pressure[node]
+            uncertainty = np.linalg.norm(root[peak] - root[node])
+            if fall < max((1 - VALLEY) * pressure[peak], MIN_FALL * uncertainty):
+                owner[owner == other] = first
+    # Nodes with little pressure that no peak has reached join the highest one.
+    owner[owner < 0] = 0
+    return np.asarray(np.unique(owner, return_inverse=True)[1].reshape(-1))
