@@ -14,7 +14,6 @@ Source: E. Betti, Il Nuovo Cimento 7 (1872) (reciprocity); M. F. Wheeler as in p
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -28,7 +27,7 @@ from cube_tensor_driver.mechanics.layer import Layer
 from .body import Body, check_pads, make_mesh
 from .fem import each_parity, make_solid
 from .memory import check_memory
-from .solid import Solid
+from .solid import Solid, mirror_images
 
 
 def compute_influence(
@@ -81,9 +80,6 @@ def _surface_influence(
     nodes = np.flatnonzero(x[-1] > x[-1].max() - 1e-12)
     dofs = dim * nodes[:, None] + np.arange(dim)
 
-    # Signs of the parts of the body that the mirrors make of the meshed one.
-    sides = [(1, -1) if sign else (1,) for sign in solid.parities[0]]
-    mirrors = np.array(list(itertools.product(*sides)))
     total: Array | float = 0.0
     for parity in each_parity(solid, report):
         # The weights of the pads are the right-hand sides, all of one parity in one solve.
@@ -91,11 +87,11 @@ def _surface_influence(
         displacement = solid.solve(parity, solid.body @ gaps)
         on_surface = np.moveaxis(displacement[dofs], -1, 0)  # (P, n, dim)
         # An even field has an odd displacement along the axis.
-        sign = np.where(mirrors < 0, parity, 1).prod(axis=1, keepdims=True)
-        flip = sign * mirrors / len(mirrors)
+        images, weights = mirror_images(parity)
+        flip = weights[:, None] * images
         total = total + on_surface[:, None] * flip[:, None]
 
-    places = (x[:-1, nodes].T * mirrors[:, None, :-1]).reshape(-1, dim - 1)
+    places = (x[:-1, nodes].T * images[:, None, :-1]).reshape(-1, dim - 1)
     pads = np.reshape(total, (layout.n_pads, -1, dim))
     # A node on a mirror is there twice, with the same value.
     rounded = np.round(places, 9)

@@ -69,15 +69,17 @@ def stiffness(basis: skfem.Basis, moduli: tuple[float, float]) -> sp.csr_matrix:
     scalar = basis.with_element(basis.elem.elem)
     slopes = {}
     for a, b in itertools.combinations_with_replacement(axes, 2):
-        product = skfem.BilinearForm(lambda u, w, _, a=a, b=b: w.grad[a] * u.grad[b])
-        slopes[a, b] = product.assemble(scalar)
+        form = skfem.BilinearForm(lambda u, w, _, a=a, b=b: w.grad[a] * u.grad[b])
+        slopes[a, b] = form.assemble(scalar)
         slopes[b, a] = slopes[a, b].T
     # The part of mu grad u : grad w couples equal components only.
     laplace = sum(slopes[a, a] for a in axes)
     total = sp.kron(mu * laplace, sp.identity(len(axes)))
     for (a, b), product in slopes.items():
-        coupled = sp.csr_matrix(([1.0], ([a], [b])), (len(axes), len(axes)))
-        total = total + sp.kron(lam * product + mu * product.T, coupled)
+        # Components a of the test function and b of the displacement are coupled by this block.
+        place = np.zeros((len(axes), len(axes)))
+        place[a, b] = 1.0
+        total = total + sp.kron(lam * product + mu * product.T, place)
     return total.tocsr()
 
 
@@ -89,7 +91,8 @@ def sample_matrix(basis: skfem.Basis, values: Array) -> sp.csr_matrix:
         values: (n, ..., E, Q) samples of each of the n shape functions of an element; they make
             S = ... x E x Q rows of the matrix, row-major.
     """
-    rows = np.broadcast_to(np.arange(values[0].size).reshape(values.shape[1:]), values.shape)
+    samples = np.arange(values[0].size).reshape(values.shape[1:])
+    rows = np.broadcast_to(samples, values.shape)
     inner_axes = range(1, values.ndim - 2)
     dofs = np.expand_dims(basis.element_dofs, (*inner_axes, values.ndim - 1))
     columns = np.broadcast_to(dofs, values.shape)
@@ -245,15 +248,11 @@ class Solid:
         swap = self.dim * before[:, None] + axes
         return tuple(parity[k] for k in axes), swap.ravel()
 
-    def reactions(self, u: Array) -> Array:
-        """Return the nodal forces (dofs, n) on the body by what holds it.
-
-        On the surface of the cube, they are the forces of the cube.
-        """
-        return self.body @ u
-
     def pad_weights(self, layout: Layout, parity: Parity) -> Array:
-        """Return weights (P, dofs); weights @ reactions is the mean normal stress of each pad."""
+        """Return weights (P, dofs) from nodal forces on the body to the mean stresses of the pads.
+
+        On the surface of the cube, `body` @ u are the forces of the cube.
+        """
         return -pad_weights(self.positions, self.order, layout, parity)
 
     def _restrict(self, elements: Mask) -> skfem.Basis:
@@ -311,16 +310,26 @@ def _parity_part(
 
     It is the mean of the field over all mirrored points, with the signs of the parity.
     """
-    # Along an axis without a mirror the part is the whole.
-    mirrors = list(itertools.product(*((1.0, -1.0) if sign else (1.0,) for sign in parity)))
     part = np.zeros(())
-    for mirror in map(np.array, mirrors):
-        sign = np.prod(np.where(mirror < 0, parity, 1))
-        weight = sign / len(mirrors)
+    for image, weight in zip(*mirror_images(parity), strict=True):
         # A component sigma_ij changes its sign with each of its axes that is mirrored.
-        signs = np.outer(mirror, mirror)
-        part = part + weight * signs * field(x * mirror)
+        signs = np.outer(image, image)
+        part = part + weight * signs * field(x * image)
     return part
+
+
+def mirror_images(parity: Parity) -> tuple[Array, Array]:
+    """Return the parts of the whole body that mirrors make of the meshed one, M in number.
+
+    Returns:
+        The sign (M, dim) of each axis in each part, and the weight (M,) with which a field in that
+        part counts in its part of this parity: the sign of a field of this parity there, over M.
+    """
+    # Along an axis without a mirror the body is meshed as a whole.
+    signs = [(1.0, -1.0) if sign else (1.0,) for sign in parity]
+    images = np.array(list(itertools.product(*signs)))
+    weights = np.where(images < 0, parity, 1).prod(axis=1) / len(images)
+    return images, weights
 
 
 def nested_dissection(grid: Index) -> Index:
