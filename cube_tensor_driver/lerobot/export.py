@@ -89,8 +89,8 @@ def export_lerobot(
     topics = find_topics(bags, choices)
     frames = sum(len(each) for each in counts)
     depth = max(int(each.max()) for each in counts)
-    # The incomplete data set lies beside the final folder, so that it can be renamed: this works only
-    # within one file system.
+    # The incomplete data set lies beside the final folder, so that it can be renamed. That works
+    # only within one file system.
     partial = folder.absolute()
     partial = partial.with_name(f"{partial.name}.partial")
     try:
@@ -307,8 +307,8 @@ def _write_bag(
             # All unfinished episodes are offered the rows, because rows of a hub whose connection
             # is slow can belong to an earlier episode than those of the other hubs.
             done += sum(writer.add(rows) for writer in waiting)
-            # The frames of a data set lie episode after episode, so only the first unfinished one may
-            # be written.
+            # The frames of a data set lie episode after episode. So only the first unfinished
+            # episode may be written.
             while waiting and waiting[0].write():
                 waiting.pop(0)
             report(done, total, f"exporting {plan.path}")

@@ -131,8 +131,8 @@ class _SetLoad:
                 f"the load has a stress of shape {stress.shape} and a gradient of shape "
                 f"{gradient.shape}; a skin of {cubes} cubes takes ({cubes}, 6) and ({cubes}, 6, 3)"
             )
-        # A single assignment of both arrays is atomic in Python, so no lock between the threads is
-        # needed.
+        # A single assignment of both arrays is atomic in Python, so the thread that reads them
+        # needs no lock.
         self._field = stress, gradient
 
     def at(self, seconds: float) -> StressField:

@@ -22,7 +22,7 @@ from .imperfections import Imperfections, PadBehaviour
 from .sample_log import ABSENT
 
 Millihertz = NDArray[np.uint32]
-"""Array of frequencies in mHz as in SAMPLE frames; `NOT_MEASURED` is a pad without a frequency."""
+"""Array of frequencies in mHz, as a hub sends them; `NOT_MEASURED` is a pad without a frequency."""
 
 
 class SimulatedCubes:
@@ -47,10 +47,10 @@ class SimulatedCubes:
             calibrations: Calibration of each cube.
             noise: Standard deviation of a frequency divided by the frequency, 0 for no noise. None:
                 the noise in the calibration of each cube.
-            drift: Relative change of every rest frequency per second.
+            drift: Relative change of every rest frequency (frequency without load) per second.
             imperfections: Deviations of the pads from their calibrations; None: no deviations.
-            seed: Seed of the noise. Together with the seed of the imperfections, it also determines
-                the deviation of each pad.
+            seed: Seed of the random noise. Together with the seed of the imperfections, it also
+                determines the deviation of each pad.
         """
         self.n_pads = calibrations[0].layout.n_pads
         self._drift = drift
@@ -82,8 +82,8 @@ class SimulatedCubes:
             seconds: Simulated time in s.
 
         Returns:
-            Frequencies (cubes, pads) in mHz. A pad whose stress is beyond the range of the law from
-            stress to frequency has `NOT_MEASURED`, like a pad whose oscillator has stopped.
+            Frequencies (cubes, pads) in mHz. A pad has `NOT_MEASURED` if its oscillator does not
+            run, or if no frequency belongs to the stress on it.
         """
         pad_stress = np.empty((len(stress), self.n_pads))
         for calibration, rows in self._groups:
@@ -114,7 +114,7 @@ class HubCubes:
         link: Link of the skin that the hub is on.
         members: Index in the skin of each cube (hub cubes,) of the hub, in the order of the hub;
             `ABSENT` for cubes that are not in the skin.
-        cubes: Those cubes of the hub that are in the skin.
+        cubes: Computes the frequencies of those cubes of the hub that are in the skin.
     """
 
     link: SkinLink
@@ -270,15 +270,15 @@ def true_state(
     stress: Array,
     gradient: Array,
 ) -> Array:
-    """Project true stress fields onto the modes of a calibration.
+    """Compute the amplitudes of the modes in given stress fields.
 
-    The modes are the stress states for which the calibration contains the response of the pads.
-    Other parts of the field, such as yy for a planar cube, are left out.
+    The modes are the linear stress fields for which the calibration contains the response of the
+    pads. Other parts of the given fields, such as yy for a planar cube, are left out.
 
     Args:
         calibration: Calibration of the cubes.
-        stress: Stress (N, 6) in Pa.
-        gradient: Gradient (N, 6, 3) in Pa/m.
+        stress: Stress (N, 6) at N cubes in Pa, order xx yy zz yz zx xy.
+        gradient: Gradient (N, 6, 3) in Pa/m: derivatives of the stress along x, y and z.
 
     Returns:
         Amplitudes (N, modes) in Pa.
@@ -295,7 +295,7 @@ def skin_components(
     stress: Array,
     gradient: Array,
 ) -> Array:
-    """Return the components that the cubes of a skin would measure without errors.
+    """Return the stress components that the cubes of a skin would measure without errors.
 
     Args:
         skin: Skin.
@@ -309,7 +309,8 @@ def skin_components(
     shape = (len(skin.cubes), len(COMPONENTS))
     components = np.empty(shape)
     for calibration, rows in calibration_groups(skin.calibrations):
-        # Modes of gradients are in Pa (change over half a side), the components in Pa/m.
+        # Amplitudes of modes (linear stress fields) with a gradient are in Pa: the change of the
+        # stress over half the side of a cube. Components of the gradient are in Pa/m.
         scale = np.where(is_stress, 1.0, 1 / calibration.half_side)
         state = true_state(calibration, stress[rows], gradient[rows])
         components[rows] = state @ calibration.modes.components.T * scale

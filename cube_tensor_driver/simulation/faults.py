@@ -23,7 +23,7 @@ KINDS = {
     "stall": "send nothing for `seconds`; what does not fit the hub's buffer is dropped there",
     "burst": "send every 16 ms what has gathered, for `seconds`",
     "unplug": "cut the port and the power for `seconds`",
-    "rename": "the same, and come back under another name",
+    "rename": "cut the port and the power for `seconds`, and come back under another name",
     "reset": "restart the hub behind the open port",
     "wrap": "restart the hub with its sample count `count` before 2^32",
     "drift": "let the hub's clock run fast by `value` ppm",
@@ -40,14 +40,15 @@ KINDS = {
     "pads": "send one pad too many for `seconds`",
     "version": "speak protocol version 2 for `seconds`",
 }
-"""Effect of each kind of fault. Words in backquotes are the keys of `Fault` that the kind uses."""
+"""Effect of each kind of fault of simulated hubs, as a text for the user. Words in backquotes are
+the attributes of `Fault` that the kind uses."""
 
 MAX_COUNT = (1 << 32) - 1
 """Maximum value of the whole numbers of a fault: number of affected samples, index of a cube, index
 of a pad."""
 
 FRAME_FAULTS = ("drop", "flip", "insert", "duplicate", "reorder", "truncate")
-"""Kinds of faults that alter or lose the frames of single samples."""
+"""Kinds of faults that alter or lose single frames (messages of a hub) with a sample."""
 
 PAD_FAULTS = ("open", "short", "stuck", "noisy", "report")
 """Kinds of faults of one pad (sensing element) of a cube."""
@@ -73,8 +74,8 @@ MOMENTARY_FAULTS = (*FRAME_FAULTS, "reset", "wrap", "drift", "step")
 the time `seconds` of the fault."""
 
 
-# Times and counts of a fault are not negative. Only its size (`value`) may be: a clock may run
-# slow, and a temperature may fall.
+# Times and counts of a fault are not negative. Only its size (`value`) may be negative: a clock may
+# run slow, and a temperature may fall.
 _AMOUNT = real("a number from 0 up", minimum=0)
 _COUNT = integer(0, MAX_COUNT, "a whole number from 0 up")
 _SCHEMA = Schema(
@@ -135,7 +136,8 @@ class Fault:
         """
         for _, mistake in _SCHEMA.mistakes(data):
             raise ConfigError(f"{place}: {mistake}")
-        # YAML may contain 2 where a float is needed, and 2.0 where an integer is needed.
+        # The values are converted to the types of the attributes, because YAML may contain 2 where
+        # a float is needed, and 2.0 where an integer is needed.
         types: dict[str, Any] = {"kind": str}
         for field in fields(cls)[1:]:
             types[field.name] = type(field.default)

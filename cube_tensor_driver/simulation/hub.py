@@ -29,22 +29,26 @@ from .cubes import Millihertz
 from .sample_log import SampleRun
 
 FIRMWARE = 0x00010000
-"""Firmware version that a simulated hub reports in HELLO."""
+"""Firmware version that a simulated hub reports in HELLO (message that describes the hub)."""
 
 PERIOD_LIMITS_US = (100, 10_000_000)
 """Shortest and longest sample period in µs that a simulated hub accepts."""
 
 _BUFFER_SIZE = 5000
-"""Free size, in bytes, of the send buffer that a simulated hub reports in STATS; it is constant."""
+"""Free size, in bytes, of the send buffer that a simulated hub reports in STATS (frame with the
+hub's counters); it is constant."""
 
 _UINT32_MASK = 0xFFFFFFFF
-"""Mask that reduces a counter of the simulation, which does not wrap around, to the 32 bits of the
-counters in frames."""
+"""Mask that reduces a counter of the simulation, which does not wrap around, to 32 bits, which the
+counters in the frames (messages of a hub) have."""
 
 
 @dataclass
 class SimulatedHub:
-    """A hub, the device side of the protocol. Simulated times are in µs.
+    """A hub (device that samples the pads of some cubes and sends their frequencies to the host).
+
+    It sends frames of bytes: HELLO with a description of the hub, SAMPLE with the frequencies of
+    all pads, STATS with counters, and answers to requests. Simulated times are in µs.
 
     The attributes from `drift_ppm` on are changed by faults.
 
@@ -87,9 +91,11 @@ class SimulatedHub:
     pad_fault: PadMasks | None = None
     _drift_since_us: int = 0
     _ended_runs: list[SampleRun] = field(default_factory=list)
-    _run: SampleRun | None = None  # the newest run, as it began; `_last` is its last sample
+    # The newest run (samples at equal intervals) as it began, the number of its last sample, and
+    # time, period and restarts of the hub that the next sample must have to continue the run.
+    _run: SampleRun | None = None
     _last: int = 0
-    _expected: tuple[int, int, int] | None = None  # time, period and boot of its next sample
+    _expected: tuple[int, int, int] | None = None
 
     def hello(self) -> bytes:
         """Return the HELLO frame, the description of the hub and its cubes."""
@@ -114,7 +120,7 @@ class SimulatedHub:
         return self.boot_us + now_us + gained
 
     def _positive_device_us(self, now_us: int) -> int:
-        """Return the value of the hub's clock in µs, or 0 if it is negative, as frames hold it."""
+        """Return the value of the hub's clock in µs, or 0 if it is negative, as in frames."""
         return max(0, self.device_us(now_us))
 
     def set_clock(
@@ -130,8 +136,8 @@ class SimulatedHub:
             step_us: Time in µs by which the clock is set forward.
             drift_ppm: New excess rate of the clock in ppm; None: the rate does not change.
         """
-        # The time that the clock has gained so far becomes part of its offset. So a new rate does
-        # not change the clock's present value.
+        # The time that the clock has gained so far by its rate becomes part of its offset. So a new
+        # rate does not change the clock's present value.
         self.boot_us = self.device_us(now_us) - now_us + step_us
         self.drift_ppm = self.drift_ppm if drift_ppm is None else drift_ppm
         self._drift_since_us = now_us
@@ -204,9 +210,9 @@ class SimulatedHub:
         return [*self._ended_runs, newest]
 
     def _log_sample(self) -> None:
-        """Add the sample of `next_us` to the newest run of the log, or begin a new run with it."""
-        # A run is a sequence of samples at equal intervals. It ends when samples are skipped, the
-        # period changes or the hub restarts.
+        """Add the sample that is due at `next_us` to the log of all samples."""
+        # The log consists of runs (samples at equal intervals). A run ends when samples are
+        # skipped, the period changes or the hub restarts.
         now = (self.next_us, self.period_us, self.boots)
         if now != self._expected:
             self._ended_runs = self.runs

@@ -67,7 +67,8 @@ class Imperfections:
     Attributes:
         gain_spread: Standard deviation of a pad's sensitivity divided by the calibrated one.
         dead: Fraction of the pads whose oscillators do not run, 0 to 1.
-        creep: Terms (c, tau) of the creep (file head): relative size c and time constant tau in s.
+        creep: Terms (c, tau) of the creep: in addition to the stress, a pad reports c times the
+            stress after a low-pass filter with the time constant tau, in s.
         seed: Seed of the random numbers that determine the deviation of each pad.
 
     Raises:
@@ -97,7 +98,7 @@ def read_imperfections(path: Path) -> Imperfections:
         _raise_first_mistake(data)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
-    # Tuples, because an instance is immutable.
+    # Lists become tuples, because an instance of `Imperfections` is immutable.
     terms = data.pop("creep", ())
     creep = tuple((size, time) for size, time in terms)
     return Imperfections(creep=creep, **data)
@@ -110,7 +111,10 @@ def _raise_first_mistake(data: Any) -> None:
 
 
 class PadBehaviour:
-    """Computes the stress that imperfect pads of some cubes report, with the creep so far."""
+    """Computes the stress that imperfect pads of some cubes report.
+
+    Because of creep, the reported stress depends on all stresses since the beginning.
+    """
 
     def __init__(
         self,
@@ -118,15 +122,15 @@ class PadBehaviour:
         shape: tuple[int, int],
         seed: int,
     ) -> None:
-        """Draw the gains and the dead pads.
+        """Draw random gains (relative sensitivities) of the pads, and the pads that do not work.
 
         Args:
             imperfections: Size of the deviations.
             shape: Number of cubes and of pads per cube.
             seed: Seed that differs between the hubs of a skin.
         """
-        # Gains and dead pads are always drawn in this order, so that the same seeds give the same
-        # dead pads whatever the spread of the gains and the creep are.
+        # Gains and dead pads (pads that do not work) are always drawn in this order, so that the
+        # same seeds give the same dead pads whatever the spread of the gains and the creep are.
         random = np.random.default_rng([imperfections.seed, seed])
         self._gain = 1 + imperfections.gain_spread * random.standard_normal(shape)
         self._dead = random.random(shape) < imperfections.dead
@@ -136,24 +140,25 @@ class PadBehaviour:
         terms = terms.reshape(-1, 2)
         self._creep_size = terms[:, 0]
         self._creep_time = terms[:, 1]
-        self._crept = np.zeros((len(terms), *shape))  # q_i of the module head
+        self._crept = np.zeros((len(terms), *shape))  # low-passed stress of each term, in Pa
         self._seconds = 0.0
 
     def reported(self, stress: Array, seconds: float) -> Array:
         """Compute the stress that the pads report, and advance their creep.
 
         Args:
-            stress: True stress (cubes, pads) in Pa, constant since the previous call.
+            stress: True stress (cubes, pads) in Pa, taken as constant since the previous call.
             seconds: Simulated time in s; it should not decrease from call to call.
 
         Returns:
-            Reported stress (cubes, pads) in Pa; NaN for a dead pad.
+            Reported stress (cubes, pads) in Pa; NaN for a pad that does not work.
         """
         # NaN stands for the missing frequency of an oscillator that does not run.
         reported = np.where(self._dead, np.nan, stress * self._gain)
         if len(self._creep_time):
             elapsed = max(seconds - self._seconds, 0.0)
-            # Solution of tau dq/dt = v - q for a constant v: 1 - exp(-t / tau)
+            # The low-passed stress q follows tau dq/dt = v - q. If the stress v is constant for the
+            # time t, q approaches it by the fraction 1 - exp(-t / tau).
             approach = -np.expm1(-elapsed / self._creep_time)
             target = np.nan_to_num(reported)
             self._crept += approach[:, None, None] * (target - self._crept)

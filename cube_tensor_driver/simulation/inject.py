@@ -35,7 +35,7 @@ def inject(ports: Path | None, words: Sequence[str]) -> str:
             "seconds=2"
         )
     pairs = dict(word.split("=", 1) for word in words)
-    # The values of these two keys stay texts, even if they look like numbers.
+    # The values of `kind` and `link` stay texts, even if they look like numbers.
     fault = {
         key: value if key in ("kind", "link") else parse_yaml(value, "fault")
         for key, value in pairs.items()
@@ -44,7 +44,8 @@ def inject(ports: Path | None, words: Sequence[str]) -> str:
     folder = ports or _newest_demo()
 
     with os.fdopen(_open_pipe(folder / FAULT_PIPE), "w") as stream:
-        # The simulator writes this file before it creates the pipe, so the file exists.
+        # The simulator writes the file with the sizes of its hubs before it creates the pipe, so
+        # the file exists.
         sizes = read_yaml(folder / HUBS_FILE)
         hubs = {}
         for name, size in sizes.items():
@@ -64,7 +65,11 @@ def fault_line(fault: dict[str, object]) -> str:
 
 
 def _open_pipe(pipe: Path) -> int:
-    """Open the pipe of a simulator for writing."""
+    """Open the pipe for writing from which a simulator reads faults.
+
+    Raises:
+        ConfigError: The pipe does not exist, or no simulator reads it.
+    """
     try:
         # Without O_NONBLOCK, opening the pipe would block until a simulator reads it.
         return os.open(pipe, os.O_WRONLY | os.O_NONBLOCK)

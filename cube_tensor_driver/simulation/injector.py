@@ -25,15 +25,15 @@ ROOM_CELSIUS = 25.0
 """Temperature in °C at which pads have the rest frequencies of their calibration."""
 
 OPEN_FACTOR = 8
-"""Factor by which the frequency of a pad rises if its lead is broken (fault `open`). Only the
-parasitic capacitance remains, so the frequency is above the range that stress can cause if this
-capacitance is β = 0.3 times that of the pad at rest."""
+"""Factor by which the frequency of a pad rises if its lead is broken (fault `open`), because only
+the parasitic capacitance remains. No stress can cause such a high frequency if the parasitic
+capacitance is 0.3 times that of the pad at rest (the usual value)."""
 
 MAX_MILLIHERTZ = 0xFFFFFFFF
-"""Highest frequency, in mHz, that the 32-bit field of a SAMPLE frame can hold."""
+"""Highest frequency, in mHz, that the 32 bits for a pad in a message of a hub can hold."""
 
 DAMAGING_FAULTS = ("drop", "flip", "insert", "truncate")
-"""Kinds of faults after which the host may not be able to decode a SAMPLE frame."""
+"""Kinds of faults after which the host may not be able to decode a frame (message) of a hub."""
 
 _MAX_INSERTED_BYTES = 20
 """Exclusive upper limit of the random number of bytes that the fault `insert` adds to a frame."""
@@ -47,8 +47,8 @@ their times by itself; a changed temperature stays until the next fault of the k
 `temperature`."""
 
 _Schedule = list[tuple[int, int, Fault]]
-"""Heap of (simulated time in µs, number, fault). Of faults at the same time, the one with the lower
-number comes first."""
+"""Heap of (simulated time in µs, serial number, fault). Of faults at the same time, the one with
+the lower serial number comes first."""
 
 
 @dataclass
@@ -95,7 +95,7 @@ class _LinkState:
     """Faults that affect one link now.
 
     Attributes:
-        frames: Kinds of faults for the next SAMPLE frames, one for each frame.
+        frames: Kinds of faults for the next SAMPLE frames (messages with a sample), one for each.
         held_back: Frame that is sent after the next one (fault `reorder`).
         pads: Pads under a fault.
         warming: Simulated time in µs at which the temperature began to change, and the fault.
@@ -111,7 +111,7 @@ class _LinkState:
 
 
 class Injector:
-    """Carries out faults on the links of one simulator.
+    """Carries out faults, such as lost frames or broken pads, on the links of one simulator.
 
     Attributes:
         records: Records of all faults that have begun.
@@ -190,7 +190,7 @@ class Injector:
         Args:
             link: Link of the hub.
             frequency: Frequencies (cubes, pads) in mHz of pads without faults.
-            now_us: Simulated time of the sample.
+            now_us: Simulated time of the sample in µs.
         """
         state = self._states[link.name]
         hub = link.hub
@@ -230,7 +230,7 @@ class Injector:
         return now_us if hold is None else hold[0]
 
     def transmitted(self, link: SimulatedLink, data: bytes) -> bytes:
-        """Return the bytes that are sent on a link in place of one SAMPLE frame.
+        """Return the bytes that are sent on a link in place of one frame (message) with a sample.
 
         Args:
             link: The link.
@@ -364,7 +364,7 @@ class Injector:
                 state.pads = [broken for broken in pads if broken.fault is not fault]
                 _report_pads(hub, state)
             case "hold":
-                # If the hold that acts now is another fault, it began later and replaced this one.
+                # A fault `hold` that began later has replaced this one, and does not end now.
                 if state.hold is not None and state.hold[1] is fault:
                     state.hold = None
             case "unplug" | "rename":

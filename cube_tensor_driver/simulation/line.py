@@ -23,7 +23,9 @@ _READ_BYTES = 65536
 
 
 class SimulatedLine:
-    """A pseudo-terminal. The hub has one end; the other end appears as the symbolic link `port`.
+    """A pseudo-terminal (virtual serial port) between a hub and the host.
+
+    The hub has one end; the other end appears as the symbolic link `port`.
 
     Attributes:
         port: Path of the port.
@@ -45,7 +47,7 @@ class SimulatedLine:
 
     @property
     def plugged(self) -> bool:
-        """Whether the port exists."""
+        """Whether the port exists, so that the host can open it."""
         return self.fd >= 0
 
     def plug(self, port: Path | None = None) -> None:

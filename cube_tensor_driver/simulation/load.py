@@ -102,10 +102,10 @@ class AnyLoad(Fields, Protocol):
         """Distance from the centres of the cubes to the surface, in m."""
 
     def total(self, seconds: float) -> Resultant:
-        """Return total force (3,) in N, centre (3,) in m and mean normal (3,) at a time.
+        """Return the resultant of all contacts at a time, in the skin's parent frame.
 
-        The centre is the centre of pressure. They are those of all contacts together, in the skin's
-        parent frame.
+        It consists of the total force (3,) in N, the centre of pressure (3,) in m, and the mean
+        normal (3,) out of the skin.
 
         Args:
             seconds: Simulated time in s.
@@ -164,7 +164,7 @@ class Load:
             self._check(indenter)
 
     def at(self, seconds: float) -> StressField:
-        """Compute stress and gradient at the cubes at a simulated time in s, as `Fields.at`."""
+        """Compute stress (cubes, 6) in Pa and gradient (cubes, 6, 3) in Pa/m at a time in s."""
         # For each cube, the surface is the plane z = 0, and the cube is at z = -depth.
         position, rotation, _ = self.poses
         n = len(position)
@@ -213,7 +213,7 @@ class Load:
         return [load for load in loads if load.force.any()]
 
     def total(self, seconds: float) -> Resultant:
-        """Return force, centre and normal of all contacts at a time in s, as `total`."""
+        """Return total force, centre of pressure and mean normal of all contacts at a time in s."""
         return total(self.contact_loads(seconds))
 
     def _check(self, indenter: Indenter) -> None:
@@ -324,7 +324,7 @@ def surface_normal(
     pitch: float,
     position: Array,
 ) -> Array:
-    """Return the unit normal (3,) out of the skin at a position.
+    """Return the unit normal (3,) out of the skin at a position, in the skin's parent frame.
 
     It is the mean of the cubes' z axes, weighted with a Gaussian of the distance.
 
@@ -370,9 +370,9 @@ def total(loads: Sequence[ContactLoad]) -> Resultant:
 
 
 class LoadMemory:
-    """Computes the fields of a load at whole microseconds and keeps those of a load that repeats.
+    """Computes the stress fields of a load at whole microseconds.
 
-    Fields are kept for the next period of the load, because computing them takes long.
+    Fields of a load that repeats are kept for its next period, because computing them takes long.
     """
 
     def __init__(self, load: Fields) -> None:
@@ -382,7 +382,7 @@ class LoadMemory:
         self._fields: dict[int, StressField] = {}
 
     def at(self, time_us: int) -> StressField:
-        """Return stress and gradient at the cubes at a simulated time in µs, as `Fields.at`."""
+        """Return stress (cubes, 6) in Pa and gradient (cubes, 6, 3) in Pa/m at a time in µs."""
         if self._period_us is not None:
             time_us %= self._period_us
         field = self._fields.get(time_us)
@@ -403,10 +403,11 @@ def _choose_orders(
     depth: float,
     distance: Array,
 ) -> Index:
-    """Return the quadrature order (cubes,) for each cube; it is lower far from the contact.
+    """Return the number of rings of point forces (cubes,) that represent a contact for each cube.
 
-    The errors of stress and gradient are at most 1e-3 of their largest values. The stress is
-    exactly in equilibrium with the force, because every sum of point forces is.
+    It is lower for cubes far from the contact. The errors of stress and gradient are at most 1e-3
+    of their largest values. The stress is exactly in equilibrium with the force, because that of
+    every point force is.
 
     Args:
         shape: Shape of the contact, `disc` or `sphere`.
@@ -416,7 +417,8 @@ def _choose_orders(
     """
     to_rim = np.maximum(distance - radius, 0.0)
     ratio = radius / np.hypot(depth, to_rim)
-    # Numerical tests gave these factors, with which the errors are at most 1e-3.
+    # Numerical tests gave these factors. With them, the errors are at most 1e-3 of the largest
+    # stress and gradient.
     wanted = 5 * ratio + 1 if shape == "sphere" else 3.3 * ratio + 0.5
     orders = _ORDERS[np.searchsorted(_ORDERS, wanted)]
     return np.where(ratio < _FAR_RATIO, 1, orders)

@@ -29,7 +29,7 @@ def main(
 
     Args:
         arguments: Command line arguments; None: those of the process.
-        simulator: Class of the simulator.
+        simulator: Class of the simulator; a subclass may connect its hubs in another way.
 
     Returns:
         Exit code: 0, or 1 if an input file cannot be used.

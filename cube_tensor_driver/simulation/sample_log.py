@@ -170,8 +170,7 @@ class SampleLog:
     @cached_property
     def table(self) -> SampleTable:
         """All samples of the log, link after link, in the order of time."""
-        # The log holds runs (samples at equal intervals). They become columns with one row per
-        # sample.
+        # The runs (samples at equal intervals) of the log become columns with one row per sample.
         # An empty array in front gives the columns their type even if there are no runs.
         links, numbers, times_us = [[np.empty(0, np.int64)] for _ in range(3)]
         rows_per_sample = []
@@ -222,7 +221,7 @@ class SampleTable:
         rows: SampleRows,
         among: Index | None = None,
     ) -> Index:
-        """Find the logged sample from which each of N received rows comes.
+        """Find the logged sample from which each of N received rows (samples of one cube) comes.
 
         A hub that restarts uses the same sample numbers again. So among the samples of the row's
         link with the row's number, the one whose time is nearest to the row's stamp is chosen.
@@ -249,11 +248,11 @@ class SampleTable:
             rows.stamp_ns,
         )
         found = match_rows(known, wanted)
-        # `NO_MATCH` is -1, so it selects the appended element.
+        # A row without a match has the index `NO_MATCH`, which is -1 and selects the last element.
         return np.append(among, NO_MATCH)[found]
 
     def rows_taken(self, start_ns: int, end_ns: int) -> int:
-        """Count the rows (one for each cube of the skin and sample) taken in an interval of time.
+        """Count the rows (samples of one cube) that the hubs took in an interval of time.
 
         Args:
             start_ns: Begin of the interval, in ns since the Unix epoch.

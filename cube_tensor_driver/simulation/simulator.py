@@ -116,7 +116,7 @@ class Simulator:
             noise: Standard deviation of a frequency divided by the frequency; None: that of the
                 calibration of each cube.
             drift: Relative change of every rest frequency (frequency without load) per second.
-            imperfections: Imperfections of the pads as in `SimulatedCubes`.
+            imperfections: Deviations of the pads from their calibrations; None: none.
             instants: Number of times, equally spaced over the period of the load, at which the load
                 is computed in advance; successive samples use successive times, again and again.
                 0: the load is computed for each sample.
@@ -159,7 +159,7 @@ class Simulator:
             link.line.send(link.hub.hello(), 0)
 
     def _make_line(self, link: SkinLink) -> SimulatedLine:
-        """Create the line of a hub to the host; torture has hubs that are on other lines."""
+        """Create the line of a hub to the host: a pseudo-terminal, unless a subclass differs."""
         return SimulatedLine(self._ports / link.name)
 
     def _prepare(self, load: Fields, instants: int) -> None:
@@ -242,7 +242,7 @@ class Simulator:
         for link in self._links:
             link.line.unplug()
         os.close(self._fault_pipe)
-        # `inject` recognises a running simulator by these files.
+        # `./cube inject` recognises a running simulator by these files.
         for name in (FAULT_PIPE, HUBS_FILE):
             (self._ports / name).unlink(missing_ok=True)
         # The folder stays if it contains other files.
@@ -367,7 +367,8 @@ class StopRequest:
     """
 
     def __init__(self) -> None:
-        # Monotonic time, in s, at which the simulator ends at the latest.
+        # Monotonic time, in s, at which the simulator ends at the latest. It is infinite until the
+        # stop is requested.
         self._until_s = math.inf
         self.fd, self._write = os.pipe()
 

@@ -41,7 +41,7 @@ def simulate(
         rate: Samples per second; None: the rate in the skin file, or 100.
         duration: Simulated time in s; None: without end.
         noise: Standard deviation of a frequency divided by the frequency (8e-6 is usual).
-        drift: Relative change of every rest frequency per second.
+        drift: Relative change of every rest frequency (frequency without load) per second.
         imperfections: Spread, creep and failure of the pads; None: pads without deviations from
             their calibrations.
 
@@ -57,14 +57,15 @@ def simulate(
         load = Load(skin, script)
     if rate is None:
         rate = skin.rate or 1e6 / SimulatedHub.period_us
-    # The limits are sample periods; the longest period gives the lowest rate.
+    # The limits of a hub are sample periods; the longest period gives the lowest rate.
     low, high = (1e6 / limit for limit in reversed(PERIOD_LIMITS_US))
     if not low <= rate <= high:
         raise ConfigError(f"rate is {rate!r}, allowed: {low:g} to {high:g} samples per second")
     if duration is not None and not duration > 0:
         raise ConfigError(f"duration is {duration!r}, allowed: a time greater than 0 s, or None")
 
-    # Errors of the skin are raised here instead of at the first iteration.
+    # The cubes are created again in each iteration. Creating them here, too, raises errors of the
+    # skin before the first iteration.
     hub_cubes(skin)
     return SimulatedSource(
         skin,
@@ -79,9 +80,10 @@ def simulate(
 
 @dataclass
 class SimulatedSource:
-    """A `core.rows.Source` of simulated frequencies. Every iteration starts again at time 0.
+    """A source (`core.rows.Source`) of simulated frequencies. Each iteration starts at time 0.
 
-    One scan has a row of every cube, in the order in which the driver delivers them: link by link.
+    One scan has a row (sample) of every cube, in the order in which the driver delivers them: link
+    by link.
     All rows of scan k have the sequence number k and stamp_ns = k × period; simulated time 0 is the
     start of the load script. Frequencies are rounded as those of a real hub: whole mHz, in Hz as
     float32. They are NaN for pads that a cube does not have or whose oscillator stopped. The

@@ -56,7 +56,8 @@ class CubicSpline:
 
     def position(self, time: float) -> Array:
         """Return the position (D,) at a time from 0 to 1."""
-        # Cubic Hermite polynomial with the points p and q at the ends and the slopes m and n there
+        # Cubic Hermite polynomial of t (0 to 1 from one point to the next) between the points p and
+        # q, with the slopes m and n there.
         t, p, q, m, n = self._interval(time)
         left = 1 - t
         value = (1 + 2 * t) * left**2 * p

@@ -77,7 +77,10 @@ def flat_contact(
     normal: Array,
     min_width: float,
 ) -> Polygon:
-    """Return the polygon that represents the contact of a flat body (see the file head).
+    """Return the traction on a polygon that represents the contact of a flat body.
+
+    It has the force and the moments of the forces at the contact points. The polygon is their
+    convex hull, shrunk until its centroid is the centre of pressure.
 
     Args:
         points: Positions (K, 3) of the contact points in m.
@@ -158,7 +161,8 @@ def _area_moments(corners: Array) -> tuple[float, Array, float]:
         ]
     )
     centroid = first / (6 * area)
-    # Integral of x^2 + y^2 over the triangles between the origin and the edges
+    # The polar moment about the origin is the integral of x² + y² over the triangles between the
+    # origin and the edges.
     squares = x * x + x * next_x + next_x * next_x
     squares = squares + y * y + y * next_y + next_y * next_y
     polar_about_origin = double_area @ squares / 12
@@ -181,7 +185,7 @@ def _convex_hull(flat: Array) -> Array:
     """
     points = sorted(map(tuple, flat.tolist()))
     hull: list[tuple[float, float]] = []
-    for run in (points, points[::-1]):  # the lower half, then the upper one
+    for run in (points, points[::-1]):  # lower, then upper half of the hull
         start = len(hull)
         for x, y in run:
             while len(hull) > start + 1:

@@ -44,7 +44,7 @@ def read_scene(path: Path) -> MjModel:
     try:
         return mujoco.MjModel.from_xml_path(str(path))
     except (ValueError, RuntimeError, MemoryError) as error:
-        # MuJoCo's messages have several lines.
+        # MuJoCo's messages have several lines, which become one.
         reason = " ".join(str(error).split())
         raise ConfigError(f"{path}: MuJoCo cannot read it: {reason}") from None
 
@@ -127,11 +127,11 @@ class MujocoLoad:
         self._restart()
 
     def at(self, seconds: float) -> StressField:
-        """Compute the fields as `AnyLoad.at`, with the contacts of the last step before a time."""
+        """Compute stress and gradient at the cubes under the contacts at a time in s."""
         return self.touch.field(self._touches_at(seconds))
 
     def total(self, seconds: float) -> Resultant:
-        """Return force, centre and normal of all contacts at a time in s, as `AnyLoad.total`."""
+        """Return total force, centre of pressure and mean normal of all contacts at a time in s."""
         return total([touch.press for touch in self._touches_at(seconds)])
 
     def _touches_at(self, seconds: float) -> list[Touch]:
@@ -150,7 +150,7 @@ class MujocoLoad:
         """Return the number of the last step of the scene before a time in s."""
         if self.repeats is not None:
             seconds %= self.repeats
-        # The small addition keeps exact multiples of the time step from being rounded down.
+        # Without the small addition, a multiple of the time step could be rounded down by one step.
         steps = seconds / self.touch.model.opt.timestep
         return int(np.floor(steps + 1e-6))
 

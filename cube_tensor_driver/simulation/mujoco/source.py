@@ -146,11 +146,11 @@ class MujocoSkin:
             noise: Standard deviation of a frequency divided by the frequency; None: that of the
                 calibration of each cube.
             drift: Relative change of every rest frequency (frequency without load) per second.
-            imperfections: Imperfections of the pads as in `simulate`.
+            imperfections: Deviations of the pads from their calibrations; None: none.
 
         Raises:
-            ConfigError: MuJoCo is not installed, the model has no body of that name, or a cube does
-                not lie below the surface of its body.
+            ConfigError: MuJoCo is not installed, no body of the model has the name of the skin's
+                parent frame, or a cube does not lie below the surface of its body.
             ElasticError: Thickness or Poisson's ratio is out of range, or the cubes lie deeper than
                 the layer.
         """
@@ -239,7 +239,7 @@ class MujocoSkin:
         rows: Index,
         side: int,
     ) -> Touch | None:
-        """Return the contact of one pair of bodies; None if it does not press on the front.
+        """Return the contact of one pair of bodies; None if it is not on the side of the cubes.
 
         Args:
             part: Body of the skin and its cubes.
@@ -361,7 +361,7 @@ class MujocoSkin:
                 outward,
                 cube,
             )
-        # One table serves all cubes, so their depths must be nearly equal.
+        # One table of stresses serves all cubes, so their depths must be nearly equal.
         median = float(np.median(depth))
         deviation = np.abs(depth - median)
         farthest = int(np.argmax(deviation))
@@ -406,7 +406,7 @@ class MujocoSkin:
         outward: Array,
         cube: SkinCube,
     ) -> float:
-        """Return the distance in m from a cube to the nearest colliding geom of its body.
+        """Return the distance in m from a cube to the nearest colliding geom (shape) of its body.
 
         Args:
             reference: State in the reference configuration.
@@ -487,8 +487,8 @@ def _field_of_discs(
 
     outward = rotation[:, :, 2]
     facing = np.maximum(outward @ normals, 0.0)
-    # Positions of the cubes relative to the centre of each contact, and the forces of the contacts,
-    # both in the frame of each cube
+    # `place` is the position of each cube relative to the centre of each contact, `force` the force
+    # of each contact, both in the frame of the cube.
     place = (position[:, None] - centres) @ rotation
     force = forces @ rotation * facing[..., None]
     return tables.field(place[..., :2], force, radii)
@@ -527,8 +527,8 @@ def _field_of_polygons(
     centres = np.stack([polygon.centre for polygon in polygons])
     centre = (centres - origin) @ in_plane
 
-    # The twist of a polygon is given about its centroid. The tables need it about the point of the
-    # surface above the cube.
+    # The twist (circulating traction) of a polygon is given about its centroid. The tables need it
+    # about the point of the surface above the cube.
     outward = rotation[:, :, 2]
     facing = np.maximum(outward @ normals, 0.0)
     twist = facing * [polygon.twist for polygon in polygons]
@@ -546,7 +546,7 @@ def _field_of_polygons(
 
 
 def _curvatures(model: MjModel, mujoco: Any) -> Array:
-    """Return the curvature (geoms + 1,) of each geom in 1/m.
+    """Return the curvature (geoms + 1,) of each geom (shape of a body) in 1/m.
 
     It is 1 / radius for spheres, capsules and cylinders, and 0 for all others. The last entry, 0,
     is for flexible bodies, which have no geom.
