@@ -68,7 +68,14 @@ def __getattr__(name: str) -> Any:
     """Import a public name when it is first used (PEP 562)."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_HOMES[name], __name__), name)
+    try:
+        return getattr(import_module(_HOMES[name], __name__), name)
+    except ModuleNotFoundError as error:
+        from .core.errors import CubeError
+
+        raise CubeError(
+            f"{name} needs the Python package {error.name}: pip install 'cube_tensor_driver[bags]'"
+        ) from None
 
 
 def __dir__() -> list[str]:

@@ -210,6 +210,11 @@ def read_skin(path: str | Path, frame_prefix: str = "") -> Skin:
     raise ConfigError(f"{path}: {mistakes[0]}{more}")
 
 
+def as_skin(skin: Skin | str | Path) -> Skin:
+    """Return a skin as it is, or read the skin file with this path."""
+    return read_skin(skin) if isinstance(skin, (str, Path)) else skin
+
+
 def check_skin(path: Path) -> tuple[Skin | None, list[str]]:
     """Read a skin file and report all its mistakes.
 

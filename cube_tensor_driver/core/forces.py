@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
 
+from .arguments import check_number, check_skin
 from .arrays import Array
 from .rows import StressRows
 from .tensor import face_force, rotation_from_rpy
@@ -49,7 +51,14 @@ class Forces:
             side: Side w of the square area of each cube, in m. If it is the distance of
                 neighbouring cubes, the squares cover the skin and the sum of the forces is the
                 force on the whole skin. None stands for the side of the cube itself.
+
+        Raises:
+            ConfigError: The argument `skin` is no skin, or the side is not above 0.
         """
+        check_skin(skin, "cubes")
+        if side is not None:
+            allowed = "a number above 0, in m, or None"
+            check_number("side", side, lambda x: 0 < x < math.inf, allowed)
         cubes = skin.cubes
         positions = [cube.xyz for cube in cubes]
         sides = [side or 2 * cube.calibration.half_side for cube in cubes]

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from .arguments import check_skin
 from .arrays import Array, Mask, PadMasks, StatusBits
 from .calibration import Calibration
 from .errors import TareError
@@ -79,11 +80,13 @@ class Reconstructor:
 
         Raises:
             CalibrationError: There are no cubes.
+            ConfigError: The argument is no skin, such as the path of a skin file.
         """
-        if isinstance(skin, Sequence):
+        if isinstance(skin, Sequence) and not isinstance(skin, str):
             calibrations = list(skin)
             self.names = [str(number) for number in range(len(calibrations))]
         else:
+            check_skin(skin, "calibrations")
             calibrations = list(skin.calibrations)
             self.names = list(skin.names)
         self.pipeline = Pipeline(calibrations, dtype)
@@ -94,8 +97,8 @@ class Reconstructor:
         self._drift = DriftTracker(self.pipeline, self.health)
 
     def __repr__(self) -> str:
-        settings = f"drift_time={self.drift_time:g}, rest_changes={self.rest_changes}"
-        return f"Reconstructor({self.pipeline!r}, {settings})"
+        changes = f"{self.rest_changes} changes of rest frequencies"
+        return f"<Reconstructor: {len(self.names)} cubes, {self.pipeline.dtype}, {changes}>"
 
     @property
     def calibrations(self) -> tuple[Calibration, ...]:
@@ -213,6 +216,7 @@ class Reconstructor:
         """
         if not len(cubes):
             raise TareError("tare of no cube; name one, or leave the list out for all")
+        self._check_cubes(cubes)
         return measure_rest(self.pipeline, self.health, cubes, duration, self.names)
 
     def clear_tare(self, cubes: Sequence[int] | None = None) -> None:
@@ -221,7 +225,18 @@ class Reconstructor:
         Args:
             cubes: Numbers of the cubes; None means all.
         """
+        self._check_cubes(cubes or ())
         chosen = slice(None) if cubes is None else list(cubes)
         rest = self.rest_frequency
         rest[chosen] = self._calibrated_rest[chosen]
         self.rest_frequency = rest
+
+    def _check_cubes(self, cubes: Sequence[int]) -> None:
+        """Raise TareError for an entry that is not the number of a cube."""
+        numbers = range(len(self.names))
+        for cube in cubes:
+            if cube not in numbers:
+                raise TareError(
+                    f"no cube {cube!r}; cubes are numbers from 0 to {numbers[-1]}, "
+                    "as names.index(NAME) gives them"
+                )

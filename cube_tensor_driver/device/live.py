@@ -9,7 +9,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from ..config.port import port_problem
-from ..config.skin import Skin
+from ..config.skin import Skin, as_skin
+from ..core.arguments import check_number
 from ..core.errors import ConfigError
 from ..core.rows import FrequencyRows
 from .chain import LiveLinks
@@ -27,7 +28,7 @@ MAX_RATE = 10_000.0
 
 
 def open_links(
-    skin: Skin,
+    skin: Skin | str | Path,
     *,
     rate: float | None = None,
     port: str = "",
@@ -42,7 +43,7 @@ def open_links(
     A port that does not exist yet is tried again until it can be opened or the source is closed.
 
     Args:
-        skin: The skin: its cubes and links, as read from the skin file.
+        skin: The skin: its cubes and links, as read from the skin file, or the path of this file.
         rate: Sample rate to request from the hubs, 0.1 to 10000 Hz; None takes that of the skin
             file.
         port: Port to use instead of the one in the skin file, for a skin with one link.
@@ -53,10 +54,10 @@ def open_links(
         ConfigError: `rate` is out of its range, `port` was given for several links, or a port is
             neither a device path nor a TCP address.
     """
-    if rate is not None and not MIN_RATE <= rate <= MAX_RATE:
-        raise ConfigError(
-            f"rate is {rate}, allowed: {MIN_RATE:g} to {MAX_RATE:g} samples per second"
-        )
+    skin = as_skin(skin)
+    if rate is not None:
+        allowed = f"{MIN_RATE:g} to {MAX_RATE:g} samples per second"
+        check_number("rate", rate, lambda x: MIN_RATE <= x <= MAX_RATE, allowed)
     links = link_configs(skin, port, port_directory)
     return LinkSource(skin, links, skin.rate if rate is None else rate)
 

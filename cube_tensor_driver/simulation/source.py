@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from ..config.load_script import read_script
-from ..config.skin import Skin
+from ..config.skin import Skin, as_skin
+from ..core.arguments import check_number
 from ..core.arrays import Array
-from ..core.errors import ConfigError
 from ..core.rows import FrequencyRows
 from ..device.wire.protocol import NOT_MEASURED
 from .cubes import hub_cubes
@@ -23,7 +24,7 @@ from .sample_log import SEQUENCE_RANGE
 
 
 def simulate(
-    skin: Skin,
+    skin: Skin | Path | str,
     load: AnyLoad | Path | str | None = None,
     *,
     rate: float | None = None,
@@ -35,7 +36,7 @@ def simulate(
     """Simulate the frequencies that the hubs of a skin would send under a load, scan by scan.
 
     Args:
-        skin: Skin to simulate.
+        skin: Skin to simulate, or the path of a skin file.
         load: Load on the skin (a `Load`, a `MujocoLoad`), or the file of a load script; None: the
             shipped script, an indenter that wanders over the skin.
         rate: Samples per second; None: the rate in the skin file, or 100.
@@ -49,9 +50,10 @@ def simulate(
         Source of frequency rows.
 
     Raises:
-        ConfigError: The rate is out of the range of the hubs, the duration is not positive, the
-            load script cannot be used, or cubes of one hub have different numbers of pads.
+        ConfigError: The rate is out of the range of the hubs, another number is out of its range,
+            the load script cannot be used, or cubes of one hub have different numbers of pads.
     """
+    skin = as_skin(skin)
     if load is None or isinstance(load, (Path, str)):
         script = default_script() if load is None else read_script(Path(load))
         load = Load(skin, script)
@@ -59,10 +61,13 @@ def simulate(
         rate = skin.rate or 1e6 / SimulatedHub.period_us
     # The limits of a hub are sample periods; the longest period gives the lowest rate.
     low, high = (1e6 / limit for limit in reversed(PERIOD_LIMITS_US))
-    if not low <= rate <= high:
-        raise ConfigError(f"rate is {rate!r}, allowed: {low:g} to {high:g} samples per second")
-    if duration is not None and not duration > 0:
-        raise ConfigError(f"duration is {duration!r}, allowed: a time greater than 0 s, or None")
+    check_number(
+        "rate", rate, lambda x: low <= x <= high, f"{low:g} to {high:g} samples per second"
+    )
+    if duration is not None:
+        check_number("duration", duration, lambda x: x > 0, "a time greater than 0 s, or None")
+    check_number("noise", noise, lambda x: 0 <= x < math.inf, "a number of at least 0")
+    check_number("drift", drift, math.isfinite, "a finite number")
 
     # The cubes are created again in each iteration. Creating them here, too, raises errors of the
     # skin before the first iteration.

@@ -7,11 +7,12 @@ posterior of t, prediction.py replaces values that are missing.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from ..config.skin import Skin
+from ..config.skin import Skin, as_skin
 from ..core.arrays import Array, Index, Single
 from ..core.defaults import POISSONS_RATIO, SURFACE_DEPTH
 from ..core.errors import ElasticError
@@ -82,7 +83,7 @@ class SurfaceInverse:
 
     def __init__(
         self,
-        skin: Skin,
+        skin: Skin | str | Path,
         *,
         depth: float = SURFACE_DEPTH,
         thickness: float = np.inf,
@@ -93,7 +94,7 @@ class SurfaceInverse:
         """Set up the matrices. The first time takes about a second, later ones load from the cache.
 
         Args:
-            skin: Skin as from `read_skin`.
+            skin: Skin as from `read_skin`, or the path of a skin file.
             depth: Distance from the centres of the cubes to the surface, in m.
             thickness: Thickness of the elastomer on rigid ground, in m; infinite for a half space.
             poisson: Poisson's ratio of the elastomer.
@@ -106,6 +107,7 @@ class SurfaceInverse:
             ElasticError: The layer is impossible, no cube observes any component, or the influence
                 functions belong to other cubes.
         """
+        skin = as_skin(skin)
         by_pad = noise_of_all_pads(skin.calibrations)
         layer = Layer(thickness, poisson)
         model = None

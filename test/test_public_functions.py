@@ -1,0 +1,63 @@
+"""The public functions in Python: arguments that cannot be used are an error of the package, which
+names the value and the fix; a path stands for the skin that it leads to."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+import cube_tensor_driver as ctd
+from cube_tensor_driver.config.package_data import package_data
+
+FILE = package_data() / "config" / "skin_demo.yaml"
+SKIN = ctd.read_skin(FILE)
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: ctd.Reconstructor(SKIN).tare(["c05"]), "no cube 'c05'; cubes are numbers from 0"),
+        (lambda: ctd.Reconstructor(SKIN).tare([99]), "no cube 99; cubes are numbers from 0 to 15"),
+        (lambda: ctd.Reconstructor(SKIN).clear_tare([-1]), "no cube -1; cubes are numbers from 0"),
+        (lambda: ctd.Reconstructor(str(FILE)), "is no skin; read_skin"),
+        (lambda: ctd.Forces(FILE), "is no skin; read_skin"),
+        (lambda: ctd.Forces(SKIN.poses), "is no skin; read_skin"),
+        (lambda: ctd.Forces(SKIN, side=-1), "side is -1, allowed: a number above 0, in m"),
+        (lambda: ctd.Forces(SKIN, side="a"), "side is 'a', allowed: a number above 0, in m"),
+        (lambda: ctd.simulate(SKIN, noise="a"), "noise is 'a', allowed: a number of at least 0"),
+        (lambda: ctd.simulate(SKIN, noise=-1.0), "noise is -1.0, allowed: a number of at least 0"),
+        (lambda: ctd.simulate(SKIN, drift=None), "drift is None, allowed: a finite number"),
+        (lambda: ctd.simulate(SKIN, rate="a"), "rate is 'a', allowed: 0.1 to 10000"),
+        (lambda: ctd.simulate(SKIN, duration="a"), "duration is 'a', allowed: a time"),
+        (lambda: ctd.open_links(SKIN, rate="a"), "rate is 'a', allowed: 0.1 to 10000"),
+    ],
+)
+def test_an_argument_that_cannot_be_used_is_named_with_the_fix(call, words):
+    with pytest.raises(ctd.CubeError) as refused:
+        call()
+    assert words in str(refused.value) and len(str(refused.value)) < 200
+
+
+def test_a_path_is_accepted_where_a_skin_is():
+    assert next(iter(ctd.simulate(str(FILE)))).cube.tolist() == list(range(16))
+    assert ctd.SurfaceInverse(FILE).points.shape == ctd.SurfaceInverse(SKIN).points.shape
+    with ctd.open_links(FILE, port_directory="/nowhere") as source:
+        assert source.skin.names == SKIN.names
+
+
+def test_bags_without_their_libraries_name_what_installs_them():
+    program = """
+import sys
+sys.modules["rosbags"] = None
+import cube_tensor_driver as ctd
+try:
+    ctd.open_bag("bag")
+except ctd.CubeError as error:
+    print(error)
+"""
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "open_bag needs the Python package rosbags" in done.stdout
+    assert "pip install 'cube_tensor_driver[bags]'" in done.stdout
