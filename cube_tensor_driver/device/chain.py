@@ -44,9 +44,9 @@ MIN_LAG_S = 0.05
 """Shortest time, in s, by which reading was behind (data of links waited) at which lost samples are
 put down to this host. The buffers of a serial port hold about that much."""
 OVERLOAD_S = 0.5
-"""Time, in s, for which reading must have been behind before scans (one sample of every cube) are
-dropped because this host is too slow. After a shorter pause it catches up by itself. Dropping ends
-when none was needed for as long."""
+"""Time, in s, for which reading must have been behind, with samples lost since, before scans (one
+sample of every cube) are dropped because this host is too slow. After a shorter pause it catches up
+by itself. Dropping ends when none was needed for as long."""
 
 
 @dataclass(frozen=True)
@@ -164,6 +164,8 @@ class LiveLinks:
         self._step_ns = 0
         self._errors = 0
         self._overloaded_until = 0.0  # monotonic time, in s
+        # Number of samples missing at the last look while reading was behind; else None.
+        self._missing_before: int | None = None
         self._reader: Reader | None = None
 
     def start(self) -> None:
@@ -286,13 +288,19 @@ class LiveLinks:
     def _is_overloaded(self) -> bool:
         """Return whether this host is too slow, so that scans must be dropped.
 
-        Whole scans are dropped, the oldest first, so that those that are delivered are complete and
-        late by a few sample periods at most. If the kernel or the hubs dropped samples instead, at
-        random, scans would have gaps and cost more time than complete ones.
+        It is if samples are lost although reading has been behind for `OVERLOAD_S`; a host that is
+        only behind delivers all. Whole scans are dropped, the oldest first, so that those that are
+        delivered are complete and late by a few sample periods at most. If kernel and hubs dropped
+        samples instead, at random, scans would have gaps and cost more time than complete ones.
         """
         now = time.monotonic()
         if self._reader is not None and self._reader.behind_s > OVERLOAD_S:
-            self._overloaded_until = now + OVERLOAD_S
+            n_missing = sum(record.account.missing for record in self._records)
+            if self._missing_before is not None and n_missing > self._missing_before:
+                self._overloaded_until = now + OVERLOAD_S
+            self._missing_before = n_missing
+        else:
+            self._missing_before = None
         return now < self._overloaded_until
 
     def _count_overload(self, n_rows: int) -> None:

@@ -399,6 +399,11 @@ class SampleAccount:
         return tracker is not None and len(self._trackers) == 1 and tracker.n_cubes == self._n_cubes
 
     @property
+    def missing(self) -> int:
+        """Number of samples that have not come."""
+        return sum(tracker.counters.missing for tracker in self._trackers.values())
+
+    @property
     def resets(self) -> int:
         """Number of restarts of the hub plus number of times its clock was set back."""
         return self._total().resets
