@@ -22,10 +22,10 @@ from .mesh import mesh_box, mesh_section
 
 
 class BrickSizes(NamedTuple):
-    """Sizes of the bricks of one mesh.
+    """Sizes of the bricks (box-shaped elements) of one mesh.
 
     Attributes:
-        face: Size of a brick on a face of the cube, in d0.
+        face: Size of a brick on a face of the cube, in d0 (half the side of the cube).
         edge: Size of a brick at an edge of the cube, in d0.
         growth: Ratio of the sizes of two neighbouring bricks, away from the cube.
     """
@@ -40,12 +40,14 @@ BRICK_SIZES = (
     BrickSizes(0.25, 0.2, 2.0),
     BrickSizes(0.25, 0.1, 1.5),
 )
-"""Sizes of the bricks of the three meshes in space, from coarse to fine."""
+"""Sizes of the bricks (box-shaped elements) of the three meshes of a body in space, from coarse to
+fine."""
 MAX_BRICK_ON_GROUND = 2.0
-"""Largest brick of a body on ground, in d0. Where forces act on its surface the field is not
-linear, so bricks must stay small far away from the cube, too."""
+"""Largest brick (box-shaped element) of a body on rigid ground, in d0 (half the side of the cube).
+Where forces act on the surface the stress is not linear in the position, so bricks must stay small
+far away from the cube, too."""
 MIN_EDGE_DISTANCE = 1e-3
-"""Smallest distance of two pad edges that a mesh resolves, in d0."""
+"""Smallest distance of two pad edges that a mesh resolves, in d0 (half the side of the cube)."""
 MIN_BODY_RATIO = 1.1
 """Smallest ratio of the body's width, depth and height to the cube's side."""
 
@@ -65,11 +67,11 @@ class Body:
         cube_poisson: Poisson's ratio of the cube.
         plane: "strain" or "stress", for layouts in a plane.
         x: Position of the cube's centre along x relative to the body's centre, in m.
-        z: The same along z.
+        z: Position of the cube's centre along z relative to the body's centre, in m.
         ground: Whether the lower face is bonded to rigid ground.
 
     Raises:
-        ElasticError: No such body can be computed.
+        ElasticError: A value is out of its range, or the cube does not fit into the body.
     """
 
     width: float = 60e-3
@@ -133,7 +135,7 @@ def strip_layout(
 
     Args:
         layout: Layout whose pads keep their faces and directions.
-        width: Width of the pads, in d0.
+        width: Width of the pads, in d0 (half the side of the cube).
         centre: Distance of a pad's centre from the centre of its face, in d0. A width of 1 and a
             distance of 0.5 are the halves of each face.
 
@@ -149,7 +151,8 @@ def strip_layout(
 
 
 def field_axes(layout: Layout) -> tuple[int, ...]:
-    """Return the axes of a layout's problem: x and z in a plane, all three in space."""
+    """Return the axes in which a layout is computed: 0 and 2 (x and z) for a layout in a plane, all
+    three for one in space."""
     return (0, 2) if layout.planar else (0, 1, 2)
 
 
@@ -176,7 +179,7 @@ def make_mesh(
     layout: Layout,
     level: int,
 ) -> skfem.Mesh:
-    """Mesh the body about the cube's centre.
+    """Mesh the body, with the origin in the cube's centre.
 
     Along an axis where the body is its own mirror image, only the positive part is meshed.
 
@@ -186,7 +189,7 @@ def make_mesh(
         level: 0 is the coarsest mesh, 2 the finest.
 
     Returns:
-        A mesh with lengths in d0.
+        A mesh with lengths in d0 (half the side of the cube).
 
     Raises:
         ElasticError: Edges of pads are too close to each other.
@@ -199,7 +202,7 @@ def make_mesh(
     half = lengths[axes] / body.side
     centre = np.array([body.x, 0.0, body.z])
     offset = centre[axes] / (body.side / 2)
-    # The ground is on one side only, so it breaks the mirror along z.
+    # Ground below the body makes it unequal to its mirror image along z.
     no_mirror = (offset != 0) | (body.ground & (np.array(axes) == 2))
     lower = np.where(no_mirror, half + offset, 0.0).tolist()
     upper = (half - offset).tolist()
@@ -219,7 +222,8 @@ def make_mesh(
 
 
 def _pad_edges(layout: Layout) -> Array:
-    """Return the distances of pad edges from the centres of their faces, in d0, sorted."""
+    """Return the sorted distances of pad edges from the centres of their faces, in d0 (half the
+    side of the cube)."""
     half = layout.pad_size / 2
     edges = []
     for position, normal in zip(layout.positions, layout.normals, strict=True):
@@ -229,13 +233,14 @@ def _pad_edges(layout: Layout) -> Array:
                     abs(position[axis] - half),
                     abs(position[axis] + half),
                 ]
-    # Edges of different pads that are equal except for rounding must be one stop.
+    # Edges of different pads that are equal except for rounding must be one end of elements.
     return np.unique(np.round(edges, 9))
 
 
 def _check_edges(stops: Array, half_side: float) -> None:
-    """Raise ElasticError when two edges are closer than the mesh resolves."""
-    # Elements also end at the centre of a face and at its edge.
+    """Raise ElasticError when two of the pad edges `stops` (in d0, half the side of the cube) are
+    closer than `MIN_EDGE_DISTANCE`."""
+    # Elements also end at the centre of a face (0) and at its edge (1).
     ends = np.unique([0.0, *stops[stops < 1], 1.0])
     distance = np.diff(ends).min()
     if distance < MIN_EDGE_DISTANCE:

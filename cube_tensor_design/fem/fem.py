@@ -1,4 +1,5 @@
-"""The response matrix of a cube by finite elements: the mean stress of each pad under each mode.
+"""The response matrix of a cube by finite elements: the mean stress of each pad under each mode (a
+linear stress field in equilibrium).
 
 The body is a box with the cube bonded in it. The tractions of a mode load its outer faces: without
 the cube, the field of the mode would be everywhere in the body.
@@ -43,28 +44,29 @@ Progress = Callable[[float, float, str], None]
 """Called as progress(done, total, what) before every step of a computation and at its end."""
 
 MAX_MESHES = 3
-"""Number of meshes from the coarsest to the finest."""
+"""Largest number of meshes on which one response is computed, from the coarsest to the finest."""
 NO_FORCE = 1e-12
-"""Largest nodal force of a load, relative to the largest of all loads, that counts as rounding: the
-load has no part of this parity."""
+"""Largest nodal force of a load, relative to the largest of all loads, that counts as rounding:
+such a load has no part of the parity (even or odd under each mirror) that is solved."""
 STIFF_CUBE_RATIO = 1e6
-"""Ratio of the Young's moduli of cube and body that stands for a rigid cube, where the cube cannot
-be held because it moves with the body."""
+"""Ratio of the Young's moduli of cube and body that stands for a rigid cube in a body on ground. A
+cube that is held at rest would not do, because the cube moves with the body there."""
 
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """A computed response matrix.
+    """A computed response matrix: stress of each pad under each mode (linear stress field).
 
     Attributes:
         body: The body.
         layout: Pads of the cube.
-        symmetry: Group whose coefficients describe the response.
+        symmetry: Symmetry group whose coefficients describe the response.
         modes: Names of the modes.
         matrix: (pads, modes) in Pa per Pa, tension positive, gradients times d0.
-        coefficients: Its projection on the matrices that `symmetry` allows.
-        structure_residual: Part of the matrix that the projection leaves (relative, Frobenius).
-        mode_residual: The same part of each mode's column.
+        coefficients: Coefficients by name of the matrices that `symmetry` allows, by projection.
+        structure_residual: Part of the matrix that these do not explain: Frobenius norm of the
+            difference over that of the matrix.
+        mode_residual: The same ratio for the column of each mode.
         rank: Number of independent states that the pads observe.
         unobservable: Names of the modes that the pads cannot tell from others.
         convergence: One row per mesh: unknowns, seconds, coefficients, and `change`, the largest
@@ -108,8 +110,8 @@ def compute_response(
     Args:
         body: The body.
         layout: Pads of the cube.
-        symmetry: Group whose coefficients are to describe the response.
-        meshes: Number of meshes, of which more show more of the convergence.
+        symmetry: Symmetry group whose coefficients are to describe the response.
+        meshes: Number of meshes; with more than one, the convergence is known.
         progress: Called before every solve and at the end.
 
     Raises:
@@ -164,7 +166,8 @@ def compute_response(
 
 
 def count_steps(progress: Progress | None, total: int) -> Callable[[str], None]:
-    """Return a function that reports the next of `total` steps by its name."""
+    """Return a function that reports, by its name, that the next of `total` steps of work
+    begins."""
     done = itertools.count()
 
     def report(what: str) -> None:
@@ -181,11 +184,11 @@ def _solve_mesh(
     number: int,
     report: Callable[[str], None],
 ) -> tuple[Array, int]:
-    """Return the response matrix on the mesh of this number, and its number of unknowns."""
+    """Return the response matrix on one mesh, and the number of unknowns of the mesh."""
     try:
         solid = make_solid(body, layout, grid)
         matrix = linear_response(solid, layout, lambda what: report(f"mesh {number}, {what}"))
-    except MemoryError:  # from a limit that check_memory does not know
+    except MemoryError:  # Some limit that check_memory does not know was reached.
         raise ElasticError(
             f"the memory ran out on mesh {number}, of {grid.nvertices} corners; "
             "ask for fewer meshes or wider pads"
@@ -198,7 +201,8 @@ def _mode_residual(
     matrix: Array,
     coefficients: dict[str, float],
 ) -> dict[str, float]:
-    """Return the relative part of each mode's column that the structure does not explain."""
+    """Return, by mode, the part of its column of the response that the symmetric coefficients do
+    not explain: norm of the difference over norm of the column."""
     explained = np.tensordot(list(coefficients.values()), structure.basis, axes=1)
     left = np.linalg.norm(matrix - explained, axis=0)
     norms = np.linalg.norm(matrix, axis=0)
@@ -207,7 +211,8 @@ def _mode_residual(
 
 
 def _find_observable(matrix: Array, names: tuple[str, ...]) -> tuple[int, tuple[str, ...]]:
-    """Return the rank of a response matrix, and the modes with a part in its null space."""
+    """Return the rank of a response matrix, and the names of modes with a part in its null space,
+    which no pad measures."""
     _, singular, rows = np.linalg.svd(matrix)
     rank = int(np.sum(singular > RANK_TOLERANCE * singular[0]))
     # The last rows span the null space: states that no pad measures.
@@ -224,16 +229,16 @@ def calibration_from_fem(
 ) -> Calibration:
     """Return a calibration with the computed response.
 
-    Rest frequency, beta and modulus are placeholders, which tare and fit replace. The noise is that
-    of counting periods for 1 ms.
+    Rest frequency f0, beta and modulus of the pad law are placeholders, which tare and fit replace.
+    The noise is that of counting periods of the pad's oscillator for 1 ms.
 
     Args:
         result: The computed response.
         whole_matrix: Whether to store the matrix instead of its symmetric coefficients.
-        neglect: Modes that are assumed to be zero, so that few pads can tell the others.
-        source: What the calibration is made from.
+        neglect: Names of modes that are assumed to be zero, so that few pads can tell the others.
+        source: Text about the origin of the calibration, which the calibration stores.
     """
-    # A calibration holds one of the two.
+    # A calibration holds either coefficients or the whole matrix.
     content: dict[str, Any] = {"coefficients": result.coefficients}
     if whole_matrix:
         content = {"matrix": result.matrix}
@@ -268,7 +273,7 @@ def make_solid(
     if not np.isinf(body.cube_young):
         cube = lame(body.cube_young / body.young, body.cube_poisson, plane)
     elif body.ground:
-        # The ground holds the body, so a rigid cube must be able to move in it.
+        # A rigid cube moves with a body on ground, so it is a very stiff elastic one here.
         cube = lame(STIFF_CUBE_RATIO, 0.0, plane)
     mesh = grid or make_mesh(body, layout, MAX_MESHES - 1)
     return Solid(mesh, lame(1.0, body.poisson, plane), cube, body.ground)
@@ -279,7 +284,7 @@ def linear_response(
     layout: Layout,
     report: Callable[[str], None] = lambda _: None,
 ) -> Array:
-    """Return the response matrix (pads, modes) on one mesh.
+    """Return the response matrix (pads, modes) on one mesh, in Pa per Pa.
 
     Args:
         solid: The meshed body.
@@ -304,12 +309,13 @@ def pad_stresses(
     forces: Callable[[Parity], Array],
     report: Callable[[str], None] = lambda _: None,
 ) -> Array:
-    """Return the mean normal stress (pads, n) under n loads.
+    """Return the mean normal stress (pads, n) under n loads, as the sum over all parities.
 
     Args:
         solid: The meshed body.
         layout: Pads of the cube.
-        forces: Returns, for a parity, the nodal forces (dofs, n) of that part of the loads.
+        forces: Returns, for a parity (+1 even or -1 odd under the mirror of each axis, 0 without
+            mirror), the nodal forces (dofs, n) of that part of the loads.
         report: Called as report(what) before every solve.
     """
     stresses: Any = 0.0
@@ -327,7 +333,8 @@ def pad_stresses(
 
 
 def each_parity(solid: Solid, report: Callable[[str], None]) -> Iterator[Parity]:
-    """Yield the parities of a body, each after its report; those that share factors follow."""
+    """Yield and report the parities of a body, so that those that share a factorisation of the
+    stiffness follow one another."""
 
     def shared(parity: Parity) -> Parity:
         return solid.with_sorted_axes(parity)[0]

@@ -14,9 +14,10 @@ from cube_tensor_driver.core.modes import PLANE
 from cube_tensor_driver.mechanics.layer import FIELD, Layer
 
 WAVES = 4000
-"""Number of wavenumbers of the integral."""
+"""Number of wavenumbers k at which the integral over all waves along x is evaluated."""
 MAX_WAVENUMBER = 30.0
-"""Largest wavenumber times depth. The field has decayed there by exp(-30)."""
+"""Largest wavenumber of the integral over waves, times the depth of the point. The stress of such a
+wave has decayed by exp(-30) at this depth."""
 
 
 def line_load(
@@ -34,12 +35,12 @@ def line_load(
         scale: Length that gradients are multiplied with, in m.
 
     Returns:
-        (7, m, 2) amplitudes of the modes `PLANE`, in Pa under 1 N/m.
+        (7, m, 2) amplitudes of the modes `PLANE` (linear stress fields), in Pa under 1 N/m.
     """
     # Midpoints of equal intervals, so that k = 0 needs no limit.
     k = (np.arange(WAVES) + 0.5) * MAX_WAVENUMBER / depth / WAVES
     transfer = layer.transfer(k, 0 * k, depth)
-    transfer = transfer[:, :, [0, 2]]  # forces along x and z
+    transfer = transfer[:, :, [0, 2]]  # The columns of forces along x and z.
     rows = transfer[:, [FIELD.index(name) for name in PLANE.names]]
     is_gradient = ["_" in name for name in PLANE.names]
     rows[:, is_gradient] *= scale

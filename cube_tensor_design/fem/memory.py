@@ -10,7 +10,8 @@ import skfem
 from cube_tensor_driver.core.errors import ElasticError
 
 FIXED_BYTES = 3e8
-"""Memory in bytes that is needed for any mesh. With less, SuperLU was seen to hang."""
+"""Memory, in bytes, that is needed for any mesh, however small. With less, SuperLU (the solver) was
+seen to hang."""
 BYTES_PER_CORNER = {2: 3e5, 3: 8e5}
 """Peak memory of the solver in bytes per corner of an element, by dimension; measured."""
 
@@ -18,7 +19,8 @@ BYTES_PER_CORNER = {2: 3e5, 3: 8e5}
 def check_memory(grid: skfem.Mesh, bytes_per_corner: float | None = None) -> None:
     """Raise ElasticError when the solver needs more memory than is available.
 
-    This is asked before any work, because SuperLU may look for memory for ever near a limit.
+    This is checked before any work, because SuperLU (the solver) may search for memory without end
+    near a limit.
 
     Args:
         grid: The mesh.
@@ -39,7 +41,7 @@ def available_memory() -> float | None:
     """Return the bytes that this process may still take, limited by the machine and by ulimit.
 
     Returns:
-        None where that is unknown, which is everywhere but on Linux. Nothing is refused then.
+        None where the number is unknown, on systems other than Linux; then no mesh is refused.
     """
     try:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()

@@ -17,14 +17,15 @@ import skfem
 from cube_tensor_driver.core.arrays import Array, Index
 
 DECAY_DISTANCE = 1.5
-"""Distance from the cube's faces, in d0, at which the stress that the cube adds has decayed. Beyond
-it a linear field needs no fine mesh, and bricks grow by `FAR_GROWTH`."""
+"""Distance from the cube's faces, in d0 (half the side of the cube), at which the stress that the
+cube adds has decayed. Beyond it, where the field is linear, bricks grow by `FAR_GROWTH`."""
 FAR_GROWTH = 3.0
-"""Ratio of the sizes of two neighbouring bricks beyond `DECAY_DISTANCE`."""
+"""Ratio of the sizes of two neighbouring bricks (box-shaped elements) beyond `DECAY_DISTANCE`."""
 SECTION_GROWTH = 2.0
 """Ratio of the sizes of two neighbouring triangles away from the cube."""
 RING_HALF_SIDE = 0.5
-"""Half side of the largest ring of triangles around the cube's corner, in d0."""
+"""Half side of the largest square ring of triangles around the cube's corner, in d0 (half the side
+of the cube)."""
 _RING_POINTS = np.array(
     [
         (1.0, 0.0),
@@ -37,7 +38,8 @@ _RING_POINTS = np.array(
         (1.0, -1.0),
     ]
 )
-"""Points of a ring around the origin, anticlockwise; those with an odd number are corners."""
+"""Points (8, 2) of a square ring of half side 1 around the origin, anticlockwise. Those with an odd
+number are corners, the others the middles of sides."""
 
 
 def mesh_quarter(
@@ -50,9 +52,11 @@ def mesh_quarter(
 ) -> skfem.MeshTri:
     """Mesh [0, half[0]] x [0, half[1]] with triangles in rings around the cube's corner (1, 1).
 
+    Lengths are in d0 (half the side of the cube), from the cube's centre.
+
     Args:
         half: Half width and half height of the section.
-        stops: Pad edges on [0, 1].
+        stops: Pad edges on [0, 1], at which elements end.
         level: 0 is coarse, 1 has twice as many rings, each further one cuts all triangles in four.
         smallest: Ratio of the last ring's size to the first one's. What the rings leave out at 1e-8
             is less than 1e-4 of any entry of the response.
@@ -93,7 +97,7 @@ def mesh_section(
     Where `lower` is 0, only the positive part is meshed.
     """
     stops = list(stops)
-    # All quarters need the same rings, or their common edges would not match.
+    # All quarters need rings of the same size, or the points on their common edges would differ.
     meshed = [length for length in (*lower, *upper) if length > 0]
     ring = min(RING_HALF_SIDE, min(meshed) - 1.0)
     # The sign and the length of each half that is meshed, along each axis.
@@ -118,7 +122,8 @@ def mirror_quarter(quarter: skfem.MeshTri) -> skfem.MeshTri:
 def _join_quarters(
     parts: Sequence[tuple[skfem.MeshTri, tuple[int, ...]]],
 ) -> skfem.MeshTri:
-    """Return one mesh of quarters, each with the signs of its axes, that share their edges."""
+    """Return one mesh of quarters that share their edges; the signs of a quarter mirror its
+    axes."""
     points: list[Array] = []
     triangles: list[Index] = []
     first = 0
@@ -132,13 +137,13 @@ def _join_quarters(
 
 
 def _merge_points(points: Array, triangles: Index) -> skfem.MeshTri:
-    """Return a mesh of points (2, n), some of which are equal, and triangles (3, m)."""
+    """Return a mesh of triangles (3, m, numbers of points) in which equal points (2, n) are one."""
     # The points are complex numbers here, because np.unique of rows (axis=0) swallows Ctrl-C.
     # Adding 0.0 turns -0.0 into 0.0.
     corners = (points + 0.0).T[triangles.T.ravel()] @ [1, 1j]
     unique, inverse = np.unique(corners, return_inverse=True)
     merged = np.array([unique.real, unique.imag])
-    # skfem wants contiguous arrays.
+    # skfem (the finite element library) wants contiguous arrays.
     return skfem.MeshTri(merged, inverse.reshape(-1, 3).T.copy())
 
 
@@ -155,12 +160,12 @@ def mesh_box(
     """Mesh the product of the intervals [-lower[k], upper[k]] with bricks.
 
     Away from the cube bricks grow by the factor `growth`, and faster where the stress that the cube
-    adds has decayed.
+    adds has decayed. Lengths are in d0 (half the side of the cube), from the cube's centre.
 
     Args:
         lower: Length on the negative side of each axis; 0 where there is a mirror.
         upper: Length on the positive side of each axis.
-        stops: Pad edges on [0, 1].
+        stops: Pad edges on [0, 1], at which bricks end.
         size: Size of a brick on a face of the cube.
         smallest: Size of a brick at an edge of the cube.
         growth: Ratio of the sizes of two neighbouring bricks.
@@ -193,7 +198,7 @@ def _split(
     end: float,
     size: float,
 ) -> Array:
-    """Return points through all stops to the end, at most `size` apart."""
+    """Return points (n,) that contain all stops and the end, and are at most `size` apart."""
     stops = sorted({*stops, end})
     points = [np.array([stops[0]])]
     for a, b in pairwise(stops):
@@ -209,7 +214,8 @@ def _grow_to(
     growth: float,
     largest: float,
 ) -> Array:
-    """Return points from start to end inclusive, in steps from about `first` up to `largest`."""
+    """Return points (n,) from start to end inclusive. Steps begin near `first` and grow by the
+    factor `growth` up to `largest`."""
     if start == end:
         return np.array([start])
     points = start + _graded(end - start, first * growth, growth)
@@ -221,7 +227,8 @@ def _graded(
     first: float,
     growth: float,
 ) -> Array:
-    """Return points from 0 to length in steps that grow by one factor, from `first` or less."""
+    """Return points (n,) from 0 to length in steps that grow by the factor `growth`; the first step
+    is at most `first`."""
     # The geometric series of n steps from `first` must reach the length.
     ratio = length * (growth - 1.0) / first
     exact = np.log1p(ratio) / np.log(growth)
@@ -231,7 +238,7 @@ def _graded(
     points = np.zeros(n + 1)
     points[1:] = np.cumsum(steps)
     points *= length / steps.sum()
-    points[-1] = length  # free of rounding, so that neighbouring parts share it
+    points[-1] = length  # Free of rounding, so that the next part begins at the same point.
     return points
 
 
@@ -242,17 +249,18 @@ def _rings(
 ) -> tuple[Array, Index]:
     """Return points (n, 2) and triangles (m, 3) of rings of eight trapezoids about (1, 1).
 
-    Each ring is the one before it times `ratio`; the first one has the half side `rho`.
-    """
+    Each ring is the one before times `ratio`; the first has the half side `rho`, the last
+    `smallest` times that."""
     n = int(np.ceil(np.log(smallest) / np.log(ratio)))
     radii = rho * ratio ** np.arange(n + 1)
     around = 1.0 + np.multiply.outer(radii, _RING_POINTS).reshape(-1, 2)
     # The corner of the cube is the last point.
     points = np.concatenate([around, [[1.0, 1.0]]])
     triangles = []
-    for outer in range(0, 8 * n, 8):  # number of the ring's first point
+    for outer in range(0, 8 * n, 8):  # `outer` is the number of the ring's first point.
         inner = outer + 8
-        for side in range(0, 8, 2):  # a point in the middle of a side, between two corners
+        # `side` is a point in the middle of a side, between two corners.
+        for side in range(0, 8, 2):
             for corner in ((side + 1) % 8, (side - 1) % 8):
                 # Cut the trapezoid along its shorter diagonal.
                 triangles.append((outer + side, outer + corner, inner + corner))

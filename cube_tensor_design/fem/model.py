@@ -38,7 +38,7 @@ from cube_tensor_driver.core.symmetry import (
 from .body import Body, strip_layout
 
 DEFAULT_LAYOUT = "planar"
-"""Layout of a model that names none."""
+"""Name of the layout (places of the pads) of a model file that names none."""
 
 _LENGTH = real("a length in m greater than 0", exclusiveMinimum=0)
 _OFFSET = real("a distance in m")
@@ -92,13 +92,13 @@ _SCHEMA = Schema(
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """What `./cube fem` computes.
+    """Content of a model file of `./cube fem`.
 
     Attributes:
         body: Box of elastomer with the cube in it.
         layout: Pads of the cube.
-        symmetry: Group whose coefficients describe the response.
-        neglect: Names of modes that the calibration takes as zero.
+        symmetry: Symmetry group whose coefficients describe the response.
+        neglect: Names of modes (linear stress fields) that the calibration takes as zero.
     """
 
     body: Body
@@ -122,7 +122,7 @@ def find_model(name: str) -> Path:
 
 
 def read_model(name: str | None) -> Model:
-    """Read and check a model; without a name, take the default of every key.
+    """Read and check a model file; without a name, take the default of every key.
 
     Raises:
         ConfigError: There is no such model, a key is unknown or a value is not allowed. The
@@ -141,7 +141,8 @@ def read_model(name: str | None) -> Model:
 
 
 def _build_model(data: Mapping[str, Any], folder: Path) -> Model:
-    """Build the model of checked values; layout files are looked up in `folder`."""
+    """Build a model from the checked content of its file; layout files are looked up in
+    `folder`."""
     name = str(data.get("layout", DEFAULT_LAYOUT))
     is_file = name.endswith((".yaml", ".yml"))
     layout = named_layout(str(folder / name) if is_file else name)
@@ -155,14 +156,15 @@ def _build_model(data: Mapping[str, Any], folder: Path) -> Model:
     layout = _place_pads(layout, data.get("pads", {}), body.side / 2)
     symmetry = data.get("symmetry") or largest_symmetry(layout)
     neglect = tuple(data.get("neglect", ()))
-    # Both raise an error for a name that does not fit the layout, before any work.
+    # Both calls raise an error for a name that does not fit the layout, before any work.
     find_structure(layout, symmetry)
     default_modes(layout).index(neglect)
     return Model(body, layout, symmetry, neglect)
 
 
 def _build_body(data: Mapping[str, Any]) -> Body:
-    """Build the body from the tables `body` and `cube`; what they leave out has Body's default."""
+    """Build the body from the keys `body` and `cube` of a model file; values that the file leaves
+    out have the defaults of `Body`."""
     values = dict(data.get("body", {}))
     # A body without a depth is square seen from above.
     values.setdefault("depth", values.get("width", Body.depth))

@@ -28,10 +28,11 @@ from cube_tensor_driver.core.layout import Layout
 from .body import field_axes
 
 SAME_COORDINATE = 1e-13
-"""Distance below which two coordinates of nodes are equal, in d0. They are known to rounding, and
-the smallest element has 1e-10."""
+"""Distance, in d0 (half the side of the cube), below which two coordinates of nodes are equal.
+Coordinates are exact to rounding, and the smallest element has a size of 1e-10."""
 SAME_PLACE = 1e-9
-"""Distance below which a pad's centre counts as on the centre line of its face, in d0."""
+"""Distance, in d0 (half the side of the cube), below which a pad's centre counts as on the centre
+line of its face."""
 
 
 def pad_weights(
@@ -41,15 +42,18 @@ def pad_weights(
     parity: Sequence[int],
     rotation: Array | None = None,
 ) -> Array:
-    """Return weights (P, dofs) from nodal forces on the cube to the mean normal stress of pads.
+    """Return weights (P, dofs) from nodal forces on the cube to the mean normal stress of P pads.
 
     Args:
-        positions: (dim, dofs) position of each unknown, in d0; the components of one node are
+        positions: (dim, dofs) position of each unknown displacement, in d0 (half the side of the
+            cube); the components of one node are
             neighbours among the unknowns. Elements end where pads end.
         order: Order of the elements.
         layout: Pads of the cube.
-        parity: Parity of the field along each axis; 0 where there is no mirror.
-        rotation: Rotation (dim, dim) of the cube in the finite strain of the body; None for none.
+        parity: +1 where the field is even under the mirror of an axis, -1 where it is odd, 0 where
+            there is no mirror.
+        rotation: Rotation matrix (dim, dim) of the cube in a deformed body; None: the cube has not
+            rotated.
     """
     axes = list(field_axes(layout))
     dim = len(axes)
@@ -60,10 +64,10 @@ def pad_weights(
     for pad, (centre, normal) in enumerate(pads):
         axis = int(np.argmax(np.abs(normal)))
         others = [k for k in range(dim) if k != axis]
-        # A field that is odd about the pad's centre has no mean.
+        # A field that is odd about the pad's centre has a mean of zero.
         if any(parity[k] < 0 and abs(centre[k]) < SAME_PLACE for k in others):
             continue
-        # A pad on the other side of a mirror is read on this side.
+        # Only one side of a mirror is meshed, so a pad on the other side is read on this one.
         face = normal[axis] if parity[axis] == 0 else 1.0
         direction = normal if face == normal[axis] else -parity[axis] * normal
         if rotation is not None:
@@ -92,7 +96,8 @@ def interval_weights(
     start: float,
     stop: float,
 ) -> Array:
-    """Return the weights w (n,) with w . r = integral of the traction from start to stop.
+    """Return weights w (n,) for nodal reactions r: w . r is the integral of the traction from start
+    to stop.
 
     Args:
         nodes: (n,) positions on half a face, from its centre 0 to its corner 1, or on a whole face
@@ -109,7 +114,7 @@ def interval_weights(
         weights = np.zeros(len(nodes))
         weights[half:] = (even + odd) / 2
         weights[half::-1] += (even - odd) / 2
-        weights[half] = even[0] / 2  # the node in the centre belongs to both halves
+        weights[half] = even[0] / 2  # The node in the centre belongs to both halves.
         return weights
 
     def from_centre(end: float) -> Array:
@@ -126,9 +131,10 @@ def _weights_from_centre(
     parity: int,
     stop: float,
 ) -> Array:
-    """Return the weights (n,) of the integral from 0 to stop.
+    """Return the weights (n,) of nodal reactions for the integral of the traction from 0 to stop.
 
-    They solve (int phi_i t_j)^T w = int_0^stop t_j for all trial functions t_j.
+    They solve (int phi_i t_j)^T w = int_0^stop t_j for all trial functions t_j of the traction,
+    with the nodal functions phi_i.
     """
     n = len(nodes)
     mass = np.zeros((n, n))
@@ -153,7 +159,8 @@ def _weights_from_centre(
 
 
 def _line_element(order: int) -> tuple[Array, Array]:
-    """Return mass matrix and integrals of the polynomials of order + 1 equal nodes on [0, 1]."""
+    """Return integrals int phi_i phi_j and int phi_i on [0, 1] of the polynomials phi_i that are 1
+    at one of order + 1 equally spaced nodes and 0 at the others."""
     points, weight = np.polynomial.legendre.leggauss(order + 1)
     points = (points + 1) / 2
     weight = weight / 2
@@ -164,8 +171,9 @@ def _line_element(order: int) -> tuple[Array, Array]:
 
 
 def _continuation(order: int) -> Array:
-    """Return the values at the element's end of the polynomials through its other nodes."""
+    """Return the values (order,) at the end 1 of an element [0, 1] of the polynomials that are 1 at
+    one of its other nodes and 0 at the rest."""
     nodes = np.arange(order) / order
     powers = np.vander(nodes, increasing=True)
-    # At the end 1 all powers are one.
+    # At the end 1 of the element all powers are one.
     return np.ones(order) @ np.linalg.inv(powers)

@@ -73,7 +73,8 @@ def _surface_influence(
     layout: Layout,
     report: Callable[[str], None],
 ) -> tuple[Array, Array]:
-    """Return positions (n, dim - 1) and influence (P, n, dim) of the nodes on the surface, d0."""
+    """Return positions (n, dim - 1) of the nodes on the surface, and the stress (P, n, dim) of P
+    pads under unit forces there; lengths in d0 (half the side of the cube)."""
     dim = solid.dim
     # The components of one node are neighbours among the unknowns.
     x = solid.positions[:, ::dim]
@@ -86,14 +87,14 @@ def _surface_influence(
         gaps = solid.pad_weights(layout, parity).T
         displacement = solid.solve(parity, solid.body @ gaps)
         on_surface = np.moveaxis(displacement[dofs], -1, 0)  # (P, n, dim)
-        # An even field has an odd displacement along the axis.
+        # The displacement along an axis is odd where the field is even under the mirror.
         images, weights = mirror_images(parity)
         flip = weights[:, None] * images
         total = total + on_surface[:, None] * flip[:, None]
 
     places = (x[:-1, nodes].T * images[:, None, :-1]).reshape(-1, dim - 1)
     pads = np.reshape(total, (layout.n_pads, -1, dim))
-    # A node on a mirror is there twice, with the same value.
+    # A node on a mirror belongs to two parts of the body, with the same value.
     rounded = np.round(places, 9)
     places, first = np.unique(rounded, axis=0, return_index=True)
     return places, pads[:, first]

@@ -29,10 +29,12 @@ from cube_tensor_driver.core.layout import Layout
 from .pads import SAME_COORDINATE, pad_weights
 
 Parity = tuple[int, ...]
-"""For each axis +1 where a field is even under its mirror, -1 where it is odd, 0 without mirror."""
+"""For each axis +1 where a field is even under the mirror x_k -> -x_k, -1 where the field is odd, 0
+where the body has no such mirror."""
 
 SMALLEST_DISSECTED = 60
-"""Number of nodes below which nested dissection does not cut a part of the grid any more."""
+"""Number of nodes below which nested dissection (an elimination order that cuts the grid in halves)
+does not cut a part of the grid any more."""
 
 
 def _is_at(x: Array, value: float | Array) -> Mask:
@@ -44,9 +46,10 @@ def lame(
     poisson: float,
     plane: str = "strain",
 ) -> tuple[float, float]:
-    """Return Lame's constants lambda and mu, in Pa.
+    """Return Lame's constants lambda and mu, in the unit of Young's modulus.
 
-    For plane stress, lambda is the one with which a computation in plane strain has no sigma_yy.
+    For plane stress, lambda has the value with which a computation in plane strain gives the stress
+    in the plane of a body that is free along y (sigma_yy = 0).
     """
     lam, mu = lame_parameters(young, poisson)
     if plane == "stress":
@@ -55,10 +58,11 @@ def lame(
 
 
 def stiffness(basis: skfem.Basis, moduli: tuple[float, float]) -> sp.csr_matrix:
-    """Assemble K_ij = int lambda div w_i div w_j + 2 mu eps(w_i) : eps(w_j) dV.
+    """Assemble the stiffness K_ij = int lambda div w_i div w_j + 2 mu eps(w_i) : eps(w_j) dV.
 
-    The sparse matrix (dofs, dofs) is put together from the integrals of d_a f d_b g over the scalar
-    elements f and g: vector elements have as many zeros as components, which cost time.
+    w_i are the nodal functions and eps their strain. The sparse matrix (dofs, dofs) is put together
+    from the integrals of d_a f d_b g over the scalar elements f and g: vector elements have as many
+    zeros as components, which cost time.
 
     Args:
         basis: The elements, whose dofs number the components of one node one after the other.
@@ -103,7 +107,8 @@ def sample_matrix(basis: skfem.Basis, values: Array) -> sp.csr_matrix:
 
 
 class _Factors(NamedTuple):
-    """LU factors of the stiffness of the free unknowns `free` (m,) under one parity."""
+    """LU factors of the stiffness of the unknowns `free` (m,) that nothing holds in fields of one
+    parity (+1 even or -1 odd under the mirror of each axis)."""
 
     parity: Parity
     free: Index
@@ -115,11 +120,12 @@ class Solid:
 
     Attributes:
         basis: The elements; its dofs are the unknown displacements.
-        positions: (dim, dofs) position of each unknown, in d0.
-        component: (dofs,) axis that each unknown is along.
+        positions: (dim, dofs) position of each unknown, in d0 (half the side of the cube).
+        component: (dofs,) number of the axis along which each unknown displacement is.
         body: (dofs, dofs) stiffness of the body without the cube.
         total: (dofs, dofs) stiffness of body and cube.
-        parities: Parities of the fields that make up any field.
+        parities: Parities (+1 even or -1 odd under the mirror of each axis, 0 without mirror) of
+            the parts that any field is the sum of.
     """
 
     def __init__(
@@ -306,9 +312,10 @@ def _parity_part(
     x: Array,
     parity: Parity,
 ) -> Array:
-    """Return the part of one parity of a stress field at x (q, dim).
+    """Return the part of one parity (even or odd under each mirror) of a stress field at x (q,
+    dim).
 
-    It is the mean of the field over all mirrored points, with the signs of the parity.
+    This part is the mean of the field over all mirrored points, with the signs of the parity.
     """
     part = np.zeros(())
     for image, weight in zip(*mirror_images(parity), strict=True):
