@@ -4,8 +4,10 @@ same out of a bag."""
 from __future__ import annotations
 
 import time
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,6 +24,7 @@ from cube_tensor_driver.config.influence import find_influence
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import Skin, read_skin
 from cube_tensor_driver.core.defaults import FREQUENCY_NOISE, POISSONS_RATIO, SURFACE_DEPTH
+from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.core.modes import to_matrix
 from cube_tensor_driver.core.oscillator import pad_frequency
@@ -143,6 +146,34 @@ def test_pads_in_a_thin_layer_out_of_a_bag(tmp_path):
     (by_pads,), (by_points,) = ([one.z for one in found.force] for found in forces)
     assert by_pads == pytest.approx(FORCE[2], rel=0.01)
     assert abs(by_points / FORCE[2] - 1) > 0.03
+
+
+def test_a_node_that_cannot_get_ready_says_so_and_tries_again(monkeypatch):
+    from cube_tensor_driver.ros.nodes import contacts as module
+
+    failures = [ConfigError("a.npz: damaged; make it again"), MemoryError()]
+    logged: list[str] = []
+
+    def set_up() -> str:
+        if failures:
+            raise failures.pop(0)
+        return "finder"
+
+    monkeypatch.setattr(module, "RETRY_PERIOD_S", 0.0)
+    node = module.Contacts.__new__(module.Contacts)
+    node.get_logger = lambda: SimpleNamespace(error=logged.append)
+    node._finder, node._problem, node._set_up = None, "", set_up
+    with ThreadPoolExecutor(1) as node._worker:
+        node._future_finder = node._worker.submit(set_up)
+        said: list[str] = []
+        until = time.monotonic() + 10
+        while node._take_finder() is None:
+            assert time.monotonic() < until
+            said += [status.message for status in node._statuses() if status.message not in said]
+            wait([node._future_finder], timeout=10)
+    assert said == ["no contacts: a.npz: damaged; make it again", "no contacts: MemoryError"]
+    assert logged == ["a.npz: damaged; make it again", "MemoryError"]
+    assert node._take_finder() == "finder" and node._statuses() == []
 
 
 def test_contacts_and_traction_of_a_pressed_skin_live_and_out_of_a_bag(ros, tmp_path):

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import fields
+from functools import partial
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import PointCloud2
 
 from ...config.parameters import CONTACTS
 from ...core.arrays import Index
-from ...core.errors import CubeError
 from ...messages.contacts import contacts_message, traction_message
 from ...messages.skin_info import cube_calibrations
 from ...msg import SkinContacts
@@ -20,9 +22,14 @@ from ...touch.contact_finder import (
     ContactSettings,
     contact_finder,
 )
+from ..diagnostics.updater import Diagnostics, make_status
 from ..messages import make_message
 from ..node import run
 from ..skin_subscriber import FollowedSkin, SkinSubscriberNode
+
+RETRY_PERIOD_S = 5.0
+"""Time, in seconds, after a failed set-up of the contact finder until it is tried again, because a
+missing or damaged file may have been replaced."""
 
 
 class Contacts(SkinSubscriberNode):
@@ -37,6 +44,10 @@ class Contacts(SkinSubscriberNode):
     def __init__(self) -> None:
         super().__init__("contacts", CONTACTS, SkinContacts, 10)
         self._worker = ThreadPoolExecutor(1)
+        self._finder: ContactFinder | None = None
+        self._future_finder: Future[ContactFinder] | None = None
+        self._problem = ""
+        self._updater = Diagnostics(self, self._statuses, lambda: self.callback_errors.count)
 
     def configure(self) -> None:
         self._traction = None
@@ -53,10 +64,9 @@ class Contacts(SkinSubscriberNode):
         settings = ContactSettings(**{name: self.value(name) for name in names})
         calibrations = cube_calibrations(skin.info)
         self._processed_messages = 0
-        self._finder: ContactFinder | None = None
-        self._future_finder: Future[ContactFinder] | None = self._worker.submit(
-            contact_finder, settings, skin.poses, calibrations
-        )
+        self._finder = None
+        self._set_up = partial(contact_finder, settings, skin.poses, calibrations)
+        self._future_finder = self._worker.submit(self._set_up)
 
     def compute_message(self, skin: FollowedSkin, health: Index) -> SkinContacts | None:
         finder = self._take_finder()
@@ -87,15 +97,30 @@ class Contacts(SkinSubscriberNode):
     def _take_finder(self) -> ContactFinder | None:
         """Return the contact finder; None while it is being set up, or if the set-up has failed.
 
-        A failure is logged once.
+        A failure is logged once, and the set-up is tried again after `RETRY_PERIOD_S`.
         """
-        if self._future_finder is not None and self._future_finder.done():
-            future, self._future_finder = self._future_finder, None
-            try:
+        future = self._future_finder
+        if future is not None and future.done():
+            self._future_finder = None
+            self._ended_s = time.monotonic()
+            error = future.exception()
+            problem = "" if error is None else str(error) or type(error).__name__
+            if error is None:
                 self._finder = future.result()
-            except CubeError as error:
-                self.get_logger().error(str(error))
+            elif problem != self._problem:
+                self.get_logger().error(problem)
+            self._problem = problem
+        is_idle = self._problem and self._future_finder is None
+        if is_idle and time.monotonic() - self._ended_s >= RETRY_PERIOD_S:
+            self._future_finder = self._worker.submit(self._set_up)
         return self._finder
+
+    def _statuses(self) -> list[DiagnosticStatus]:
+        """Return a status that says why no contacts are computed; empty if they are."""
+        if self._take_finder() is not None or not self._problem:
+            return []
+        text = f"no contacts: {self._problem}"
+        return [make_status("contact finder", "", DiagnosticStatus.ERROR, text, {})]
 
     def _has_traction_listeners(self) -> bool:
         return self._traction is not None and self._traction.get_subscription_count() > 0
