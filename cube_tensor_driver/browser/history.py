@@ -50,22 +50,25 @@ class History:
 
     def add(
         self,
-        now: float,
+        time_s: float,
         values: Array,
         residual: Array,
     ) -> None:
         """Add the values of one instant; the oldest is overwritten if the buffer is full.
 
         Args:
-            now: Time of the instant, in s, on any clock that all calls share.
+            time_s: Time of the instant, in s, on any clock that all calls share.
             values: Stress in Pa and gradients in Pa/m (cubes, 15); NaN where unknown.
             residual: Misfit between pads and tensor relative to the noise (cubes,); about 1 for
                 noise alone.
         """
+        if self.count and time_s < self._times[self._slots()[-1]]:
+            # A replay has jumped back.
+            self.clear()
         slot = self.count % len(self._times)
         self._values[slot, :, :-1] = values
         self._values[slot, :, -1] = residual
-        self._times[slot] = now
+        self._times[slot] = time_s
         self.count += 1
 
     def clear(self) -> None:

@@ -277,6 +277,7 @@ def explanation(
     lines += [
         f"<div><b>▦</b> field: {field.source}{_typical(field.sigma)}</div>",
         "<div><b>⌜⌟</b> the chosen cube; click another one to choose it</div>",
+        "<div><b style='color:#c828a0'>◯</b> contacts; the first line has the strongest</div>",
         "<div>principal stresses: <b style='color:#d22828'>red</b> pulls, "
         "<b style='color:#2850dc'>blue</b> pushes</div>",
         "<div><b>✕</b> over a cube: see <i>health</i>. Axes: x red, y green, z blue</div>",

@@ -72,6 +72,7 @@ class ScanSynchronizer:
     same stamp. While the node runs, later rows wait until a result for one of them has come.
 
     Attributes:
+        stamp_ns: Stamp of the newest `stress` message at the instant, in ns; 0 before the first.
         latest: Latest row of each cube at the instant.
         sample_rate: Samples per second of each cube at the instant.
         contacts: Contacts for these rows; None if the node does not run.
@@ -80,6 +81,7 @@ class ScanSynchronizer:
     """
 
     def __init__(self, n_cubes: int) -> None:
+        self.stamp_ns = 0
         self.latest = LatestStress(n_cubes)
         self.sample_rate = SampleRate(n_cubes)
         self.contacts: list[Contact] | None = None
@@ -111,10 +113,14 @@ class ScanSynchronizer:
         """Add the points of `traction` that belong to the `stress` message with this stamp."""
         _add_result(self._clouds, stamp_ns, cloud)
 
-    def advance(self) -> None:
-        """Go on to the newest instant whose results are complete, if there is a newer one."""
+    def advance(self) -> bool:
+        """Go on to the newest instant whose results are complete.
+
+        Returns:
+            Whether there was a newer one.
+        """
         if not self._waiting:
-            return
+            return False
         newest_ns = self._waiting[-1][0]
         required = [
             results
@@ -129,14 +135,14 @@ class ScanSynchronizer:
             if all(stamp_ns in results for results in required)
         ]
         if not complete:
-            return
-        stamp_ns = 0
+            return False
         for _ in range(complete[-1]):
-            stamp_ns, rows, arrival = self._waiting.popleft()
+            self.stamp_ns, rows, arrival = self._waiting.popleft()
             self.latest.update(rows, arrival)
             self.sample_rate.update(rows)
-        self.contacts = self._contacts.get(stamp_ns)
-        self.cloud = self._clouds.get(stamp_ns)
+        self.contacts = self._contacts.get(self.stamp_ns)
+        self.cloud = self._clouds.get(self.stamp_ns)
+        return True
 
 
 def _add_result(

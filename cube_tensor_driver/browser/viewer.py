@@ -260,14 +260,13 @@ class Viewer:
         self._replay.forget_if_silent()
         self._update_recording()
 
-        now = self._subscriber.now()
         scans = self._scans
-        scans.advance()
-        is_held = self._replay.is_held
-        health = scans.latest.health(now, NEVER_STALE_S if is_held else STALE_S)
-        values = scans.latest.usable_values(health)
-        if not is_held:
-            self._history.add(now, values, scans.latest.residual)
+        has_advanced = scans.advance()
+        stale_s = NEVER_STALE_S if self._replay.is_held else STALE_S
+        health = scans.latest.health(self._subscriber.now(), stale_s)
+        if has_advanced:
+            values = scans.latest.usable_values(health)
+            self._history.add(1e-9 * scans.stamp_ns, values, scans.latest.residual)
         # Without a page, computing the field and the contacts would be useless work.
         if not self._pages:
             return
