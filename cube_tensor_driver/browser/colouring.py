@@ -82,7 +82,7 @@ class Colouring(NamedTuple):
         Args:
             cube: Index of the cube in the skin.
         """
-        value = markup.value(self.quantity, self.cubes[cube])
+        value = markup.value(self.quantity, float(self.cubes[cube]))
         if self.above is None or self.quantity not in (QUANTITIES["pressure"], DEVIATION):
             return value
         surface = markup.surface_pressure(*self.above[cube])

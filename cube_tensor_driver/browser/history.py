@@ -46,6 +46,7 @@ class History:
             np.float32,
         )
         self._times = np.full(length, np.nan)
+        self._is_observed = np.zeros(len(self.COLUMNS), bool)
         self.count = 0
 
     def add(
@@ -69,11 +70,13 @@ class History:
         self._values[slot, :, :-1] = values
         self._values[slot, :, -1] = residual
         self._times[slot] = time_s
+        self._is_observed |= np.isfinite(self._values[slot]).any(axis=0)
         self.count += 1
 
     def clear(self) -> None:
         """Remove all instants, for example because a replay has jumped to another time."""
         self.count = 0
+        self._is_observed[:] = False
 
     def of(self, cube: int, column: int) -> Array:
         """Return one value of a cube at the M stored instants (M,), in SI units, the oldest first.
@@ -93,10 +96,8 @@ class History:
 
     @property
     def observed_names(self) -> set[str]:
-        """Names of the `COLUMNS` that are finite for any cube at any stored instant."""
-        finite = np.isfinite(self._values[self._slots()])
-        columns = np.flatnonzero(finite.any(axis=(0, 1)))
-        return {self.COLUMNS[column] for column in columns}
+        """Names of the `COLUMNS` that were finite for any cube at any instant since `clear`."""
+        return {self.COLUMNS[column] for column in np.flatnonzero(self._is_observed)}
 
     def _slots(self) -> Index:
         """Return the indices (M,) of the stored instants in the ring buffer, the oldest first."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from html import escape
@@ -146,7 +147,7 @@ def value(quantity: scene.Quantity, si_value: float) -> str:
         quantity: The quantity, which has a label and a unit for users.
         si_value: Its value in SI units, which is converted to the unit for users.
     """
-    if np.isnan(si_value):
+    if math.isnan(si_value):
         return "unknown"
     return f"{quantity.label} {_hundredths(si_value / quantity.size)} {quantity.unit}"
 
@@ -316,8 +317,8 @@ def numbers(scan: Scan, cube: int) -> str:
 
 
 def _hundredths(number: float) -> str:
-    # Adding 0.0 turns -0.0 into 0.0, so that no "-0.00" is printed.
-    return f"{round(number, 2) + 0.0:.2f}"
+    text = f"{number:.2f}"
+    return "0.00" if text == "-0.00" else text
 
 
 def _state(status: int, health: int) -> str:

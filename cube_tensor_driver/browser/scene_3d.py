@@ -106,15 +106,6 @@ MESH_COLOURS: dict[str, Colour] = {
 }
 """Name of a mesh whose shape changes with the scan -> its colour."""
 
-PART_OF_MESH = {
-    "traction": "traction",
-    "gradient": "gradient",
-    "tension": "principal",
-    "compression": "principal",
-}
-"""Name of a mesh that the user can hide -> the part of the view (`PARTS` in controls.py) to which
-it belongs."""
-
 ArrowLines = Callable[[CubePoses, Array, float], Array]
 """Function of poses of N cubes, their values (N, 15) and a length per SI unit that returns tails
 and tips (N, 2, 3) of arrows."""
@@ -330,22 +321,16 @@ class Scene:
         """
         update = self._colours(colouring, "field" in parts)
         update["names"] = {"visible": "names" in parts}
-        meshes = {
-            "traction": self._arrows(
-                scene.traction_arrows,
-                scan.values,
-                self._traction(ranges),
-            ),
-            "gradient": self._arrows(
-                scene.gradient_arrows,
-                scan.values,
-                self._gradient(ranges),
-            ),
-            **self._crosses(scan.values, ranges.traction),
-        }
-        for name, mesh in meshes.items():
-            is_drawn = PART_OF_MESH[name] in parts
-            update[name] = _properties(mesh if is_drawn else NO_MESH)
+        meshes = dict.fromkeys(("traction", "gradient", "tension", "compression"), NO_MESH)
+        if "traction" in parts:
+            length = self._traction(ranges)
+            meshes["traction"] = self._arrows(scene.traction_arrows, scan.values, length)
+        if "gradient" in parts:
+            length = self._gradient(ranges)
+            meshes["gradient"] = self._arrows(scene.gradient_arrows, scan.values, length)
+        if "principal" in parts:
+            meshes |= self._crosses(scan.values, ranges.traction)
+        update |= {name: _properties(mesh) for name, mesh in meshes.items()}
         for state in FAULT_COLOURS:
             update[f"fault {state}"] = self._fault_crosses(scan.health, state)
         update["chosen"] = self._chosen_cube(chosen)

@@ -151,7 +151,7 @@ class TopView:
             parts.append(
                 f"<polygon points='{self._outlines[cube]}' fill='rgb({red},{green},{blue})' "
                 f"stroke='#212529' stroke-width='{width}'>"
-                f"<title>{self._names[cube]}: {escape(colouring.text(cube))}</title></polygon>"
+                f"<title>{self._names[cube]}: {colouring.text(cube)}</title></polygon>"
             )
         return parts
 
