@@ -95,10 +95,9 @@ def read_recorded_loads(
     steps = np.diff(reference_ns)
     max_step = MAX_STEP_RATIO * np.median(steps)
     is_close = steps[following - 1] <= max_step
-    is_after_start = stamp_ns >= reference_ns[0]
-    is_before_end = stamp_ns <= reference_ns[-1]
+    is_within = (stamp_ns >= reference_ns[0]) & (stamp_ns <= reference_ns[-1])
     is_complete = np.isfinite(frequency).all(axis=1)
-    used = is_after_start & is_before_end & is_close & is_complete
+    used = is_within & is_close & is_complete
     if not used.any():
         raise BagError(
             f"{path}: the frequencies of {source.skin.cubes[number].name} and {reference} have no "

@@ -136,11 +136,6 @@ def show_exported(folder: Path, exported: Exported) -> None:
             f"{exported.depth}: hubs paused, or stamps are in doubt; --marks can leave that out",
             "yellow",
         )
-    left_out = {
-        "samples outside of the marks": exported.outside,
-        "samples of cubes that the skin does not have": exported.unknown,
-        "marks without a sample": exported.empty,
-    }
-    for what, number in left_out.items():
+    for what, number in exported.left_out.items():
         if number:
             say(f"left out: {number} {what}", "yellow")

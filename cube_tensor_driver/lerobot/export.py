@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import shutil
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,9 +45,7 @@ class Exported:
         depth: Number of samples of each cube that a frame has room for.
         usual: Number of samples of each cube in most frames.
         features: Names of the features (columns) that come from topics other than stress.
-        outside: Number of samples that lie in no episode.
-        unknown: Number of samples of cubes that the skin does not have.
-        empty: Number of episodes without a sample, which are not exported.
+        left_out: Numbers of samples and episodes that were not exported, by a text with the reason.
     """
 
     episodes: int
@@ -55,9 +54,7 @@ class Exported:
     depth: int
     usual: int
     features: list[str]
-    outside: int
-    unknown: int
-    empty: int
+    left_out: Counter[str]
 
 
 def export_lerobot(
@@ -117,6 +114,9 @@ def export_lerobot(
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     rate = max(plan.rate for plan in plans)
+    left_out: Counter[str] = Counter()
+    for plan in plans:
+        left_out.update(plan.left_out)
     return Exported(
         episodes=len(counts),
         frames=data_set.frames,
@@ -124,9 +124,7 @@ def export_lerobot(
         depth=data_set.depth,
         usual=math.ceil(rate / choices.fps),
         features=[topic.key for topic in topics],
-        outside=sum(plan.outside for plan in plans),
-        unknown=sum(plan.unknown for plan in plans),
-        empty=sum(plan.empty for plan in plans),
+        left_out=left_out,
     )
 
 

@@ -11,6 +11,7 @@ must therefore be known before the first frame is written.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -216,18 +217,14 @@ class BagPlan:
         skin: The skin (cubes and their poses) as the bag describes it.
         episodes: Episodes of the bag that have samples.
         rate: Sample rate of a cube, in Hz: the median of all cubes.
-        outside: Number of samples that lie in no episode.
-        unknown: Number of samples of cubes that the skin does not have.
-        empty: Number of episodes without a sample, which are not exported.
+        left_out: Numbers of samples and episodes that are not exported, by a text with the reason.
     """
 
     path: Path
     skin: Skin
     episodes: list[Episode]
     rate: float
-    outside: int
-    unknown: int
-    empty: int
+    left_out: Counter[str]
 
 
 def plan_bag(
@@ -290,14 +287,18 @@ def plan_bag(
         episode.finish()
         _check_depth(source, episode, math.ceil(rate / choices.fps))
     known_rows = int(samples.sum())
+    used_rows = sum(episode.rows for episode in used)
+    left_out = {
+        "samples outside of the marks": known_rows - used_rows,
+        "samples of cubes that the skin does not have": source.rows - known_rows,
+        "marks without a sample": len(episodes) - len(used),
+    }
     return BagPlan(
-        path=path,
-        skin=source.skin,
-        episodes=used,
-        rate=rate,
-        outside=known_rows - sum(episode.rows for episode in used),
-        unknown=source.rows - known_rows,
-        empty=len(episodes) - len(used),
+        path,
+        source.skin,
+        used,
+        rate,
+        Counter(left_out),
     )
 
 

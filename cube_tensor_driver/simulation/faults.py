@@ -53,22 +53,6 @@ FRAME_FAULTS = ("drop", "flip", "insert", "duplicate", "reorder", "truncate")
 PAD_FAULTS = ("open", "short", "stuck", "noisy", "report")
 """Kinds of faults of one pad (sensing element) of a cube."""
 
-CUT_FAULTS = (
-    "stall",
-    "burst",
-    "unplug",
-    "rename",
-    "reset",
-    "wrap",
-    "drift",
-    "step",
-    "uid",
-    "pads",
-    "version",
-)
-"""Kinds of faults that interrupt a link, restart its hub, change the hub's description of itself,
-or disturb the hub's clock."""
-
 MOMENTARY_FAULTS = (*FRAME_FAULTS, "reset", "wrap", "drift", "step")
 """Kinds of faults without a duration: they end as soon as they have begun. All other kinds last for
 the time `seconds` of the fault."""

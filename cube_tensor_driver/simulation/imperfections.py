@@ -20,7 +20,6 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -84,7 +83,8 @@ class Imperfections:
         # The schema describes the values of a file, in which a term is a list.
         values = asdict(self)
         values["creep"] = [list(term) for term in self.creep]
-        _raise_first_mistake(values)
+        for _, mistake in _SCHEMA.mistakes(values):
+            raise ConfigError(mistake)
 
 
 def read_imperfections(path: Path) -> Imperfections:
@@ -94,20 +94,12 @@ def read_imperfections(path: Path) -> Imperfections:
         ConfigError: A key is unknown, or a value is wrong.
     """
     data = read_yaml(path)
-    try:
-        _raise_first_mistake(data)
-    except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from None
+    for _, mistake in _SCHEMA.mistakes(data):
+        raise ConfigError(f"{path}: {mistake}")
     # Lists become tuples, because an instance of `Imperfections` is immutable.
     terms = data.pop("creep", ())
     creep = tuple((size, time) for size, time in terms)
     return Imperfections(creep=creep, **data)
-
-
-def _raise_first_mistake(data: Any) -> None:
-    """Raise ConfigError for the first value that does not fit the schema."""
-    for _, mistake in _SCHEMA.mistakes(data):
-        raise ConfigError(mistake)
 
 
 class PadBehaviour:

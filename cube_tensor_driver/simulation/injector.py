@@ -46,10 +46,6 @@ _LASTING_STATES = ("stall", "burst", "temperature")
 their times by itself; a changed temperature stays until the next fault of the kind
 `temperature`."""
 
-_Schedule = list[tuple[int, int, Fault]]
-"""Heap of (simulated time in µs, serial number, fault). Of faults at the same time, the one with
-the lower serial number comes first."""
-
 
 @dataclass
 class SimulatedLink:
@@ -137,8 +133,10 @@ class Injector:
         self._links = {link.name: link for link in links}
         self._states = {name: _LinkState() for name in self._links}
         self._random = np.random.default_rng(seed)
-        self._begins: _Schedule = []
-        self._ends: _Schedule = []
+        # Heap of begins and ends of faults: simulated time in µs, whether the fault begins, serial
+        # number, fault. At the same time, faults end before others begin, because a fault may begin
+        # when another one on the same pad ends.
+        self._schedule: list[tuple[int, bool, int, Fault]] = []
         self._number = 0
         for fault in faults:
             self.add(fault, round(1e6 * fault.at))
@@ -157,27 +155,21 @@ class Injector:
         # A fault without a link becomes one fault per link.
         for name in check_target(fault, sizes):
             on_link = replace(fault, link=name)
-            self._schedule(self._begins, at_us, on_link)
+            self._push(at_us, True, on_link)
 
     def due_us(self) -> int | None:
         """Return the simulated time in µs at which the next fault begins or ends.
 
         The result is None if no fault is scheduled.
         """
-        schedules = (self._begins, self._ends)
-        times = [schedule[0][0] for schedule in schedules if schedule]
-        return min(times, default=None)
+        return self._schedule[0][0] if self._schedule else None
 
     def step(self, now_us: int) -> None:
         """Begin and end the faults that are due at simulated time `now_us`."""
-        # Faults end before others begin, because a fault may begin at the time at which another one
-        # on the same pad ends.
-        while self._ends and self._ends[0][0] <= now_us:
-            _, _, fault = heapq.heappop(self._ends)
-            self._end(fault, now_us)
-        while self._begins and self._begins[0][0] <= now_us:
-            _, _, fault = heapq.heappop(self._begins)
-            self._begin(fault, now_us)
+        while self._schedule and self._schedule[0][0] <= now_us:
+            _, begins, _, fault = heapq.heappop(self._schedule)
+            act = self._begin if begins else self._end
+            act(fault, now_us)
 
     def measured(
         self,
@@ -328,7 +320,7 @@ class Injector:
 
         self.records.append(FaultRecord(now_us, end_us, fault))
         if end_us > now_us and fault.kind not in _LASTING_STATES:
-            self._schedule(self._ends, end_us, fault)
+            self._push(end_us, False, fault)
 
     def _restart(
         self,
@@ -382,21 +374,22 @@ class Injector:
             case "version":
                 hub.version = VERSION
 
-    def _schedule(
+    def _push(
         self,
-        schedule: _Schedule,
         at_us: int,
+        begins: bool,
         fault: Fault,
     ) -> None:
-        """Add the begin or the end of a fault to a schedule.
+        """Schedule the begin or the end of a fault.
 
         Args:
-            schedule: Schedule of all begins or of all ends, which is changed.
             at_us: Simulated time in µs.
+            begins: Whether the fault begins at this time; otherwise it ends.
             fault: Fault with the name of a single link.
         """
         self._number += 1
-        heapq.heappush(schedule, (at_us, self._number, fault))
+        entry = (at_us, begins, self._number, fault)
+        heapq.heappush(self._schedule, entry)
 
 
 def broken_reading(

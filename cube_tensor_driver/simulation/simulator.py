@@ -8,11 +8,11 @@ from __future__ import annotations
 import contextlib
 import math
 import os
-import selectors
+import select
 import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -184,33 +184,35 @@ class Simulator:
 
         They send HELLO and STATS at 1 Hz, and samples after the host has requested them (START).
         """
-        # SelectSelector is used, because epoll rounds waiting times to milliseconds.
-        with selectors.SelectSelector() as selector:
-            watched: dict[str, int] = {}
-            read_stop = partial(os.read, stop.fd, 64)
-            selector.register(stop.fd, selectors.EVENT_READ, read_stop)
-            selector.register(self._fault_pipe, selectors.EVENT_READ, self._read_faults)
-            report_us = SECOND_US
-            while not stop.is_due(self._is_needed()):
-                for link in self._links:
-                    self._watch(selector, watched, link)
-                wait_us = self._due_us(report_us) - self.now_us()
-                for key, _ in selector.select(max(0.0, wait_us * 1e-6)):
-                    key.data()
+        report_us = SECOND_US
+        while not stop.is_due(self._is_needed()):
+            readers: dict[int, Callable[[], object]] = {
+                stop.fd: partial(os.read, stop.fd, 64),
+                self._fault_pipe: self._read_faults,
+            }
+            # A line that was unplugged and plugged in again has another file descriptor.
+            for link in self._links:
+                if link.line.plugged:
+                    readers[link.line.fd] = partial(self._answer, link)
+            wait_us = self._due_us(report_us) - self.now_us()
+            # `select` is used, because epoll rounds waiting times to milliseconds.
+            readable, _, _ = select.select(readers, [], [], max(0.0, wait_us * 1e-6))
+            for fd in readable:
+                readers[fd]()
 
-                now = self.now_us()
-                self._skip_late(now)
-                self._take_samples(now, stop)
-                for link in self._links:
-                    link.line.flush(now)
-                    if link.computes_load:
-                        # The load of the next sample is computed and kept before the sample is due,
-                        # because a real hub spends no time on computing a load.
-                        self._load.at(link.hub.next_us)
-                self._injector.step(now)
-                if now >= report_us:
-                    report_us += SECOND_US
-                    self._report(now)
+            now = self.now_us()
+            self._skip_late(now)
+            self._take_samples(now, stop)
+            for link in self._links:
+                link.line.flush(now)
+                if link.computes_load:
+                    # The load of the next sample is computed and kept before the sample is due,
+                    # because a real hub spends no time on computing a load.
+                    self._load.at(link.hub.next_us)
+            self._injector.step(now)
+            if now >= report_us:
+                report_us += SECOND_US
+                self._report(now)
 
     def _report(self, now_us: int) -> None:
         """Send the HELLO and STATS frames of all hubs whose line is plugged in."""
@@ -313,31 +315,6 @@ class Simulator:
         if not link.line.send(sent, now_us):
             link.hub.dropped += 1
             link.mark_damaged()
-
-    def _watch(
-        self,
-        selector: selectors.BaseSelector,
-        watched: dict[str, int],
-        link: PlayedLink,
-    ) -> None:
-        """Register the file descriptor of a line, which changes when the line is plugged in again.
-
-        Args:
-            selector: Selector of the main loop.
-            watched: Registered file descriptor by the name of the link, -1 for none; it is changed.
-            link: Link to watch.
-        """
-        fd = link.line.fd
-        before = watched.get(link.name, -1)
-        # A line that was unplugged and plugged again has another descriptor.
-        if fd == before:
-            return
-        if before >= 0:
-            selector.unregister(before)
-        if fd >= 0:
-            answer = partial(self._answer, link)
-            selector.register(fd, selectors.EVENT_READ, answer)
-        watched[link.name] = fd
 
     def _answer(self, link: PlayedLink) -> None:
         """Read the requests of the host on a link and send the hub's answers."""

@@ -10,11 +10,11 @@ from cube_tensor_driver.core.arrays import Index, Mask
 from cube_tensor_driver.core.matching import NO_MATCH
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.core.status import STAMP
-from cube_tensor_driver.simulation.faults import CUT_FAULTS
 
 from .expected import Readings, split_in_chunks
 from .record import DRIVER_KILLS, DRIVER_STOPS, UNFLUSHED_S
 from .run import Findings, Run, agree, count, find_matched
+from .samples import CUT_FAULTS
 
 RECOVERY_S = 6.0
 """Time, in seconds, after a cut in which a link delivers again: the driver tries a port at least

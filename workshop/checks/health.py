@@ -14,12 +14,12 @@ from cube_tensor_driver.core.health.statistics import WINDOW_S
 from cube_tensor_driver.core.oscillator import stress_slope
 from cube_tensor_driver.core.rows import StressRows
 from cube_tensor_driver.core.status import DRIFT, NOISY, OPEN, RANGE, REPORTED, SHORT, STUCK
-from cube_tensor_driver.simulation.faults import CUT_FAULTS, PAD_FAULTS
+from cube_tensor_driver.simulation.faults import PAD_FAULTS
 
 from .expected import EDGE_NS
 from .record import DRIVER_KILLS, NODE_STARTS, NS_PER_S, Span
 from .run import Findings, Run, count, find_matched
-from .samples import HubFault
+from .samples import CUT_FAULTS, HubFault
 
 STATUS_OF_FAULT = {
     "open": OPEN,

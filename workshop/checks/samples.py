@@ -12,6 +12,22 @@ from cube_tensor_driver.simulation.sample_log import FaultRecord, SampleLog
 
 from .record import Span
 
+CUT_FAULTS = (
+    "stall",
+    "burst",
+    "unplug",
+    "rename",
+    "reset",
+    "wrap",
+    "drift",
+    "step",
+    "uid",
+    "pads",
+    "version",
+)
+"""Kinds of faults that interrupt a link, restart its hub, change the hub's description of itself,
+or disturb the hub's clock."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class HubFault(Span):

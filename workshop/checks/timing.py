@@ -7,11 +7,11 @@ import numpy as np
 from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.matching import NO_MATCH
 from cube_tensor_driver.core.status import STAMP
-from cube_tensor_driver.simulation.faults import CUT_FAULTS
 
 from .frequencies import RECOVERY_S, FrequencyFindings
 from .record import DRIVER_KILLS, DRIVER_STOPS, NS_PER_S, Span
 from .run import Run
+from .samples import CUT_FAULTS
 
 MS_PER_NS = 1e-6
 

@@ -6,7 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from cube_tensor_driver.simulation.faults import CUT_FAULTS, FRAME_FAULTS, PAD_FAULTS
+from cube_tensor_driver.simulation.faults import FRAME_FAULTS, PAD_FAULTS
+
+from ..checks.samples import CUT_FAULTS
 
 HUBS = 4
 """Number of hubs."""
