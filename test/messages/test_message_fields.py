@@ -1,0 +1,183 @@
+"""Each field of the messages about a skin and its contacts, against values from elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
+
+from bag_maker import START_NS, make_bag
+
+from cube_tensor_driver.bags.read import Bag, make_message
+from cube_tensor_driver.bags.reprocess.job import Overrides, ReprocessJob, reprocess
+from cube_tensor_driver.config.calibration import shipped_calibration
+from cube_tensor_driver.config.package_data import package_data
+from cube_tensor_driver.config.skin import Skin, SkinCube, SkinLink, read_skin
+from cube_tensor_driver.config.yaml import parse_yaml
+from cube_tensor_driver.core.calibration import Calibration
+from cube_tensor_driver.core.layout import LAYOUTS
+from cube_tensor_driver.core.pipeline import Pipeline
+from cube_tensor_driver.core.rows import FrequencyRows
+from cube_tensor_driver.messages.contacts import contacts_message, traction_message
+from cube_tensor_driver.touch.surface import Contact
+from cube_tensor_driver.touch.tracker.contact_tracker import TrackedContact
+
+PLANAR, CUBE = (shipped_calibration(LAYOUTS[name]) for name in ("planar", "cube"))
+DRAWS = 40_000
+SKIN_FILE = package_data() / "config" / "skin_demo.yaml"
+
+
+def noise_covariance(calibration: Calibration) -> np.ndarray:
+    """(15, 15) of the stress and gradients of an unloaded cube: from draws, to 1 % of a variance.
+
+    The noise of a pad is given in Pa; without load its frequency changes by f0 / (E (1 + beta)).
+    """
+    per_pascal = calibration.rest_frequency / (calibration.modulus * (1 + calibration.beta))
+    draws = np.random.default_rng(5).standard_normal((DRAWS, calibration.layout.n_pads))
+    hertz = calibration.rest_frequency + draws * calibration.noise * per_pascal
+    pipeline = Pipeline([calibration], np.float64)
+    rows = pipeline.process(FrequencyRows.of(np.zeros(DRAWS, int), hertz))
+    return np.cov(np.hstack([rows.stress, rows.gradient]), rowvar=False)
+
+
+def assert_is_covariance(stated: np.ndarray, calibration: Calibration) -> None:
+    """Within 5 standard errors of the draws: 5 sqrt(2 / DRAWS) = 3.5 % of each variance."""
+    expected = noise_covariance(calibration)
+    seen = np.isfinite(np.diag(expected))
+    np.testing.assert_array_equal(np.isfinite(np.diag(stated)), seen)
+    scale = np.sqrt(np.diag(expected)[seen])
+    off = (stated - expected)[np.ix_(seen, seen)] / np.outer(scale, scale)
+    assert np.abs(off).max() < 5 * np.sqrt(2 / DRAWS)
+
+
+def rotated(quaternion: object, vector: np.ndarray) -> np.ndarray:
+    """q v q*, by the vector formula."""
+    axis = np.array([quaternion.x, quaternion.y, quaternion.z])
+    twice = 2 * np.cross(axis, vector)
+    return vector + quaternion.w * twice + np.cross(axis, twice)
+
+
+def test_info_says_what_the_skin_is():
+    pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
+    from cube_tensor_driver.ros.messages import info_message
+
+    cubes = (
+        SkinCube("c0", "left", 3, None, (0.1, 0.2, 0.3), (0.0, 0.0, 0.0), PLANAR),
+        SkinCube("c1", None, None, 0xC1, (-0.1, 0.0, 0.05), (0.0, 0.0, np.pi / 2), CUBE),
+        SkinCube("c2", "left", 4, 0xC2, (0.0, 0.0, 0.0), (np.pi / 2, 0.0, 0.0), PLANAR),
+    )
+    skin = Skin("hand", "wrist", None, (SkinLink("left", "/dev/ttyACM0", 0, None),), cubes)
+    pipeline = Pipeline(skin.calibrations)
+    rest = pipeline.rest_frequency
+    rest[2] *= 1.01
+    pipeline.rest_frequency = rest
+    info = info_message(skin, pipeline, START_NS + 7, {0: 0xA0, 1: 0xA1}, "driver")
+
+    assert info.version == info.VERSION == 3 and info.header.frame_id == "wrist"
+    assert info.header.stamp.sec * 10**9 + info.header.stamp.nanosec == START_NS + 7
+    assert (info.sender, info.name) == ("driver", "hand")
+    assert info.calibration_ids == [PLANAR.id, CUBE.id]
+    for text, calibration in zip(info.calibrations, (PLANAR, CUBE), strict=True):
+        read = Calibration.from_dict(parse_yaml(text, "info"))
+        assert read.id == calibration.id
+        np.testing.assert_array_equal(read.response, calibration.response)
+    covariances = np.reshape(info.covariance, (2, 15, 15))
+    assert_is_covariance(covariances[0], PLANAR)
+    assert_is_covariance(covariances[1], CUBE)
+
+    said = [
+        (one.name, one.frame_id, one.link, one.index, one.uid, one.layout, one.calibration_id)
+        for one in info.cubes
+    ]
+    assert said == [
+        ("c0", "hand_c0", "left", 3, 0xA0, "planar", PLANAR.id),
+        ("c1", "hand_c1", "", 0, 0xC1, "cube", CUBE.id),
+        ("c2", "hand_c2", "left", 4, 0xC2, "planar", PLANAR.id),
+    ]
+    axes = {
+        0: np.eye(3),
+        1: [[0, 1, 0], [-1, 0, 0], [0, 0, 1]],
+        2: [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+    }
+    for number, (one, cube) in enumerate(zip(info.cubes, cubes, strict=True)):
+        position = one.pose.position
+        assert (position.x, position.y, position.z) == cube.xyz
+        turned = [rotated(one.pose.orientation, axis) for axis in np.eye(3)]
+        np.testing.assert_allclose(turned, axes[number], atol=1e-12)
+        assert tuple(one.pads) == cube.calibration.layout.pads
+        assert one.half_side == cube.calibration.half_side
+        factor = 1.01 if number == 2 else 1.0
+        np.testing.assert_array_equal(one.rest_frequency, factor * cube.calibration.rest_frequency)
+
+
+def test_reprocessed_info_says_what_was_used(tmp_path):
+    bag = make_bag(tmp_path / "bag", SKIN_FILE, 20)
+    skin = read_skin(SKIN_FILE)
+    used = skin.calibrations[0]
+    reprocess(ReprocessJob(bag, tmp_path / "out", "bag", Overrides(skin=skin)))
+    with Bag(bag) as recorded, Bag(tmp_path / "out") as made:
+        (before,), (after,) = recorded.infos("/info"), made.infos("/info")
+    assert (after.sender, after.name, after.version) == ("reconstruction", skin.name, 3)
+    assert after.header == before.header and after.cubes[3].pose == before.cubes[3].pose
+    assert list(after.calibration_ids) == [used.id]
+    assert Calibration.from_dict(parse_yaml(after.calibrations[0], "info")).id == used.id
+    assert_is_covariance(after.covariance.reshape(15, 15), used)
+    for one, cube in zip(after.cubes, skin.cubes, strict=True):
+        assert (one.name, one.calibration_id, one.half_side) == (cube.name, used.id, used.half_side)
+        np.testing.assert_array_equal(one.rest_frequency, used.rest_frequency)
+
+
+NUMBERS = ("normal_force", "shear_force", "area", "position_uncertainty", "force_uncertainty")
+TRACKED = ("moment", "shear_uncertainty", "area_uncertainty", "moment_uncertainty")
+
+
+def distinct(kind: Callable, number: int) -> Contact | TrackedContact:
+    """A contact whose every number is another one."""
+    values = iter(np.arange(1, 30) / 7 + number)
+    fields = {
+        name: np.array([next(values) for _ in range(3)])
+        if name in ("position", "normal", "force")
+        else 10 + number
+        if name == "id"
+        else next(values)
+        for name in kind._fields
+    }
+    return kind(**fields)
+
+
+@pytest.mark.parametrize("kind", [Contact, TrackedContact])
+def test_each_number_of_a_contact_is_in_its_field(kind):
+    contacts = [distinct(kind, number) for number in range(3)]
+    message = contacts_message(make_message, START_NS + 5, "wrist", contacts)
+    assert message.header.frame_id == "wrist"
+    assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == START_NS + 5
+    for name in ("position", "normal", "force"):
+        got = [[one.x, one.y, one.z] for one in getattr(message, name)]
+        np.testing.assert_array_equal(got, [getattr(one, name) for one in contacts])
+    for name in (*NUMBERS, *TRACKED, "id"):
+        has_it = name in kind._fields
+        expected = [getattr(one, name) for one in contacts] if has_it else []
+        np.testing.assert_array_equal(getattr(message, name), expected)
+
+
+def test_each_number_of_a_point_is_in_its_field():
+    cloud = np.arange(30.0).reshape(5, 6) / 7
+    message = traction_message(make_message, START_NS + 5, "wrist", cloud)
+    assert message.header.frame_id == "wrist" and message.header.stamp.nanosec == 5
+    assert (message.height, message.width, message.is_dense, message.is_bigendian) == (
+        1,
+        5,
+        True,
+        False,
+    )
+    assert (message.point_step, message.row_step) == (24, 120)
+    names = ["x", "y", "z", "pressure", "shear", "sigma"]
+    assert [field.name for field in message.fields] == names
+    for number, field in enumerate(message.fields):
+        assert (field.datatype, field.count) == (7, 1)  # sensor_msgs/PointField: FLOAT32
+        points = np.frombuffer(bytes(message.data), np.uint8).reshape(5, message.point_step)
+        column = points[:, field.offset : field.offset + 4].copy().view("<f4")[:, 0]
+        np.testing.assert_array_equal(column, cloud[:, number].astype(np.float32))
