@@ -26,17 +26,20 @@ MAX_STRUCTURE_RESIDUAL = 1e-3
 """Largest part of the response (relative, Frobenius norm) that the coefficients of a calibration
 may leave out. If more is left out, the calibration holds the whole matrix."""
 MAX_MODE_COLUMNS = 7
-"""Number of modes in one table of the matrix; more do not fit into 80 columns."""
+"""Maximum number of modes (columns) in one printed table of the response matrix, so that the table
+fits into 80 characters."""
 LABEL_WIDTH = 9
-"""Width of the first column of the matrix, in characters."""
+"""Width of the first column of a printed response matrix, with the names of pads, in characters."""
 MIN_NUMBER_WIDTH = 7
-"""Width of a value of the matrix, in characters."""
+"""Width of a value in a printed response matrix, in characters."""
 COLUMN_GAP = 2
-"""Space between two columns of a table, in characters."""
+"""Space between two columns of a printed table, in characters."""
 MAX_COEFFICIENTS_SHOWN = 40
-"""Number of coefficients in the table of convergence; the file of --json has all."""
+"""Maximum number of coefficients in the printed table of convergence; the file of --json has
+all."""
 MIN_SHOWN_SHARE = 0.05
-"""Share of the largest stress under a load below which no ratio is shown: it would be noise."""
+"""Share of the largest stress under a load below which no ratio of measured to true stress is
+printed, because it would be noise."""
 
 
 def arguments(parser: Parser) -> None:
@@ -90,7 +93,7 @@ def run(options: argparse.Namespace) -> int:
     symmetry = "" if options.surface else f", symmetry {model.symmetry}"
     print(f"{describe(body, layout)}{place}; {layout.n_pads} pads{symmetry}", flush=True)
     result: Response | SurfaceStudy
-    # A factorisation in C does not notice Ctrl-C by itself.
+    # The factorisation runs in C, where Ctrl-C would not be noticed.
     with ends_at_once(), progress_bar() as report:
         if options.surface:
             result = study_surface(body, layout, options.meshes, model.neglect, report)
@@ -174,7 +177,7 @@ def describe(body: Body, layout: Layout) -> str:
 
 
 def _command(options: argparse.Namespace) -> str:
-    """Return the command line that computes the same, without its outputs."""
+    """Return the command line that computes the same result, without options for output files."""
     words = ["./cube", "fem"]
     # Only what changes the result; the default number of meshes is left out.
     if options.model is not None:
@@ -272,7 +275,8 @@ def _matrix_table(
     start: int,
     count: int,
 ) -> Table:
-    """Return the table of pads by `count` modes; the first one has the title of all."""
+    """Return the table of the response of all pads to `count` modes; the first table has the
+    title."""
     title = "response, Pa per Pa; below, what the symmetry does not explain"
     names = result.modes[start : start + count]
     table = new_table("" if start else title, "pad", names)
@@ -320,7 +324,7 @@ def show_surface(study: SurfaceStudy) -> None:
 
     is_plane = study.layout.planar
     names = list(study.rows[0].measured)
-    # Short, so that the table fits into 80 columns.
+    # Short headings let the table fit into 80 characters.
     heads = [f"{name} {column}" for name in names for column in ("cube", "true", "ratio")]
     table = new_table(
         f"stress in kPa under {'1 N/mm' if is_plane else '1 N'}: measured by the cube, and true",

@@ -68,5 +68,5 @@ def show_study(result: LayoutStudy) -> None:
 
 
 def _format_width(width: float | None) -> str:
-    """Format a width in mm; None stands for no width at all."""
+    """Format a width (m) in mm; None means that no indenter is wide enough."""
     return "never" if width is None else f"{1e3 * width:g}"

@@ -24,12 +24,13 @@ FIGURE_4_TITLES = {
     "zx": r"(a) shear alone: $\sigma_{zx}$ = 10 kPa",
     "zz_x": r"(b) $\sigma_{zz}$ grows along $x$: $d_0\,\partial\sigma_{zz}/\partial x$ = 10 kPa",
 }
-"""Titles of the panels of the paper's Fig. 4 by mode."""
+"""Titles of the panels of the paper's Fig. 4, by the name of the mode (linear stress field)
+shown."""
 MAX_DISPLACEMENT = 0.4
-"""Largest displacement of the drawn outline, in d0."""
+"""Largest displacement that is drawn, in d0 (half the side of the cube); all are scaled to it."""
 COLOUR_PERCENTILE = 95
-"""Percentile of the stress at which the colours end. At the corners of the cube the stress is
-infinite."""
+"""Percentile of the stress around the cube at which the colour scale ends. The maximum would not
+do, because the stress is infinite at the corners of the cube."""
 
 
 @print_style()
@@ -88,7 +89,7 @@ def _draw_pads(
     layout: Layout,
     half_side: float,
 ) -> None:
-    """Draw pads on the faces of an undeformed cube; half_side in mm."""
+    """Draw pads on the faces of an undeformed cube whose half side is `half_side` mm."""
     centres = layout.positions[:, [0, 2]]
     normals = layout.normals[:, [0, 2]]
     for centre, normal in zip(centres, normals, strict=True):
@@ -133,7 +134,7 @@ def _draw_deformation(
     _draw_stress(axis, deformation, drawn, window)
     _draw_arrows(axis, deformation, drawn, limits)
 
-    # Dotted: where the cube was. White: where it is.
+    # The cube before the deformation is dotted, and after it white.
     side = 2e3 * d0
     place = (-side / 2, -side / 2)
     axis.add_patch(Rectangle(place, side, side, fill=False, linestyle=":", linewidth=0.8))
@@ -197,14 +198,15 @@ def _draw_stress(
         label.set_rotation(0)
         label.set_path_effects([withStroke(linewidth=2, foreground="white")])
         beside_cube = np.abs(label.get_position()).max() < 1.5e3 * deformation.half_side
-        if beside_cube:  # too narrow for a label
+        if beside_cube:  # There is no room for a label beside the cube.
             label.remove()
     colorbar = axis.figure.colorbar(image, ax=axis, label=r"$\sigma_{zz}$ / kPa (dashed: negative)")
     colorbar.add_lines(lines)
 
 
 def _contour_levels(limit: float) -> Array:
-    """Return ten levels at round steps. None is 0 or 10 kPa, which large parts of a body have."""
+    """Return ten levels of stress for contour lines, in kPa, at round steps. None of them is 0 or
+    10 kPa, which large parts of a body have."""
     powers = 10.0 ** np.arange(-9, 10)
     steps = np.multiply.outer([1, 2, 3, 5], powers).ravel()
     # Four steps should be about the range of the colours on one side of zero.
@@ -228,7 +230,7 @@ def _draw_arrows(
     # Nodes are drawn where they have moved to, as the body is.
     tails = drawn[:, nodes]
     moved = deformation.displacement[:, nodes]
-    # The longest arrow is as long as d0; only those are drawn that are in view as a whole.
+    # The longest arrow is as long as d0. Arrows that would leave the view are not drawn.
     arrows = 1e3 * d0 * moved / np.hypot(*moved).max()
     ends = np.abs([tails, tails + arrows])
     in_view = np.all(ends < limits[:, None], axis=(0, 1))

@@ -17,11 +17,11 @@ from ..paper.rod_shear import RodShear
 from .curves import add_legend_below, draw_curves
 
 PAD_LABELS = tuple(f"$f_{number}$ of pad C{number}" for number in range(1, 5))
-"""Labels of the frequencies."""
+"""Labels of the frequencies of the prototype's pads C1 .. C4."""
 SIGNAL_LABELS = tuple(rf"$P_\mathrm{{{name}}}$" for name in ("normal", "shear", "grad"))
-"""Labels of the prototype's signals."""
+"""Labels of the prototype's signals P_normal, P_shear and P_grad."""
 UPPER_LABEL = "$P_\\mathrm{shear}$, C1 and C2\non the upper face"
-"""Label of P_shear with the pads of the prototype on the other faces."""
+"""Label of the signal P_shear of a prototype whose pads C1 and C2 are on the upper face."""
 PART_LABELS = (
     "signal",
     "uniform shear",
@@ -30,7 +30,7 @@ PART_LABELS = (
     "second derivatives",
     "higher derivatives",
 )
-"""Labels of the signal and of its `PARTS`."""
+"""Labels of the signal P_shear and of its parts, in the order of `rod_parts.PARTS`."""
 SHEAR_LABELS = {
     "truth": "true, same rod without the cube",
     "same_load": "true, same pressure",
@@ -38,9 +38,9 @@ SHEAR_LABELS = {
     "points": "eight pads: tensor, points",
     "pads": "eight pads: influence functions",
 }
-"""Labels of the drawn attributes of RodShear."""
+"""Labels of the attributes of `RodShear` (shear at the cube under a rod) that are drawn."""
 ROD_LABEL = "distance of the rod's centre from the cube's / mm"
-"""Label of the axis of the rod's position."""
+"""Label of the axis on which the position of the rod is drawn."""
 MIN_SHOWN_SHARE = 1e-3
 """Share of the largest stress below which a panel shows no values, because they are zero by
 symmetry."""
@@ -86,7 +86,7 @@ def _draw_modes(
     result: Experiment,
     modes: slice,
 ) -> None:
-    """Draw the recovered and the true amplitudes of some modes."""
+    """Draw recovered and true amplitudes of some modes (linear stress fields) of the plane."""
     names = PLANE.names[modes]
     recovered = result.recovered[:, modes]
     truth = result.truth[:, modes]

@@ -15,9 +15,9 @@ from ..studies.field_study import FieldExample, FieldStudy
 from ..studies.traction_study import METHODS
 
 VIEW_MM = 22.0
-"""Half side of the maps, in mm."""
+"""Half side of the square that each map of the pressure shows, in mm."""
 CONTOUR_STEP_KPA = 4
-"""Difference between two contour lines, in kPa."""
+"""Difference in pressure between two neighbouring contour lines of a map, in kPa."""
 PRESSURE_LABEL = f"pressure at the cubes' depth / kPa\n(contours: {CONTOUR_STEP_KPA} kPa apart)"
 """Label of the colour bar of pressures."""
 

@@ -23,13 +23,13 @@ from ..studies.pads_example import BALL_X, LOAD, Sweep, simple_loads
 from .curves import draw_curves
 
 ARROWS = np.linspace(-0.8, 0.8, 5)
-"""Positions of the arrows on a face, in half sides."""
+"""Positions along a face at which arrows of the load are drawn, in half sides of the square."""
 ARROW_LENGTH = 0.45
-"""Length of the arrow for the stress LOAD, in half sides."""
+"""Length of the arrow for the stress `LOAD`, in half sides of the square."""
 PAD_WIDTH = 0.85
-"""Width of a drawn pad along its face, in half sides."""
+"""Width of a drawn pad along its face, in half sides of the cube."""
 PAD_THICKNESS = 0.22
-"""Thickness of a drawn pad, in half sides."""
+"""Thickness of a drawn pad, in half sides of the cube."""
 
 
 @print_style()

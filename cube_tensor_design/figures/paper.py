@@ -20,8 +20,8 @@ from .deformation import draw_figure_4
 from .experiments import draw_experiment, draw_rod_parts, draw_rod_shear
 
 NEAR_PLACES = (1e-3, 2e-3, 3e-3)
-"""Positions of the rod whose force is held, in m. Farther away the cube changes the force by less
-than 20 %."""
+"""Positions along x, in m from the cube's centre, of the rod whose force is the same with and
+without the cube. Farther away the cube changes the force of a held rod by less than 20 %."""
 PROGRESS_SPANS = {
     "linear": (0.01, 0.17),
     "finite": (0.17, 0.59),
@@ -29,8 +29,8 @@ PROGRESS_SPANS = {
     "rod, held force": (0.69, 0.87),
     "shear": (0.87, 1.0),
 }
-"""Begin and end of each part of the work, as measured shares of the whole time. Fig. 4 comes before
-them."""
+"""Begin and end of each part of the work of `./cube paper`, as measured shares of the whole time;
+the first share belongs to Fig. 4."""
 
 
 def save_paper(folder: Path, report: Progress) -> list[Path]:
@@ -89,6 +89,6 @@ def _report_part(report: Progress, name: str) -> Progress:
 
 
 def _columns(table: Any) -> dict[str, object]:
-    """Return the arrays of a result as lists."""
+    """Return the arrays of a result by their name, as lists for JSON."""
     columns = vars(table).items()
     return {name: column.tolist() for name, column in columns if isinstance(column, np.ndarray)}

@@ -20,13 +20,13 @@ from ..fem.fem import Response
 from .curves import add_legend_below, draw_curves
 
 MAX_COEFFICIENTS = 12
-"""Number of coefficients in the picture of convergence; the largest ones are drawn."""
+"""Maximum number of coefficients in the picture of convergence; the largest ones are drawn."""
 MIN_LABELLED = 5e-3
-"""Share of the largest entry of the matrix below which an entry has no number."""
+"""Share of the largest entry of the response matrix below which no number is drawn on an entry."""
 POINTS = 201
-"""Number of points of a curve of influence."""
+"""Number of points of a curve of influence (stress of a pad over the place of a force)."""
 REACH = 8
-"""Half width of the picture of influence, in half sides of the cube."""
+"""Half width of the picture of influence functions, in half sides of the cube."""
 SAME_CURVE = 1e-3
 """Share of the largest stress up to which the curves of two pads may differ to share one curve."""
 
@@ -135,7 +135,7 @@ def draw_influence(
     for axis, title, direction in zip(figure.subplots(1, 2), titles, stress.T, strict=True):
         curves = {}
         for pads in groups:
-            # The factor makes Pa of kPa, as the curves are drawn in kPa.
+            # The factor 1e3 is undone by draw_curves, which draws Pa as kPa.
             label = ", ".join(layout.pads[pad] for pad in pads)
             curves[label] = 1e3 * direction[:, pads[0]] / unit
         draw_curves(axis, x, curves, spacing=20)

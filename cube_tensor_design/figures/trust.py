@@ -19,11 +19,11 @@ from cube_tensor_driver.views.figures.style import (
 from ..studies.layout_study import MAX_TRUSTED_ERROR, LayoutStudy
 
 DIRECTION_DASHES = ("--", "-.", ":")
-"""Dashes of the gradients along x, y and z."""
+"""Line styles of the curves of gradients along x, y and z."""
 DIRECTION_COLOURS = ("0.0", "0.35", "tab:cyan")
-"""Colours of the gradients along x, y and z."""
+"""Colours of the curves of gradients along x, y and z."""
 MAX_SHOWN_ERROR = 20
-"""Upper end of the axis of errors, relative to the range of a component."""
+"""Upper end of the axis of errors, which are relative to the range of a component."""
 
 
 @print_style()

@@ -31,32 +31,37 @@ from .virtual_bench import Deformation, LoadStep, VirtualBench
 FOAM_MODULUS = 3e6
 """Modulus of the pads' foam, in Pa: stiff enough that no pad is crushed at 27 % compression."""
 MODE_AMPLITUDE = 1e4
-"""Amplitude of each mode in the pictures of deformation, in Pa."""
+"""Amplitude, in Pa, of the mode (linear stress field) that deforms the body in a picture."""
 ON_LOWER = [2, 3, 0, 1]
 """Columns of the planar layout's pads V1 .. V8 that are the prototype's pads C1 .. C4, if C1 and C2
 are on the lower face."""
 ON_UPPER = [0, 1, 2, 3]
-"""Columns of V1 .. V8 that are C1 .. C4, if C1 and C2 are on the upper face."""
+"""Columns of the planar layout's pads V1 .. V8 that are the prototype's pads C1 .. C4, if C1 and C2
+are on the upper face."""
 SHEAR_SIGNS = np.array([-1.0, 1.0, 1.0, -1.0])
-"""Signs of C1 .. C4 in P_shear, the paper's eq. 9."""
+"""Signs with which the frequency changes of the prototype's pads C1 .. C4 are added to its signal
+for shear, P_shear (the paper's eq. 9)."""
 GRAD_SIGNS = np.array([1.0, -1.0, 1.0, -1.0])
-"""Signs of C1 .. C4 in P_grad, the paper's eq. 10."""
+"""Signs with which the frequency changes of the prototype's pads C1 .. C4 are added to its signal
+for the gradient, P_grad (the paper's eq. 10)."""
 DISPLACEMENTS = np.linspace(0.25e-3, 3e-3, 12)
 """Displacements of plates and rods in the steps of an experiment, in m."""
 
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """One experiment of section 4, a row per step.
+    """Result of one experiment of the paper's section 4, with a row for each step of the load.
 
     Attributes:
         name: Name of the experiment.
         displacement: (n,) displacement of the plate or rod that moves, in m.
         pads: (n, 8) stress of the pads, in Pa.
-        prototype: (n, 3) P_normal, P_shear, P_grad with C1 and C2 on the lower face, in Hz.
-        upper: The same with C1 and C2 on the upper face.
-        recovered: (n, 7) plane modes from all eight pads, in Pa.
-        truth: (n, 7) plane modes in the body without a cube, in Pa.
+        prototype: (n, 3) signals P_normal, P_shear, P_grad of the paper's prototype, in Hz, with
+            its pads C1 and C2 on the lower face.
+        upper: (n, 3) the same signals with C1 and C2 on the upper face.
+        recovered: (n, 7) amplitudes of the plane modes (linear stress fields) that all eight pads
+            give, in Pa.
+        truth: (n, 7) amplitudes of the plane modes in the body without a cube, in Pa.
         rotation: (n,) rotation of the cube, in rad.
     """
 
@@ -86,19 +91,19 @@ def experiments(
 ) -> list[Experiment]:
     """Run the three experiments, with bonded plates and with plates that slide.
 
-    Plates that shear the body must hold it, so they grip after they have slid.
+    Plates that shear the body must hold it, so plates that slid while they pressed grip after that.
 
     Args:
         body: The body, by default that of the paper.
         finite: Whether the material is neo-Hookean.
-        progress: Called after every step.
+        progress: Called as progress(done, total, name) after every step.
     """
     body = body or Body()
     protocols = _protocols(body)
     # The cube is calibrated in the same body, which has the symmetry of a slab.
     calibration = compute_response(body, LAYOUTS["planar"], "slab", meshes=1)
     done = itertools.count(1)
-    # With the cube and without it.
+    # Every step is solved with the cube and without it.
     total = 2 * sum(len(protocol.steps) for protocol in protocols)
 
     def report(name: str) -> None:
@@ -110,7 +115,7 @@ def experiments(
         _run_experiment(protocol, body, finite, calibration, partial(report, protocol.name))
         for protocol in protocols
     ]
-    # Experiment (a) is how (b) begins.
+    # Experiment (a) is the first half of experiment (b).
     bonded, sliding = found[:2]
     return [
         _first_half(bonded, "a, top plate pressed, bonded"),
@@ -138,7 +143,8 @@ def _protocols(body: Body) -> list[_Protocol]:
 
 
 def _first_half(experiment: Experiment, name: str) -> Experiment:
-    """Return the pressing steps of an experiment, under another name."""
+    """Return the first half of the steps of an experiment, in which a plate presses, under another
+    name."""
     columns = {key: value[: len(DISPLACEMENTS)] for key, value in vars(experiment).items()}
     return Experiment(**columns | {"name": name})
 
@@ -168,7 +174,8 @@ def _run_experiment(
 
 
 def plane_estimator(response: Array) -> Array:
-    """Return the matrix (7, 8) from eight pads of equal noise to all modes of the plane.
+    """Return the matrix (7, 8) from the stresses of eight pads of equal noise to the amplitudes of
+    all plane modes (linear stress fields).
 
     Args:
         response: Response matrix (8, 7) of the pads.
@@ -183,7 +190,8 @@ def foam_frequency(pads: Array) -> Array:
 
 
 def prototype(frequency: Array) -> Array:
-    """Return P_normal, P_shear, P_grad (n, 3) in Hz from frequencies (n, 4), eqs. 8 to 10."""
+    """Return the signals P_normal, P_shear, P_grad (n, 3) of the paper's prototype, in Hz, from the
+    frequencies (n, 4) of its pads C1 .. C4 (the paper's eqs. 8 to 10)."""
     change = frequency - REST_FREQUENCY
     return np.stack(
         [
@@ -210,8 +218,8 @@ def plates(
         pressed: Displacement of the top plate, in m.
         sheared: Displacement of the bottom plate, in m.
         bonded: Whether the plates hold the body; otherwise they slide and leave x free.
-        gripped: Whether plates that slid before hold the body from now on, as it stands.
-        rod: Rod in place of the top plate.
+        gripped: Whether plates that slid so far hold the body from now on, where it has slid to.
+        rod: Rod that presses in place of the top plate; None: the plate presses.
     """
 
     def prescribed(x: Array) -> Array:
@@ -241,13 +249,15 @@ def dent(
 
 
 def figure_4(body: Body | None = None) -> dict[str, Deformation]:
-    """Return section 3: shear only ("zx"), and a normal stress that grows along x ("zz_x")."""
+    """Return the deformations of the paper's section 3: under shear only (key "zx"), and under a
+    normal stress that grows along x (key "zz_x")."""
     bench = VirtualBench(body or Body(), size=0.2)
     return _deformations(bench, ("zx", "zz_x"))
 
 
 def mode_deformations(body: Body, layout: Layout) -> dict[str, Deformation]:
-    """Return the section under `MODE_AMPLITUDE` of each plane mode, by the mode's name."""
+    """Return the section deformed by `MODE_AMPLITUDE` of each plane mode (linear stress field), by
+    the mode's name."""
     bench = VirtualBench(body, layout=layout, size=0.3)
     return _deformations(bench, PLANE.names)
 

@@ -50,7 +50,7 @@ class Material:
     def stress(self, f: Array) -> Array:
         """Return the first Piola-Kirchhoff stress P = dW/dF (2, 2, E, Q), in Pa.
 
-        It is the force over the undeformed area.
+        P is the force over the undeformed area.
         """
         if not self.finite:
             strain = _strain(f)
@@ -62,18 +62,19 @@ class Material:
     def cauchy(self, f: Array) -> Array:
         """Return the true stress P Fᵀ / J (2, 2, E, Q), in Pa: the force over the deformed area.
 
-        A linear material does not distinguish it from P.
+        In a linear material the true stress is P itself.
         """
         p = self.stress(f)
         return mul(p, transpose(f)) / det(f) if self.finite else p
 
     def moduli(self, f: Array) -> Array:
-        """Return dP_ij/dF_kl (2, 2, 2, 2, E, Q), in Pa; Q is 1 for a linear material."""
+        """Return the moduli dP_ij/dF_kl (2, 2, 2, 2, E, Q), in Pa; Q is 1 for a linear material,
+        which has the same moduli at all points."""
         inverse, log = _ONE, 0.0
         if self.finite:
             inverse, log = transpose(inv(f)), np.log(det(f))
         identity = np.einsum("ik...,jl...->ijkl...", _ONE, _ONE)
-        # With g = F^-T, these are g_ij g_kl and g_il g_kj.
+        # With g = F^-T (1 for a linear material), these are g_ij g_kl and g_il g_kj.
         outer = np.einsum("ij...,kl...->ijkl...", inverse, inverse)
         crossed = np.swapaxes(outer, 1, 3)
         # The derivative of F^-T by F is -crossed.

@@ -19,20 +19,23 @@ from scipy.sparse.linalg import SuperLU, splu
 from cube_tensor_driver.core.arrays import Array, Index
 
 TOLERANCE = 1e-9
-"""Largest correction over the largest displacement at which the method has converged."""
+"""Ratio of the largest correction to the largest displacement below which Newton's method has
+converged."""
 MAX_ITERATIONS = 60
 """Number of corrections after which the method counts as failed. For a deep rod it converges in 32
 to 54; with a limit of 30 the load steps would be halved, at twice the number of corrections."""
 MAX_CORRECTION = 0.3
-"""Largest correction of any unknown in one step, in d0."""
+"""Largest change of any unknown displacement in one step of Newton's method, in d0 (half the side
+of the cube)."""
 MAX_HALVINGS = 7
-"""Number of times that one correction is halved at most."""
+"""Maximum number of times that one correction is halved, before Newton's method gives up."""
 ARMIJO = 1e-4
-"""Part of the linear decrease of the energy that a step must reach (Armijo's rule)."""
+"""Share of the decrease of the energy in the linearised problem that a step must reach at least
+(Armijo's rule)."""
 
 
 class Balance(NamedTuple):
-    """Forces out of balance (dofs,) and energy at some displacements."""
+    """Nodal forces (dofs,) out of balance, and the energy, at given displacements."""
 
     force: Array
     energy: float
@@ -40,11 +43,12 @@ class Balance(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Constraints:
-    """Conditions on the unknowns.
+    """Conditions on the unknown displacements.
 
     Attributes:
         prescribed: (dofs,) values, NaN where an unknown is free.
-        row: (dofs,) weights with row @ u = 0, or None.
+        row: (dofs,) weights of a combination of the unknowns u that is held, row @ u = 0; None: no
+            combination is held.
     """
 
     prescribed: Array
@@ -58,7 +62,7 @@ def find_balance(
     tangents: Callable[[Array], Iterable[sp.csr_matrix]],
     linear: bool = False,
 ) -> Array | None:
-    """Find displacements at which the free forces balance.
+    """Find displacements at which the forces on the free unknowns balance.
 
     Args:
         u: (dofs,) the guess.
@@ -66,7 +70,7 @@ def find_balance(
         balance: Returns forces and energy, or None at displacements that are not possible.
         tangents: Yields the derivative of the forces, then matrices to try where that one gives no
             descent.
-        linear: Whether one step is enough.
+        linear: Whether the problem is linear, so that one step solves it.
 
     Returns:
         u (dofs,), or None where the method does not converge.
@@ -87,7 +91,7 @@ def find_balance(
             is_small = largest_change < TOLERANCE * largest
             if linear or is_small:
                 return u + change
-            if jump.any():  # prescribed displacements are not shortened
+            if jump.any():  # Prescribed displacements are taken as a whole.
                 reached = u + change, balance(u + change)
             else:
                 reached = search.descend(u, state, change)
@@ -101,7 +105,8 @@ def find_balance(
 
 
 class _Search:
-    """Corrections of the free unknowns `free` (m,), and how much of a correction is taken."""
+    """Computes corrections of the free unknowns `free` (m,), and how much of a correction is
+    taken."""
 
     def __init__(
         self,
@@ -125,8 +130,8 @@ class _Search:
 
         Args:
             u: (dofs,) displacements.
-            state: Forces and energy there.
-            matrix: Derivative of the forces.
+            state: Forces and energy at u.
+            matrix: Derivative of the forces by the displacements.
             jump: (dofs,) change of the prescribed unknowns.
         """
         free = self._free
@@ -150,10 +155,11 @@ class _Search:
         state: Balance,
         change: Array,
     ) -> tuple[Array, Balance] | None:
-        """Take as much of a change as lowers the energy or the forces out of balance, or None."""
+        """Return u plus as much of a change as lowers the energy or the forces out of balance, and
+        the state there; None if no part of the change does so."""
         slope = float(state.force @ change)
         unbalanced = self._unbalanced(state.force)
-        # A longer step would leave the region in which the linearised forces mean anything.
+        # Linearised forces are valid near u only, so the step has a largest length.
         size = min(1.0, MAX_CORRECTION / np.abs(change).max())
         for _ in range(MAX_HALVINGS):
             reached = self._balance(u + size * change)
@@ -167,11 +173,12 @@ class _Search:
         return None
 
     def _unbalanced(self, force: Array) -> float:
-        """Return the norm of the forces that nothing holds."""
+        """Return the norm of the forces that neither a prescribed unknown nor the held row
+        bears."""
         free = force[self._free]
         held = self._held
         if held is not None:
-            # The force along the row is what holds the row.
+            # The part of the force along the row is the force that holds the row.
             free = free - held * (held @ free) / (held @ held)
         return float(np.linalg.norm(free))
 

@@ -1,4 +1,5 @@
-"""Parts of the fall of P_normal in the paper's experiment (b), where a pressed body is sheared.
+"""Parts of the fall of the signal P_normal in the paper's experiment (b): a pressed body is
+sheared.
 
 Before the shear all four pads have the stress s_zz + c: the true stress, and what the cube adds to
 it because it is stiffer than the elastomer in its place. Under shear the cube rotates by an angle
@@ -24,10 +25,10 @@ from .experiments import Experiment, foam_frequency, prototype
 
 @dataclass(frozen=True, eq=False)
 class NormalFall:
-    """Parts of a change, in this order.
+    """Parts of the change of P_normal, the prototype's signal for pressure, under shear.
 
-    The parts come from s_zz, from s_zx on the rotated faces, from s_xx - s_zz on them, from c, and
-    from the difference between the pads of a face.
+    The parts come, in this order, from s_zz, from s_zx on the rotated faces, from s_xx - s_zz on
+    them, from c, and from the difference between the pads of a face.
 
     Attributes:
         stress: (4,) change of the pads' mean by the first four parts, in Pa.
@@ -55,13 +56,13 @@ def normal_fall(experiment: Experiment) -> NormalFall:
     shear_part = -2 * zx * sin * cos
     normal_part = (xx - zz) * sin**2
     field = np.array([zz - zz_before, shear_part, normal_part])
-    # What the field does not explain is the change of c.
+    # What the stress field does not explain is the change of c, which the cube adds.
     stress = np.append(field, after - before - field.sum())
 
     # Four equal pads, after each part has been added to those before it.
     mean_stress = np.cumsum([before, *stress])
     equal_pads = np.tile(mean_stress[:, None], 4)
     signal = prototype(foam_frequency(equal_pads))[:, 0]
-    # The last part leads to the signal of the pads as they are.
+    # The last part leads from four equal pads to the pads as they are.
     end = experiment.prototype[-1, 0]
     return NormalFall(stress, np.diff(signal, append=end))

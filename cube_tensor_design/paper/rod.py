@@ -21,27 +21,29 @@ import skfem
 from cube_tensor_driver.core.arrays import Array
 
 STIFFNESS_RATIO = 300.0
-"""Ratio of k to Young's modulus, per d0. A pressure of three times E penetrates a hundredth of
-d0."""
+"""Stiffness k of the contact of a rod over Young's modulus E of the body, per d0 (half the side of
+the cube). A pressure of three times E penetrates a hundredth of d0."""
 ONSET_LENGTH = 0.001
-"""Length over which the contact sets in, in d0."""
+"""Length of penetration over which the contact of a rod sets in, in d0 (half the side of the
+cube)."""
 SAME_DISPLACEMENT = 1e-9
-"""Difference below which two displacements are the same, in d0."""
+"""Difference below which two displacements count as the same, in d0 (half the side of the cube)."""
 
 
 @dataclass(frozen=True)
 class Rod:
-    """A rod whose flat part ends `edge_radius` before its edges, in parabolas; lengths in m.
+    """A rod with a flat lower side whose edges are rounded by parabolas; lengths in m.
 
     Sides of elements, as far as they are stretched, must be short compared with the radius.
     Otherwise a node stays on the rod's edge while the surface slides around it, and how far it
     slides depends on the steps of the load.
 
     Attributes:
-        pressed: Depth of its lowest point below the undeformed top.
-        position: Position of its centre along x.
-        width: Width along x.
-        edge_radius: Radius of curvature of the parabolas at their apex.
+        pressed: Depth of the rod's lowest point below the undeformed top of the body.
+        position: Position of the rod's centre along x, from the cube's centre.
+        width: Width of the rod along x.
+        edge_radius: Radius of curvature of the parabolas at their apex, which is as far from the
+            edge.
     """
 
     pressed: float
@@ -55,7 +57,8 @@ class Rod:
         top: float,
         unit: float,
     ) -> tuple[Array, Array, Array]:
-        """Return h, dh/dx and d²h/dx² at x; x, top and h are in units of `unit` m."""
+        """Return the height h of the rod's lower side, dh/dx and d²h/dx² at x. Lengths but those of
+        the rod are in units of `unit` m, and `top` is the height of the undeformed top."""
         radius = self.edge_radius / unit
         flat = (self.width / 2 - self.edge_radius) / unit
         from_centre = x - self.position / unit
@@ -66,7 +69,8 @@ class Rod:
 
 
 class _Penetration(NamedTuple):
-    """p, dp/dg, d²p/dg², dh/dx and d²h/dx² at the quadrature points."""
+    """Penetration p, its derivatives dp/dg and d²p/dg² by the gap g, and dh/dx and d²h/dx² of the
+    rod's height h, at the quadrature points."""
 
     p: Array
     dp: Array
@@ -76,7 +80,7 @@ class _Penetration(NamedTuple):
 
 
 class RodContact:
-    """Energy, nodal forces and tangent of a rod on the facets of a basis."""
+    """Contact of a rod with the top of a meshed body: energy, nodal forces and their derivative."""
 
     def __init__(
         self,
@@ -91,10 +95,10 @@ class RodContact:
         Args:
             facets: The top of the body.
             rod: The rod.
-            unit: Metres per unit of length of the basis.
+            unit: Unit of length of the mesh, in m.
             young: Young's modulus of the body, in Pa.
-            finite: Whether the rod meets the surface where it has moved to along x. In linear
-                theory it meets it where it was.
+            finite: Whether the rod meets points of the surface where these have moved to along x.
+                In linear theory it meets them where they were.
         """
         self._facets = facets
         self._rod = rod
@@ -137,7 +141,7 @@ class RodContact:
         has_moved = np.abs(change) > SAME_DISPLACEMENT
         difference = at.p * at.dp - other.p * other.dp
         quotient = difference / np.where(has_moved, change, 1.0)
-        # Where nothing has moved, the secant is the tangent.
+        # Where the displacements u and v are equal, the secant is the tangent.
         tangent = at.dp**2 + at.p * at.ddp
         normal = self._stiffness * np.where(has_moved, quotient, tangent)
         zero = np.zeros_like(normal)
@@ -164,7 +168,7 @@ class RodContact:
         top = x[1].max()
         height, slope, curvature = self._rod.lower_side(position, top, self._unit)
         g = x[1] + moved[1] - height
-        # A smooth max(g, 0): it differs from it within the onset length only.
+        # A smooth form of max(g, 0), which differs within the onset length only.
         root = np.hypot(g, ONSET_LENGTH)
         p = (g + root) / 2
         return _Penetration(
@@ -178,7 +182,7 @@ class RodContact:
 
 
 _PUSH = skfem.LinearForm(lambda w, p: p.pressure * (w[1] - p.slope * w[0]))
-"""Work of the pressure along the rod's normal in a test function w."""
+"""Linear form: work of the contact pressure along the rod's normal in a test function w."""
 
 
 def _push_change(
@@ -186,7 +190,8 @@ def _push_change(
     w: Any,
     p: Any,
 ) -> Any:
-    """Derivative of `_PUSH` by u: the penetration changes, and so does the normal."""
+    """Bilinear form: derivative of `_PUSH`, the work of the pressure, by the displacement u, which
+    changes the penetration and the normal."""
     normal_w = w[1] - p.slope * w[0]
     normal_u = u[1] - p.slope * u[0]
     along_normal = normal_w * normal_u

@@ -47,21 +47,25 @@ from .rod import Rod
 from .virtual_bench import LoadStep, VirtualBench
 
 Held = Literal["displacement", "force"]
-"""Quantity of the rod that is the same with the cube as without it."""
+"""Quantity of a pressed rod, displacement or force, that is the same with the cube as without
+it."""
 
 PARTS = ("shear", "normal", "gradients", "second", "higher")
-"""Uniform shear, uniform normal stresses, gradients, second derivatives of stress, the rest."""
+"""Names of the parts of the stress field in the cube's place: uniform shear, uniform normal
+stresses, gradients, second derivatives, higher derivatives."""
 PADS = {
     "strips": LAYOUTS["planar"],
     "half faces": strip_layout(LAYOUTS["planar"], 1.0),
 }
-"""Layouts whose signal is split."""
+"""Layouts of pads, by name, whose signal P_shear is split into parts."""
 RADII = {"rounded rod": 1e-3, "sharp rod": 1e-5}
-"""Radii of the rod's edges, in m."""
+"""Radius of the edges of each rod, by its name, in m."""
 P_SHEAR = np.append(SHEAR_SIGNS, np.zeros(4))
-"""Signs -v1 + v2 + v3 - v4 of the eight pads' stresses in P_shear, eq. 9."""
+"""Signs of the eight pads' stresses in the signal for shear P_shear = -v1 + v2 + v3 - v4 (the
+paper's eq. 9)."""
 ORDERS = 8
-"""Number of orders of the polynomials. Beyond them 0.2 % of the signal is left."""
+"""Largest order of the polynomials in which the displacement in the cube's place is expanded.
+Higher orders make 0.2 % of the signal."""
 SAME_DEPTH = 1e-8
 """Difference between two depths of a rod below which the search for the held force ends, in m. The
 secant method converges fast, so the force is then much closer to the held one."""
@@ -69,12 +73,12 @@ secant method converges fast, so the force is then much closer to the held one."
 
 @dataclass(frozen=True, eq=False)
 class RodParts:
-    """Parts of the signal P_shear by the position of the rod.
+    """Parts of P_shear, the prototype's signal for shear, by the position of the rod.
 
     Attributes:
-        place: (n,) position of the rod along x, in m.
-        signal: (n,) in Pa.
-        parts: (n, 5) in Pa, in the order of `PARTS`; they sum to the signal.
+        place: (n,) position of the rod along x, from the cube's centre, in m.
+        signal: (n,) P_shear as a sum of pad stresses, in Pa.
+        parts: (n, 5) parts of the signal in Pa, in the order of `PARTS`; they sum to the signal.
     """
 
     place: Array
@@ -89,7 +93,9 @@ def rod_parts(
     progress: Progress | None = None,
     held: Held = "displacement",
 ) -> dict[str, RodParts]:
-    """Split -v1 + v2 + v3 - v4 for each position of a rod; the bottom is bonded, without friction.
+    """Split the signal -v1 + v2 + v3 - v4 of the pads for each position of a rod without friction.
+
+    The bottom of the body is bonded.
 
     Args:
         body: The body, by default that of the paper.
@@ -131,7 +137,8 @@ def draw_back(bench: VirtualBench, step: LoadStep) -> LoadStep:
 
     @cache
     def excess(depth: float) -> float:
-        """Return how much larger the force is, relative to that without the cube."""
+        """Return the relative excess of the rod's force at this depth over that without the
+        cube."""
         _, forces = bench.rod_pressure(step_to(depth))
         return float(forces.sum() / force - 1)
 
@@ -148,7 +155,7 @@ def split_signals(
     signals: Sequence[Array],
     held: Held = "displacement",
 ) -> Array:
-    """Return the parts (signals, 5) of each signal under a step of a linear bench.
+    """Return the parts (signals, 5) of each signal, by `PARTS`, under a step of a linear bench.
 
     Args:
         bench: A linear bench with the cube.
@@ -172,7 +179,7 @@ def split_signals(
     dofs = np.unique(bench.section.basis.element_dofs[:, in_cube])
     polynomials, part = _polynomials(bench)
     polynomials = polynomials[:, dofs]
-    # Columns of one size keep the fit well conditioned.
+    # Columns of equal norm keep the fit well conditioned.
     size = np.linalg.norm(polynomials, axis=1)
     scaled = (polynomials / size[:, None]).T
     scaled_amplitude = np.linalg.lstsq(scaled, field[dofs], rcond=None)[0]
@@ -191,7 +198,7 @@ def split_signals(
         response -= _forces(bench, adjoint, in_cube)
         each = (polynomials @ response[dofs]) * amplitude
         parts = np.bincount(part, each, len(PARTS))
-        # What the polynomials leave of the field belongs to the higher derivatives.
+        # The residual of the fit by polynomials belongs to the higher derivatives.
         parts[-1] += response @ field - each.sum()
         rows.append(parts)
     return np.array(rows)
@@ -237,14 +244,15 @@ def _forces(
     u: Array,
     elements: Mask,
 ) -> Array:
-    """Return the nodal forces (dofs,) of some elements at u: their stiffness times u."""
+    """Return the nodal forces (dofs,) of some elements at displacements u (dofs,)."""
     section = bench.section
     stress = section.material.stress(section.deformation(u))
     return section.forces(stress, elements)
 
 
 def _polynomials(bench: VirtualBench) -> tuple[Array, Index]:
-    """Return displacements (n, dofs) in balance without a cube, and the part (n,) of each one."""
+    """Return n polynomial displacements (n, dofs) that are in balance without a cube, and the
+    number in `PARTS` of the part (n,) to which each belongs."""
     body = bench.body
     section = bench.section
     lam, mu = lame(body.young, body.poisson, body.plane)
@@ -257,7 +265,7 @@ def _polynomials(bench: VirtualBench) -> tuple[Array, Index]:
     for order in range(1, ORDERS + 1):
         # Real and imaginary parts of a and of b are independent amplitudes.
         for a, b in ((1, 0), (1j, 0), (0, 1), (0, 1j)):
-            if order == 1 and a == 1j:  # a rotation
+            if order == 1 and a == 1j:  # A rotation gives no stress.
                 continue
             derivative = a * z ** (order - 1)
             slope = order * z * np.conj(derivative)

@@ -34,23 +34,26 @@ from .rod import Rod
 from .virtual_bench import VirtualBench
 
 GRID_STEP = 1e-4
-"""Distance between the points of the grid on the surface, in m."""
+"""Distance between neighbouring points of the grid on the surface at which the traction is unknown,
+in m."""
 
 
 @dataclass(frozen=True, eq=False)
 class RodShear:
-    """Shear σzx at the cube's place, in Pa; one row per place of the rod.
+    """Shear σzx at the cube's place, true and recovered, in Pa, for n positions of a rod.
 
     Attributes:
-        place: (n,) position of the rod along x, in m.
-        truth: (n,) of the same rod on the body without a cube.
-        same_load: (n,) of the pressure that the rod has with the cube, on the layer without it.
-        eq_4: (n,) from the four upper and lower pads by eq. 4.
-        tensor: (n,) from the tensor of all eight pads.
-        points: (n,) from the traction that the tensor gives.
-        pads: (n,) from the traction that the pads give.
+        place: (n,) position of the rod along x, from the cube's centre, in m.
+        truth: (n,) true shear of the same rod on the body without a cube.
+        same_load: (n,) true shear of the pressure that the rod has with the cube, acting on the
+            layer without it.
+        eq_4: (n,) shear from the four upper and lower pads by the paper's eq. 4.
+        tensor: (n,) shear from the tensor of all eight pads.
+        points: (n,) shear from the surface traction that the tensor gives.
+        pads: (n,) shear from the surface traction that the pads give.
         seen: (n, 8) mean stress of the pads on the bench.
-        predicted: (n, 8) the same by influence functions from the traction under the rod.
+        predicted: (n, 8) mean stress of the pads by influence functions from the traction under
+            the rod.
     """
 
     place: Array
@@ -70,13 +73,13 @@ def rod_shear(
     pressed: float = 1e-3,
     progress: Progress | None = None,
 ) -> RodShear:
-    """Recover the shear for each place of the rod.
+    """Recover the shear σzx at the cube's place for each position of a rod.
 
     Args:
         body: The body, by default that of the paper.
         places: Positions of the rod along x, in m.
         pressed: Depth of the rod, in m.
-        progress: Called before every place.
+        progress: Called as progress(done, total, what) before every position.
     """
     body = body or Body()
     layout = LAYOUTS["planar"]
@@ -132,11 +135,14 @@ def _shear_weights(
     x: Array,
     depth: float,
 ) -> Array:
-    """Return the weights h S H' (H S H' + N)^-1 (n,) of the measurements y for the shear.
+    """Return weights h S H' (H S H' + N)^-1 (n,) from n measurements to the shear at the cube's
+    place.
+
+    S is the prior covariance of the traction, and N the variance of the measurements' errors.
 
     Args:
-        kernel: H (n, m, 2) per traction along x and z.
-        shear_kernel: h (m, 2).
+        kernel: H (n, m, 2), measurements per traction along x and z at m points.
+        shear_kernel: h (m, 2), shear per traction along x and z.
         x: (m,) positions on the surface, in m.
         depth: Depth of the cube's centre, in m.
     """

@@ -27,9 +27,10 @@ class Section:
     Attributes:
         mesh: The triangles.
         material: The material; its constants have the shape (E, 1).
-        basis: The elements, whose dofs are the unknown displacements u (dofs,), in d0.
+        basis: The elements, whose dofs are the unknown displacements u (dofs,), in d0 (half the
+            side of the cube).
         component: (dofs,) 0 where an unknown is along x, 1 along z.
-        points: (2, E, Q) positions of the quadrature points.
+        points: (2, E, Q) positions of the quadrature points, in d0 (half the side of the cube).
     """
 
     def __init__(self, mesh: skfem.MeshTri, material: Material) -> None:
@@ -51,14 +52,15 @@ class Section:
         return int(np.hypot(*from_point).argmin())
 
     def deformation(self, u: Array) -> Array:
-        """Return F = 1 + grad u (2, 2, E, Q)."""
+        """Return the gradient of the deformation F = 1 + grad u (2, 2, E, Q) at the quadrature
+        points."""
         gradient = (self._gradient @ u).reshape(2, 2, *self.basis.dx.shape)
         return gradient + np.eye(2)[:, :, None, None]
 
     def balance(self, u: Array) -> Balance | None:
-        """Return nodal forces and energy; None when an element is inside out."""
+        """Return nodal forces (dofs,) and energy; None when an element is turned inside out."""
         f = self.deformation(u)
-        # A linear material knows no volume, so it has no limit.
+        # Linear theory does not limit the change of volume.
         if self.material.finite and det(f).min() <= 0:
             return None
         density = self.material.energy(f)
@@ -71,7 +73,7 @@ class Section:
 
         Args:
             stress: (2, 2, E, Q) in Pa.
-            elements: (E,) which elements count.
+            elements: (E,) whether an element counts; True: all count.
         """
         volume = self.basis.dx * np.reshape(elements, (-1, 1))
         return (stress * volume).ravel() @ self._gradient
@@ -79,7 +81,7 @@ class Section:
     def tangent(self, u: Array) -> sp.csr_matrix:
         """Return the derivative of the nodal forces by u, sparse (dofs, dofs).
 
-        That of a linear material is the same everywhere, and is assembled once.
+        The derivative of a linear material does not depend on u, and is assembled once.
         """
         if self._linear_tangent is not None:
             return self._linear_tangent

@@ -35,24 +35,25 @@ CUBE_REFINEMENTS = 2
 """Number of times that the triangles at the cube are cut in four. P_shear is a small difference of
 pad stresses; without a cut it is 2 % off."""
 STEP_HALVINGS = 5
-"""Number of times that a step of the load is halved before it counts as too large."""
+"""Maximum number of times that a step of the load is halved, before it counts as too large."""
 BYTES_PER_CORNER = 6e4
-"""Peak memory of the solver in bytes per corner of a triangle; measured."""
+"""Peak memory of the solver of the bench, in bytes per corner of a triangle, as measured."""
 CUBE_STIFFNESS_RATIO = 1e4
-"""Ratio of the Young's moduli of cube and body. The cube is then rigid to 1e-4, and the equations
-of Newton's method stay well conditioned."""
+"""Ratio of the Young's moduli of cube and body on the bench. With it the cube is rigid to 1e-4, and
+the equations of Newton's method stay well conditioned."""
 SURFACE_TOLERANCE = 1e-9
-"""Distance from a surface below which a point counts as on it, in the unit of the coordinates."""
+"""Distance from a surface, in the unit of the coordinates (d0, half the side of the cube), below
+which a point counts as on the surface."""
 
 
 @dataclass(frozen=True)
 class LoadStep:
-    """One step of the load.
+    """One step of the load on the bench.
 
     Attributes:
         prescribed: Maps node positions (2, n) in m to displacements (2, n) in m, NaN where a
             component is free.
-        rod: Rod that presses into the top.
+        rod: Rod that presses into the top; None: no rod does.
         gripped: Whether displacements along x count from where the body was after the last step
             without a grip.
         sliding: Whether the bottom is free along x, except that its mean stays. The force that
@@ -68,12 +69,14 @@ class LoadStep:
 
 @dataclass(frozen=True, eq=False)
 class BenchRun:
-    """Results of a run, one row per step; tension is positive, gradients are times d0.
+    """Results of a run of the bench, one row per step of the load; tension is positive, gradients
+    are times d0 (half the side of the cube).
 
     Attributes:
         pads: (n, P) mean normal stress of each pad in Pa, along its own normal as the cube rotates.
-        state: (n, 7) modes zz, zx, xx, zz_x, zz_z, xx_z, xx_x in Pa, fitted to the stress within
-            d0/2 of the centre. It is the true field if there is no cube, and meaningless in a cube.
+        state: (n, 7) amplitudes of the modes (linear stress fields) zz, zx, xx, zz_x, zz_z, xx_z,
+            xx_x in Pa, fitted to the stress within d0/2 of the centre: the true field if there is
+            no cube, and meaningless within a cube.
         rotation: (n,) angle of the cube, in rad.
     """
 
@@ -84,15 +87,15 @@ class BenchRun:
 
 @dataclass(frozen=True, eq=False)
 class Deformation:
-    """A deformed section, as plain arrays.
+    """A deformed section of a body, as plain arrays.
 
     Attributes:
-        points: (2, nodes) in d0.
+        points: (2, nodes) positions before the deformation, in d0 (half the side of the cube).
         triangles: (3, elements) numbers of nodes.
-        half_side: d0, in m.
+        half_side: Half the side of the cube, d0, in m.
         height: Height of the body, in m.
-        displacement: (2, nodes) in m.
-        stress_zz: (elements,) in Pa.
+        displacement: (2, nodes) displacements of the nodes, in m.
+        stress_zz: (elements,) mean stress sigma_zz of each triangle, in Pa.
     """
 
     points: Array
@@ -105,7 +108,8 @@ class Deformation:
 
 @dataclass(frozen=True, eq=False)
 class _Task:
-    """Constraints of the unknowns in one step, and the rod that presses."""
+    """Constraints of the unknown displacements in one step of the load, and the rod that
+    presses."""
 
     constraints: Constraints
     rod: Rod | None
@@ -113,21 +117,22 @@ class _Task:
 
 @dataclass(frozen=True, eq=False)
 class _Position:
-    """A body in balance: u (dofs,) in d0, and the rod that presses on it."""
+    """A body in balance: displacements u (dofs,) in d0 (half the side of the cube), and the rod
+    that presses on the body."""
 
     u: Array
     rod: Rod | None
 
 
 class VirtualBench:
-    """The body on the bench. Lengths are in d0 unless stated otherwise.
+    """A body on the bench. Lengths are in d0 (half the side of the cube) unless stated otherwise.
 
     Attributes:
         body: The body.
         finite: Whether the material is neo-Hookean.
         layout: Pads of the cube.
         section: The finite elements.
-        in_cube: (elements,) which elements are in the cube's place.
+        in_cube: (elements,) whether an element is in the cube's place.
     """
 
     def __init__(
@@ -160,7 +165,7 @@ class VirtualBench:
         self.in_cube = np.all(np.abs(centres) < 1.0, axis=0)
         lam, mu = lame(body.young, body.poisson, body.plane)
         ratio = np.where(self.in_cube & cube, CUBE_STIFFNESS_RATIO, 1.0)
-        stiffness = ratio[:, None]  # the same at all points of an element
+        stiffness = ratio[:, None]  # The same at all points of an element.
         material = Material(lam * stiffness, mu * stiffness, finite)
         self.section = Section(mesh, material)
 
@@ -168,7 +173,7 @@ class VirtualBench:
         self._top = self._horizontal_facets(top)
         along_x = skfem.LinearForm(lambda w, _: w[0])
         bottom_mean = along_x.assemble(self._horizontal_facets(-top))
-        # Its numbers have the size of the stiffness, so that the equations are well conditioned.
+        # Numbers of the size of the stiffness keep the equations well conditioned.
         self._bottom_mean = bottom_mean * body.young
 
     def run(
@@ -190,7 +195,7 @@ class VirtualBench:
         loose = position.u
         rows = []
         for number, step in enumerate(steps, 1):
-            guess = 2 * position.u - before.u  # continues as the last step went
+            guess = 2 * position.u - before.u  # As if the body moved on as in the last step.
             task = self._task(step, loose)
             reached = self._advance(position, guess, task, number)
             before = position
@@ -204,12 +209,14 @@ class VirtualBench:
         return BenchRun(*map(np.array, columns))
 
     def solve(self, step: LoadStep) -> Array | None:
-        """Return the displacements (dofs,) under one step from rest, or None if it is too large."""
+        """Return the displacements (dofs,) under one step from rest; None if the step is too
+        large."""
         rest = np.zeros(self.section.basis.N)
         return self._newton(rest, self._task(step, rest))
 
     def rod_pressure(self, step: LoadStep) -> tuple[Array, Array]:
-        """Return positions (n,) in m along x and forces (n,) in N/m of the rod of a linear step."""
+        """Return positions (n,) along x, in m, and nodal forces (n,) of the rod of a linear step on
+        the body, in N/m."""
         u = self.solve(step)
         if u is None or step.rod is None or self.finite:
             raise ElasticError("give a linear step with a rod, that presses less")
@@ -223,7 +230,7 @@ class VirtualBench:
         """Return weights (P, dofs) from nodal forces on the cube to the mean stresses of the pads.
 
         Args:
-            layout: Pads that end where elements of this bench's mesh end.
+            layout: Pads, whose edges must be ends of elements of this bench's mesh.
             angle: Rotation of the cube, in rad.
         """
         rotation = rotation_from_rpy(0, -angle, 0)[::2, ::2]
@@ -234,7 +241,7 @@ class VirtualBench:
         """Return a linear bench of the same mesh, with elastomer in the cube's place."""
         bench = copy(self)
         material = self.section.material
-        # The elastomer is softer than the cube.
+        # The elastomer has the smaller of the two stiffnesses.
         lam = np.full_like(material.lam, material.lam.min())
         mu = np.full_like(material.mu, material.mu.min())
         elastomer = Material(lam, mu, False)
@@ -242,7 +249,8 @@ class VirtualBench:
         return bench
 
     def free(self, step: LoadStep) -> Index:
-        """Return the numbers of the unknowns that a step from rest does not prescribe."""
+        """Return the numbers of the unknown displacements that a step from rest does not
+        prescribe."""
         task = self._task(step, np.zeros(self.section.basis.N))
         return np.flatnonzero(np.isnan(task.constraints.prescribed))
 
@@ -283,7 +291,7 @@ class VirtualBench:
         )
 
     def _horizontal_facets(self, z: float) -> skfem.FacetBasis:
-        """Return the surface at this height."""
+        """Return the facets of the surface at the height z."""
         mesh = self.section.mesh
 
         def is_at_height(x: Array) -> Mask:
@@ -293,7 +301,8 @@ class VirtualBench:
         return skfem.FacetBasis(mesh, self.section.basis.elem, facets=facets, intorder=8)
 
     def _task(self, step: LoadStep, loose: Array) -> _Task:
-        """Return a step as constraints; loose (dofs,) is the last position without a grip."""
+        """Return the constraints and the rod of a step; `loose` (dofs,) are the displacements after
+        the last step without a grip."""
         basis = self.section.basis
         component = self.section.component
         by_component = step.prescribed(self._half_side * basis.doflocs)
@@ -311,7 +320,8 @@ class VirtualBench:
         number: int,
         halvings: int = 0,
     ) -> _Position:
-        """Solve one step of the load from a guess; the step is halved where that fails."""
+        """Solve one step of the load from a guess of u; halve the step where Newton's method
+        fails."""
         u = self._newton(guess, task)
         if u is not None:
             return _Position(u, task.rod)
@@ -328,7 +338,8 @@ class VirtualBench:
         return self._advance(middle, guess, task, number, halvings + 1)
 
     def _half_task(self, start: _Position, task: _Task) -> _Task:
-        """Return the task that is half of the way from the start."""
+        """Return the task half of the way from the displacements and the rod at the start to a
+        task."""
         rod = task.rod
         if rod is not None:
             pressed = start.rod.pressed if start.rod else 0.0
@@ -337,7 +348,8 @@ class VirtualBench:
         return _Task(replace(task.constraints, prescribed=halfway), rod)
 
     def _newton(self, u: Array, task: _Task) -> Array | None:
-        """Return the displacements (dofs,) in balance from the guess u, or None on failure."""
+        """Return displacements (dofs,) in balance, found from the guess u; None if none were
+        found."""
         contact = self.rod_contact(task.rod) if task.rod else None
 
         def tangents(u: Array) -> Iterator[sp.csr_matrix]:
@@ -352,11 +364,11 @@ class VirtualBench:
         # Even a linear body has a contact that is not linear.
         linear = not self.finite and contact is None
         balance = partial(self._balance, contact=contact)
-        with np.errstate(all="ignore"):  # a failed attempt passes through inverted elements
+        with np.errstate(all="ignore"):  # A failed attempt has inverted elements.
             return find_balance(u, task.constraints, balance, tangents, linear)
 
     def _balance(self, u: Array, contact: RodContact | None) -> Balance | None:
-        """Return nodal forces out of balance and energy; None when an element is inside out."""
+        """Return nodal forces out of balance, and energy; None when an element is inside out."""
         inner = self.section.balance(u)
         if inner is None or contact is None:
             return inner
@@ -365,7 +377,7 @@ class VirtualBench:
         return Balance(force, energy)
 
     def _rotation(self, u: Array) -> float:
-        """Return the angle of the cube in rad, of the line between the centres of its sides."""
+        """Return the rotation, in rad, of the line between the centres of the cube's two sides."""
         section = self.section
         ends = [section.node(x, 0.0) for x in (-1.0, 1.0)]
         left, right = u[section.basis.nodal_dofs[:, ends]].T
@@ -376,23 +388,24 @@ class VirtualBench:
     def _pad_stresses(self, u: Array) -> Array:
         """Return the mean normal stress (P,) of the pads in the rotated frame of the cube, in Pa.
 
-        It comes from the nodal forces of the elastomer on the cube.
+        The stress is computed from the nodal forces of the elastomer on the cube.
         """
         section = self.section
         stress = section.material.stress(section.deformation(u))
         force = -section.forces(stress, ~self.in_cube)
-        angle = self._rotation(u) if self.finite else 0.0  # linear: no second-order terms
+        angle = self._rotation(u) if self.finite else 0.0  # Linear theory has no rotation.
         return self.pad_weights(self.layout, angle) @ force
 
     def _state(self, u: Array) -> Array:
-        """Fit the seven plane modes to the Cauchy stress within d0/2 of the centre."""
+        """Return amplitudes (7,) of the plane modes (linear stress fields), in Pa, fitted to the
+        true stress within d0/2 of the centre."""
         section = self.section
         is_near = np.all(np.abs(section.points) < 0.5, axis=0)
         stress = section.material.cauchy(section.deformation(u))[:, :, is_near]
         x = section.points[:, is_near]
         design = np.vstack([np.ones(x.shape[1]), x]).T
         columns = stress[[0, 1, 0], [0, 1, 1]].T  # xx, zz, zx
-        # Of each component its value, its slope along x and its slope along z.
+        # The fit has the value, the slope along x and the slope along z of each component.
         fit = np.linalg.lstsq(design, columns, rcond=None)[0]
         xx, zz, zx = fit.T
         values = [zz[0], zx[0], xx[0]]
@@ -406,7 +419,8 @@ def _bench_mesh(
     cube: bool,
     size: float,
 ) -> skfem.MeshTri:
-    """Return triangles of the section, in d0, refined at the cube and where rods press."""
+    """Return triangles of the section, refined at the cube and where rods press; lengths in d0
+    (half the side of the cube)."""
     half_side = body.side / 2
     half_pad = layout.pad_size / 2
     on_face = np.abs(layout.positions - layout.normals)
@@ -435,7 +449,7 @@ def _refine(
     mesh: skfem.MeshTri,
     where: Callable[[Array, Array], Mask],
 ) -> skfem.MeshTri:
-    """Cut the triangles in four for whose centroids `where` is true."""
+    """Return the mesh with those triangles cut in four at whose centroids `where` is true."""
     x, z = mesh.p[:, mesh.t].mean(axis=1)
     chosen = np.flatnonzero(where(x, z))
     mesh = mesh.refined(chosen)

@@ -1,4 +1,4 @@
-"""What gradients gain: error of the field between the cubes against the contact model.
+"""What gradients gain: error of the pressure field that is interpolated between the cubes.
 
 Three kinds of skin are compared: values alone; cubes that observe all of stress and gradient;
 planar cubes, whose section lies along x, so that they observe ∂σzz/∂x of the gradient and σzx of
@@ -23,22 +23,23 @@ from cube_tensor_driver.mechanics import contact
 from cube_tensor_driver.touch.surface import Surface
 
 SKIN_KINDS = ("values alone", "values and gradients", "planar cubes")
-"""Kinds of skin that are compared."""
+"""Kinds of skin that are compared: cubes of which only the stress is used, cubes of which the
+gradient is used as well, and planar cubes, which observe a part of both."""
 UNOBSERVED_BY_PLANAR = [k for k, name in enumerate(COMPONENTS) if "y" in name]
-"""Indices of the components that planar cubes do not observe."""
+"""Indices in `COMPONENTS` of the components with an index y, which planar cubes do not observe."""
 
 FORCE = 3.0
-"""Normal force of the ball, in N."""
+"""Normal force, in N, with which the ball of each random contact presses."""
 FRICTION = 0.3
 """Ratio of the ball's shear force to its normal force."""
 PITCHES = np.array([6, 8, 10, 12, 16, 20, 24]) * 1e-3
-"""Distances between neighbouring cubes, in m."""
+"""Distances between neighbouring cubes, in m, for which errors are computed."""
 WIDTHS = np.array([2, 5, 10, 15, 20]) * 1e-3
-"""Widths of the contact, in m."""
+"""Widths of the contact, in m, for which errors are computed."""
 CASES = 16
-"""Number of contacts per pitch and width, anywhere in the cell between four cubes."""
+"""Number of random contacts per pitch and width, anywhere in the cell between four cubes."""
 SKIN_SIDE = 0.1
-"""Side of the skin, in m."""
+"""Side of the square skin on which contacts press, in m."""
 WINDOW = 0.04
 """Side of the square in the middle of the skin in which fields are compared, in m."""
 POINT_SPACING = 2e-3
@@ -49,13 +50,15 @@ SEED = 8
 
 @dataclass(frozen=True, eq=False)
 class FieldStudy:
-    """Errors for each width (rows), pitch (columns) and one of `SKIN_KINDS` (last axis).
+    """Errors for each contact width (rows), pitch (columns) and kind of skin (last axis).
+
+    The kinds are those of `SKIN_KINDS`.
 
     A contact that was not found counts as a position error of `WINDOW` and a force error of 1.
 
     Attributes:
-        pitches: (columns,) in m.
-        widths: (rows,) in m.
+        pitches: (columns,) distances between neighbouring cubes, in m.
+        widths: (rows,) widths of the contact, in m.
         error: rms of the pressure's error over rms of the pressure, in the window.
         position: 95th percentile of the contact's position error, in m.
         force: rms error of the contact's normal force over the force.
@@ -84,12 +87,13 @@ class FieldStudy:
         return saved
 
     def _pitch_for(self, error: float, curve: Array) -> float:
-        """Return the pitch at which a curve of errors (pitches,) reaches this one, or NaN."""
+        """Return the pitch at which a curve of errors (pitches,) reaches an error; NaN if none
+        does."""
         # Noise may make a curve fall for a step, and np.interp needs it to rise.
         rising = np.maximum.accumulate(curve)
         if not rising[0] < error < rising[-1]:
             return np.nan
-        # Errors are nearly powers of the pitch.
+        # Errors are nearly powers of the pitch, so logarithms are interpolated.
         log_error = np.log(rising)
         log_pitches = np.log(self.pitches)
         return float(np.exp(np.interp(np.log(error), log_error, log_pitches)))
@@ -97,10 +101,10 @@ class FieldStudy:
 
 @dataclass(frozen=True, eq=False)
 class FieldExample:
-    """One contact between the cubes, and the field that different methods compute of it.
+    """One contact between the cubes, and the pressure that different methods compute of it.
 
     Attributes:
-        points: (M, 3) in m.
+        points: (M, 3) positions at which the pressure is given, in m.
         pressure: (M,) pressure in Pa by the name of the method; "truth" is the true one.
         cubes: (cubes, 3) positions of the cubes, in m.
         centre: (2,) position of the contact, in m.
@@ -141,12 +145,12 @@ def true_components(
     force: Array,
     centre: Array,
 ) -> Array:
-    """Return the components at points of the cubes' plane below a ball.
+    """Return the true stress and gradient at points of the cubes' plane below a ball.
 
     Args:
-        points: (N, 3) in m.
+        points: (N, 3) positions in m.
         width: Width of the contact, in m.
-        force: (3,) in N.
+        force: (3,) force on the skin, in N.
         centre: (2,) position of the contact, in m.
 
     Returns:
@@ -179,7 +183,8 @@ def field_below(
 
 
 def field_example(pitch: float = 0.010, width: float = 0.012) -> FieldExample:
-    """Return a contact beside the centre of a cell: true pressure, and the field of two skins."""
+    """Return the pressure under a contact between four cubes: the true one, and what interpolation
+    computes with and without gradients."""
     skin = flat_skin(pitch, 0.05)
     centre = pitch * np.array([0.35, 0.25])
     force = FORCE * np.array([FRICTION, 0.0, -1.0])
@@ -198,7 +203,8 @@ def field_study(
     widths: Array = WIDTHS,
     cases: int = CASES,
 ) -> FieldStudy:
-    """Run the study, with the same numbers every time. It takes about two minutes."""
+    """Compute the errors for all pitches and widths, in about two minutes; the same numbers every
+    time."""
     shape = (len(widths), len(pitches), len(SKIN_KINDS))
     error, position, force = np.zeros((3, *shape))
     for column, pitch in enumerate(pitches):
@@ -207,7 +213,7 @@ def field_study(
             # The same contacts for every pitch and width make the errors comparable.
             random = np.random.default_rng(SEED)
             errors = np.array([trial.errors(width, random) for _ in range(cases)])
-            squares, distances, forces = np.moveaxis(errors, 1, 0)  # each (cases, kinds)
+            squares, distances, forces = np.moveaxis(errors, 1, 0)  # Each (cases, kinds).
             error[row, column] = np.sqrt(squares.mean(axis=0))
             position[row, column] = np.percentile(distances, 95, axis=0)
             force[row, column] = np.sqrt((forces**2).mean(axis=0))
@@ -215,7 +221,7 @@ def field_study(
 
 
 class _Trial:
-    """Skins of one pitch, and the errors that they make of one contact."""
+    """Skins of one pitch, and the errors of their interpolated fields under one contact."""
 
     def __init__(self, pitch: float) -> None:
         self._pitch = pitch

@@ -38,12 +38,13 @@ from ..fem.fem import (
 from ..fem.memory import check_memory
 
 MAX_TRUSTED_ERROR = 0.2
-"""Largest error of a component, relative to its range, with which it counts as trusted."""
+"""Largest error of a component with which it counts as trusted, relative to the range that its true
+value takes while the indenter passes."""
 BOX_RATIO = 2.0
-"""Ratio of the sides of box and cube."""
+"""Ratio of the side of the computed box of elastomer to the side of the cube in it."""
 FRICTION = 0.3
-"""Ratio of the indenter's shear force to its normal force. It slides towards +x, so that there is
-shear under its centre, too."""
+"""Ratio of the indenter's shear force to its normal force. The indenter slides towards +x, so that
+there is shear under its centre, too."""
 LATERAL_OFFSET = 1e-3
 """Distance along y at which the indenter passes the cube, in m."""
 MAX_POINT_SPACING = 4e-3
@@ -54,11 +55,12 @@ NEGLECTED_MODES = {
     "planar": (),
     "cube": (),
 }
-"""Modes that each layout takes as zero."""
+"""Names of the modes (linear stress fields) that each layout takes as zero, by its name."""
 
 
 class TrustedWidth(NamedTuple):
-    """The narrowest indenter, in m, from which on the error stays small; None if there is none."""
+    """Width of the narrowest indenter, in m, from which on the error of a component stays below the
+    limit; None if there is none. `side` is that of the cube, in m."""
 
     layout: str
     side: float
@@ -68,7 +70,7 @@ class TrustedWidth(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LayoutStudy:
-    """Error of each component, relative to the range that it takes as the indenter passes.
+    """Error of each component, relative to the range of its true value as the indenter passes.
 
     Attributes:
         sides: (S,) sides of the cube, in m.
@@ -122,7 +124,7 @@ class LayoutStudy:
 
 @dataclass(frozen=True)
 class _Passage:
-    """One indenter at one offset from a cube of one side; lengths in m."""
+    """One indenter at one offset along x from the centre of a cube; lengths in m."""
 
     side: float
     width: float

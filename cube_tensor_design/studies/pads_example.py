@@ -23,9 +23,9 @@ from cube_tensor_driver.simulation.cubes import true_state
 from .field_study import field_below
 
 LOAD = -10e3
-"""Stress of each simple load, in Pa."""
+"""Stress of each simple load on the cube, in Pa; compression is negative."""
 BALL_RADIUS = 0.004
-"""Radius of the ball's contact, in m."""
+"""Radius of the contact of the ball with the skin, in m."""
 BALL_FORCE = (0.0, 0.0, -2.0)
 """Force of the ball on the skin, in N."""
 REACH = 0.016
@@ -33,16 +33,17 @@ REACH = 0.016
 BALL_X = 0.005
 """Position of the ball in the picture of the field, in m."""
 PAIR = ("+z-x", "+z+x")
-"""The two pads of a sensor that has pads on its upper face only."""
+"""Names of the two pads of a sensor that has pads on its upper face only."""
 
 
 def planar_calibration() -> Calibration:
-    """Return the shipped planar calibration."""
+    """Return the calibration of planar cubes in the package."""
     return read_calibration(package_data() / "config" / "calibration" / "planar.yaml")
 
 
 def simple_loads(calibration: Calibration) -> dict[str, Array]:
-    """Return the state (7,) of each load by its title: pressure, shear, growing pressure."""
+    """Return the amplitudes of the modes (7,) of three loads, by their title: pressure, shear, and
+    a pressure that grows along x."""
     size = f"{abs(LOAD) / 1e3:g}"
     states = {
         rf"pressure: $\sigma_{{zz}} = -{size}$ kPa": {"zz": LOAD},
@@ -65,12 +66,13 @@ class Sweep:
 
     Attributes:
         place: (M,) positions along x, in m.
-        profile: (M,) σzz there in the plane of the sensor while the ball is at `BALL_X`, in Pa.
-        value: σzz at the sensor then, in Pa.
-        slope: ∂σzz/∂x at the sensor then, in Pa/m.
+        profile: (M,) σzz at `place` in the plane of the sensor while the ball is at `BALL_X`, in
+            Pa.
+        value: σzz at the sensor while the ball is at `BALL_X`, in Pa.
+        slope: ∂σzz/∂x at the sensor while the ball is at `BALL_X`, in Pa/m.
         truth: (M,) true σzx at the sensor while the ball is at `place`, in Pa.
-        cube: (M,) σzx from all eight pads.
-        pair: (M,) σzx from the two upper pads, calibrated by uniform shear alone.
+        cube: (M,) σzx from all eight pads, in Pa.
+        pair: (M,) σzx from the two upper pads, calibrated by uniform shear alone, in Pa.
     """
 
     place: Array
@@ -97,7 +99,7 @@ def sweep(points: int = 129) -> Sweep:
 
     estimator = make_estimator(calibration.response, calibration.noise, calibration.modes)
     left, right = (calibration.layout.index(name) for name in PAIR)
-    # The pair reads the difference of its pads as shear, with the gain of uniform shear.
+    # The difference of the two pads counts as shear, with the gain of uniform shear.
     to_shear = calibration.response[:, calibration.modes.names.index("zx")]
     pair_gain = to_shear[left] - to_shear[right]
     return Sweep(
@@ -112,6 +114,7 @@ def sweep(points: int = 129) -> Sweep:
 
 
 def _beside_ball(x: Array) -> Array:
-    """Return stress and gradient (N, 24) at x (N,) from the ball's centre, by `field_below`."""
+    """Return stress in Pa and gradient in Pa/m (N, 6 + 18) at distances x (N,) from the ball's
+    centre, in m, in the plane of the sensor."""
     ball = contact.hertz(BALL_RADIUS, BALL_FORCE)
     return field_below(np.stack([x, 0 * x], axis=1), SURFACE_DEPTH, ball, POISSONS_RATIO)

@@ -1,8 +1,8 @@
 """Contacts on a thin layer, with the cubes taken for points or for pads.
 
-The true stress comes from influence functions of finite elements on a coarser mesh than those which
-the inverse knows, integrated over the contact's point forces: neither the table's circular
-components nor its Hankel transforms are in it.
+The true stress of the pads is the sum of influence functions (stress under a unit force) over the
+point forces of the contact. These functions come from finite elements on a coarser mesh than those
+that the inverse knows, so that none of the tables of the inverse is in the true stress.
 """
 
 from __future__ import annotations
@@ -24,14 +24,16 @@ from .field_study import FieldExample
 from .traction_study import CUBES, METHODS, Errors, Setting, TractionBench
 
 FORMS = ("points", "pads")
-"""Models of a cube that the inverse assumes: a point, or pads with influence functions."""
+"""Models of a cube that the inverse (traction from measurements) assumes: a point that measures the
+stress there, or pads with influence functions."""
 BODY = Body(
     width=80e-3,
     depth=80e-3,
     cube_young=np.inf,
     ground=True,
 )
-"""The body of the shipped influence functions."""
+"""Body of the influence functions in the package: a rigid cube in the middle of a layer of 11
+mm."""
 THIN = tuple(
     Setting(
         cubes=cubes,
@@ -46,7 +48,8 @@ layer."""
 
 
 class LayerBench(TractionBench):
-    """A skin in a layer, whose pads have the stress that finite elements of a cube in it give."""
+    """A skin in a layer, whose pads have the stress that finite elements of a cube in the layer
+    give."""
 
     def __init__(
         self,
@@ -61,7 +64,7 @@ class LayerBench(TractionBench):
             setting: Skin with the layer and the depth of the influence functions.
             true: Influence functions of the pads.
             known: Influence functions that the inverse assumes; None: cubes count as points.
-            side: Number of points along the side of a cube's patch.
+            side: Number of points along the side of a cube's patch, the square grid around it.
         """
         super().__init__(setting, side, known)
         self._true = true
@@ -91,7 +94,7 @@ class LayerBench(TractionBench):
 
 
 def coarse_influence() -> Influence:
-    """Return the true influence functions, from the coarsest mesh. This takes minutes."""
+    """Return the influence functions that count as true, from the coarsest mesh, after minutes."""
     return compute_influence(BODY, LAYOUTS["cube"], 0)
 
 
@@ -100,7 +103,8 @@ def _make_benches(
     true: Influence,
     side: int = 4,
 ) -> dict[str, LayerBench]:
-    """Return a bench for each of `FORMS`; for pads, the inverse assumes the shipped functions."""
+    """Return a bench for each of `FORMS`. For pads, the inverse assumes the influence functions in
+    the package."""
     shipped = read_influence(find_influence("cube_11mm"))
     known = {"points": None, "pads": shipped}
     return {form: LayerBench(setting, true, known[form], side) for form in FORMS}
@@ -122,10 +126,10 @@ def study_pads(
 
 
 def layer_example(true: Influence) -> FieldExample:
-    """Return a contact of 5 mm between 24-pad cubes.
+    """Return the pressure at the cubes' depth under a contact of 5 mm between 24-pad cubes.
 
-    The pressure at the cubes' depth is the true one, and that of the inverse with contacts for each
-    of `FORMS`.
+    The pressure is the true one, and the one that the inverse with contacts computes for each of
+    `FORMS`.
     """
     pressure = {}
     for form, bench in _make_benches(THIN[0], true, side=10).items():

@@ -38,26 +38,30 @@ from ..fem.reciprocity import compute_influence
 WIDTHS = (2e-3, 5e-3, 10e-3, 20e-3)
 """Widths of the contacts, in m. Those that do not fit onto the body are left out."""
 COMPONENTS = ("zz", "zx")
-"""Stress components that are compared, where the layout observes them."""
+"""Names of the stress components that are compared, where the layout of pads observes them."""
 LOADS = {"press": (-1, -1.0), "rub": (0, 1.0)}
-"""Axis and sign of the force by the name of the load: a ball presses against z and rubs along x."""
+"""Axis (-1 for the last one, z) and sign of the force by the name of the load: a ball presses
+against z and rubs along x."""
 POINTS_ACROSS = 41
-"""Number of point forces across a contact. With them its force is right to a hundredth."""
+"""Number of point forces across the diameter of a contact. With this number the stress of the
+contact is right to a hundredth."""
 MAX_LEAK = 1e-6
-"""Largest deviation from 1 of a component's own entry in R^+ R. Beyond it the pads confuse the
-component with others, and it is not compared."""
+"""Largest deviation from 1 of a component's diagonal entry in R^+ R, with the response matrix R and
+its pseudo-inverse R^+. With a larger one, the pads confuse the component with others, and it is not
+compared."""
 
 
 class SurfaceRow(NamedTuple):
-    """Result for one load.
+    """Measured and true stress under one load.
 
     Attributes:
         load: Name in `LOADS`.
         width: Width of the contact, in m.
-        offset: Distance of its centre from the cube's centre along x, in m.
+        offset: Distance of the contact's centre from the cube's centre along x, in m.
         measured: Stress by component that the cube measures, in Pa under 1 N along the load's axis;
             for a layout in a plane under 1 N/m.
-        true: The same of the layer without the cube.
+        true: Stress by component at the place of the cube's centre in the layer without the cube,
+            in the same unit.
     """
 
     load: str
@@ -79,7 +83,8 @@ class SurfaceRow(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SurfaceStudy:
-    """Influence functions of the pads of a cube in a layer, and one row for each load."""
+    """Influence functions (stress under a unit force anywhere on the surface) of the pads of a cube
+    in a layer, and measured and true stress under each load."""
 
     body: Body
     layout: Layout
@@ -110,14 +115,14 @@ def study_surface(
         body: The body; its lower face is taken as bonded to rigid ground.
         layout: Pads of the cube.
         meshes: Number of meshes, 1 to 3; the last one gives the result.
-        neglect: Modes that the cube takes as zero.
+        neglect: Names of modes (linear stress fields) that the cube takes as zero.
         progress: Called before every stage and at the end.
 
     Raises:
         ElasticError: No contact of `WIDTHS` fits onto the body, the layout observes none of
             `COMPONENTS`, pads overlap, or the mesh does not fit into memory.
     """
-    # Above the cube, and beside it by its side.
+    # The contact is above the cube, or its centre is beside it by the side of the cube.
     offsets = (0.0, body.side)
     reach = body.width / 2 - abs(body.x) - offsets[-1]
     widths = [width for width in WIDTHS if width / 2 <= reach]
@@ -156,13 +161,14 @@ def _inverse_rows(
     meshes: int,
     neglect: Sequence[str],
 ) -> dict[str, Array]:
-    """Return, by component, the row (P,) of R^+ where the pads tell it from all other modes."""
+    """Return, for each component that the pads tell from all other modes, the row (P,) of the
+    pseudo-inverse of the response matrix: from pad stresses to the component."""
     response = compute_response(body, layout, largest_symmetry(layout), meshes)
     names = [name for name in response.modes if name not in neglect]
     columns = [response.modes.index(name) for name in names]
     matrix = response.matrix[:, columns]
     inverse = np.linalg.pinv(matrix)
-    # R^+ R is the identity for the modes that the pads tell from all others.
+    # R^+ R has 1 on the diagonal for the modes that the pads tell from all others.
     own_entry = np.diag(inverse @ matrix)
     rows = {}
     for name in COMPONENTS:
@@ -187,7 +193,7 @@ def _true_stress_in_plane(
     Args:
         body: The body without the cube.
         x: (n,) positions of the line loads, in m.
-        parts: (n,) shares of the load.
+        parts: (n,) share of the load on each line; they sum to 1.
     """
     poisson = body.poisson
     if body.plane == "stress":

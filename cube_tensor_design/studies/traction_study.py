@@ -53,27 +53,31 @@ from .field_study import (
 )
 
 CUBES = ("24-pad", "planar", "planar, crosswise")
-"""Kinds of cubes. Crosswise, every second planar cube is turned by a quarter about z."""
+"""Kinds of cubes on a skin. Crosswise means that every second planar cube is turned by a quarter
+about z."""
 METHODS = ("interpolation", "inverse", "inverse with contacts")
-"""Methods that compute the field between the cubes."""
+"""Methods that compute the pressure between the cubes: interpolation, the surface traction that
+explains all cubes, and this inverse with contacts fitted first."""
 SHAPES = ("ball", "flat punch", "rounded punch", "two balls")
-"""Shapes of the load. Two balls touch each other, and together are as wide as a ball."""
+"""Shapes of the load. Two balls touch each other, and are together as wide as a single ball."""
 ROUNDED_RADII = np.linspace(0.6, 1.0, 8)
 """Relative radii of the flat punches whose mean is a rounded punch."""
 GAIN_ERROR = 0.01
 """Standard deviation of the error of a pad's calibrated gain, relative to the gain. The inverse
 assumes the value in pad_noise.py."""
 CASES = 16
-"""Number of loads for each setting and width."""
+"""Number of random loads for each setting and contact width."""
 SKIN_SIDE = 0.072
-"""Side of the skin, in m. It is five pitches if that is more."""
+"""Smallest side of the square skin, in m; a skin has a side of at least five pitches."""
 ORDER = 14
-"""Order of the quadrature of a ball. The stress at 4 mm below a contact of 20 mm is then within
-1e-3 of its peak."""
+"""Order of the quadrature (number of rings of point forces) of a ball. With it the error of the
+stress at 4 mm below a contact of 20 mm is within 1e-3 of the peak."""
 SURFACE_ORDER = 100
-"""Order of the quadrature of a ball for the pressure on the surface itself."""
+"""Order of the quadrature (number of rings of point forces) of a ball with which the pressure on
+the surface itself is computed."""
 MIN_PRESSURE_SHARE = 0.1
-"""Share of the peak pressure below which a point does not count for the ratio of a field."""
+"""Share of the peak pressure below which a point does not count for the calibration ratio (rms
+error over predicted deviation) of a pressure field."""
 
 
 @dataclass(frozen=True)
@@ -90,10 +94,10 @@ class Setting:
         shape: One of `SHAPES`.
         known_thickness: Thickness of the elastomer as the inverse knows it; infinite for a half
             space.
-        depth_error: How much deeper the cubes are.
-        poisson: Poisson's ratio of the elastomer.
-        thickness: Thickness of the elastomer.
-        gain_error: Standard deviation of the pads' gains.
+        depth_error: How much deeper the cubes are than `depth`.
+        poisson: True Poisson's ratio of the elastomer.
+        thickness: True thickness of the elastomer.
+        gain_error: Standard deviation of the pads' gains, relative to the calibrated ones.
     """
 
     cubes: str = CUBES[0]
@@ -116,12 +120,14 @@ class Errors:
     Attributes:
         width: Width of the contact, in m.
         field: (3,) rms error of the pressure at the cubes' depth over its rms, by `METHODS`.
-        force: (2,) rms error of the normal force over the force, of interpolation and contacts.
-        position: (2,) 95th percentile of the position error, in m, of both.
-        ratio: (2, 2) calibration ratios of force and position, of both.
+        force: (2,) rms error of the normal force over the force: of interpolation, and of the
+            inverse with contacts.
+        position: (2,) 95th percentile of the position error, in m, of these two methods.
+        ratio: (2, 2) calibration ratios of force and position (columns) of these two methods
+            (rows).
         field_ratio: (2,) calibration ratios of the pressure with contacts, at the cubes' depth and
             on the surface, where it exceeds `MIN_PRESSURE_SHARE` of its peak.
-        found: Part of the loads with exactly one contact.
+        found: Share of the loads for which exactly one contact was found.
     """
 
     width: float
@@ -140,9 +146,9 @@ class TractionBench:
         setting: The setting.
         poses: Poses of the cubes.
         calibration: Calibration of all cubes.
-        inverse: Computes the traction on the surface.
-        surface: Interpolates between the cubes.
-        window: (M,) which points of the inverse are in the middle of the skin.
+        inverse: Computes the traction on the surface at M points.
+        surface: Interpolates the pressure between the cubes.
+        window: (M,) whether a point is in the middle of the skin, where errors are computed.
     """
 
     def __init__(
@@ -155,7 +161,7 @@ class TractionBench:
 
         Args:
             setting: Skin and loads.
-            side: Number of points along the side of a cube's patch.
+            side: Number of points along the side of a cube's patch, the square grid around it.
             influence: Influence functions that the inverse assumes; None: cubes count as points.
         """
         self.setting = setting
@@ -188,7 +194,8 @@ class TractionBench:
         force: Array,
         centre: Array,
     ) -> Array:
-        """Return stress and gradient (N, 24), in Pa and Pa/m, below points (N, 2)."""
+        """Return true stress and gradient (N, 6 + 18), in Pa and Pa/m, at the cubes' depth below
+        points (N, 2) of the surface, in m."""
         # A table of the layer under a ball's unit forces, or the closed form of a half space.
         if self._true_layer is not None:
             unit_fields = self._true_layer.field(points - centre, width / 2)
@@ -203,7 +210,8 @@ class TractionBench:
         force: Array,
         centre: Array,
     ) -> Array:
-        """Return the pressure (M,) on the surface, in Pa, as the mean over each point's square."""
+        """Return the true pressure (M,) on the surface, in Pa, as the mean over the square of each
+        point of the inverse."""
         inverse = self.inverse
         sources, forces = self.point_forces(width, force, centre, SURFACE_ORDER)
         # Each point force counts for the square in which it lies.
@@ -243,7 +251,8 @@ class TractionBench:
         centre: Array,
         random: np.random.Generator,
     ) -> Array:
-        """Return the components (cubes, 15) that the pipeline computes under a load."""
+        """Return stress and gradient (cubes, 15), in Pa and Pa/m, that the pipeline computes under
+        a load."""
         return self.measured(self.pads_under(width, force, centre), random)
 
     def pads_under(
@@ -257,7 +266,8 @@ class TractionBench:
         return self.pads_in(self.truth(cubes, width, force, centre))
 
     def pads_in(self, field: Array) -> Array:
-        """Return the pad stresses (cubes, P), in Pa, in a field (cubes, 24) in the skin's frame."""
+        """Return the pad stresses (cubes, P), in Pa, in a field (cubes, 6 + 18) of stress and
+        gradient in the skin's frame."""
         calibration = self.calibration
         # Tensors of the skin's frame become those of each cube's frame.
         to_cube = self.poses.rotation.swapaxes(1, 2)
@@ -273,10 +283,10 @@ class TractionBench:
         random: np.random.Generator,
         left_out: PadMasks | None = None,
     ) -> Array:
-        """Return the components (cubes, 15) that the pipeline computes of pad stresses.
+        """Return stress and gradient (cubes, 15), in Pa and Pa/m, that the pipeline computes.
 
         Args:
-            pads: (cubes, P) in Pa.
+            pads: (cubes, P) true stresses of the pads, in Pa.
             random: Source of the gain errors and of the counter's noise.
             left_out: (cubes,) one bit for each pad that is not used.
         """
@@ -291,7 +301,8 @@ class TractionBench:
         return np.concatenate([result.stress, result.gradient], axis=1)
 
     def load(self, random: np.random.Generator) -> tuple[Array, Array]:
-        """Return a random force (3,) in N, and its position (2,) in the middle cell, in m."""
+        """Return a random force (3,) in N, and its position (2,) in the cell around the middle
+        cube, in m."""
         force = draw_force(random)
         return force, self.setting.pitch * (random.random(2) - 0.5)
 
@@ -305,7 +316,7 @@ class TractionBench:
         random = np.random.default_rng(seed)
         results = [self._case_errors(width, random) for _ in range(cases)]
         square, force, position, ratio, field_squares, found = zip(*results, strict=True)
-        # At the cubes' depth and on the surface, over the points of all loads.
+        # The errors at the cubes' depth and on the surface, joined over all loads.
         below, surface = (np.concatenate(one) for one in zip(*field_squares, strict=True))
         return Errors(
             width=width,
@@ -350,14 +361,19 @@ class TractionBench:
                 difference = total.force - FORCE
                 force_error[k] = difference / FORCE
                 position_error[k] = np.linalg.norm(total.position - centre)
-                # The deviation is that of each coordinate, the error a distance.
+                # The deviation is that of each of two coordinates, while the error is a distance.
                 ratio[k, 0] = difference / total.force_deviation
                 ratio[k, 1] = position_error[k] / (total.position_deviation * np.sqrt(2))
         is_single = len(tracked) == 1
         return _CaseErrors(square, force_error, position_error, ratio, field_squares, is_single)
 
     def _solve(self, values: Array) -> tuple[ContactTracker, list[TrackedContact], list[Array]]:
-        """Return the tracker after these components, its contacts, and the pressure by METHODS."""
+        """Return the contact tracker after one update, the contacts, and the pressure (M,) at the
+        cubes' depth by each of `METHODS`, in Pa.
+
+        Args:
+            values: Stress and gradient (cubes, 15) of the cubes, in Pa and Pa/m.
+        """
         tracker = ContactTracker(self.inverse, CONTACT_PRESSURE)
         tracked = tracker.update(values, max_work=np.inf)
         pressures = [
@@ -370,8 +386,8 @@ class TractionBench:
     def example(self, width: float, centre: Array) -> FieldExample:
         """Return the pressure at the cubes' depth under one load with friction along x.
 
-        It is the true one, that of each of `METHODS`, and the "standard deviation" that the inverse
-        predicts, in Pa.
+        The pressures are the true one, that of each of `METHODS`, and the "standard deviation" that
+        the inverse predicts, in Pa.
 
         Args:
             width: Width of the contact, in m.
@@ -452,7 +468,7 @@ def _shipped_calibration(setting: Setting) -> Calibration:
 
 
 def traction_example() -> FieldExample:
-    """Return a narrow contact between planar cubes, crosswise."""
+    """Return the pressure under a contact of 6 mm between planar cubes, every second one turned."""
     setting = Setting(cubes=CUBES[2], pitch=10e-3, depth=4e-3)
     return TractionBench(setting, side=10).example(6e-3, setting.pitch * np.array([0.35, 0.25]))
 
@@ -468,9 +484,9 @@ def flat_punch(
     The traction is F / (2 pi a sqrt(a^2 - r^2)) (Johnson, Contact Mechanics, 3.8).
 
     Args:
-        radius: a, in m.
-        force: F (3,), in N.
-        centre: (2,) in m.
+        radius: Radius a of the punch, in m.
+        force: Force F (3,) on the skin, in N.
+        centre: (2,) position of the centre of the punch, in m.
         order: Number of rings; each has four times as many points.
     """
     sources, forces = contact.hertz(radius, force, centre, order)
@@ -487,7 +503,7 @@ def traction_study(
     cases: int = CASES,
     seed: int = 8,
 ) -> dict[Setting, list[Errors]]:
-    """Return the errors of each setting at each width (m)."""
+    """Return the errors of each setting for loads of each width (m)."""
     return {setting: TractionBench(setting).study(widths, cases, seed) for setting in settings}
 
 
@@ -503,7 +519,7 @@ PITCHES = tuple(
     for pitch in (12e-3, 24e-3)
     for cubes in CUBES[:2]
 )
-"""Skins with pitches of 12 and 24 mm and a depth of 4 mm."""
+"""Skins with pitches (distances between neighbouring cubes) of 12 and 24 mm and a depth of 4 mm."""
 SHAPED = tuple(
     replace(setting, shape=shape) for shape in SHAPES[1:] for setting in (*MAIN[:2], *PITCHES)
 )
