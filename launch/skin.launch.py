@@ -20,6 +20,7 @@ from cube_tensor_driver.ros.launching import (
     FromSkin,
     GivenParameters,
     check_arguments,
+    contacts_file,
     declare_switch,
     declare_text,
     record_skin,
@@ -110,7 +111,9 @@ def generate_launch_description() -> LaunchDescription:
             make_node("reconstruction", skin, UnlessCondition(is_composed)),
             make_node("driver", skin, UnlessCondition(is_composed)),
             make_node("composed", skin, IfCondition(is_composed)),
-            make_node("contacts", autostart, if_any("contacts")),
+            make_node(
+                "contacts", autostart, if_any("contacts"), ParameterFile(FromSkin(contacts_file))
+            ),
             make_node("markers", autostart, if_any("markers", "rviz")),
             OpaqueFunction(function=record_skin, condition=if_any("record")),
             make_state_publisher(),
@@ -136,13 +139,14 @@ def if_any(argument: str, other: str | None = None) -> IfCondition:
     return IfCondition(OrSubstitution(first, second))
 
 
-def make_node(executable: str, parameters: Any, condition: Any) -> Node:
+def make_node(executable: str, parameters: Any, condition: Any, *more: Any) -> Node:
     """Return the launch action that starts a node of this package.
 
     Args:
         executable: Name of the executable.
         parameters: Parameters of the node, as a file or a mapping.
         condition: Condition under which the node starts.
+        more: Further parameters, which override the first ones.
     """
     # A name would be given to both nodes of the process `composed`; they keep their own names.
     name = None if executable == "composed" else executable
@@ -151,7 +155,7 @@ def make_node(executable: str, parameters: Any, condition: Any) -> Node:
         executable=executable,
         name=name,
         namespace=LaunchConfiguration("namespace"),
-        parameters=[parameters],
+        parameters=[parameters, *more],
         condition=condition,
         output="screen",
         emulate_tty=True,

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..core.calibration import Calibration
+from ..core.defaults import CONTACT_METHODS, POISSONS_RATIO
 from ..core.errors import ConfigError, CubeError
 from ..core.poses import CubePoses
 from ..core.tensor import rotation_from_rpy
@@ -67,6 +68,14 @@ _CUBE = mapping(
         "calibration": TEXT,
     },
 )
+_ELASTOMER = mapping(
+    ("depth", "thickness"),
+    {
+        "depth": real("m, greater than 0", exclusiveMinimum=0),
+        "thickness": real("m, 0 or greater (0: a half space)", minimum=0),
+        "poisson": real("0 to 0.5", minimum=0, maximum=0.5),
+    },
+)
 _SCHEMA = Schema(
     mapping(
         ("name", "parent_frame", "links", "cubes"),
@@ -74,6 +83,7 @@ _SCHEMA = Schema(
             "name": NAME,
             "parent_frame": _FRAME,
             "rate": real("samples per second, 0.1 to 10000", minimum=0.1, maximum=10_000),
+            "elastomer": _ELASTOMER,
             "links": list_of(_LINK, "links"),
             "cubes": list_of(_CUBE, "cubes"),
         },
@@ -121,6 +131,21 @@ class SkinCube:
     calibration: Calibration
 
 
+@dataclass(frozen=True)
+class Elastomer:
+    """The layer of elastomer on rigid ground in which the cubes of a skin are embedded.
+
+    Attributes:
+        depth: Distance from the centres of the cubes to the surface, in m.
+        thickness: Thickness of the layer in m; infinite for a half space.
+        poisson: Poisson's ratio.
+    """
+
+    depth: float
+    thickness: float
+    poisson: float = POISSONS_RATIO
+
+
 @dataclass(frozen=True, repr=False)
 class Skin:
     """The content of a skin file.
@@ -133,6 +158,7 @@ class Skin:
         links: The links, in the order of the file.
         cubes: The cubes, in the order of the file. Index 0 in rows and messages is the first one.
         frame_prefix: Text in front of the frame ids of the cubes. `parent_frame` contains it.
+        elastomer: The elastomer around the cubes; None: the file does not describe it.
     """
 
     name: str
@@ -141,6 +167,7 @@ class Skin:
     links: tuple[SkinLink, ...]
     cubes: tuple[SkinCube, ...]
     frame_prefix: str = ""
+    elastomer: Elastomer | None = None
 
     def __repr__(self) -> str:
         layouts = ", ".join(sorted({one.layout.name for one in self.calibrations}))
@@ -177,6 +204,23 @@ class Skin:
         """Return the frame id of a cube: the frame prefix, and the names of skin and cube, joined
         by an underscore."""
         return f"{self.frame_prefix}{self.name}_{cube.name}"
+
+
+def contact_parameters(skin: Skin) -> dict[str, str | float]:
+    """Return the parameters of the node `contacts` that follow from a skin file.
+
+    If the file describes the elastomer, contacts are found by the method inverse.
+    """
+    elastomer = skin.elastomer
+    if elastomer is None:
+        return {}
+    return {
+        "method": CONTACT_METHODS[1],
+        "depth": elastomer.depth,
+        # The parameter is 0 for a half space.
+        "thickness": elastomer.thickness if np.isfinite(elastomer.thickness) else 0.0,
+        "poisson": elastomer.poisson,
+    }
 
 
 def read_skin(path: str | Path, frame_prefix: str = "") -> Skin:
@@ -268,11 +312,22 @@ def check_skin_data(data: Any, folder: Path) -> tuple[Skin | None, list[str]]:
     mistakes += _find_cube_mistakes(cubes)
     mistakes += _find_pad_mistakes(links, cubes)
 
+    elastomer = None
+    if "elastomer" in data and ("elastomer",) not in {where[:1] for where, _ in schema_mistakes}:
+        numbers = {key: float(value) for key, value in data["elastomer"].items()}
+        elastomer = Elastomer(**{**numbers, "thickness": numbers["thickness"] or np.inf})
+        if elastomer.depth >= elastomer.thickness:
+            mistakes.append(
+                f"elastomer.depth: {elastomer.depth} m; it must be below the thickness, "
+                f"{elastomer.thickness} m"
+            )
+
     if mistakes:
         return None, mistakes
     # The rate is converted because YAML gives an integer if it is written as 100.
     rate = None if data.get("rate") is None else float(data["rate"])
-    return Skin(data["name"], data["parent_frame"], rate, links, cubes), []
+    skin = Skin(data["name"], data["parent_frame"], rate, links, cubes, elastomer=elastomer)
+    return skin, []
 
 
 class _CubeReader:

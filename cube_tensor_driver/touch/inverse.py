@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..config.skin import Skin, as_skin
+from ..config.skin import Elastomer, Skin, as_skin
 from ..core.arrays import Array, Index, Single
-from ..core.defaults import POISSONS_RATIO, SURFACE_DEPTH
+from ..core.defaults import SURFACE_DEPTH
 from ..core.errors import ElasticError
 from ..core.modes import STRESS
 from ..core.poses import CubePoses
@@ -85,9 +85,9 @@ class SurfaceInverse:
         self,
         skin: Skin | str | Path,
         *,
-        depth: float = SURFACE_DEPTH,
-        thickness: float = np.inf,
-        poisson: float = POISSONS_RATIO,
+        depth: float | None = None,
+        thickness: float | None = None,
+        poisson: float | None = None,
         side: int = 2,
         influence: Influence | None = None,
     ) -> None:
@@ -95,9 +95,12 @@ class SurfaceInverse:
 
         Args:
             skin: Skin as from `read_skin`, or the path of a skin file.
-            depth: Distance from the centres of the cubes to the surface, in m.
+            depth: Distance from the centres of the cubes to the surface, in m. None: that of the
+                skin file, or else `SURFACE_DEPTH`.
             thickness: Thickness of the elastomer on rigid ground, in m; infinite for a half space.
-            poisson: Poisson's ratio of the elastomer.
+                None: that of the skin file, or else infinite.
+            poisson: Poisson's ratio of the elastomer. None: that of the skin file, or else
+                0.48.
             side: Number of points along a side of the patch (square grid of points) of each cube.
             influence: Influence functions (stress of each pad under a force of 1 N, by the force's
                 position), whose depth, thickness and Poisson's ratio replace those given here.
@@ -109,7 +112,12 @@ class SurfaceInverse:
         """
         skin = as_skin(skin)
         by_pad = noise_of_all_pads(skin.calibrations)
-        layer = Layer(thickness, poisson)
+        elastomer = skin.elastomer or Elastomer(SURFACE_DEPTH, np.inf)
+        depth = elastomer.depth if depth is None else depth
+        layer = Layer(
+            elastomer.thickness if thickness is None else thickness,
+            elastomer.poisson if poisson is None else poisson,
+        )
         model = None
         if influence is not None:
             layer = influence.layer

@@ -7,6 +7,7 @@ import copy
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
@@ -14,9 +15,10 @@ from cube_tensor_driver.calibrate.load_table import read_loads
 from cube_tensor_driver.config.calibration import read_calibration
 from cube_tensor_driver.config.grid import grid
 from cube_tensor_driver.config.package_data import package_data
-from cube_tensor_driver.config.skin import check_skin, read_skin
+from cube_tensor_driver.config.skin import Elastomer, check_skin, contact_parameters, read_skin
 from cube_tensor_driver.config.yaml import parse_yaml, write_yaml
 from cube_tensor_driver.core.errors import ConfigError, FitError
+from cube_tensor_driver.touch.inverse import SurfaceInverse
 
 GOOD = grid(nx=3, ny=2, pitch=0.012, links=2, rate=100.0)
 
@@ -77,6 +79,25 @@ def test_pose_and_uid(tmp_path):
     )
 
 
+@pytest.mark.parametrize(("thickness", "expected"), [(0.011, 0.011), (0, np.inf)])
+def test_with_its_elastomer_the_contacts_of_a_skin_are_found_by_the_inverse(
+    tmp_path, thickness, expected
+):
+    data = copy.deepcopy(GOOD)
+    data["elastomer"] = {"depth": 0.005, "thickness": thickness}
+    skin = read(tmp_path, data)
+    assert skin.elastomer == Elastomer(0.005, expected, 0.48)
+    assert contact_parameters(skin) == {
+        "method": "inverse",
+        "depth": 0.005,
+        "thickness": thickness,
+        "poisson": 0.48,
+    }
+    inverse = SurfaceInverse(skin)
+    assert (inverse.depth, inverse.kernels.layer.thickness) == (0.005, expected)
+    assert contact_parameters(read(tmp_path, GOOD)) == {}
+
+
 def change(*path, to=None, remove=False):
     def apply(data):
         for part in path[:-1]:
@@ -135,6 +156,15 @@ def change(*path, to=None, remove=False):
         (change("links", 1, "port", to="socket://h"), ["hub1", "a port from 1 to 65535"]),
         (change("links", 1, "port", to="a\nb"), ["hub1", "a device path"]),
         (change("parent_frame", remove=True), ["'parent_frame' is missing"]),
+        (change("elastomer", to={"depth": 0.005}), ["elastomer", "'thickness' is missing"]),
+        (
+            change("elastomer", to={"depth": 0.012, "thickness": 0.011}),
+            ["elastomer.depth", "0.012", "below the thickness"],
+        ),
+        (
+            change("elastomer", to={"depth": 0.005, "thickness": 0, "poisson": 0.6}),
+            ["elastomer.poisson", "found 0.6", "0 to 0.5"],
+        ),
         (change("rate", to=0), ["rate", "found 0", "0.1 to 10000"]),
         (change("rate", to=float("nan")), ["rate", "found nan"]),
         (

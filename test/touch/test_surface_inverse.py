@@ -176,7 +176,9 @@ def test_it_is_made_of_a_skin_as_read_from_its_file():
 
     poses = CubePoses(*(column[:6] for column in grid()))
     calibrations = [illustrative("planar")] * 6
-    inverse = SurfaceInverse(Skin(poses=poses, calibrations=calibrations), depth=DEPTH)
+    inverse = SurfaceInverse(
+        Skin(poses=poses, calibrations=calibrations, elastomer=None), depth=DEPTH
+    )
     values = np.full((6, 15), np.nan)
     assert np.isfinite(inverse.field(values).traction).all()
     assert len(inverse.columns) == 7
