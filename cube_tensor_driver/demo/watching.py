@@ -19,6 +19,7 @@ from ..core.errors import CubeError, MessageError
 from ..messages.codec import frequency_codec, stress_codec
 from ..msg import SkinFrequencies, SkinStress
 from ..processes.children import Children
+from ..ros.commands.services import ANNOUNCE_S
 from ..ros.qos import batch_profile
 from ..ros.session import domain_text, node_session, spin_until
 from ..simulation.imperfections import read_imperfections
@@ -34,13 +35,6 @@ __all__ = ["DemoResult", "Interrupted", "watch"]
 
 MAX_START_S = 20.0
 """Maximum time, in seconds, from the start until a tensor of every cube must have arrived."""
-
-DISCOVERY_S = 3.5
-"""Time, in seconds, after which DDS (the middleware of ROS 2) has found all nodes in this domain.
-
-Fast DDS repeats its announcements every 3 s, and the first ones can be lost. A measurement begins
-only after this time, because otherwise it could count tensors of another skin before it is noticed.
-"""
 
 CHECK_PERIOD_S = 1.0
 """Period, in seconds, at which a demo without measurement checks that no other skin publishes in
@@ -177,7 +171,7 @@ def check_no_skin() -> None:
         CubeError: A skin publishes.
     """
     with node_session("demo") as (node, executor):
-        if spin_until(executor, lambda: node.count_publishers("stress"), DISCOVERY_S):
+        if spin_until(executor, lambda: node.count_publishers("stress"), ANNOUNCE_S):
             raise other_skin_error()
 
 
@@ -306,7 +300,8 @@ class SkinWatcher:
         from .usage import Usage
 
         spin = self._observer.spin
-        spin(self._made_s + DISCOVERY_S - time.monotonic())
+        # Otherwise it could count tensors of another skin that is found later.
+        spin(self._made_s + ANNOUNCE_S - time.monotonic())
         start_ns, usage = time.time_ns(), Usage(self._children, MEASURED_NODES)
         spin(duration)
         self._check_alone()

@@ -3,6 +3,7 @@ tests, and with none."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -76,6 +77,7 @@ def signals():
 def nobody(domain, monkeypatch):
     """A domain without a skin, where commands do not wait as long as they would."""
     monkeypatch.setattr("cube_tensor_driver.ros.commands.services.MAX_DISCOVERY_S", 0.5)
+    monkeypatch.setattr("cube_tensor_driver.ros.commands.services.ANNOUNCE_S", 0.5)
     return domain
 
 
@@ -284,3 +286,26 @@ def test_nodes_that_are_found_late_are_listed_too(monkeypatch):
     seen: list[list[str]] = []
     assert services.discover_all(executor, lambda: seen.append(found()) or seen[-1])
     assert seen[-1] == ["/demo", "/driver", "/reconstruction"] and rounds
+
+
+def test_a_list_of_nodes_waits_until_lost_announcements_are_repeated(monkeypatch):
+    """The second node is found when the first one has long been known and nothing has changed."""
+    from cube_tensor_driver.ros.commands import services
+
+    monkeypatch.setattr(services, "SETTLE_S", 0.02)
+    monkeypatch.setattr(services, "ANNOUNCE_S", 0.3)
+    begin = time.monotonic()
+
+    def found() -> list[tuple[str, list[str]]]:
+        nodes = ["/driver", "/reconstruction"][: 1 if time.monotonic() < begin + 0.2 else 2]
+        return [
+            (f"{name}/list_parameters", ["rcl_interfaces/srv/ListParameters"]) for name in nodes
+        ]
+
+    node = types.SimpleNamespace(
+        get_service_names_and_types=found, get_fully_qualified_name=lambda: "/parameters"
+    )
+    executor = types.SimpleNamespace(spin_once=lambda timeout_sec: None)
+    session = contextlib.nullcontext((node, executor))
+    monkeypatch.setattr(services, "node_session", lambda _: session)
+    assert services.list_nodes() == ["/driver", "/reconstruction"]

@@ -24,6 +24,10 @@ from ..session import domain_text, node_session, spin_until
 MAX_DISCOVERY_S = 5.0
 """Maximum time, in seconds, for which topics and services of other nodes are searched."""
 
+ANNOUNCE_S = 3.5
+"""Time, in seconds, after which all nodes in a DDS domain are found, even on a busy machine: Fast
+DDS repeats its announcements every 3 s, and the first ones can be lost."""
+
 SETTLE_S = 0.3
 """Time, in seconds, without a newly found topic or service, after which the search ends.
 
@@ -114,6 +118,7 @@ def list_nodes() -> list[str]:
         ConfigError: No such node was found within `MAX_DISCOVERY_S`.
     """
     with node_session("parameters") as (node, executor):
+        spin_until(executor, lambda: False, ANNOUNCE_S)
         return _find_nodes(node, executor)
 
 
