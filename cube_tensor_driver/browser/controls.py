@@ -16,7 +16,7 @@ SLIDER_STEP_S = 0.1
 """Step, in seconds, between two positions of the slider that sets the time within a replay."""
 
 PARTS = {
-    "field": "field between the cubes",
+    "field": "field on the surface",
     "traction": "traction arrows",
     "gradient": "gradient arrows",
     "principal": "principal stresses",

@@ -220,7 +220,7 @@ def test_all_that_a_browser_receives_at_once_is_of_one_scan(page, ros):
     ros.wait(lambda: page.reader.states and page.reader.states[-1].rate == "100")
     # Before the first contacts have come, the page finds some itself.
     states = [state for state in page.reader.states if "from the node contacts" in state.text]
-    assert len({state.zz for state in states}) > 5
+    assert len({state.zz for state in states}) > 2
     for state in states:
         number = round(-state.zz / STEP_PA)
         assert state.zz == pytest.approx(-STEP_PA * number, abs=1)
