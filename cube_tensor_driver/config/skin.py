@@ -231,7 +231,7 @@ def read_skin(path: str | Path, frame_prefix: str = "") -> Skin:
     Args:
         path: The skin file. A calibration that it names is searched among those of the package
             first, then as a file relative to the folder of the skin file.
-        frame_prefix: Text in front of all frame ids, such as "left_", by which the frames of two
+        frame_prefix: Text in front of all frame ids, such as `left_`, by which the frames of two
             skins with the same file differ.
 
     Returns:
