@@ -15,6 +15,7 @@ from cube_tensor_driver.touch.inverse import SurfaceInverse
 from cube_tensor_driver.touch.tracker.contact_tracker import ContactTracker
 from cube_tensor_driver.touch.tracker.local_values import LocalValues
 from cube_tensor_driver.touch.tracker.region_fit import RegionFit
+from workshop.bench.contacts import bar, ellipse, values_under
 
 DEPTH, PITCH, COUNT, LEAST = 4e-3, 12e-3, 7, 300.0
 PADS_NOISE = np.where(np.arange(15) < len(STRESS), 3.0, 3.0 / 2e-3)
@@ -320,30 +321,6 @@ def test_cubes_that_fail_beside_a_contact_and_a_skin_without_values(inverse):
     assert tracker.update(np.full_like(values, np.nan), max_work=np.inf) == []
 
 
-def ellipse(length, width) -> np.ndarray:
-    """Hertz's pressure on an ellipse along x, as point forces (L, 3): position and share of 1 N."""
-    sources, forces = contact.hertz(1.0, (0, 0, 1), (0, 0), order=16)
-    return np.column_stack([sources[:, 0] * length / 2, sources[:, 1] * width / 2, forces[:, 2]])
-
-
-def bar(length, width) -> np.ndarray:
-    """Uniform along x, semi-elliptic across: an edge or a rod."""
-    x, along = np.polynomial.legendre.leggauss(int(length / 0.5e-3))
-    angle = np.arange(1, 9) * np.pi / 9
-    across = np.sin(angle) ** 2 / (np.sin(angle) ** 2).sum()
-    x, y = np.meshgrid(x * length / 2, np.cos(angle) * width / 2, indexing="ij")
-    return np.column_stack([x.ravel(), y.ravel(), np.outer(along / 2, across).ravel()])
-
-
-def values_under(bench, shape, centre, force, random) -> np.ndarray:
-    """Through the whole chain, from point forces on a half space."""
-    sources = np.column_stack([shape[:, :2] + centre, np.zeros(len(shape))])
-    below = bench.poses.position - [0, 0, bench.setting.depth]
-    fields = contact.field(below, sources, shape[:, 2:] * np.asarray(force), bench.setting.poisson)
-    field = np.concatenate([part.reshape(len(below), -1) for part in fields], axis=1)
-    return bench.measured(bench.pads_in(field), random)
-
-
 SHAPES = [
     (ellipse(16e-3, 8e-3), CUBES[0], 8e-3, 0.005),
     (bar(24e-3, 2e-3), CUBES[0], 8e-3, 0.005),
@@ -360,7 +337,7 @@ def test_fingertips_edges_and_rods_have_their_force_and_place(shape, cubes, pitc
     for angle in (0.3, 2.0):
         turned = shape @ rotation_from_rpy(0, 0, angle).T * [1, 1, 0] + shape * [0, 0, 1]
         centre = pitch * (random.random(2) - 0.5)
-        values = values_under(bench, turned, centre, (0.6, -0.6, -3.0), random)
+        values = values_under(bench, turned, centre, np.array([0.6, -0.6, -3.0]), random)
         found = ContactTracker(bench.inverse, LEAST).update(values, max_work=np.inf)
         force = sum(one.normal_force for one in found)
         place = sum(one.normal_force * one.position[:2] for one in found) / force
@@ -392,7 +369,7 @@ def test_what_a_scan_has_no_time_for_is_done_in_the_next_ones(monkeypatch):
     places = [(x, y) for x in (-27e-3, -9e-3, 9e-3, 27e-3) for y in (-27e-3, -9e-3, 9e-3, 27e-3)]
     random, ball_shape = np.random.default_rng(2), ellipse(5e-3, 5e-3)
     shape = np.concatenate([ball_shape + np.array([*place, 0]) for place in places])
-    values = values_under(bench, shape, (0, 0), (0.0, 0.3, -1.5), random)
+    values = values_under(bench, shape, np.zeros(2), np.array([0.0, 0.3, -1.5]), random)
     tracker, made = ContactTracker(bench.inverse, LEAST), []
     monkeypatch.setattr(RegionFit, "__init__", counted(RegionFit.__init__, made))
     first = tracker.update(values)

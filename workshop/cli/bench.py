@@ -62,7 +62,18 @@ def arguments(parser: Parser) -> None:
     )
     _add_time(scale)
 
-    for benchmark in (pipeline, decode, links, echo, skin, scale):
+    contacts = parser.add_subcommand(
+        "contacts", "errors and CPU time of contacts by the shape of the load"
+    )
+    contacts.add_argument(
+        "--loads",
+        type=count,
+        default=10,
+        metavar="N",
+        help="number of loads of each shape (default: %(default)s)",
+    )
+
+    for benchmark in (pipeline, decode, links, echo, skin, scale, contacts):
         benchmark.add_json()
     scale.add_output(
         "--figure",
@@ -116,6 +127,10 @@ def _measure(options: argparse.Namespace) -> dict[str, Any]:
         from ..bench.pipeline import bench_pipeline
 
         return bench_pipeline(options.cubes)
+    if options.what == "contacts":
+        from ..bench.contacts import bench_contacts
+
+        return bench_contacts(options.loads)
     if options.what == "links":
         from ..bench.links import bench_links
 

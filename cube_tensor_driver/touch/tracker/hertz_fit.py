@@ -8,10 +8,6 @@ whitened values by the parameters, the whitened residual r, and the prior precis
 
     (J' J + P) change = J' r - P (x - x0),    covariance t (J' J + P)^-1
 
-A shape is a deviation of a contact from a circular Hertz contact. The shapes move pressure within a
-contact without changing its force and position: two make the contact longer along x or along a
-diagonal, the third one (flatness) moves pressure between centre and rim.
-
 Source: K. L. Johnson, Contact Mechanics (1985), 4.2 (Hertz); D. J. C. MacKay, Bayesian
 interpolation, Neural Computation 4 (1992) 415 (evidence).
 """
@@ -41,18 +37,14 @@ FORCE_DEVIATION = 1e2
 """Prior standard deviation of each component of the force of a contact, in N; the prior mean is 0.
 The value is so large that the prior does not influence the fitted force."""
 
-SHAPE_DEVIATIONS = np.array([0.7, 0.7, 1.0])
-"""Prior standard deviations of the coefficients of the three shapes (deviations from a circular
-Hertz contact): elongation along x, elongation along a diagonal, flatness. For comparison, two balls
-side by side have an elongation of 1.1, a rigid flat punch has a flatness of 1."""
+SIZE_STEP = 0.2
+"""Change of the natural logarithm of the radius for the numerical derivative by it, and of the
+narrower and the wider contact that make up the flatness.
 
-SHAPE_SHIFT = 0.5
-"""Shift, divided by the contact's radius, of the contacts from which an elongation shape is made:
-contacts shifted along an axis minus contacts shifted across it."""
-
-SHAPE_WIDENING = 0.2
-"""Change of the natural logarithm of the radius that gives the narrower and the wider contact of
-the flatness shape. This shape is a contact minus a mixture of a narrower and a wider one."""
+The flatness moves pressure from the centre of a contact to its rim without changing force, position
+and second moment: a contact is added, and a mixture of a narrower and a wider one is subtracted. A
+Hertz contact has flatness 0, a rigid flat punch flatness 1.
+"""
 
 SETTLED_STEP = 0.02
 """Size of a Gauss-Newton step below which a fit has converged. The size is the larger one of two
@@ -67,21 +59,13 @@ _DIFFERENCE_STEP = 1 / 50
 """Step of the numerical derivatives with respect to the centre of a contact, divided by the depth
 of the cubes' centres below the surface."""
 
-_N_PARAMETERS = 9
+_N_PARAMETERS = 7
 """Number of parameters of a contact: force f_x, f_y, f_z, centre c_x, c_y, logarithm ln a of the
-radius, and the coefficients of three shapes, divided by `SHAPE_DEVIATIONS`."""
+radius, and flatness."""
 
 _STENCIL = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], float)
 """Shifts (5, 2) of a contact for numerical derivatives by its centre, in units of the step: none,
 then both directions along x and along y."""
-
-_DIAGONALS = np.array([[1, 1], [-1, -1], [1, -1], [-1, 1]]) / np.sqrt(2)
-"""Unit vectors (4, 2): both directions along one diagonal of the x-y plane, then along the other
-one."""
-
-_SHAPE_STENCIL = np.concatenate([_STENCIL[1:], _DIAGONALS])
-"""Unit vectors (8, 2) along which contacts are shifted to make the two elongation shapes: both
-directions along x, y and the two diagonals."""
 
 
 class HertzFit:
@@ -114,7 +98,7 @@ class HertzFit:
         self.log_sizes = np.clip(np.log(sizes), *self._log_range)
         self.forces = np.array([one.force for one in starts])
         precision = np.array([FORCE_DEVIATION**-2] * 3 + [depth**-2] * 2 + [SIZE_DEVIATION**-2])
-        own = np.tile([*precision, 1.0, 1.0, 1.0], len(starts))
+        own = np.tile([*precision, 1.0], len(starts))
         self._others = region.response_to_others()
         self._precision = np.concatenate([own, np.ones(self._others.shape[1])])
         self.score = np.inf
@@ -212,31 +196,22 @@ class HertzFit:
         """Compute the derivatives of the whitened values by the parameters of one contact.
 
         Returns:
-            Derivatives (n C, 9). The first three columns are the response to unit forces.
+            Derivatives (n C, 7). The first three columns are the response to unit forces.
         """
         step = _DIFFERENCE_STEP * self._depth
-        offsets = np.concatenate([step * _STENCIL, SHAPE_SHIFT * size * _SHAPE_STENCIL])
-        moved = self._respond(centre + offsets, size)
-        narrower = self._respond(centre[None], size * np.exp(-SHAPE_WIDENING))[:, :, 0] @ force
-        wider = self._respond(centre[None], size * np.exp(SHAPE_WIDENING))[:, :, 0] @ force
-        response = moved[:, :, 0]
-        under_force = np.einsum("dak,a->kd", moved, force)
-
-        by_centre = (under_force[[1, 3]] - under_force[[2, 4]]) / (2 * step)
-        by_log_size = (wider - narrower) / (2 * SHAPE_WIDENING)
-        # Change of the response by an elongated contact: contacts shifted along an axis, minus
-        # contacts shifted across it.
-        axes = under_force[5:].reshape(4, 2, -1).sum(axis=1) / 4
-        # Change of the response by a flatter pressure: the contact minus a mixture of a narrower
-        # and a wider contact. The share of the wider one is chosen so that the second moment of the
-        # pressure about the centre stays the same.
-        shrink = np.exp(-2 * SHAPE_WIDENING)
-        grow = np.exp(2 * SHAPE_WIDENING)
-        share = (1 - shrink) / (grow - shrink)
-        flatness = under_force[0] - (share * wider + (1 - share) * narrower)
-        shapes = np.stack([axes[0] - axes[1], axes[2] - axes[3], flatness])
-        slopes = [by_centre, by_log_size[None], SHAPE_DEVIATIONS[:, None] * shapes]
-        return np.concatenate([response, *(one.T for one in slopes)], axis=1)
+        moved = self._respond(centre + step * _STENCIL, size)
+        wider, narrower = (
+            self._respond(centre[None], size * np.exp(sign * SIZE_STEP))[:, :, 0] @ force
+            for sign in (1, -1)
+        )
+        under_force = np.einsum("dak,a->dk", moved, force)
+        by_centre = (under_force[:, [1, 3]] - under_force[:, [2, 4]]) / (2 * step)
+        by_log_size = (wider - narrower) / (2 * SIZE_STEP)
+        # The mixture with this share of the wider contact has the second moment of the contact.
+        share = 1 / (1 + np.exp(2 * SIZE_STEP))
+        flatness = under_force[:, 0] - (share * wider + (1 - share) * narrower)
+        slopes = [by_centre, by_log_size[:, None], flatness[:, None]]
+        return np.concatenate([moved[:, :, 0], *slopes], axis=1)
 
     def _respond(self, centres: Array, size: float) -> Array:
         """Return the whitened response (n C, 3, K) to forces of 1 N on K contacts."""

@@ -1,0 +1,188 @@
+"""`./cube bench contacts`: errors and CPU time of contacts by the shape of the load.
+
+The stress is that of point forces on a half space. It goes through the whole chain: pads whose
+gains are known to 1 %, the pad law, a counter's noise, the pipeline. The estimator uses none of it.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cube_tensor_design.studies.traction_study import CUBES, Setting, TractionBench, flat_punch
+from cube_tensor_driver.core.arrays import Array
+from cube_tensor_driver.core.defaults import CONTACT_PRESSURE
+from cube_tensor_driver.mechanics import contact
+from cube_tensor_driver.touch.tracker.contact_tracker import ContactTracker
+
+FORCE_N = 3.0
+"""Normal force of each load in N; the shear force is 0.3 times as large."""
+
+SCANS = 12
+"""Number of scans of each load. The figures are those of the last one, the first time is given
+apart."""
+
+DENSE = Setting()
+"""Skin of 24-pad cubes, 8 mm apart and 5 mm deep."""
+
+SPARSE = Setting(pitch=12e-3, depth=4e-3)
+"""Skin of 24-pad cubes, 12 mm apart and 4 mm deep."""
+
+
+class Line(NamedTuple):
+    """Loads of one shape on one skin.
+
+    Attributes:
+        setting: The skin.
+        shape: Point forces (L, 3) of a load of 1 N: position x, y in m, force in N.
+        outside: Distance of the centre from the outermost cubes in pitches (distances of
+            neighbouring cubes); None: the centre is in the middle cell.
+    """
+
+    setting: Setting
+    shape: Array
+    outside: float | None = None
+
+
+def ellipse(length: float, width: float) -> Array:
+    """Return Hertz's pressure on an ellipse along x with 1 N, as in `Line.shape`."""
+    sources, forces = contact.hertz(1.0, (0, 0, 1), order=16)
+    scaled = sources[:, :2] * np.array([length, width]) / 2
+    return np.column_stack([scaled, forces[:, 2]])
+
+
+def punch(width: float) -> Array:
+    """Return the pressure of a rigid flat punch with 1 N, as in `Line.shape`."""
+    sources, forces = flat_punch(width / 2, np.array([0, 0, 1.0]), np.zeros(2), 14)
+    return np.column_stack([sources[:, :2], forces[:, 2]])
+
+
+def bar(length: float, width: float) -> Array:
+    """Return a pressure that is uniform along x and semi-elliptic across, with 1 N."""
+    nodes, along = np.polynomial.legendre.leggauss(int(length / 0.5e-3))
+    angle = np.arange(1, 9) * np.pi / 9
+    across = np.sin(angle) ** 2 / (np.sin(angle) ** 2).sum()
+    x, y = np.meshgrid(nodes * length / 2, np.cos(angle) * width / 2, indexing="ij")
+    return np.column_stack([x.ravel(), y.ravel(), np.outer(along / 2, across).ravel()])
+
+
+def pair(width: float, distance: float) -> Array:
+    """Return two balls with 0.5 N each."""
+    half = ellipse(width, width) * [1, 1, 0.5]
+    shift = np.array([distance / 2, 0, 0])
+    return np.concatenate([half + shift, half - shift])
+
+
+LINES = {
+    "ball 5 mm": Line(DENSE, ellipse(5e-3, 5e-3)),
+    "flat punch 16 mm": Line(DENSE, punch(16e-3)),
+    "fingertip 8 x 16 mm": Line(DENSE, ellipse(16e-3, 8e-3)),
+    "edge 12 x 1 mm": Line(DENSE, bar(12e-3, 1e-3)),
+    "edge 24 x 2 mm": Line(DENSE, bar(24e-3, 2e-3)),
+    "rod 40 x 3 mm": Line(DENSE, bar(40e-3, 3e-3)),
+    "two balls 1.2 pitches apart": Line(DENSE, pair(5e-3, 9.6e-3)),
+    "ball half a pitch outside": Line(DENSE, ellipse(5e-3, 5e-3), 0.5),
+    "ball a pitch outside": Line(DENSE, ellipse(5e-3, 5e-3), 1.0),
+    "ball 5 mm, pitch 12": Line(SPARSE, ellipse(5e-3, 5e-3)),
+    "flat punch 8 mm, pitch 12": Line(SPARSE, punch(8e-3)),
+    "rod 40 x 3 mm, pitch 12": Line(SPARSE, bar(40e-3, 3e-3)),
+    "edge 24 x 2 mm, planar, pitch 12": Line(replace(SPARSE, cubes=CUBES[1]), bar(24e-3, 2e-3)),
+}
+"""Loads by their names in the result."""
+
+
+def values_under(
+    bench: TractionBench,
+    shape: Array,
+    centre: Array,
+    force: Array,
+    random: np.random.Generator,
+) -> Array:
+    """Return the components (cubes, 15) that the pipeline computes under a load.
+
+    Args:
+        bench: The skin.
+        shape: Point forces as in `Line.shape`.
+        centre: Centre (2,) of the load in m.
+        force: Force (3,) in N.
+        random: Source of gain errors and noise.
+    """
+    sources = np.column_stack([shape[:, :2] + centre, np.zeros(len(shape))])
+    below = bench.poses.position - [0, 0, bench.setting.depth]
+    fields = contact.field(below, sources, shape[:, 2:] * force, bench.setting.poisson)
+    field = np.concatenate([part.reshape(len(below), -1) for part in fields], axis=1)
+    return bench.measured(bench.pads_in(field), random)
+
+
+def bench_contacts(loads: int) -> dict[str, Any]:
+    """Measure the contacts of loads of each shape.
+
+    A calibration ratio is an rms error divided by the predicted standard deviation.
+
+    Args:
+        loads: Number of loads of each shape.
+    """
+    return {name: _bench_line(line, loads) for name, line in LINES.items()}
+
+
+def _bench_line(line: Line, loads: int) -> dict[str, float]:
+    bench = TractionBench(line.setting, side=2)
+    random = np.random.default_rng(11)
+    results = np.array([_bench_load(bench, line, random) for _ in range(loads)])
+    force, force_ratio, place, place_ratio = np.sqrt((results[:, :4] ** 2).mean(axis=0))
+    count, first_ms, scan_ms = results[:, 4:].mean(axis=0)
+    return {
+        "force_error_percent": 100 * force / FORCE_N,
+        "force_ratio": force_ratio,
+        "place_error_mm": 1e3 * place,
+        "place_ratio": place_ratio,
+        "contacts": count,
+        "first_scan_cpu_ms": first_ms,
+        "scan_cpu_ms": scan_ms,
+    }
+
+
+def _bench_load(
+    bench: TractionBench,
+    line: Line,
+    random: np.random.Generator,
+) -> list[float]:
+    """Return errors and ratios of force and place, number of contacts, and CPU times in ms."""
+    direction, angle = random.uniform(0, 2 * np.pi, 2)
+    shear = 0.3 * FORCE_N * np.array([np.cos(direction), np.sin(direction)])
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    shape = np.column_stack([line.shape[:, :2] @ turn.T, line.shape[:, 2]])
+    centre = line.setting.pitch * (random.random(2) - 0.5)
+    if line.outside is not None:
+        outermost = float(bench.poses.position[:, 0].max())
+        centre[0] = outermost + line.outside * line.setting.pitch
+    values = values_under(bench, shape, centre, np.array([*shear, -FORCE_N]), random)
+
+    tracker = ContactTracker(bench.inverse, CONTACT_PRESSURE)
+    times_ms = []
+    for _ in range(SCANS):
+        start_s = time.process_time()
+        found = tracker.update(values)
+        times_ms.append(1e3 * (time.process_time() - start_s))
+    forces = np.array([one.normal_force for one in found])
+    deviations = np.array([one.force_uncertainty for one in found])
+    places = np.array([one.position[:2] for one in found])
+    force = float(forces.sum())
+    place = forces @ places / force
+    # The uncertain forces of several contacts move their common centre.
+    levers = np.linalg.norm(places - place, axis=1) / np.sqrt(2)
+    own = forces * np.array([one.position_uncertainty for one in found])
+    place_deviation = np.linalg.norm(np.hypot(own, levers * deviations)) / force
+    error = float(np.linalg.norm(place - centre))
+    return [
+        force - FORCE_N,
+        (force - FORCE_N) / float(np.linalg.norm(deviations)),
+        error,
+        error / float(place_deviation * np.sqrt(2)),
+        len(found),
+        times_ms[0],
+        times_ms[-1],
+    ]
