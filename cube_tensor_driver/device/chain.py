@@ -31,7 +31,7 @@ from .scans.sequence import Arrival, SampleAccount
 from .track import LinkTrack
 from .wire.decoder import unpack_all
 from .wire.native import NOT_COMPILED, wire
-from .wire.protocol import VERSION, Ack, Command, Frame, Hello, Request, Sample, Stats, Time
+from .wire.protocol import VERSION, Ack, Command, Hello, Request, Sample, Stats, Time
 
 MAX_SCANS = 4
 """Largest number of scans (one sample of every cube) whose rows one callback receives. If the
@@ -321,24 +321,19 @@ class LiveLinks:
         """Handle frames of links that are not all usual samples."""
         with self._lock:
             now_ns, step_ns = self._check_host_clock()
-            step_ns += self._step_ns
-            for link, arrival_ns, frames, asked_ns, is_late in received:
-                if step_ns:
-                    # The arrival of bytes that were read just before the host's clock was set is a
-                    # time of the old clock, and is moved by the step of the clock.
-                    shifted_ns = arrival_ns + step_ns
-                    is_old = abs(shifted_ns - now_ns) < abs(arrival_ns - now_ns)
-                    arrival_ns = shifted_ns if is_old else arrival_ns
+            is_set = bool(step_ns or self._step_ns)
+            for read in received:
+                if is_set:
+                    # The arrival may be a time of the old clock, and a round trip between a
+                    # question for the hub's time and its answer says nothing (0: not used).
+                    read = read._replace(arrival_ns=now_ns, asked_ns=0)
                 # All rows are counted before any frame is handled, so that rows of the frames
                 # behind a frame that raises an error are counted, too.
-                for frame in frames:
+                for frame in read.frames:
                     if isinstance(frame, Sample):
-                        self._rows.received += frame.shape[0]
+                        self._rows.received += frame.n_cubes
                 try:
-                    # If the host's clock was set between a question for the hub's time and its
-                    # answer, the round trip says nothing about the hub's clock (0: not used).
-                    asked_ns = 0 if step_ns else asked_ns
-                    self._handle_frames(link, arrival_ns, frames, asked_ns, is_late)
+                    self._handle_frames(read)
                 except Exception as error:  # noqa: BLE001  (other links must still be handled)
                     self._count_error(error)
 
@@ -368,31 +363,15 @@ class LiveLinks:
             self._reader.forget_questions()
         return now_ns, step_ns
 
-    def _handle_frames(
-        self,
-        link: int,
-        arrival_ns: int,
-        frames: Sequence[Frame],
-        asked_ns: int,
-        is_late: bool,
-    ) -> None:
-        """Count the frames of a link and add their samples to the scans.
-
-        Args:
-            link: Index of the link.
-            arrival_ns: Host time at which the bytes of the frames arrived, in ns.
-            frames: The frames, in order.
-            asked_ns: Host time, in ns, of the question that a TIME frame among them answers; 0 if
-                the answer must not be used.
-            is_late: Whether this host is behind with reading.
-        """
-        record = self._records[link]
+    def _handle_frames(self, read: LinkFrames) -> None:
+        """Count the frames of a link and add their samples to the scans."""
+        record = self._records[read.link]
         samples: list[Sample] = []
-        for frame in frames:
+        for frame in read.frames:
             if isinstance(frame, Sample):
                 arrival = record.account.sample(frame)
                 if arrival is Arrival.RESET:
-                    self._add_samples(link, arrival_ns, samples, is_late)
+                    self._add_samples(read, samples)
                     samples = []
                     record.clock.reset()
                 if arrival is Arrival.DUPLICATE:
@@ -401,43 +380,35 @@ class LiveLinks:
                     samples.append(frame)
             elif isinstance(frame, Hello):
                 record.account.announce(frame.n_cubes, frame.n_pads)
-                self._learn_cubes(link, frame)
+                self._learn_cubes(read.link, frame)
             elif isinstance(frame, Time):
-                if asked_ns:
-                    record.clock.add_answer(asked_ns, frame.device_us, arrival_ns)
+                if read.asked_ns:
+                    record.clock.add_answer(read.asked_ns, frame.device_us, read.arrival_ns)
             elif isinstance(frame, Stats):
                 record.account.stats(frame)
                 record.account_errors = record.account.contradictions()
             elif isinstance(frame, Ack) and frame.request == Command.START:
                 record.account.start()
-        self._add_samples(link, arrival_ns, samples, is_late)
+        self._add_samples(read, samples)
 
-    def _add_samples(
-        self,
-        link: int,
-        arrival_ns: int,
-        samples: Sequence[Sample],
-        is_late: bool,
-    ) -> None:
+    def _add_samples(self, read: LinkFrames, samples: Sequence[Sample]) -> None:
         """Convert the times of samples from the hub's to the host's clock, and add them to scans.
 
         A scan is one sample of every cube.
 
         Args:
-            link: Index of the link.
-            arrival_ns: Host time at which all of these samples arrived, in ns.
+            read: Read of the link that holds the samples.
             samples: The samples, in order.
-            is_late: Whether this host is behind with reading.
         """
         if not samples:
             return
-        record = self._records[link]
+        record = self._records[read.link]
         clock = record.clock
         device_us = [sample.device_us for sample in samples]
         numbers = [sample.sequence for sample in samples]
-        stamps_ns = clock.update(device_us, arrival_ns, numbers, is_late)
+        stamps_ns = clock.update(device_us, read.arrival_ns, numbers, read.is_late)
         status = STAMP if clock.in_doubt else 0
-        self._scans.add(link, samples, stamps_ns, status)
+        self._scans.add(read.link, samples, stamps_ns, status)
         record.track.is_usual = record.account.is_usual and clock.is_usual
 
     def _deliver(self) -> None:

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 from ..track import MAX_DEVICE_US, NEVER, LinkTrack
 from .line import ClockLine, ClockRoundTrip
-from .steps import SampleTiming, StepDecision
+from .steps import MAX_DECISION_NS, SampleTiming, StepDecision
 
 MAX_DELAY_NS = 60_000_000_000
 """Longest credible delay, in ns, between the sampling of a sample and its arrival. If the estimated
@@ -317,7 +317,7 @@ class HubClock:
         if problem:
             self.problems.add(problem)
             self._decision = None
-        elif self._decision is not None and not self._n_still and not self._is_late:
+        elif self._decision is not None and not self._n_still:
             self._decide(self._decision, newest_us, arrival_ns)
 
         device_ns = 1000 * (newest_us - track.first_us)
@@ -411,7 +411,13 @@ class HubClock:
         device_ns = 1000 * (newest_us - self._track.first_us)
         arrival = arrival_ns - self._track.first_ns
         delay = self._line.height(device_ns, arrival)
-        was_set = decision.was_set(device_ns, delay, arrival, self._track.jitter_ns)
+        was_set = None
+        if not self._is_late:
+            was_set = decision.was_set(device_ns, delay, arrival, self._track.jitter_ns)
+        elif arrival - decision.since_ns > MAX_DECISION_NS:
+            # The delays of samples that are read late tell nothing. If the clock was set all the
+            # same, the clock line shows it when they are read in time again.
+            was_set = False
         if was_set is None:
             return
         self._decision = None

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import ctypes
 import select
-import time
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -18,10 +17,6 @@ from ..wire.decoder import NativeDecoder, unpack_all
 from ..wire.native import wire
 from ..wire.protocol import Frame
 from .link import Link
-
-WAIT_STEP_S = 2e-4
-"""Period, in s, at which data are looked for while the samples of other hubs are waited for. Waking
-up for each hub would take more processor time. Arrival times may be late by up to this period."""
 
 
 class UsualSamples(NamedTuple):
@@ -99,7 +94,7 @@ class Intake:
             all other results of reading.
         """
         if wire is None or len(self._targets) < len(self._links):
-            return self._read_in_python(timeout_s, gather_s, expected)
+            return self._read_in_python(timeout_s)
         is_late, links, raws, stamps_ns, reads = wire.read_links(
             self._targets, self._wake_fd, timeout_s, gather_s, expected, self._clock_ns
         )
@@ -109,13 +104,8 @@ class Intake:
             events.append(LinkRead(i, arrival_ns, result))
         return is_late, UsualSamples(links, raws, stamps_ns), events
 
-    def _read_in_python(
-        self,
-        timeout_s: float,
-        gather_s: float,
-        expected: int,
-    ) -> tuple[bool, UsualSamples, list[LinkRead]]:
-        """Wait, read and decode in Python; see `read`."""
+    def _read_in_python(self, timeout_s: float) -> tuple[bool, UsualSamples, list[LinkRead]]:
+        """Wait, read and decode in Python; see `read`. It does not wait for the other links."""
         numbers = {link.fileno(): i for i, link in enumerate(self._links) if link.is_open}
         poll = select.poll()
         for fd in (self._wake_fd, *numbers):
@@ -123,15 +113,8 @@ class Intake:
         ready = poll.poll(0)
         is_late = bool(ready)
         ready = ready or poll.poll(1000 * timeout_s)
-        until = time.monotonic() + gather_s
-        reads: list[LinkRead] = []
-        while True:
-            reads += self._read_ready([numbers[fd] for fd, _ in ready if fd in numbers])
-            delivered = {read.link for read in reads if read.result}
-            if is_late or not 0 < len(delivered) < expected or time.monotonic() > until:
-                return is_late, UsualSamples([], [], []), reads
-            time.sleep(WAIT_STEP_S)
-            ready = poll.poll(0)
+        reads = self._read_ready([numbers[fd] for fd, _ in ready if fd in numbers])
+        return is_late, UsualSamples([], [], []), reads
 
     def _read_ready(self, ready: Sequence[int]) -> list[LinkRead]:
         """Read and decode the links with these indices once."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -97,7 +96,6 @@ class SequenceTracker:
         self._is_begun = False
         self._first = 0
         self._first_us = 0
-        self._set_back = 0  # number of the first sample after the clock was last set back
         self._started_at = -1  # number of the next sample when the hub was last started
 
     def update(self, sequence: int, device_us: int) -> Arrival:
@@ -181,7 +179,7 @@ class SequenceTracker:
         self.counters.missing += number - self._track.next
         arrival = Arrival.NEW
         if device_us < self._track.newest_us:
-            arrival, self._set_back = Arrival.SET_BACK, number
+            arrival = Arrival.SET_BACK
             self.counters.resets += 1
         self._track.next = number + 1
         self._track.newest_us = device_us
@@ -205,30 +203,23 @@ class SequenceTracker:
         """Return whether a late sample was taken since the last restart of the hub.
 
         This is so if its device time lies between those of the samples with the next smaller and
-        larger numbers. If the hub's clock was set back, only samples on the same side of that step
-        are compared.
+        the next larger number. If the hub's clock was set back between these two, the sample may
+        have been taken with the old or the new time.
 
         Args:
             number: Unwrapped number of the sample.
             device_us: Device time of the sample, in µs.
         """
-        if any(other == number for other, _ in self._seen()):
-            return False
         if number < self._first:
             return abs(self._track.newest_us - device_us) < RESTART_US
-
-        before = [entry for entry in self._seen() if entry[0] < self._set_back]
-        after = [entry for entry in self._seen() if entry[0] >= self._set_back]
-        fits_after = _is_in_order(number, device_us, after)
-        if number >= self._set_back:
-            return fits_after
-        fits_before = _is_in_order(number, device_us, before)
-        last_before, _ = max(before)
-        if number < last_before:
-            return fits_before
-        # The sample lies between the last one before the hub's clock was set back and the first one
-        # after that, and may have been taken with the old or the new time.
-        return fits_before or fits_after
+        seen = self._seen()
+        if any(other == number for other, _ in seen):
+            return False
+        _, below_us = max((entry for entry in seen if entry[0] < number), default=(0, 0))
+        newest = 0, MAX_DEVICE_US
+        _, above_us = min((entry for entry in seen if entry[0] > number), default=newest)
+        fits_below, fits_above = below_us <= device_us, device_us <= above_us
+        return fits_below and fits_above if below_us <= above_us else fits_below or fits_above
 
     def _restart(self, sequence: int, device_us: int) -> Arrival:
         """Begin to count the samples anew with the first one after a restart of the hub.
@@ -246,7 +237,7 @@ class SequenceTracker:
         if sequence <= MAX_GAP:
             # Numbers begin at 0 with power-up, so all samples before this one are missing.
             self.counters.missing += sequence
-            self._first = self._set_back = 0
+            self._first = 0
         return arrival
 
     def _begin(self, sequence: int, device_us: int, arrival: Arrival) -> Arrival:
@@ -260,7 +251,7 @@ class SequenceTracker:
         self._is_begun = True
         for entry in self._track.seen:
             entry[0] = NEVER
-        self._first = self._set_back = sequence
+        self._first = sequence
         self._first_us = device_us
         self._track.next = sequence + 1
         self._track.newest_us = device_us
@@ -282,21 +273,6 @@ class SequenceTracker:
         """Return number and device time, in µs, of the newest `MAX_DISORDER` samples that came."""
         oldest = self._track.next - MAX_DISORDER
         return [(number, us) for number, us in self._track.seen if number >= oldest]
-
-
-def _is_in_order(number: int, device_us: int, seen: Sequence[tuple[int, int]]) -> bool:
-    """Return whether device times (hub's clock) grow with the numbers if this sample is added.
-
-    Args:
-        number: Number of the sample, continued beyond 32 bits.
-        device_us: Device time of the sample, in µs.
-        seen: Numbers and device times of other samples.
-    """
-    for other, other_us in seen:
-        is_wrong = other_us > device_us if other < number else other_us < device_us
-        if is_wrong:
-            return False
-    return True
 
 
 class SampleAccount:
