@@ -127,7 +127,8 @@ def compute_response(
     check_memory(grids[-1])
 
     # Each axis with a mirror has two parities, and each parity is one solve.
-    total = sum(2 ** int(np.sum(grid.p.min(axis=1) >= 0)) for grid in grids)
+    mirrors = [int(np.sum(grid.p.min(axis=1) >= 0)) for grid in grids]
+    total = sum(2**count for count in mirrors)
     report = count_steps(progress, total)
 
     rows: list[dict[str, Any]] = []
@@ -145,7 +146,8 @@ def compute_response(
         rows.append(row)
     report("done")
     for row, (coarse, fine) in zip(rows, pairwise(matrices), strict=False):
-        row["change"] = float(np.abs(fine - coarse).max() / np.abs(fine).max())
+        change = np.abs(fine - coarse).max()
+        row["change"] = float(change / np.abs(fine).max())
 
     coefficients, residual = project(structure, matrix)
     rank, unobservable = _find_observable(matrix, structure.modes.names)
@@ -323,7 +325,8 @@ def pad_stresses(
         load = forces(parity)
         part = np.zeros((layout.n_pads, load.shape[1]))
         # Most loads have no part of this parity and need no solve.
-        used = np.flatnonzero(np.abs(load).max(axis=0) > NO_FORCE * np.abs(load).max())
+        largest = np.abs(load).max(axis=0)
+        used = np.flatnonzero(largest > NO_FORCE * largest.max())
         weights = solid.pad_weights(layout, parity)
         if len(used) and weights.any():
             reactions = solid.body @ solid.solve(parity, load[:, used])

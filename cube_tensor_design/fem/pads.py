@@ -110,7 +110,9 @@ def interval_weights(
     if parity == 0:
         half = len(nodes) // 2
         # The forces are split into an even and an odd part about the centre.
-        even, odd = (interval_weights(nodes[half:], order, sign, start, stop) for sign in (1, -1))
+        upper = nodes[half:]
+        even = interval_weights(upper, order, 1, start, stop)
+        odd = interval_weights(upper, order, -1, start, stop)
         weights = np.zeros(len(nodes))
         weights[half:] = (even + odd) / 2
         weights[half::-1] += (even - odd) / 2

@@ -92,7 +92,8 @@ def _surface_influence(
         flip = weights[:, None] * images
         total = total + on_surface[:, None] * flip[:, None]
 
-    places = (x[:-1, nodes].T * images[:, None, :-1]).reshape(-1, dim - 1)
+    meshed = x[:-1, nodes].T
+    places = (meshed * images[:, None, :-1]).reshape(-1, dim - 1)
     pads = np.reshape(total, (layout.n_pads, -1, dim))
     # A node on a mirror belongs to two parts of the body, with the same value.
     rounded = np.round(places, 9)

@@ -195,8 +195,9 @@ class Solid:
             stress = _parity_part(field, x.reshape(self.dim, -1).T, parity)
             traction = sign * stress[..., axis]  # (q, n, dim)
             # A quadrature point loads the nodes whose functions are not zero there.
-            values = np.stack([np.asarray(shape[0]) for shape in face.basis]) * face.dx
-            forces = sample_matrix(face, values).T @ traction.reshape(face.dx.size, -1)
+            values = np.stack([np.asarray(shape[0]) for shape in face.basis])
+            samples = sample_matrix(face, values * face.dx)
+            forces = samples.T @ traction.reshape(face.dx.size, -1)
             # The components of one node are neighbours among the unknowns.
             by_node = forces.reshape(face.N, -1, self.dim).swapaxes(1, 2)
             total = total + by_node.reshape(self.basis.N, -1)

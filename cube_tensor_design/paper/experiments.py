@@ -145,7 +145,8 @@ def _protocols(body: Body) -> list[_Protocol]:
 def _first_half(experiment: Experiment, name: str) -> Experiment:
     """Return the first half of the steps of an experiment, in which a plate presses, under another
     name."""
-    columns = {key: value[: len(DISPLACEMENTS)] for key, value in vars(experiment).items()}
+    count = len(DISPLACEMENTS)
+    columns = {key: value[:count] for key, value in vars(experiment).items()}
     return Experiment(**columns | {"name": name})
 
 
@@ -180,7 +181,9 @@ def plane_estimator(response: Array) -> Array:
     Args:
         response: Response matrix (8, 7) of the pads.
     """
-    return make_estimator(response, np.ones(8), PLANE, targets=np.eye(7)).matrix
+    noise = np.ones(8)
+    estimator = make_estimator(response, noise, PLANE, targets=np.eye(7))
+    return estimator.matrix
 
 
 def foam_frequency(pads: Array) -> Array:

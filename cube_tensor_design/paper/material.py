@@ -54,7 +54,8 @@ class Material:
         """
         if not self.finite:
             strain = _strain(f)
-            return self.lam * trace(strain) * _ONE + 2 * self.mu * strain
+            volume_part = self.lam * trace(strain) * _ONE
+            return volume_part + 2 * self.mu * strain
         inverse = transpose(inv(f))
         pressure_part = self.lam * np.log(det(f)) * inverse
         return self.mu * (f - inverse) + pressure_part

@@ -126,7 +126,10 @@ def rod_shear(
             "predicted": -pads_at_rod @ force,
         }
         rows.append(row)
-    return RodShear(**{name: np.array([row[name] for row in rows]) for name in rows[0]})
+    columns = {}
+    for name in rows[0]:
+        columns[name] = np.array([row[name] for row in rows])
+    return RodShear(**columns)
 
 
 def _shear_weights(

@@ -54,8 +54,9 @@ class Section:
     def deformation(self, u: Array) -> Array:
         """Return the gradient of the deformation F = 1 + grad u (2, 2, E, Q) at the quadrature
         points."""
-        gradient = (self._gradient @ u).reshape(2, 2, *self.basis.dx.shape)
-        return gradient + np.eye(2)[:, :, None, None]
+        gradient = self._gradient @ u
+        by_component = gradient.reshape(2, 2, *self.basis.dx.shape)
+        return by_component + np.eye(2)[:, :, None, None]
 
     def balance(self, u: Array) -> Balance | None:
         """Return nodal forces (dofs,) and energy; None when an element is turned inside out."""

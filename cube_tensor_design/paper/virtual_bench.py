@@ -203,7 +203,8 @@ class VirtualBench:
             u = position.u
             if not step.gripped:
                 loose = u
-            rows.append((self._pad_stresses(u), self._state(u), self._rotation(u)))
+            pads = self._pad_stresses(u)
+            rows.append((pads, self._state(u), self._rotation(u)))
             report()
         columns = zip(*rows, strict=True)
         return BenchRun(*map(np.array, columns))
@@ -269,8 +270,8 @@ class VirtualBench:
         """
         section = self.section
         mesh = self.section.mesh
-        field = stress[:, :, None, None] + np.einsum("ijk,kep->ijep", gradient, section.points)
-        force = section.forces(field)
+        linear_part = np.einsum("ijk,keq->ijeq", gradient, section.points)
+        force = section.forces(stress[:, :, None, None] + linear_part)
         # Three unknowns stop the rigid motions; the loads balance, so they bear no force.
         centre = section.node(0.0, 0.0)
         side = section.node(1.0, 0.0)
@@ -401,7 +402,8 @@ class VirtualBench:
         true stress within d0/2 of the centre."""
         section = self.section
         is_near = np.all(np.abs(section.points) < 0.5, axis=0)
-        stress = section.material.cauchy(section.deformation(u))[:, :, is_near]
+        f = section.deformation(u)
+        stress = section.material.cauchy(f)[:, :, is_near]
         x = section.points[:, is_near]
         design = np.vstack([np.ones(x.shape[1]), x]).T
         columns = stress[[0, 1, 0], [0, 1, 1]].T  # xx, zz, zx

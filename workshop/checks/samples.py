@@ -76,7 +76,8 @@ class Samples:
         runs = [run for link in log.links for run in link.runs]
         values = [(len(run), run.boot, run.period_us) for run in runs]
         # One column each; the shape is stated because there may be no runs.
-        lengths, boots, periods_us = np.array(values, int).reshape(-1, 3).T
+        columns = np.array(values, int).reshape(-1, 3)
+        lengths, boots, periods_us = columns.T
         self.boot = np.repeat(boots, lengths)
         self.period_us = np.repeat(periods_us, lengths)
 

@@ -178,8 +178,10 @@ class _Reference:
         self._pipeline.rest_frequency = rest.values
         wanted = self._pipeline.process(measured, made.left_out)
 
-        allowed = MAX_ERROR * self._range + MAX_NOISE_SHARE * self._deviation(made)
-        allowed_residual = MAX_RESIDUAL_ERROR + MAX_RELATIVE_RESIDUAL_ERROR * wanted.residual
+        noise_part = MAX_NOISE_SHARE * self._deviation(made)
+        allowed = MAX_ERROR * self._range + noise_part
+        relative_part = MAX_RELATIVE_RESIDUAL_ERROR * wanted.residual
+        allowed_residual = MAX_RESIDUAL_ERROR + relative_part
         agrees = agree(made.residual, wanted.residual, allowed_residual)
         agrees &= agree(
             _components(made),
