@@ -3,71 +3,55 @@
 #include <math.h>
 #include <string.h>
 
-/* The compiler makes a version for vector instructions of AVX2, and the loader chooses one. Both
- * give the same bits, because neither changes the order of operations. */
+/* The compiler also makes a version with the vector instructions of AVX2, and the loader chooses.
+ * Both give the same bits. LANES states that the passes of a loop do not depend on each other. */
 #if defined(__x86_64__) && defined(__GLIBC__) && !defined(__clang__) && !defined(__SANITIZE_ADDRESS__)
-#define CLONES __attribute__((target_clones("avx2", "default")))
-#else
-#define CLONES
-#endif
-
-#ifdef __GNUC__
+#define CLONES __attribute__((target_clones("avx512f", "avx2", "default")))
 #define INLINE static inline __attribute__((always_inline))
 #define LANES _Pragma("GCC ivdep") _Pragma("GCC unroll 1")
-#define UNROLL _Pragma("GCC unroll 8")
 #else
+#define CLONES
 #define INLINE static inline
 #define LANES
-#define UNROLL
 #endif
 
-#define ROWS 32            /* rows of a block */
-#define UNKNOWN_TABLE (-1) /* of a row whose cube the skin does not have */
-
-/* Bits of core/status.py. */
-enum {
-    PAD_FAULT = 1,
-    RESIDUAL = 2,
-    INVALID = 4,
-    TEMPERATURE = 8,
-    OPEN = 16,
-    SHORT = 32,
-    RANGE = 64,
-    REPORTED = 512,
-    STAMP = 2048,
-};
-
-/* Quantities of each pad in the order of PAD_STATE in core/kernel/contract.py. */
-enum quantity {
-    LAST,
-    DIFFERENCE,
-    FIRST_SQUARES,
-    SECOND_SQUARES,
-    BOUNDED_SQUARES,
-    SUM,
-    LOWEST,
-    HIGHEST,
-    BASE,
-    BOUND,
-    LOW,
-    HIGH,
-    OPEN_FROM,
-    QUANTITIES,
-};
-
-
-_Static_assert(sizeof(cube_state) == 8 * 8, "the length in cube_scan_arrays");
-
+/* Bits of core/status.py, and limits of core/health/statistics.py. */
+enum { PAD_FAULT = 1, RESIDUAL = 2, INVALID = 4, TEMPERATURE = 8, STAMP = 2048 };
 static const int64_t GAP_NS = 50000000;
 static const double MAX_JITTER_RATIO = 1.5;
+
+/* Quantities of each pad: PAD_QUANTITIES in core/kernel/contract.py. */
+enum { LAST, DIFFERENCE, FIRST_SQUARES, SECOND_SQUARES, BOUNDED_SQUARES, SUM, LOWEST, HIGHEST };
+enum { BASE = HIGHEST + 1, BOUND, LOW, HIGH, QUANTITIES };
+
+enum { N, C, P, G, D, T, E, K, Q }; /* places of CUBE_SCAN_LETTERS */
+enum { ROWS = 32, LANES_OF_BLOCK = ROWS * CUBE_SCAN_MAX_PADS };
+
+/* Rows that are processed together: successive cubes of a scan, so that their pads lie side by side
+ * in all arrays. A step is a loop over all of them, in which a processor works on many at a time. */
+typedef struct {
+    int64_t row, cube, n_rows; /* first row and its cube */
+    float v[LANES_OF_BLOCK], rest[LANES_OF_BLOCK], highest[LANES_OF_BLOCK]; /* by row and pad */
+    float out[ROWS][CUBE_SCAN_MAX_OUTPUTS];
+    int32_t table[ROWS];
+    bool is_over_limit[ROWS];
+} block;
 
 INLINE uint32_t mask_of(int32_t pads) {
     return pads >= 32 ? UINT32_MAX : (UINT32_C(1) << pads) - 1;
 }
 
+INLINE cube_state *state_of(const cube_scan_call *call, int64_t cube) {
+    return (cube_state *)(void *)call->words + cube;
+}
+
+INLINE float *quantity(const cube_scan_call *call, int64_t number, int64_t cube) {
+    return call->quantities + (number * call->length[C] + cube) * call->length[P];
+}
+
 /* Returns the number of the table of a key, by bisection; -1 if there is none. */
-INLINE int32_t find_table(const cube_scan_call *call, int64_t key) {
-    int64_t low = 0, high = call->n_extra;
+static int32_t find_table(const cube_scan_call *call, int64_t key) {
+    int64_t low = 0, high = call->length[E];
     while (low < high) {
         const int64_t middle = (low + high) / 2;
         if (call->keys[middle] < key)
@@ -75,19 +59,136 @@ INLINE int32_t find_table(const cube_scan_call *call, int64_t key) {
         else
             high = middle;
     }
-    return low < call->n_extra && call->keys[low] == key ? call->numbers[low] : -1;
+    return low < call->length[E] && call->keys[low] == key ? call->numbers[low] : -1;
 }
 
-/* Returns whether the newest stamp of a scan lies in the window. A scan begins where the cube
- * number does not rise; other rows belong to a scan that was asked about already. */
-INLINE bool is_in_window(const cube_scan_call *call, int64_t row) {
-    if (row > 0 && call->cube[row] > call->cube[row - 1])
-        return true;
+/* Returns whether the newest stamp of the scan that begins here lies in the window. */
+static bool is_in_window(const cube_scan_call *call, int64_t row) {
     int64_t newest_ns = call->stamp_ns[row];
-    for (int64_t i = row + 1; i < call->n_rows && call->cube[i] > call->cube[i - 1]; i++)
-        newest_ns = call->stamp_ns[i] > newest_ns ? call->stamp_ns[i] : newest_ns;
+    for (row++; row < call->length[N] && call->cube[row] > call->cube[row - 1]; row++)
+        newest_ns = call->stamp_ns[row] > newest_ns ? call->stamp_ns[row] : newest_ns;
     call->window_ns[2] = newest_ns;
     return call->window_ns[0] <= newest_ns && newest_ns < call->window_ns[1];
+}
+
+/* f0 and f_highest at the temperature T of a row: both times
+ * 1 + sum_d c_d (T - reference)^d, by Horner's scheme. Without a model or T, they stay as they are. */
+static void warm_row(const cube_scan_call *call, block *b, int64_t i) {
+    const int64_t n = call->length[P], n_degrees = call->length[D];
+    const int64_t row = b->row + i, at = (b->cube + i) * n, calibration = call->calibration[b->cube + i];
+    const double reference = call->reference[calibration];
+    const double change = (double)call->temperature[row] - reference;
+    const double *c = call->coefficients + calibration * n_degrees * n;
+    for (int64_t p = 0; p < n; p++) {
+        double sum = 0;
+        for (int64_t d = n_degrees - 1; isfinite(change) && d >= 0; d--)
+            sum = (sum + c[d * n + p]) * change;
+        b->rest[i * n + p] = (float)((double)call->rest[at + p] * (1 + sum));
+        b->highest[i * n + p] = (float)((double)call->highest[at + p] * (1 + sum));
+    }
+    if (!isnan(reference) && !isfinite(change))
+        call->status[row] |= TEMPERATURE;
+}
+
+/* Pad law (Kiyota & Shinoda, eq. 6): v = (f - f0) / (f_highest - f), the stress on a pad divided by
+ * its stiffness; 0 without 0 < f < f_highest. NaN fails all comparisons.
+ *
+ * Returns the number of pads with such a frequency and, with health, one in their possible range. */
+INLINE int64_t apply_law(const cube_scan_call *call, block *b, const float *rest, const float *highest) {
+    const int64_t n_lanes = b->n_rows * call->length[P];
+    const float *f = call->frequency + b->row * call->length[P];
+    int32_t n_good = 0, n_possible = 0;
+    LANES for (int64_t l = 0; l < n_lanes; l++) {
+        const float below = highest[l] - f[l], quotient = (f[l] - rest[l]) / below;
+        const bool is_good = (f[l] > 0) & (below > 0);
+        b->v[l] = is_good ? quotient : 0;
+        n_good += is_good;
+    }
+    if (call->words == NULL)
+        return n_good;
+    const float *low = quantity(call, LOW, b->cube), *high = quantity(call, HIGH, b->cube);
+    LANES for (int64_t l = 0; l < n_lanes; l++)
+        n_possible += (f[l] > low[l]) & (f[l] < high[l]);
+    return n_good < n_possible ? n_good : n_possible;
+}
+
+/* Gets mask and conditions of a row. Returns whether a pad may be bad. */
+INLINE bool get_health(const cube_scan_call *call, int64_t row, int64_t cube) {
+    const bool has_health = call->words != NULL;
+    if (has_health && (call->known == NULL || !call->known[row])) {
+        call->left_out[row] = call->pad_fault[row] | state_of(call, cube)->mask;
+        call->status[row] = state_of(call, cube)->status;
+    }
+    call->status[row] |= call->doubt[row] & STAMP;
+    return call->left_out[row] != 0 || (has_health && call->pad_fault[row] != 0);
+}
+
+/* Finds the table of a row whose pads may be bad, and sets v of bad pads to 0. Returns a request. */
+static int64_t leave_out(const cube_scan_call *call, block *b, int64_t i, const float *highest) {
+    const int64_t n = call->length[P], row = b->row + i, cube = b->cube + i;
+    const int32_t calibration = b->table[i];
+    const uint32_t exists = mask_of(call->pads[calibration]);
+    const float *f = call->frequency + row * n;
+    uint32_t bad = call->left_out[row], impossible = 0;
+    for (int64_t p = 0; p < n; p++) {
+        const bool is_good = f[p] > 0 && highest[i * n + p] - f[p] > 0;
+        bad |= (uint32_t)!is_good << p;
+        if (call->words != NULL)
+            impossible |= (uint32_t) !(f[p] > quantity(call, LOW, cube)[p] &&
+                                       f[p] < quantity(call, HIGH, cube)[p])
+                          << p;
+    }
+    if (call->words != NULL &&
+        ((impossible | call->pad_fault[row]) & exists & ~state_of(call, cube)->found) != 0)
+        return CUBE_SCAN_CONDITION;
+    bad &= exists;
+    if (bad == 0)
+        return CUBE_SCAN_DONE;
+    for (int64_t p = 0; p < n; p++)
+        b->v[i * n + p] = bad >> p & 1 ? 0 : b->v[i * n + p];
+    const int64_t key = (int64_t)calibration << 32 | bad;
+    b->table[i] = find_table(call, key);
+    if (b->table[i] < 0)
+        return key;
+    call->left_out[row] |= bad;
+    call->status[row] |= PAD_FAULT;
+    return CUBE_SCAN_DONE;
+}
+
+/* Outputs of a row: out_k = sum over pads p of v_p * matrix_pk, in the order of the pads. */
+INLINE void multiply(const cube_scan_call *call, const float *restrict v, int32_t table, float *restrict out) {
+    const int64_t n = call->length[P], n_outputs = call->length[K];
+    for (int64_t k = 0; k < n_outputs; k += CUBE_SCAN_BLOCK) {
+        const float *m = call->matrix + table * n * n_outputs + k;
+        float sum[CUBE_SCAN_BLOCK];
+        LANES for (int j = 0; j < CUBE_SCAN_BLOCK; j++)
+            sum[j] = 0 + v[0] * m[j];
+        for (int64_t p = 1; p < n; p++) {
+            m += n_outputs;
+            LANES for (int j = 0; j < CUBE_SCAN_BLOCK; j++)
+                sum[j] += v[p] * m[j];
+        }
+        LANES for (int j = 0; j < CUBE_SCAN_BLOCK; j++)
+            out[k + j] = sum[j];
+    }
+}
+
+/* Writes a row, with residual = sqrt(chi-square / degrees of freedom), the root of a sum of squares.
+ * Returns whether the residual is above its limit. */
+INLINE bool write_row(const cube_scan_call *call, int64_t row, const float *out, int32_t table) {
+    float squares = 0;
+    for (int64_t k = CUBE_SCAN_COMPONENTS; k < CUBE_SCAN_COMPONENTS + call->n_residuals; k++)
+        squares += out[k] * out[k];
+    const float residual = sqrtf(squares);
+    const size_t n_gradient = CUBE_SCAN_COMPONENTS - CUBE_SCAN_STRESS;
+    memcpy(call->stress + row * CUBE_SCAN_STRESS, out, CUBE_SCAN_STRESS * sizeof *out);
+    memcpy(call->gradient + row * (int64_t)n_gradient, out + CUBE_SCAN_STRESS, n_gradient * sizeof *out);
+    call->residual[row] = residual;
+    call->row_observed[row] = table < 0 ? 0 : call->observed[table];
+    const bool is_over_limit = table >= 0 && residual > call->limit[table];
+    call->status[row] |= is_over_limit ? RESIDUAL : 0;
+    call->status[row] |= call->row_observed[row] == 0 ? INVALID : 0;
+    return is_over_limit;
 }
 
 INLINE uint64_t magnitude(int64_t value) {
@@ -99,122 +200,175 @@ INLINE uint64_t magnitude(int64_t value) {
  *     r = interval / interval before,   w = 6 / (1 + (1 + r)^2 + r^2)
  *
  * r = 1 if both are equal up to jitter. w = 0 if an interval is a gap, or a stamp doubtful. */
-INLINE void measure_pace(
-    cube_state *state, int64_t stamp_ns, bool is_doubtful, float *ratio, float *weight) {
+INLINE void measure_pace(cube_state *state, int64_t stamp_ns, bool is_doubtful, float *r, float *w) {
     const int64_t between = (int64_t)((uint64_t)stamp_ns - (uint64_t)state->time_ns);
     const int64_t before = state->interval_ns;
     const int64_t now = is_doubtful || state->is_doubtful != 0 ? 0 : between;
     state->time_ns = stamp_ns;
     state->interval_ns = now;
     state->is_doubtful = is_doubtful;
-
     if (between < 0 || between >= GAP_NS) {
         if (state->rows == 0)
-            state->gap_before_ns = between;
-        else if (magnitude(between) > magnitude(state->gap_within_ns))
-            state->gap_within_ns = between;
+            state->gap_before = between;
+        else if (magnitude(between) > magnitude(state->gap_within))
+            state->gap_within = between;
     }
     const int64_t shorter = now < before ? now : before, longer = now < before ? before : now;
     const bool is_known = shorter > 0 && longer < GAP_NS;
-    const bool is_even = (double)longer < MAX_JITTER_RATIO * (double)shorter;
-    *ratio = 1;
-    *weight = is_known ? 1 : 0;
-    if (is_known && !is_even) {
-        const double r = (double)now / (double)before;
-        *ratio = (float)r;
-        *weight = (float)(6 / (1 + (1 + r) * (1 + r) + r * r));
+    *r = 1;
+    *w = is_known ? 1 : 0;
+    if (is_known && !((double)longer < MAX_JITTER_RATIO * (double)shorter)) {
+        const double ratio = (double)now / (double)before;
+        *r = (float)ratio;
+        *w = (float)(6 / (1 + (1 + ratio) * (1 + ratio) + ratio * ratio));
     }
 }
 
-#define REAL float
-#define NAME(x) x##_float
-#define ROOT sqrtf
-#include "cube_scan_rows.h"
-#undef REAL
-#undef NAME
-#undef ROOT
-#define REAL double
-#define NAME(x) x##_double
-#define ROOT sqrt
-#include "cube_scan_rows.h"
+/* Sums of the window of health; core/health/statistics.py has the equations.
+ *
+ * d = f[n] - f[n-1],   e = d[n] - r d[n-1],   sums of d^2, w e^2, min(w e^2, bound) and f - base. */
+INLINE void add_to_window(const cube_scan_call *call, block *b) {
+    const int64_t n = call->length[P], n_lanes = b->n_rows * n, cube = b->cube;
+    float *ratio = b->rest, *weight = b->highest; /* not used any more */
+    for (int64_t i = 0; i < b->n_rows; i++) {
+        cube_state *state = state_of(call, cube + i);
+        const int64_t row = b->row + i;
+        float r, w;
+        measure_pace(state, call->stamp_ns[row], (call->doubt[row] & STAMP) != 0, &r, &w);
+        for (int64_t p = 0; p < n; p++) {
+            ratio[i * n + p] = r;
+            weight[i * n + p] = w;
+        }
+        state->temperature = call->temperature[row];
+        state->rows++;
+        state->over_limit += b->is_over_limit[i];
+    }
+    const float *frequency = call->frequency + b->row * n;
+    float *last = quantity(call, LAST, cube), *difference = quantity(call, DIFFERENCE, cube);
+    float *first_squares = quantity(call, FIRST_SQUARES, cube);
+    float *second_squares = quantity(call, SECOND_SQUARES, cube);
+    float *bounded_squares = quantity(call, BOUNDED_SQUARES, cube), *sum = quantity(call, SUM, cube);
+    float *lowest = quantity(call, LOWEST, cube), *highest = quantity(call, HIGHEST, cube);
+    const float *base = quantity(call, BASE, cube), *bound = quantity(call, BOUND, cube);
+    LANES for (int64_t l = 0; l < n_lanes; l++) {
+        const float f = frequency[l], d = f - last[l], e = d - ratio[l] * difference[l];
+        const float square = e * e * weight[l];
+        second_squares[l] += square;
+        bounded_squares[l] += square > bound[l] ? bound[l] : square; /* NaN stays NaN */
+        first_squares[l] += d * d;
+        sum[l] += f - base[l];
+        lowest[l] = f < lowest[l] ? f : lowest[l]; /* NaN is ignored */
+        highest[l] = f > highest[l] ? f : highest[l];
+        difference[l] = d;
+        last[l] = f;
+    }
+}
+
+/* Rows of a cube that the skin does not have. */
+static void write_unknown(const cube_scan_call *call, int64_t row) {
+    float out[CUBE_SCAN_MAX_OUTPUTS];
+    for (int k = 0; k < CUBE_SCAN_MAX_OUTPUTS; k++)
+        out[k] = NAN;
+    write_row(call, row, out, -1);
+    call->status[row] |= call->doubt[row] & STAMP;
+}
+
+/* Processes the rows of a block, or those before the first whose table is missing. */
+INLINE int64_t process_block(const cube_scan_call *call, block *b) {
+    const int64_t n = call->length[P];
+    const float *rest = call->rest + b->cube * n, *highest = call->highest + b->cube * n;
+    bool is_doubtful = false;
+    int64_t n_pads = 0, request = CUBE_SCAN_DONE;
+    for (int64_t i = 0; i < b->n_rows; i++) {
+        b->table[i] = call->calibration[b->cube + i];
+        n_pads += call->pads[b->table[i]];
+        is_doubtful |= get_health(call, b->row + i, b->cube + i);
+    }
+    if (call->length[D] > 0) {
+        for (int64_t i = 0; i < b->n_rows; i++)
+            warm_row(call, b, i);
+        rest = b->rest;
+        highest = b->highest;
+    }
+    if (apply_law(call, b, rest, highest) != n_pads || is_doubtful)
+        for (int64_t i = 0; i < b->n_rows; i++) {
+            request = leave_out(call, b, i, highest);
+            if (request != CUBE_SCAN_DONE)
+                b->n_rows = i;
+        }
+    for (int64_t i = 0; i < b->n_rows; i++)
+        multiply(call, b->v + i * n, b->table[i], b->out[i]);
+    for (int64_t i = 0; i < b->n_rows; i++)
+        b->is_over_limit[i] = write_row(call, b->row + i, b->out[i], b->table[i]);
+    if (call->words != NULL)
+        add_to_window(call, b);
+    return request;
+}
+
+CLONES static int64_t process(const cube_scan_call *call, int64_t start, int64_t *request) {
+    const uint16_t *cube = call->cube;
+    block b;
+    *request = CUBE_SCAN_DONE;
+    for (b.row = start; b.row < call->length[N] && *request == CUBE_SCAN_DONE; b.row += b.n_rows) {
+        b.cube = cube[b.row];
+        b.n_rows = 1;
+        if (b.cube >= call->length[C]) {
+            write_unknown(call, b.row);
+            continue;
+        }
+        /* A scan begins where the cube number does not rise. */
+        const bool is_begin = b.row == 0 || cube[b.row] <= cube[b.row - 1];
+        if (call->words != NULL && is_begin && !is_in_window(call, b.row)) {
+            *request = CUBE_SCAN_WINDOW;
+            return b.row;
+        }
+        while (b.n_rows < ROWS && b.row + b.n_rows < call->length[N] &&
+               cube[b.row + b.n_rows] == b.cube + b.n_rows && b.cube + b.n_rows < call->length[C])
+            b.n_rows++;
+        *request = process_block(call, &b);
+    }
+    return b.row;
+}
 
 int64_t cube_scan(const cube_scan_call *call, int64_t start, int64_t *request) {
+    const int64_t n_outputs = call->length[K];
+    const bool has_health = call->words != NULL;
+    if (start < 0 || call->length[P] > CUBE_SCAN_MAX_PADS || n_outputs % CUBE_SCAN_BLOCK != 0 ||
+        n_outputs > CUBE_SCAN_MAX_OUTPUTS || call->n_residuals > n_outputs - CUBE_SCAN_COMPONENTS ||
+        (call->quantities != NULL) != has_health || (call->window_ns != NULL) != has_health)
+        return -1;
     /* A call with a cube that the skin does not have is refused before it changes any state. */
     bool is_unknown = false;
-    for (int64_t row = start; call->cubes != NULL && row < call->n_rows; row++)
-        is_unknown |= call->cube[row] >= call->n_cubes;
-    if (is_unknown) {
-        *request = CUBE_SCAN_UNKNOWN_CUBE;
-        return start;
+    for (int64_t row = start; has_health && row < call->length[N]; row++)
+        is_unknown |= call->cube[row] >= call->length[C];
+    *request = CUBE_SCAN_UNKNOWN_CUBE;
+    return is_unknown ? start : process(call, start, request);
+}
+
+#define ARRAY(type, name, kind, shape, use) \
+    {#name, shape, offsetof(cube_scan_call, name), sizeof(type), kind, CUBE_SCAN_##use},
+const cube_scan_array cube_scan_arrays[CUBE_SCAN_N_ARRAYS] = {CUBE_SCAN_ARRAYS(ARRAY)};
+_Static_assert(sizeof(cube_state) == 8 * 8, "the shape of words");
+
+cube_scan_call cube_scan_begin(void) {
+    cube_scan_call call = {0};
+    for (size_t i = 0; i < sizeof call.length / sizeof *call.length; i++)
+        call.length[i] = -1;
+    call.length[Q] = QUANTITIES;
+    return call;
+}
+
+bool cube_scan_set(
+    cube_scan_call *call, size_t number, void *address, const int64_t *shape, size_t n_axes) {
+    const cube_scan_array *array = &cube_scan_arrays[number];
+    memcpy((char *)call + array->offset, &address, sizeof address);
+    for (size_t axis = 0; axis < n_axes; axis++) {
+        const char *letter = strchr(CUBE_SCAN_LETTERS, array->shape[axis]);
+        int64_t fixed = array->shape[axis] - '0';
+        int64_t *length = letter == NULL ? &fixed : &call->length[letter - CUBE_SCAN_LETTERS];
+        *length = *length < 0 ? shape[axis] : *length;
+        if (*length != shape[axis])
+            return false;
     }
-    return (call->is_double ? process_double : process_float)(call, start, request);
+    return n_axes == strlen(array->shape);
 }
-
-/* ------------------------------------------------------------------------------ arrays -------- */
-
-/* Letters: N rows, C cubes, P pads, G calibrations, D degrees, T tables, E extra tables, K outputs,
- * Q quantities; digits stand for themselves. */
-int64_t *cube_scan_length(cube_scan_call *call, char letter) {
-    switch (letter) {
-    case 'N': return &call->n_rows;
-    case 'C': return &call->n_cubes;
-    case 'P': return &call->n_pads;
-    case 'G': return &call->n_calibrations;
-    case 'D': return &call->n_degrees;
-    case 'T': return &call->n_tables;
-    case 'E': return &call->n_extra;
-    case 'K': return &call->n_outputs;
-    case 'Q': return &call->n_quantities;
-    default: return NULL;
-    }
-}
-
-void cube_scan_begin(cube_scan_call *call) {
-    *call = (cube_scan_call){.n_quantities = QUANTITIES};
-    for (const char *letter = "NCPGDTEK"; *letter != '\0'; letter++)
-        *cube_scan_length(call, *letter) = -1;
-}
-
-bool cube_scan_fits(const cube_scan_call *call, int64_t start) {
-    const bool has_health = call->cubes != NULL;
-    return start >= 0 && call->n_pads <= CUBE_SCAN_MAX_PADS &&
-           call->n_outputs % CUBE_SCAN_BLOCK == 0 && call->n_outputs <= CUBE_SCAN_MAX_OUTPUTS &&
-           call->n_residuals >= 0 &&
-           call->n_residuals <= call->n_outputs - CUBE_SCAN_COMPONENTS &&
-           (call->quantities != NULL) == has_health && (call->found != NULL) == has_health &&
-           (call->window_ns != NULL) == has_health;
-}
-
-#define ARRAY(name, kind, size, shape, is_result, may_be_none) \
-    {#name, offsetof(cube_scan_call, name), kind, size, shape, is_result, may_be_none}
-const cube_scan_array cube_scan_arrays[] = {
-    ARRAY(calibration, 'i', 4, "C", false, false),
-    ARRAY(pads, 'i', 4, "G", false, false),
-    ARRAY(rest, 'R', 0, "CP", false, false),
-    ARRAY(highest, 'R', 0, "CP", false, false),
-    ARRAY(reference, 'f', 8, "G", false, false),
-    ARRAY(coefficients, 'f', 8, "GDP", false, false),
-    ARRAY(matrix, 'R', 0, "TPK", false, false),
-    ARRAY(limit, 'R', 0, "T", false, false),
-    ARRAY(observed, 'u', 2, "T", false, false),
-    ARRAY(keys, 'i', 8, "E", false, false),
-    ARRAY(numbers, 'i', 4, "E", false, false),
-    ARRAY(cubes, 'i', 8, "C8", true, true), /* 8 words of 8 bytes are a cube_state */
-    ARRAY(quantities, 'f', 4, "CQP", true, true),
-    ARRAY(found, 'u', 2, "CP", true, true),
-    ARRAY(window_ns, 'i', 8, "3", true, true),
-    ARRAY(cube, 'u', 2, "N", false, false),
-    ARRAY(frequency, 'R', 0, "NP", false, false),
-    ARRAY(temperature, 'f', 4, "N", false, false),
-    ARRAY(pad_fault, 'u', 4, "N", false, false),
-    ARRAY(stamp_ns, 'i', 8, "N", false, false),
-    ARRAY(doubt, 'u', 2, "N", false, false),
-    ARRAY(known, 'b', 1, "N", false, true),
-    ARRAY(stress, 'R', 0, "N6", true, false),
-    ARRAY(gradient, 'R', 0, "N9", true, false),
-    ARRAY(residual, 'R', 0, "N", true, false),
-    ARRAY(status, 'u', 2, "N", true, false),
-    ARRAY(row_observed, 'u', 2, "N", true, false),
-    ARRAY(left_out, 'u', 4, "N", true, false),
-};
-const size_t cube_scan_n_arrays = sizeof cube_scan_arrays / sizeof *cube_scan_arrays;

@@ -1,16 +1,13 @@
 /* The Python module cube_tensor_driver._scan: cube_scan.h for cube_tensor_driver/core/kernel.
  *
  * Plain C API of Python, limited to the stable ABI of 3.10. Arrays of numpy come by their attribute
- * __array_struct__, so that no header of numpy is needed. */
+ * __array_struct__ (numpy, "The array interface protocol"), so that no header of numpy is needed. */
 #define PY_SSIZE_T_CLEAN
 #define Py_LIMITED_API 0x030A0000
 #include <Python.h>
 
 #include "cube_scan.h"
 
-#include <string.h>
-
-/* PyArrayInterface of numpy ("The array interface protocol", C-struct access), version 3. */
 typedef struct {
     int two, n_axes;
     char kind;
@@ -20,77 +17,45 @@ typedef struct {
     PyObject *descr;
 } array_interface;
 
-#define C_CONTIGUOUS 0x1
-#define ALIGNED 0x100
-#define NATIVE_ORDER 0x200
-#define WRITEABLE 0x400
+/* Flags: contiguous, aligned, in the byte order of the machine; and writeable. */
+enum { READABLE = 0x1 | 0x100 | 0x200, WRITEABLE = 0x400 };
 
-/* Checks one array, and stores its address and its lengths in the call. false: it does not fit. */
-static bool store_array(
-    const array_interface *array, const cube_scan_array *wanted, cube_scan_call *call) {
-    const int needed = C_CONTIGUOUS | ALIGNED | NATIVE_ORDER | (wanted->is_result ? WRITEABLE : 0);
-    const bool is_real = wanted->kind == 'R';
-    const size_t real = call->is_double ? sizeof(double) : sizeof(float);
-    if (array->two != 2 || (array->flags & needed) != needed ||
-        array->kind != (is_real ? 'f' : wanted->kind) ||
-        (size_t)array->size != (is_real ? real : wanted->size) ||
-        (size_t)array->n_axes != strlen(wanted->shape))
+/* Stores one array in the call. false: it does not fit. */
+static bool store(cube_scan_call *call, size_t number, const array_interface *array) {
+    const cube_scan_array *wanted = &cube_scan_arrays[number];
+    const bool is_written = wanted->use == CUBE_SCAN_STATE || wanted->use == CUBE_SCAN_RESULT;
+    const int flags = READABLE | (is_written ? WRITEABLE : 0);
+    int64_t shape[4];
+    if ((array->flags & flags) != flags || array->kind != wanted->kind ||
+        (size_t)array->size != wanted->size || array->n_axes > 4)
         return false;
-    for (int axis = 0; axis < array->n_axes; axis++) {
-        const char letter = wanted->shape[axis];
-        int64_t fixed = letter - '0';
-        int64_t *length = cube_scan_length(call, letter);
-        if (length == NULL)
-            length = &fixed;
-        else if (*length < 0)
-            *length = array->shape[axis];
-        if (*length != array->shape[axis])
-            return false;
-    }
-    memcpy((char *)call + wanted->offset, &array->data, sizeof array->data);
-    return true;
+    for (int axis = 0; axis < array->n_axes; axis++)
+        shape[axis] = array->shape[axis];
+    return cube_scan_set(call, number, array->data, shape, (size_t)array->n_axes);
 }
 
 static PyObject *run(PyObject *module, PyObject *args) {
     (void)module;
-    const Py_ssize_t n_arrays = (Py_ssize_t)cube_scan_n_arrays;
-    if (PyTuple_Size(args) != n_arrays + 3) {
-        PyErr_Format(PyExc_TypeError, "run takes %zd arguments", n_arrays + 3);
-        return NULL;
-    }
-    const long long start = PyLong_AsLongLong(PyTuple_GetItem(args, 0));
-    cube_scan_call call;
-    cube_scan_begin(&call);
+    if (PyTuple_Size(args) != CUBE_SCAN_N_ARRAYS + 2)
+        return PyErr_Format(PyExc_TypeError, "run takes %d arguments", CUBE_SCAN_N_ARRAYS + 2);
+    cube_scan_call call = cube_scan_begin();
+    int64_t request, row = PyLong_AsLongLong(PyTuple_GetItem(args, 0));
     call.n_residuals = PyLong_AsLongLong(PyTuple_GetItem(args, 1));
-    call.is_double = PyObject_IsTrue(PyTuple_GetItem(args, 2)) == 1;
-    if (PyErr_Occurred())
-        return NULL;
-    for (Py_ssize_t i = 0; i < n_arrays; i++) {
-        const cube_scan_array *wanted = &cube_scan_arrays[i];
-        PyObject *object = PyTuple_GetItem(args, i + 3);
-        if (object == Py_None && wanted->may_be_none)
+    for (size_t i = 0; i < CUBE_SCAN_N_ARRAYS && !PyErr_Occurred(); i++) {
+        PyObject *object = PyTuple_GetItem(args, (Py_ssize_t)i + 2);
+        const enum cube_scan_use use = cube_scan_arrays[i].use;
+        if (object == Py_None && (use == CUBE_SCAN_STATE || use == CUBE_SCAN_OPTION))
             continue;
         PyObject *capsule = PyObject_GetAttrString(object, "__array_struct__");
-        if (capsule == NULL)
-            return NULL;
-        const array_interface *array = PyCapsule_GetPointer(capsule, NULL);
+        const array_interface *array = capsule == NULL ? NULL : PyCapsule_GetPointer(capsule, NULL);
         /* The tuple of arguments holds the array, so that its memory outlives the capsule. */
-        const bool fits = array != NULL && store_array(array, wanted, &call);
-        Py_DECREF(capsule);
-        if (PyErr_Occurred())
-            return NULL;
-        if (!fits) {
-            PyErr_Format(PyExc_ValueError, "array %s has another type or shape", wanted->name);
-            return NULL;
-        }
+        if (array != NULL && !store(&call, i, array))
+            PyErr_Format(PyExc_ValueError, "array %s does not fit", cube_scan_arrays[i].name);
+        Py_XDECREF(capsule);
     }
-    if (!cube_scan_fits(&call, start)) {
-        PyErr_SetString(PyExc_ValueError, "the lengths or arrays of a call do not fit together");
-        return NULL;
-    }
-    int64_t request;
-    const int64_t row = cube_scan(&call, start, &request);
-    return Py_BuildValue("LL", (long long)row, (long long)request);
+    if (!PyErr_Occurred() && (row = cube_scan(&call, row, &request)) < 0)
+        PyErr_SetString(PyExc_ValueError, "the arrays do not fit together");
+    return PyErr_Occurred() ? NULL : Py_BuildValue("LL", (long long)row, (long long)request);
 }
 
 static PyMethodDef functions[] = {{"run", run, METH_VARARGS, NULL}, {NULL, NULL, 0, NULL}};

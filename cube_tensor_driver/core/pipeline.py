@@ -25,6 +25,7 @@ from .estimator import FALSE_ALARM, Estimator, chi2_limit, make_estimator
 from .kernel.contract import (
     BLOCK,
     DONE,
+    NEEDS_CONDITION,
     NEEDS_WINDOW,
     UNKNOWN_CUBE,
     Columns,
@@ -76,6 +77,9 @@ class Watch(Protocol):
 
     def advance(self) -> None:
         """End the present window, because the next scan lies outside it, and start another."""
+
+    def find_conditions(self, tables: Tables, columns: Columns, row: int) -> None:
+        """Find conditions of pads that a row and the next ones of its scan show."""
 
 
 class Pipeline:
@@ -211,8 +215,11 @@ class Pipeline:
         columns = self._read_columns(rows, known)
         if out is None:
             out = self.make_rows(rows)
-        out.left_out[:] = rows.pad_fault if left_out is None else left_out
-        results = Results(*(getattr(out, name) for name in Results._fields))
+        if watch is None or known is not None:
+            out.left_out[:] = rows.pad_fault if left_out is None else left_out
+        results = Results(
+            out.stress, out.gradient, out.residual, out.status, out.observed, out.left_out
+        )
         sums = watch.sums if watch else None
         row, request = 0, DONE
         while row < len(rows):
@@ -221,6 +228,8 @@ class Pipeline:
                 raise self._misfit(rows)
             if request == NEEDS_WINDOW and watch:
                 watch.advance()
+            elif request == NEEDS_CONDITION and watch:
+                watch.find_conditions(self._tables, columns, row)
             elif request != DONE:
                 self._add_table(request)
         return out
@@ -349,13 +358,13 @@ class Pipeline:
             is_possible = (cube >= 0) & (cube < UNKNOWN)
             cube = np.where(is_possible, cube, UNKNOWN).astype(np.uint16)
         return Columns(
-            cube=np.ascontiguousarray(cube),
-            frequency=frequency,
-            temperature=np.ascontiguousarray(rows.temperature, np.float32),
-            pad_fault=np.ascontiguousarray(rows.pad_fault, np.uint32),
-            stamp_ns=np.ascontiguousarray(rows.stamp_ns, np.int64),
-            doubt=np.ascontiguousarray(rows.status, np.uint16),
-            known=known,
+            np.ascontiguousarray(cube),
+            frequency,
+            np.ascontiguousarray(rows.temperature, np.float32),
+            np.ascontiguousarray(rows.pad_fault, np.uint32),
+            np.ascontiguousarray(rows.stamp_ns, np.int64),
+            np.ascontiguousarray(rows.status, np.uint16),
+            known,
         )
 
     def _misfit(self, rows: FrequencyRows) -> LayoutError:

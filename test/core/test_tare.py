@@ -31,7 +31,7 @@ class Skin:
     """Three cubes whose pads' frequencies a test gives."""
 
     def __init__(self, calibration=CALIBRATION, noise=NOISE):
-        self.pipeline = Pipeline([calibration] * 3)
+        self.pipeline = Pipeline([calibration] * 3, np.float32)
         self.health = Health(self.pipeline)
         self.tracker = DriftTracker(self.pipeline, self.health)
         self.seconds = 0.0

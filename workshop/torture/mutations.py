@@ -277,10 +277,10 @@ def _never_release(
     found: Any,
     came: Any,
 ) -> None:
-    # `_earlier` holds the conditions of the last windows, the newest first. They must not age.
+    # `_recent` holds the conditions of the last windows, the newest first. They must not age.
     kept = conditions.state | found
     original(conditions, found, came)
-    conditions._earlier[0] |= kept
+    conditions._recent[0] |= kept
 
 
 def _use_bad_pads(

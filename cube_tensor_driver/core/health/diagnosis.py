@@ -10,7 +10,7 @@ import numpy as np
 from ..arrays import Array, Index, Mask, Real, StatusBits
 from ..kernel.contract import HealthState
 from ..kernel.rows import pack_bits
-from ..status import DRIFT, LEFT_OUT, NOISY, OPEN, RANGE, SHORT, STUCK
+from ..status import DRIFT, LEFT_OUT, NOISY, OPEN, RANGE, REPORTED, SHORT, STUCK
 from .statistics import Window
 
 HOLD_WINDOWS = 3
@@ -82,26 +82,46 @@ The shift is measured from the mean frequency at the time at which the cube came
 """
 
 
+SHOWN = OPEN | SHORT | RANGE | REPORTED
+"""Conditions of a pad that a single row (sample of a cube) shows."""
+
+
 class Conditions:
     """Present conditions (such as open, stuck or noisy) of all pads of a skin.
 
-    A condition ends when `HOLD_WINDOWS` successive windows were without it. The kernel adds the
-    conditions that single rows show in the present window, to `HealthState.found` and to the mask
-    and status of the cube.
+    A condition ends when `HOLD_WINDOWS` successive windows were without it.
     """
 
-    def __init__(self, sums: HealthState) -> None:
+    def __init__(self, sums: HealthState, exists: Mask) -> None:
         self._sums = sums
-        # Row 0 holds the conditions found in the window before the present one, the next rows those
-        # of the windows before it.
-        self._earlier = np.zeros((HOLD_WINDOWS, *sums.found.shape), np.uint16)
-        self._since_collected = np.zeros_like(sums.found)
+        # Row 0 holds the conditions found in the present window, the next rows those of the windows
+        # before it.
+        shape = (HOLD_WINDOWS + 1, *exists.shape)
+        self._recent = np.zeros(shape, np.uint16)
+        self._since_collected = np.zeros_like(self._recent[0])
 
     @property
     def state(self) -> StatusBits:
         """Conditions of each pad (cubes, P), bits of `status.py`."""
-        state: StatusBits = np.bitwise_or.reduce(self._earlier, axis=0) | self._sums.found
+        state: StatusBits = np.bitwise_or.reduce(self._recent, axis=0)
         return state
+
+    def add(self, cube: Index, bits: StatusBits) -> None:
+        """Add conditions that rows of the present window show.
+
+        Only the first condition of a pad in a window is added: a broken pad shows it in every row.
+
+        Args:
+            cube: Numbers of different cubes (n,).
+            bits: Conditions of their pads (n, P), bits of `status.py`.
+        """
+        cubes = self._sums.cubes
+        bits = np.where(self._recent[0][cube] & SHOWN, 0, bits)
+        self._recent[0][cube] |= bits
+        pads = pack_bits(bits > 0)
+        cubes["found"][cube] |= pads
+        cubes["mask"][cube] |= pads
+        cubes["status"][cube] |= np.bitwise_or.reduce(bits, axis=1)
 
     def end_window(self, found: StatusBits, has_rows: Mask) -> None:
         """Add the conditions that the statistics of a window show, and start the next window.
@@ -110,16 +130,16 @@ class Conditions:
             found: Conditions found in the window that ends (cubes, P).
             has_rows: Whether a cube had rows in this window (cubes,).
         """
-        present = self._sums.found
-        present |= found
-        self._since_collected |= self.state
-        # A cube without rows keeps its conditions, because nothing shows that its pads recovered.
-        self._earlier[1:, has_rows] = self._earlier[:-1, has_rows]
-        self._earlier[0, has_rows] = present[has_rows]
-        present[has_rows] = 0
+        self._recent[0] |= found
         state = self.state
-        self._sums.cubes["mask"] = pack_bits(state & LEFT_OUT > 0)
-        self._sums.cubes["status"] = np.bitwise_or.reduce(state, axis=1)
+        self._since_collected |= state
+        # A cube without rows keeps its conditions, because nothing shows that its pads recovered.
+        self._recent[1:, has_rows] = self._recent[:-1, has_rows]
+        self._recent[0, has_rows] = 0
+        cubes, state = self._sums.cubes, self.state
+        cubes["found"][has_rows] = 0
+        cubes["mask"] = pack_bits(state & LEFT_OUT > 0)
+        cubes["status"] = np.bitwise_or.reduce(state, axis=1)
 
     def collect(self) -> StatusBits:
         """Return all conditions (cubes, P) that a pad had at any time since the last call."""

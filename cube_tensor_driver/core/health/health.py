@@ -13,8 +13,11 @@ from collections import deque
 import numpy as np
 
 from ..arrays import Array, Index, Mask, PadMasks, Single, StatusBits, Times, pad_table
+from ..kernel.contract import Columns, Tables
+from ..kernel.rows import find_impossible, mask_bits
 from ..oscillator import pad_frequency, stress_slope
 from ..pipeline import Pipeline
+from ..status import OPEN, RANGE, REPORTED, SHORT
 from .diagnosis import Conditions, PadDiagnosis, has_high_residual
 from .statistics import WINDOW_S, Window, clear_sums, make_state, make_window
 
@@ -74,8 +77,9 @@ class Health:
         n_cubes = len(pipeline.calibrations)
         rest = pipeline.rest_frequency
         self.sums = make_state(rest)
-        self._conditions = Conditions(self.sums)
-        self._diagnosis = PadDiagnosis(~np.isnan(rest))
+        exists = ~np.isnan(rest)
+        self._conditions = Conditions(self.sums, exists)
+        self._diagnosis = PadDiagnosis(exists)
         self.high_residual = np.zeros(n_cubes, bool)
         self.history: deque[Window] = deque(maxlen=HISTORY_WINDOWS)
         self.closed = 0
@@ -144,9 +148,9 @@ class Health:
         modulus = pad_table([c.modulus for c in calibrations], n_pads, fill=1.0)
         noise = pad_table([c.noise for c in calibrations], n_pads, fill=1.0)
         rest = self.pipeline.rest_frequency
-        strains = {"low": MIN_STRAIN, "high": MAX_STRAIN, "open": OPEN_STRAIN}
-        for name, strain in strains.items():
+        for name, strain in {"low": MIN_STRAIN, "high": MAX_STRAIN}.items():
             self.sums.pads(name)[:] = pad_frequency(strain * modulus, rest, beta, modulus)
+        self._open = pad_frequency(OPEN_STRAIN * modulus, rest, beta, modulus).astype(np.float32)
         slope = stress_slope(rest, rest, beta, modulus)
         self._diagnosis.set_reference(rest, noise / slope)
 
@@ -162,6 +166,27 @@ class Health:
         clear_sums(self.sums)
         end_ns = newest_ns + WINDOW_NS
         self.sums.window_ns[:2] = end_ns - MAX_BACKWARD_NS, end_ns
+
+    def find_conditions(self, tables: Tables, columns: Columns, row: int) -> None:
+        """Add the conditions OPEN, SHORT, RANGE and REPORTED that rows of one scan show.
+
+        Args:
+            tables: Tables of the skin.
+            columns: Rows.
+            row: Number of the first row that shows a condition, and of its scan on.
+        """
+        is_end = columns.cube[row + 1 :] <= columns.cube[row:-1]
+        count = int(np.argmax(is_end)) if is_end.any() else len(is_end)
+        rows = columns.select(slice(row, row + 1 + count))
+        cube, f = rows.cube.astype(np.intp), rows.frequency.astype(np.float32)
+        reported = mask_bits(tables, tables.calibration[cube], rows.pad_fault)
+        bits = np.where(f >= self._open[cube], OPEN, RANGE)
+        bits = np.where(f > 0, bits, SHORT)  # NaN is no frequency, too
+        low, high = self.sums.pads("low")[cube], self.sums.pads("high")[cube]
+        bits[(f > low) & (f < high)] = 0
+        bits |= reported * REPORTED
+        bits[~find_impossible(tables, self.sums, rows, cube)] = 0
+        self._conditions.add(cube, bits.astype(np.uint16))
 
     def collect(self) -> tuple[StatusBits, Mask, Index]:
         """Return what was found and counted since the last call of this method.

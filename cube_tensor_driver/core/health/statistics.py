@@ -97,11 +97,10 @@ def make_state(rest_frequency: Array) -> HealthState:
             enough only for the differences.
     """
     n_cubes, n_pads = rest_frequency.shape
-    shape = n_cubes, len(PAD_QUANTITIES), n_pads
+    shape = len(PAD_QUANTITIES), n_cubes, n_pads
     state = HealthState(
         words=np.zeros((n_cubes, CUBE_STATE.itemsize // 8), np.int64),
         quantities=np.full(shape, np.nan, np.float32),
-        found=np.zeros((n_cubes, n_pads), np.uint16),
         window_ns=np.array([1, 0, 0]),  # holds no time, so that the first row opens a window
     )
     state.cubes["temperature"] = np.nan

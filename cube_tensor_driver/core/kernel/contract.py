@@ -29,7 +29,11 @@ DONE = -1
 NEEDS_WINDOW = -2
 """Request of the kernel: the next scan lies outside the present window of health; open another."""
 
-UNKNOWN_CUBE = -3
+NEEDS_CONDITION = -3
+"""Request of the kernel: a pad of the next row has an impossible frequency, or the device reports a
+fault of it, and no condition of this pad was found in the present window yet; find it."""
+
+UNKNOWN_CUBE = -4
 """Request of the kernel: a row has the number of a cube that the skin does not have, so its health
 cannot be found. No row of the call is processed."""
 
@@ -43,18 +47,20 @@ CUBE_STATE = np.dtype(
             "rows",
             "over_limit",
             "mask",
+            "found",
             "temperature",
             "status",
             "is_doubtful",
         ],
-        "formats": ["i8"] * 6 + ["u4", "f4", "u2", "u2"],
+        "formats": ["i8"] * 6 + ["u4", "u4", "f4", "u2", "u2"],
     },
     align=True,
 )
 """State of the health of one cube: newest time stamp and interval between the newest two rows, in
 ns; longest gap before and within the present window, in ns; number of rows in the window, and of
-those with a residual above its limit; mask of the pads that are not used; temperature in °C;
-conditions of all pads; and whether the newest time stamp is doubtful."""
+those with a residual above its limit; masks of the pads that are not used, and of those with a
+condition that a row of the window showed; temperature in °C; conditions of all pads; and whether
+the newest time stamp is doubtful."""
 
 PAD_QUANTITIES = (
     "last",
@@ -69,7 +75,6 @@ PAD_QUANTITIES = (
     "bound",
     "low",
     "high",
-    "open",
 )
 """Quantities in the state of the health of a pad, in their order: newest frequency and difference
 to the one before; the sums of `statistics.py` over the present window; lowest and highest frequency
@@ -116,14 +121,12 @@ class HealthState(NamedTuple):
 
     Attributes:
         words: Memory of `cubes` (C, 8), because numpy passes no structured arrays to C.
-        quantities: Quantities of each pad (C, 13, P), in the order of `PAD_QUANTITIES`.
-        found: Conditions of each pad that rows of the present window showed (C, P).
+        quantities: Quantities of each pad (12, C, P), in the order of `PAD_QUANTITIES`.
         window_ns: Begin and end of the present window, and newest time stamp of the last scan (3,).
     """
 
     words: Times
     quantities: Single
-    found: StatusBits
     window_ns: Times
 
     @property
@@ -134,7 +137,7 @@ class HealthState(NamedTuple):
 
     def pads(self, name: str) -> Single:
         """Return the quantity of all pads (C, P) with a name of `PAD_QUANTITIES`, as a view."""
-        view: Single = self.quantities[:, PAD_QUANTITIES.index(name)]
+        view: Single = self.quantities[PAD_QUANTITIES.index(name)]
         return view
 
 

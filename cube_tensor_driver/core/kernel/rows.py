@@ -10,23 +10,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..arrays import AnyArray, Array, Index, Mask, Real, Single, Times, multiply
+from ..arrays import AnyArray, Array, Index, Mask, PadMasks, Real, Single, Times, multiply
 from ..health.statistics import GAP_NS, MAX_JITTER_RATIO
 from ..modes import COMPONENTS, STRESS
 from ..oscillator import rest_ratio
-from ..status import (
-    INVALID,
-    OPEN,
-    PAD_FAULT,
-    RANGE,
-    REPORTED,
-    RESIDUAL,
-    SHORT,
-    STAMP,
-    TEMPERATURE,
-)
+from ..status import INVALID, PAD_FAULT, RESIDUAL, STAMP, TEMPERATURE
 from .contract import (
     DONE,
+    NEEDS_CONDITION,
     NEEDS_WINDOW,
     PAD_QUANTITIES,
     UNKNOWN_CUBE,
@@ -125,10 +116,10 @@ def mask_bits(tables: Tables, calibration: Numbers, mask: AnyArray) -> Mask:
     return exists & is_set
 
 
-def pack_bits(bits: Mask) -> Times:
+def pack_bits(bits: Mask) -> PadMasks:
     """Convert truth values (..., count) to bit masks (...); value p becomes bit p of a mask."""
-    weights = np.int64(1) << np.arange(bits.shape[-1])
-    masks: Times = (bits * weights).sum(axis=-1)
+    weights = np.uint32(1) << np.arange(bits.shape[-1], dtype=np.uint32)
+    masks: PadMasks = (bits * weights).sum(axis=-1, dtype=np.uint32)
     return masks
 
 
@@ -147,7 +138,7 @@ def _process(
     columns: Columns,
     results: Results,
 ) -> tuple[int, int]:
-    """Process the rows of one scan up to the first whose table is missing.
+    """Process the rows of one scan up to the first with a request.
 
     Args:
         scan: The rows.
@@ -164,19 +155,26 @@ def _process(
     is_unknown = rows.cube >= len(tables.calibration)
     cube = np.where(is_unknown, 0, rows.cube).astype(np.intp)
     calibration = tables.calibration[cube]
+    has_new_condition = np.zeros(len(cube), bool)
     if health is not None:
-        _check_pads(tables, health, rows, cube)
         state = health.cubes[cube]
         is_known = np.zeros(len(cube), bool) if rows.known is None else rows.known
         out.left_out[:] = np.where(is_known, out.left_out, rows.pad_fault | state["mask"])
         out.status[:] = np.where(is_known, out.status, state["status"])
+        shown = pack_bits(find_impossible(tables, health, rows, cube))
+        has_new_condition = shown & ~state["found"] != 0
 
     v, is_good = apply_law(tables, cube, rows.frequency, rows.temperature)
     is_bad = mask_bits(tables, calibration, out.left_out) | _lack(tables, calibration, is_good)
-    bad = np.where(is_unknown, 0, pack_bits(is_bad))
+    bad = pack_bits(is_bad & ~is_unknown[:, None])
     v[is_bad] = 0
-    table, request = _find_tables(tables, calibration, bad)
-    end = len(table)
+    table, key = _find_tables(tables, calibration, bad)
+    stops = np.flatnonzero(has_new_condition | (key != DONE))
+    end, request = len(cube), DONE
+    if len(stops):
+        end = int(stops[0])
+        request = NEEDS_CONDITION if has_new_condition[end] else int(key[end])
+    table = table[:end]
 
     outputs = multiply(v[:end], tables.matrix[table])
     outputs[is_unknown[:end]] = np.nan
@@ -193,7 +191,7 @@ def _process(
     out.gradient[:end] = outputs[:, len(STRESS) : N_COMPONENTS]
     out.residual[:end] = residual
     out.observed[:end] = observed
-    out.left_out[:end] |= bad[:end].astype(np.uint32)
+    out.left_out[:end] |= bad[:end]
     out.status[:end] |= rows.doubt[:end] & np.uint16(STAMP)
     for bit, condition in (
         (PAD_FAULT, bad[:end] != 0),
@@ -213,8 +211,8 @@ def _lack(tables: Tables, calibration: Numbers, is_good: Mask) -> Mask:
     return mask_bits(tables, calibration, all_pads) & ~is_good
 
 
-def _find_tables(tables: Tables, calibration: Numbers, bad: Times) -> tuple[Numbers, int]:
-    """Find the tables of rows, up to the first row whose table is missing.
+def _find_tables(tables: Tables, calibration: Numbers, bad: PadMasks) -> tuple[Numbers, Times]:
+    """Find the tables of rows.
 
     Args:
         tables: Tables of the skin.
@@ -222,41 +220,32 @@ def _find_tables(tables: Tables, calibration: Numbers, bad: Times) -> tuple[Numb
         bad: Bit masks of the bad pads (N,).
 
     Returns:
-        Numbers of the tables, and the key of the missing table, or `DONE`.
+        Numbers of the tables (N,), and keys of missing tables, or `DONE` (N,).
     """
     key = calibration.astype(np.int64) << 32 | bad
     place = np.searchsorted(tables.keys, key)
     place = np.minimum(place, len(tables.keys) - 1)
+    is_missing = (bad != 0) & (tables.keys[place] != key)
     table = np.where(bad == 0, calibration, tables.numbers[place])
-    missing = np.flatnonzero((bad != 0) & (tables.keys[place] != key))
-    if not len(missing):
-        return table, DONE
-    first = int(missing[0])
-    return table[:first], int(key[first])
+    return table, np.where(is_missing, key, DONE)
 
 
-def _check_pads(tables: Tables, health: HealthState, rows: Columns, cube: Index) -> None:
-    """Add the conditions OPEN, SHORT, RANGE and REPORTED of pads that the rows show.
+def find_impossible(tables: Tables, health: HealthState, rows: Columns, cube: Index) -> Mask:
+    """Return whether a pad has an impossible frequency or a fault that the device reports (N, P).
 
     Args:
         tables: Tables of the skin.
-        health: State of the health, which is changed.
-        rows: Rows of one scan.
+        health: State of the health, with the possible range of frequencies.
+        rows: N rows of one scan.
         cube: Numbers of their cubes, to index with.
     """
     f = rows.frequency.astype(np.float32)
-    low, high, open_from = (health.pads(name)[cube] for name in ("low", "high", "open"))
+    low, high = health.pads("low")[cube], health.pads("high")[cube]
     calibration = tables.calibration[cube]
     is_impossible = _lack(tables, calibration, (f > low) & (f < high))
-    bits = np.where(f >= open_from, OPEN, RANGE)
-    bits = np.where(f > 0, bits, SHORT)  # NaN is no frequency, too
-    bits = np.where(is_impossible, bits, 0)
     # The device may set the bit of a pad that the cube does not have.
-    bits = bits | mask_bits(tables, calibration, rows.pad_fault) * REPORTED
-    bits = bits.astype(np.uint16)
-    health.found[cube] |= bits
-    health.cubes["status"][cube] |= np.bitwise_or.reduce(bits, axis=1)
-    health.cubes["mask"][cube] |= pack_bits(bits > 0).astype(np.uint32)
+    is_reported = mask_bits(tables, calibration, rows.pad_fault)
+    return is_impossible | is_reported
 
 
 def _add_to_window(health: HealthState, rows: Columns, cube: Index, is_over_limit: Mask) -> None:

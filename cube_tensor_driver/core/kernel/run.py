@@ -35,10 +35,11 @@ def run(
 
     Returns:
         Number of the first row that is not processed, and the request: `DONE`, `NEEDS_WINDOW`,
-        `UNKNOWN_CUBE`, or the key (see `Tables.keys`) of a table that must be added.
+        `NEEDS_CONDITION`, `UNKNOWN_CUBE`, or the key (see `Tables.keys`) of a table that must be
+        added.
     """
-    if native is None:
+    # The kernel in C computes in float32, the precision of messages.
+    if native is None or columns.frequency.dtype != np.float32:
         return rows.run(start, n_residuals, tables, health, columns, results)
-    is_double = columns.frequency.dtype == np.float64
     state = health or _NO_HEALTH
-    return native.run(start, n_residuals, is_double, *tables, *state, *columns, *results)
+    return native.run(start, n_residuals, *tables, *state, *columns, *results)
