@@ -8,7 +8,7 @@ from typing import Any
 from cube_tensor_driver.device.wire.protocol import Hello
 
 from . import rules
-from .conversation import Report, Wire, converse
+from .conversation import Conversation, Report, Wire
 from .rule import RULES, SECTIONS, Outcome, Rule, RuleResult
 
 __all__ = ["Checked", "check", "in_order", "rules"]
@@ -70,7 +70,7 @@ def check(wire: Wire, report: Report = lambda done, total, what: None) -> Checke
         LinkError: The line was lost.
         CubeError: The hub sends without end.
     """
-    transcript = converse(wire, report)
+    transcript = Conversation(wire, report).run()
     results = {one.number: one.check(transcript) for one in in_order()}
     return Checked(transcript.port, transcript.hello, results)
 

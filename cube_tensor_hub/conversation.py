@@ -132,24 +132,16 @@ Report = Callable[[float, float, str], None]
 """Shows the progress: time done, whole time, and name of the step."""
 
 
-def converse(wire: Wire, report: Report = lambda done, total, what: None) -> Transcript:
-    """Go through all steps.
-
-    Args:
-        wire: The line to the hub.
-        report: Shows the progress.
-
-    Raises:
-        LinkError: The line was lost.
-        CubeError: The hub sends more than `MAX_FRAMES`.
-    """
-    return Conversation(wire, report).run()
-
-
 class Conversation:
     """Goes once through all steps of a check."""
 
     def __init__(self, wire: Wire, report: Report) -> None:
+        """Prepare the conversation.
+
+        Args:
+            wire: The line to the hub.
+            report: Shows the progress.
+        """
         self._wire, self._report = wire, report
         self._listener = FrameListener()
         self._begin_s = wire.now()
@@ -158,7 +150,12 @@ class Conversation:
         self._transcript = Transcript(wire.port, wire.is_tcp)
 
     def run(self) -> Transcript:
-        """Go through all steps; without an answer to the first ones the others are left out."""
+        """Go through all steps; without an answer to the first ones the others are left out.
+
+        Raises:
+            LinkError: The line was lost.
+            CubeError: The hub sends more than `MAX_FRAMES`.
+        """
         try:
             # A hub that was running sends HELLO and STATS by itself.
             self._ask("opened", seconds=SECOND_S)

@@ -43,6 +43,10 @@ def not_tried(text: str) -> RuleResult:
     return RuleResult(Outcome.NOT_TRIED, text)
 
 
+Checker = Callable[[Transcript], RuleResult]
+"""Function that looks for a rule in a conversation."""
+
+
 @dataclass(frozen=True)
 class Rule:
     """A numbered rule of docs/protocol.md.
@@ -57,7 +61,7 @@ class Rule:
     number: str
     says: str
     needs: tuple[type, ...]
-    find_result: Callable[[Transcript], RuleResult]
+    find_result: Checker
 
     @property
     def section(self) -> str:
@@ -88,12 +92,19 @@ RULES: dict[str, Rule] = {}
 
 
 def rule(
-    number: str, says: str, needs: tuple[type, ...] = ()
-) -> Callable[[Callable[[Transcript], RuleResult]], Callable[[Transcript], RuleResult]]:
+    number: str,
+    says: str,
+    needs: tuple[type, ...] = (ANY_FRAME,),
+) -> Callable[[Checker], Checker]:
     """Decorate a function that checks a rule, and enter the rule into `RULES`."""
 
-    def enter(function: Callable[[Transcript], RuleResult]) -> Callable[[Transcript], RuleResult]:
+    def enter(function: Checker) -> Checker:
         RULES[number] = Rule(number, says, needs, function)
         return function
 
     return enter
+
+
+def never_tried(number: str, says: str, why: str) -> None:
+    """Enter a rule that no conversation shows into `RULES`, with the reason."""
+    rule(number, says, needs=())(lambda transcript: not_tried(why))

@@ -117,6 +117,18 @@ def open_storage(path: Path) -> McapReader | SqliteReader:
     Raises:
         BagError: The file is missing, damaged, or not a storage file.
     """
+    check_storage_path(path)
+    is_mcap = path.suffix == SUFFIXES["mcap"]
+    with report_damage(path):
+        return McapReader(path) if is_mcap else SqliteReader(path)
+
+
+def check_storage_path(path: Path) -> None:
+    """Check that a path leads to a file whose name is that of a storage file.
+
+    Raises:
+        BagError: It does not.
+    """
     if not path.exists():
         raise BagError(f"{path}: no such file or folder; name a bag")
     if not path.is_file():
@@ -128,9 +140,6 @@ def open_storage(path: Path) -> McapReader | SqliteReader:
             f"{path}: no bag; name the folder of a bag, or a file that ends in "
             f"{' or '.join(SUFFIXES.values())}"
         )
-    is_mcap = path.suffix == SUFFIXES["mcap"]
-    with report_damage(path):
-        return McapReader(path) if is_mcap else SqliteReader(path)
 
 
 def make_message(kind: str, **fields: Any) -> Any:
@@ -275,10 +284,38 @@ class Bag:
             stop_ns: Time of recording, in ns, from which on nothing is read; None: to the end.
 
         Raises:
-            BagError: The bag is damaged.
+            BagError: A file of the bag is damaged, or has another number of messages than its
+                summary states.
         """
-        for connection, time_ns, data in self._messages(topics, start_ns, stop_ns):
-            yield Entry(connection.topic, connection.msgtype, time_ns, data)
+        wanted = {one.topic for one in self.connections}
+        if topics is not None:
+            wanted &= topics
+        is_packed = self._bag_files.compression == "message"
+        begin_ns = 0 if start_ns is None else start_ns
+        end_ns = MAX_TIME_NS if stop_ns is None else stop_ns
+        count = 0
+        with report_damage(self.path):
+            # A recorder begins a new file after the last message of the one before, so messages of
+            # different files need not be merged by time.
+            for file in self._files:
+                for connection, time_ns, data in file.messages(wanted, begin_ns, end_ns):
+                    count += 1
+                    if is_packed:
+                        try:
+                            data = _decompress(data)
+                        except READ_ERRORS as error:
+                            self.skip(connection.topic, time_ns, error)
+                            continue
+                    yield Entry(connection.topic, connection.msgtype, time_ns, data)
+
+        # If the name of a topic or the number of a channel is damaged, no library raises an error:
+        # messages are only missing. Therefore their number is compared with the one stated.
+        promised = sum(one.msgcount for one in self.connections if one.topic in wanted)
+        if start_ns is None and stop_ns is None and count != promised:
+            raise BagError(
+                f"{self.path}: damaged: {count} messages on {', '.join(sorted(wanted))}, the bag "
+                f"says {promised}; ./cube bag repair {self.path} may help"
+            )
 
     def decoded(self, topics: set[str]) -> Iterator[tuple[int, Any]]:
         """Read messages as objects, in the order of recording; damaged ones are left out.
@@ -393,56 +430,6 @@ class Bag:
         for columns, _ in self._decoded(topic, stress_codec, decode):
             yield columns
 
-    def _messages(
-        self,
-        topics: set[str] | None,
-        start_ns: int | None = None,
-        stop_ns: int | None = None,
-    ) -> Iterator[tuple[Connection, int, bytes]]:
-        """Read messages file by file, decompress them, and check their number.
-
-        Args:
-            topics: Names of the topics; None: all topics.
-            start_ns: Earliest time of recording that is read, in ns since the Unix epoch; None: no
-                limit.
-            stop_ns: Time of recording, in ns, from which on nothing is read; None: to the end.
-
-        Yields:
-            The topic, the time of recording in ns, and the serialised message.
-
-        Raises:
-            BagError: The bag is damaged, or has another number of messages than its summary states.
-        """
-        wanted = {one.topic for one in self.connections}
-        if topics is not None:
-            wanted &= topics
-        is_packed = self._bag_files.compression == "message"
-        begin_ns = 0 if start_ns is None else start_ns
-        end_ns = MAX_TIME_NS if stop_ns is None else stop_ns
-        count = 0
-        with report_damage(self.path):
-            # A recorder begins a new file after the last message of the one before, so messages of
-            # different files need not be merged by time.
-            for file in self._files:
-                for connection, time_ns, data in file.messages(wanted, begin_ns, end_ns):
-                    count += 1
-                    if is_packed:
-                        try:
-                            data = _decompress(data)
-                        except READ_ERRORS as error:
-                            self.skip(connection.topic, time_ns, error)
-                            continue
-                    yield connection, time_ns, data
-
-        # If the name of a topic or the number of a channel is damaged, no library raises an error:
-        # messages are only missing. Therefore their number is compared with the one stated.
-        promised = sum(one.msgcount for one in self.connections if one.topic in wanted)
-        if start_ns is None and stop_ns is None and count != promised:
-            raise BagError(
-                f"{self.path}: damaged: {count} messages on {', '.join(sorted(wanted))}, the bag "
-                f"says {promised}; ./cube bag repair {self.path} may help"
-            )
-
     def _decoded(
         self,
         topic: str,
@@ -477,7 +464,7 @@ class Bag:
                     except MessageError as error:
                         self.skip(topic, time_ns, error)
 
-        for _, time_ns, data in self._messages({topic}):
+        for _, _, time_ns, data in self.entries({topic}):
             has_same_shape = len(data) == size and data.startswith(shape, SHAPE_AT)
             if len(waiting) >= limit or not has_same_shape:
                 if waiting:

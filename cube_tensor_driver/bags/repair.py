@@ -57,7 +57,7 @@ from .mcap_file import (
     unpack_chunk,
 )
 from .metadata import FILE_NAME, SUFFIXES, FileSummary, write_metadata
-from .read import READ_ERRORS, open_storage, report_damage
+from .read import READ_ERRORS, check_storage_path, open_storage, report_damage
 
 REST_SUFFIX = ".rest"
 """Suffix of the file that keeps the bytes that a repair cut off; it is appended to the name of the
@@ -96,11 +96,7 @@ def repair(path: Path, keep_rest: bool = True) -> Repaired:
     """
     if path.is_dir():
         return _repair_folder(path, keep_rest)
-    if not path.is_file() or path.suffix not in SUFFIXES.values():
-        raise BagError(
-            f"{path}: no bag; name the folder of a bag, or a file that ends in "
-            f"{' or '.join(SUFFIXES.values())}"
-        )
+    check_storage_path(path)
     if (path.parent / FILE_NAME).exists():
         # metadata.yaml of the folder describes this file, so it must be written again, too.
         return _repair_folder(path.parent, keep_rest)

@@ -75,7 +75,7 @@ def last_diagnostics(bag: Bag) -> list[Any]:
     # Entries come in the order of recording, so a later status replaces an earlier one.
     last = {}
     topics = set(bag.topics(DIAGNOSTICS_TYPE))
-    for _, message in bag.decoded(topics) if topics else ():
+    for _, message in bag.decoded(topics):
         for status in message.status:
             last[status.name] = status
     return [last[name] for name in sorted(last)]

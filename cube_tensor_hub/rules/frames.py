@@ -5,14 +5,14 @@ from __future__ import annotations
 from cube_tensor_driver.device.wire.protocol import Hello, Request, Sample
 
 from ..conversation import AFTER_DAMAGE, AFTER_WRONG_WAY, DAMAGED
-from ..rule import ANY_FRAME, RuleResult, failed, not_tried, passed, rule
+from ..rule import RuleResult, failed, not_tried, passed, rule
 from ..transcript import Transcript
 
 OVERFULL = ("unread", "gone")
 """Steps in which damaged frames are checked by S9: buffers overflow there."""
 
 
-@rule("F1", "A sender puts a zero before and behind each frame.", needs=(ANY_FRAME,))
+@rule("F1", "A sender puts a zero before and behind each frame.")
 def zeros_around(transcript: Transcript) -> RuleResult:
     """Between two frames there must be two zeros: one behind the first, one before the second."""
     # A frame that follows a damaged run tells nothing about its zeros.
@@ -29,7 +29,6 @@ def zeros_around(transcript: Transcript) -> RuleResult:
     "F2",
     "A receiver counts each run that is no frame, as above, and continues with the next. It never "
     "answers it",
-    needs=(ANY_FRAME,),
 )
 def goes_on_behind_damage(transcript: Transcript) -> RuleResult:
     """Damaged requests must not be answered, and a valid request behind them must be."""
@@ -42,7 +41,7 @@ def goes_on_behind_damage(transcript: Transcript) -> RuleResult:
     return passed(f"no answer to noise and to a request {', '.join(DAMAGED.values())}")
 
 
-@rule("F3", "A frame that goes the wrong way, or that nobody waits for, is ignored.", (ANY_FRAME,))
+@rule("F3", "A frame that goes the wrong way, or that nobody waits for, is ignored.")
 def ignores_the_wrong_way(transcript: Transcript) -> RuleResult:
     step = transcript.steps["wrong way"]
     if step.ack(AFTER_WRONG_WAY) is None:
@@ -53,7 +52,7 @@ def ignores_the_wrong_way(transcript: Transcript) -> RuleResult:
     return passed("HELLO, SAMPLE, STATS, TIME and ACK are not answered")
 
 
-@rule("F4", "Flags and spare bytes are sent as 0", needs=(ANY_FRAME,))
+@rule("F4", "Flags and spare bytes are sent as 0")
 def flags_are_0(transcript: Transcript) -> RuleResult:
     flags = [hello.flags for hello in transcript.frames(Hello) if hello.flags]
     if flags:
@@ -67,6 +66,7 @@ def flags_are_0(transcript: Transcript) -> RuleResult:
 @rule(
     "F5",
     "Each run of bytes between two zeros of a sender is a frame of this page that goes its way.",
+    needs=(),
 )
 def nothing_but_frames(transcript: Transcript) -> RuleResult:
     """Every run of bytes must be a frame, and none a REQUEST, which only hosts send."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from cube_tensor_driver.device.wire.protocol import Command, Hello, Sample, Stats
 
 from ..conversation import AWAY_S, SECOND_S
-from ..rule import ANY_FRAME, RuleResult, failed, not_tried, passed, rule
+from ..rule import RuleResult, failed, never_tried, not_tried, passed, rule
 from ..transcript import Transcript
 from .request import behind_ack
 from .sample import forward, sample_rate
@@ -20,7 +20,7 @@ MIN_TAKEN_SHARE = 0.7
 """Share of the samples that are due while the port is closed, below which the hub has stopped."""
 
 
-@rule("L1", "no flow control, neither RTS/CTS nor XON/XOFF", needs=(ANY_FRAME,))
+@rule("L1", "no flow control, neither RTS/CTS nor XON/XOFF")
 def no_flow_control(transcript: Transcript) -> RuleResult:
     """A hub with XON/XOFF would stop sending behind an XOFF byte."""
     if transcript.steps["XOFF"].ack(Command.STOP) is None:
@@ -28,7 +28,7 @@ def no_flow_control(transcript: Transcript) -> RuleResult:
     return passed("an XOFF byte (0x13) does not stop the hub")
 
 
-@rule("L2", "must send while DTR is set")
+@rule("L2", "must send while DTR is set", needs=())
 def sends_while_dtr_is_set(transcript: Transcript) -> RuleResult:
     if transcript.is_tcp:
         return not_tried("TCP has no DTR")
@@ -38,7 +38,7 @@ def sends_while_dtr_is_set(transcript: Transcript) -> RuleResult:
     return passed("the hub sends with DTR and RTS set")
 
 
-@rule("L3", "The bytes are those of a serial port and nothing else: no Telnet, no TLS.")
+@rule("L3", "The bytes are those of a serial port and nothing else: no Telnet, no TLS.", needs=())
 def nothing_but_the_bytes(transcript: Transcript) -> RuleResult:
     if not transcript.is_tcp:
         return not_tried("this is no TCP link")
@@ -53,9 +53,7 @@ def nothing_but_the_bytes(transcript: Transcript) -> RuleResult:
     return passed("neither Telnet nor TLS at the beginning")
 
 
-@rule("L4", "A connection that ends or fails is lost.")
-def lost_connections(transcript: Transcript) -> RuleResult:
-    return not_tried("a rule of the host")
+never_tried("L4", "A connection that ends or fails is lost.", "a rule of the host")
 
 
 @rule(

@@ -8,7 +8,7 @@ from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.device.wire.protocol import Ack, Command, Hello, Result, Sample, Stats
 
 from ..conversation import PERIOD_US, UNKNOWN
-from ..rule import ANY_FRAME, RuleResult, failed, not_tried, passed, rule
+from ..rule import RuleResult, failed, never_tried, not_tried, passed, rule
 from ..transcript import CheckStep, Transcript
 from .sample import first_frames, periods_us
 
@@ -37,11 +37,7 @@ def behind_ack(step: CheckStep, request: int) -> list[Sample]:
     return []
 
 
-@rule(
-    "R1",
-    "Each sound request gets one ACK, in order, after it was carried out",
-    needs=(ANY_FRAME,),
-)
+@rule("R1", "Each sound request gets one ACK, in order, after it was carried out")
 def one_ack_each(transcript: Transcript) -> RuleResult:
     """In each step the ACKs must be those of the requests, in order.
 
@@ -169,9 +165,7 @@ def impossible_period(transcript: Transcript) -> RuleResult:
     return passed(f"0 µs is refused, {ack.argument} µs stay in force")
 
 
-@rule("R5", "A HELLO with a period that is neither the one asked for")
-def hosts_see_restarts(transcript: Transcript) -> RuleResult:
-    return not_tried("a rule of the host")
+never_tried("R5", "A HELLO with a period that is neither the one asked for", "a rule of the host")
 
 
 @rule(
@@ -229,7 +223,7 @@ def new_period_at_once(transcript: Transcript) -> RuleResult:
     return passed(f"{middle:.0f} µs from the next sample on")
 
 
-@rule("R8", "After power-up a hub has stopped, until START.", needs=(ANY_FRAME,))
+@rule("R8", "After power-up a hub has stopped, until START.")
 def stopped_until_start(transcript: Transcript) -> RuleResult:
     """Samples before START are wrong if the power came on after the port was opened."""
     restarted = transcript.frames(Stats, "back")

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 from cube_tensor_driver.device.wire.protocol import Command, Result, Sample, Time
 
-from ..rule import ANY_FRAME, RuleResult, failed, not_tried, passed, rule
+from ..rule import RuleResult, failed, never_tried, not_tried, passed, rule
 from ..transcript import Transcript
 from .hello import of_kind
 from .request import in_force
@@ -60,7 +60,6 @@ def knows_time(transcript: Transcript) -> bool:
     "T1",
     "The hub reads its clock for TIME after the last byte of the request has come and before the "
     "first byte of the answer goes out.",
-    needs=(ANY_FRAME,),
 )
 def clock_is_read_between(transcript: Transcript) -> RuleResult:
     """Between two answers the hub's clock must go on by what the host's clock does.
@@ -86,11 +85,7 @@ def clock_is_read_between(transcript: Transcript) -> RuleResult:
     return passed(f"{len(trips)} answers, shortest round trip {1e3 * shortest:.2f} ms")
 
 
-@rule(
-    "T2",
-    "Each sound request 6 gets one TIME with the request's argument, started or not.",
-    needs=(ANY_FRAME,),
-)
+@rule("T2", "Each sound request 6 gets one TIME with the request's argument, started or not.")
 def one_time_each(transcript: Transcript) -> RuleResult:
     if not knows_time(transcript):
         return not_tried(NOT_KNOWN)
@@ -105,7 +100,7 @@ def one_time_each(transcript: Transcript) -> RuleResult:
     return passed("one TIME with the number of the question, stopped and started")
 
 
-@rule("T3", "The clock is that of the device time in SAMPLE.", needs=(ANY_FRAME,))
+@rule("T3", "The clock is that of the device time in SAMPLE.")
 def clock_of_samples(transcript: Transcript) -> RuleResult:
     """A sample comes after it was measured, and the first one is measured after START."""
     trips = time_exchanges(transcript, "before start")
@@ -134,7 +129,6 @@ def clock_of_samples(transcript: Transcript) -> RuleResult:
 @rule(
     "T4",
     "A hub that does not know request 6 answers it with ACK and result 1, as any unknown request.",
-    needs=(ANY_FRAME,),
 )
 def unknown_time(transcript: Transcript) -> RuleResult:
     if knows_time(transcript):
@@ -147,6 +141,4 @@ def unknown_time(transcript: Transcript) -> RuleResult:
     return passed("this hub does not know request 6 and says so")
 
 
-@rule("T5", "The host asks each hub about once a second")
-def asking_for_time(transcript: Transcript) -> RuleResult:
-    return not_tried("a rule of the host")
+never_tried("T5", "The host asks each hub about once a second", "a rule of the host")
