@@ -272,16 +272,15 @@ class Bag:
     def entries(
         self,
         topics: set[str] | None = None,
-        start_ns: int | None = None,
-        stop_ns: int | None = None,
+        start_ns: int = 0,
+        stop_ns: int = MAX_TIME_NS,
     ) -> Iterator[Entry]:
         """Read messages in the order of recording.
 
         Args:
             topics: Names of the topics; None: all topics.
-            start_ns: Earliest time of recording that is read, in ns since the Unix epoch; None: no
-                limit.
-            stop_ns: Time of recording, in ns, from which on nothing is read; None: to the end.
+            start_ns: Earliest time of recording that is read, in ns since the Unix epoch.
+            stop_ns: Time of recording, in ns, from which on nothing is read.
 
         Raises:
             BagError: A file of the bag is damaged, or has another number of messages than its
@@ -291,14 +290,12 @@ class Bag:
         if topics is not None:
             wanted &= topics
         is_packed = self._bag_files.compression == "message"
-        begin_ns = 0 if start_ns is None else start_ns
-        end_ns = MAX_TIME_NS if stop_ns is None else stop_ns
         count = 0
         with report_damage(self.path):
             # A recorder begins a new file after the last message of the one before, so messages of
             # different files need not be merged by time.
             for file in self._files:
-                for connection, time_ns, data in file.messages(wanted, begin_ns, end_ns):
+                for connection, time_ns, data in file.messages(wanted, start_ns, stop_ns):
                     count += 1
                     if is_packed:
                         try:
@@ -311,7 +308,7 @@ class Bag:
         # If the name of a topic or the number of a channel is damaged, no library raises an error:
         # messages are only missing. Therefore their number is compared with the one stated.
         promised = sum(one.msgcount for one in self.connections if one.topic in wanted)
-        if start_ns is None and stop_ns is None and count != promised:
+        if (start_ns, stop_ns) == (0, MAX_TIME_NS) and count != promised:
             raise BagError(
                 f"{self.path}: damaged: {count} messages on {', '.join(sorted(wanted))}, the bag "
                 f"says {promised}; ./cube bag repair {self.path} may help"

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow
@@ -14,11 +13,12 @@ import pyarrow.parquet
 
 from ..core.errors import BagError
 from ..core.modes import GRADIENT, STRESS
-from ..core.rows import StressRows
+from ..core.rows import StressRows, concatenate
 
 ROWS_PER_GROUP = 1 << 16
-"""Number of rows that are written together, as one row group (independent block) of a Parquet
-file. Fewer, larger groups compress better and are read faster."""
+"""Number of rows (samples of cubes) that are written together, as one row group (independent block)
+of a Parquet file or one chunk (file) of each Zarr array. Fewer, larger groups compress better and
+are read faster."""
 
 _CUBE_NAME = pyarrow.dictionary(pyarrow.int32(), pyarrow.string())
 """Type of the column with the cubes' names. Dictionary encoding stores each name once, and only a
@@ -52,7 +52,39 @@ def report_write_errors(path: Path) -> Iterator[None]:
         ) from None
 
 
-class TableWriter:
+class BufferedTable:
+    """A table of stress that is written in large parts; a context manager that completes it."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._waiting: list[StressRows] = []
+        self._waiting_rows = 0
+
+    def write(self, rows: StressRows) -> None:
+        """Add rows to the table.
+
+        Raises:
+            BagError: Writing to the disk failed.
+        """
+        # Rows are collected until they fill a part, because large parts compress better, and
+        # because Zarr would read and rewrite a part that is not full.
+        self._waiting.append(rows)
+        self._waiting_rows += len(rows)
+        if self._waiting_rows >= ROWS_PER_GROUP:
+            self._flush()
+
+    def _flush(self) -> None:
+        if self._waiting:
+            with report_write_errors(self._path):
+                self._append(concatenate(self._waiting))
+        self._waiting, self._waiting_rows = [], 0
+
+    def _append(self, rows: StressRows) -> None:
+        """Write rows as one part of the table."""
+        raise NotImplementedError
+
+
+class TableWriter(BufferedTable):
     """A new table of stress; a context manager that completes the file on exit.
 
     A component of the stress is NaN where the cube's pads do not determine it.
@@ -69,10 +101,8 @@ class TableWriter:
         Raises:
             BagError: The file cannot be written.
         """
-        self._path = path
+        super().__init__(path)
         self._cubes = pyarrow.array(cubes)
-        self._batches: list[Any] = []
-        self._waiting_rows = 0
         self._is_csv = path.suffix == ".csv"
         self._schema = _SCHEMA
         if self._is_csv:
@@ -87,16 +117,11 @@ class TableWriter:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._flush()
         with report_write_errors(self._path):
-            self._flush()
             self._writer.close()
 
-    def write(self, rows: StressRows) -> None:
-        """Add rows to the table.
-
-        Raises:
-            BagError: Writing to the disk failed.
-        """
+    def _append(self, rows: StressRows) -> None:
         last = len(self._cubes) - 1
         numbers = np.minimum(rows.cube, last).astype(np.int32)
         names = pyarrow.DictionaryArray.from_arrays(numbers, self._cubes)
@@ -111,16 +136,4 @@ class TableWriter:
             pyarrow.array(rows.observed),
             pyarrow.array(rows.left_out),
         ]
-        batch = pyarrow.RecordBatch.from_arrays(columns, schema=self._schema)
-        self._batches.append(batch)
-        # Rows are collected until they fill a row group, which compresses better than small ones.
-        self._waiting_rows += len(rows)
-        if self._waiting_rows >= ROWS_PER_GROUP:
-            with report_write_errors(self._path):
-                self._flush()
-
-    def _flush(self) -> None:
-        """Write all collected rows as one row group (independent block of a Parquet file)."""
-        if self._batches:
-            self._writer.write_table(pyarrow.Table.from_batches(self._batches))
-        self._batches, self._waiting_rows = [], 0
+        self._writer.write_batch(pyarrow.RecordBatch.from_arrays(columns, schema=self._schema))

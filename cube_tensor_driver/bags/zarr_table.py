@@ -10,11 +10,8 @@ import zarr
 
 from ..core.errors import BagError
 from ..core.modes import GRADIENT, STRESS
-from ..core.rows import StressRows, concatenate
-from .tables import report_write_errors
-
-ROWS_PER_CHUNK = 1 << 16
-"""Number of rows (samples of cubes) in one chunk (file) of a Zarr array."""
+from ..core.rows import StressRows
+from .tables import ROWS_PER_GROUP, BufferedTable
 
 _UNITS = {
     "stamp_ns": "ns",
@@ -42,7 +39,7 @@ _COLUMNS: dict[str, Any] = {
 `StressRows` with these names."""
 
 
-class ZarrWriter:
+class ZarrWriter(BufferedTable):
     """A new table of stress as a Zarr group; a context manager that completes the group on exit.
 
     A component of the stress is NaN where the cube's pads do not determine it.
@@ -65,10 +62,8 @@ class ZarrWriter:
                 f"{path}: zarr {zarr.__version__} is too old, needed is 3: "
                 "pip install 'zarr>=3', with Python 3.11 or newer"
             )
-        self._path = path
+        super().__init__(path)
         self._last_cube = len(cubes) - 1
-        self._waiting: list[StressRows] = []
-        self._waiting_rows = 0
         group = zarr.open_group(str(path), mode="w")
         self._arrays = {name: _create_column(group, name, cubes) for name in _COLUMNS}
 
@@ -78,30 +73,11 @@ class ZarrWriter:
     def __exit__(self, *_: object) -> None:
         self._flush()
 
-    def write(self, rows: StressRows) -> None:
-        """Add rows to the table.
-
-        Raises:
-            BagError: Writing to the disk failed.
-        """
-        self._waiting.append(rows)
-        self._waiting_rows += len(rows)
-        if self._waiting_rows >= ROWS_PER_CHUNK:
-            self._flush()
-
-    def _flush(self) -> None:
-        """Append all collected rows (samples of cubes) to the arrays."""
-        if not self._waiting:
-            return
-        # Rows are collected until they fill a chunk, because appending to a chunk that is not full
-        # makes Zarr read and rewrite that chunk.
-        rows = concatenate(self._waiting)
+    def _append(self, rows: StressRows) -> None:
         columns = {name: getattr(rows, name) for name in self._arrays}
         columns["cube"] = np.minimum(rows.cube, self._last_cube)
-        with report_write_errors(self._path):
-            for name, array in self._arrays.items():
-                array.append(columns[name])
-        self._waiting, self._waiting_rows = [], 0
+        for name, array in self._arrays.items():
+            array.append(columns[name])
 
 
 def _create_column(
@@ -128,7 +104,7 @@ def _create_column(
     return group.create_array(
         name,
         shape=(0, *width),
-        chunks=(ROWS_PER_CHUNK, *width),
+        chunks=(ROWS_PER_GROUP, *width),
         dtype=np.dtype(_COLUMNS[name]),
         dimension_names=["row", f"{name}_component"] if components else ["row"],
         attributes=attributes,

@@ -188,7 +188,9 @@ def test_messages_come_in_the_order_in_which_rosbags_reads_them(tmp_path):
     with Bag(tmp_path / "bag") as bag:
         for topics in ("a", "b", "ab"):
             for start, stop in ((None, None), (1105, None), (None, 1290), (1100, 1300)):
-                entries = bag.entries({f"/{name}" for name in topics}, start, stop)
+                limits = {"start_ns": start, "stop_ns": stop}
+                given = {name: limit for name, limit in limits.items() if limit is not None}
+                entries = bag.entries({f"/{name}" for name in topics}, **given)
                 ours = [(entry.topic, entry.time_ns, entry.data) for entry in entries]
                 assert ours == by_rosbags(topics, start=start, stop=stop) and len(ours) > 3
                 assert [time_ns for _, time_ns, _ in ours] == sorted(one[1] for one in ours)

@@ -250,7 +250,7 @@ class Player:
             start_ns: Time of recording of the first message, in ns since the Unix epoch.
         """
         # Latched messages (such as `info`) from before the start are still valid at the start.
-        for entry in self._bag.entries(self._latched, None, start_ns):
+        for entry in self._bag.entries(self._latched, stop_ns=start_ns):
             self._publish(entry)
         self._set_time(start_ns)
         for entry in self._bag.entries(set(self._publishers), start_ns):
