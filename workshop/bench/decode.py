@@ -13,7 +13,7 @@ from cube_tensor_driver.device.wire.native import wire
 from cube_tensor_driver.device.wire.protocol import Sample, encode
 
 BYTES = 500_000
-"""Number of bytes of each kind."""
+"""Number of bytes of each kind of data (clean frames and noises) that are decoded."""
 
 READ = 4096
 """Number of bytes in one call of the decoder, as a busy link delivers them."""
@@ -22,7 +22,7 @@ ROUNDS = 5
 """Number of measurements, of which the fastest is given: other processes only slow one down."""
 
 DAMAGED_SHARE = 0.01
-"""Share of bytes that are replaced in damaged frames."""
+"""Share of the bytes of damaged frames that are replaced by random ones."""
 
 
 def clean_frames(size: int) -> bytes:
@@ -50,10 +50,11 @@ def damaged_frames(size: int) -> bytes:
 
 
 LATE_FAILURE = b"\1" * 14 + b"\2\0"
-"""Shortest bytes that could be a frame and turn out to be none in the last byte."""
+"""Shortest sequence of bytes that looks like a frame until its last byte, which shows that it is
+none."""
 
 INTACT_COBS = b"\2\7" * 7 + b"\1\0"
-"""Bytes of the same length that are correctly stuffed, and no frame."""
+"""Bytes of the same length as `LATE_FAILURE` that are correctly stuffed (COBS), but no frame."""
 
 NOISE: dict[str, Callable[[int], bytes]] = {
     "random": lambda size: np.random.default_rng(3).bytes(size),

@@ -15,7 +15,7 @@ from cube_tensor_driver.simulation.sample_log import CUBE_RANGE, SampleTable
 from cube_tensor_hub.firmware import build
 
 FIRMWARE = Path(__file__).resolve().parents[2] / "firmware"
-"""Folder of the program's source."""
+"""Folder of the source of the program that simulates hubs."""
 
 PITCH = 0.012
 """Distance of neighbouring cubes, in m."""
@@ -24,7 +24,8 @@ MAX_CUBES_PER_HUB = 80
 """Largest number of cubes on one simulated hub."""
 
 START_TIME_BYTES = 8
-"""Length of the head of the hubs' log: the wall clock at device time 0, in ns."""
+"""Length, in bytes, of the head of the hubs' log, which is the wall clock at device time 0, in
+ns."""
 
 SAMPLE_RECORD = np.dtype(
     [
@@ -33,7 +34,7 @@ SAMPLE_RECORD = np.dtype(
         ("device_us", "u8"),
     ]
 )
-"""One sample in the hubs' log, as `firmware/posix/main.c` writes it."""
+"""Format of one sample in the hubs' log, as `firmware/posix/main.c` writes it."""
 
 
 @dataclass(frozen=True)

@@ -24,16 +24,16 @@ from cube_tensor_driver.device.scans.scan import empty_rows
 from .hubs_in_c import HubLoad
 
 MAX_START_S = 10.0
-"""Longest time, in seconds, until the first rows arrive."""
+"""Longest time, in seconds, from the start of the hubs until the first rows arrive."""
 
 SETTLE_S = 2.0
 """Time, in seconds, from the first rows to the begin of the measurement."""
 
 MAX_END_S = 2.0
-"""Longest time, in seconds, until the hubs have ended."""
+"""Longest time, in seconds, from the request to end until the hubs have ended."""
 
 POLL_S = 0.05
-"""Time, in seconds, between two looks at a condition."""
+"""Time, in seconds, between two checks of a condition that is waited for."""
 
 
 def bench_links(
@@ -121,7 +121,7 @@ def _hubs(
 
 
 def _wait(done: Callable[[], bool]) -> None:
-    """Wait for a condition; CubeError if it is not met within `MAX_START_S`."""
+    """Wait until a condition is true; raise CubeError if it is not within `MAX_START_S`."""
     until_s = time.monotonic() + MAX_START_S
     while not done():
         if time.monotonic() > until_s:

@@ -15,16 +15,16 @@ from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rows import FrequencyRows
 
 Function = Callable[[], Any]
-"""Function that is timed."""
+"""Function that is called and timed."""
 
 LAYOUT = "planar"
-"""Layout of the cubes."""
+"""Name of the layout of the cubes whose pipeline is timed."""
 
 ROUNDS = 400
 """Number of calls of each function, of which the median is given."""
 
 LOAD_PA = 5e3
-"""Standard deviation of the modes of the load, in Pa."""
+"""Standard deviation of the amplitudes of the modes (linear stress fields) of the load, in Pa."""
 
 
 def bench_pipeline(cubes: int) -> dict[str, Any]:

@@ -13,16 +13,16 @@ CPU_LINES = (
     ("reconstruction", "cpu_reconstruction_percent", "s-", "black"),
     ("echo: the same messages, no work", "echo_cpu_percent", "^:", "0.55"),
 )
-"""Label, figure, line style and colour of each processor time."""
+"""Label, name of the figure, line style and colour of each drawn processor time."""
 
 MARKER: dict[str, Any] = {"mfc": "white", "ms": 5}
-"""Style of the markers of all lines."""
+"""Style of the markers of all drawn lines."""
 
 LATENCY_LINES = (
     ("median", "latency_p50_ms", "o-"),
     ("99th percentile", "latency_p99_ms", "s--"),
 )
-"""Label, figure and line style of each latency."""
+"""Label, name of the figure and line style of each drawn latency."""
 
 
 @print_style()
@@ -52,7 +52,7 @@ def draw_scale(rows: list[dict[str, Any]]) -> Figure:
             xlabel="number of cubes",
             ylim=(0, None),
         )
-        # The numbers of cubes themselves, in place of powers of ten.
+        # The ticks are the numbers of cubes, not powers of ten.
         axes.set_xticks(cubes, [str(count) for count in cubes])
         axes.xaxis.minorticks_off()
         axes.legend()

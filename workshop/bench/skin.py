@@ -39,8 +39,8 @@ from .hubs_in_c import HubLoad, read_samples
 from .scale import draw_scale
 
 INSTANTS = 16
-"""Number of instants of the load that the simulator repeats. They are few, because the simulator
-must cost little here."""
+"""Number of instants of the load that the simulator repeats. The number is small, because the
+simulator must take little processor time here."""
 
 LOADS = ("hubs", "simulator")
 """Processes that send the samples: hubs in C, or the simulator where they cannot be built."""
@@ -55,13 +55,13 @@ DRAIN_S = 1.0
 """Time, in seconds, after the measurement in which its last tensors arrive."""
 
 MAX_ECHO_S = 15.0
-"""Longest duration, in seconds, of one measurement of the floor."""
+"""Longest duration, in seconds, of one measurement of the echo, which is the floor."""
 
 MEMORY_PERIOD_S = 0.5
-"""Time, in seconds, between two measurements of memory."""
+"""Time, in seconds, between two measurements of the memory of the processes."""
 
 MIN_GROWTH_DURATION_S = 60.0
-"""Shortest measurement, in seconds, for which the growth of memory is given."""
+"""Shortest duration, in seconds, of a measurement for which the growth of memory is reported."""
 
 GROWTH_BLOCKS = 8
 """Number of equal blocks of time whose mean memory the growth is fitted to."""
@@ -86,12 +86,12 @@ class Bench:
 
 @dataclass(frozen=True)
 class Measurement:
-    """What the processes used in a span of time.
+    """Processor time and memory that the processes used in a span of time.
 
     Attributes:
-        start_ns, end_ns: Begin and end of the span, wall clock in ns.
-        cpu_percent: Load on one core, by process.
-        memory_mb: Memory every `MEMORY_PERIOD_S`, by process.
+        start_ns, end_ns: Begin and end of the span, in ns since the Unix epoch.
+        cpu_percent: Processor time in percent of one core, by process.
+        memory_mb: Resident memory in MB every `MEMORY_PERIOD_S`, by process.
         first_tensor_s: Time from the start of the processes to the first message of stress.
     """
 
@@ -138,7 +138,7 @@ def bench_scale(
 def _prepared() -> Iterator[Progress]:
     """Set a DDS domain and show a progress bar.
 
-    It is drawn once a second only, because the receiver cannot receive meanwhile.
+    The bar is drawn once a second only, because the receiver cannot receive meanwhile.
     """
     progress = Progress(console=Console(stderr=True), refresh_per_second=1)
     with own_domain(), progress:
@@ -335,9 +335,8 @@ def summarise_memory(memory_mb: dict[str, list[float]]) -> dict[str, float]:
     """Return the largest memory of any process but the load, in MB.
 
     After a minute or more, also the growth of the process that grows fastest, with its standard
-    error. It is the slope of a line through the means of blocks after the first fifth of the time:
-    allocators grow in steps, so values that are close in time are not independent.
-    """
+    error. The growth is the slope of a line through the means of blocks after the first fifth of
+    the time: allocators grow in steps, so values that are close in time are not independent."""
     nodes = [np.array(values) for name, values in memory_mb.items() if name not in LOADS]
     result = {"rss_mb": round(float(np.max(nodes)), 1)}
     n_values = len(nodes[0])

@@ -44,16 +44,16 @@ from cube_tensor_driver.simulation.load import Load, default_script
 from ..pictures.photograph import chromium
 
 RATE = 100.0
-"""Samples per second of each cube."""
+"""Sampling rate of each cube, in Hz."""
 
 INSTANTS = 200
 """Number of instants of the load that are computed in advance and repeated."""
 
 MAX_START_S = 30.0
-"""Time, in seconds, that the browser view may take to start."""
+"""Longest time, in seconds, until the browser view has started."""
 
 SETTLE_S = 6.0
-"""Time, in seconds, between the start and the measurement."""
+"""Time, in seconds, from the start of the browser view to the begin of the measurement."""
 
 MEASURE_S = 15.0
 """Duration of the measurement, in seconds."""

@@ -21,10 +21,11 @@ from .tensors import check_tensors
 from .timing import count_wrong_periods, measure_reconnects, measure_stamp_errors
 
 MAX_EXAMPLES = 8
-"""Number of examples that are printed."""
+"""Maximum number of examples of wrong rows (one cube at one sampling time) that are printed."""
 
 PERCENTILES = (50, 90, 99)
-"""Percentiles of the absolute stamp errors that are printed."""
+"""Percentiles that are printed of the stamp errors: absolute difference between the time of a
+sample and its stamp."""
 
 
 def check_all(record: Record, log: SampleLog) -> dict[str, Any]:
@@ -32,7 +33,7 @@ def check_all(record: Record, log: SampleLog) -> dict[str, Any]:
     run = Run(record, log)
     frequencies = check_frequencies(run)
     tensors = check_tensors(run)
-    # A row of stress without a source has no sample either.
+    # A row of stress that was made from no known row of frequencies has no sample either.
     samples = np.append(run.sample, NO_MATCH)
     health = check_health(run, samples[tensors.source])
     counters = check_counters(run, frequencies, tensors)

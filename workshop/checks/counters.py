@@ -12,15 +12,15 @@ from .run import Findings, Run, count, find_matched
 from .tensors import TensorFindings
 
 WRAPPED_NUMBER = 1 << 20
-"""Number of a first sample above which the hub did not begin to count at 0.
+"""Number of the first sample of a hub above which the hub did not begin to count at 0.
 
 A fault makes hubs begin shortly before 2**32. The driver cannot know of losses before their first
 sample.
 """
 
 REPORT_PERIOD_S = 1.5
-"""Longest time, in seconds, between two reports of the driver's counters. What it counted so
-shortly before it was killed may not have been reported."""
+"""Longest time, in seconds, between two reports of the driver's counters. What the driver counted
+within this time before it was killed may not have been reported."""
 
 
 def check_counters(
@@ -30,10 +30,10 @@ def check_counters(
 ) -> Findings:
     """Compare the counters with the rows that are missing and the rows that arrived.
 
-    Nobody can know the last samples of a hub before it lost its power or restarted, nor the samples
-    around the end of a driver. All others that did not arrive must be counted, and no more. The
-    reconstruction must not state that it lost messages whose tensors arrived.
-    """
+    A row is one cube at one sampling time. The driver cannot know the last samples of a hub before
+    the hub lost its power or restarted, nor samples around its own end. All other rows that did not
+    arrive must be counted, and no more. The reconstruction must not state that it lost messages
+    whose tensors arrived."""
     record, counters = run.record, run.record.counters
     cubes_per_link = len(record.skin.cubes) // len(record.skin.links)
     counted = (
@@ -43,7 +43,7 @@ def check_counters(
     )
     is_countable = frequencies.is_checked & ~_is_between_drivers(run)
     missing = int(frequencies.missing[is_countable].sum())
-    # The driver counts on after the span that is checked.
+    # The driver goes on counting after the span of time that is checked.
     missing_at_end = int(frequencies.missing.sum())
     is_lost_with_power = _is_lost_with_power(run)
     lost_with_power = int(run.samples.row_count[is_lost_with_power].sum())
@@ -101,7 +101,7 @@ def _is_between_drivers(run: Run) -> Mask:
 
 
 def _is_lost_with_power(run: Run) -> Mask:
-    """Find the samples (S,) of which nobody can know.
+    """Find the samples (S,) of which the driver cannot know, because the hub restarted.
 
     These are the ones after the last that arrived before a restart and, where the hub did not
     begin at 0, those before the first that arrived.

@@ -16,11 +16,12 @@ from .record import Tensor, Wrench
 from .run import Findings, Run, agree
 
 MAX_RELATIVE_ERROR = 1e-5
-"""Largest relative difference: a row of `stress` has float32, a message of one cube float64."""
+"""Largest relative difference between a row of the topic `stress`, which has float32, and a message
+of one cube, which has float64."""
 
 
 def check_cube_topics(run: Run) -> Findings:
-    """Count the messages, and those that agree with no row of their stamp."""
+    """Count the messages of one cube's topics, and those that agree with no row of their stamp."""
     record = run.record
     skin = record.skin
     messages = record.cube_messages
@@ -51,7 +52,7 @@ def check_cube_topics(run: Run) -> Findings:
             side,
         )
         wanted = np.concatenate([force[0], torque[0]])
-        # A row without components gives no wrench.
+        # A row without stress gives no wrench.
         is_valid = rows.status[row] & INVALID == 0
         return bool(is_valid) and _is_near(message[1], wanted)
 
@@ -63,7 +64,7 @@ def check_cube_topics(run: Run) -> Findings:
     agrees = [has_row(message, is_tensor_of) for message in messages.tensors]
     agrees += [has_row(message, is_wrench_of) for message in messages.wrenches]
     wrong = len(messages.frame_ids - {skin.frame(cube)})
-    # Where messages of `stress` are missing here, the row of a message may be missing, too.
+    # Where messages of `stress` did not arrive here, the row of a cube's message may be missing.
     if not record.stress.gaps:
         wrong += agrees.count(False)
     figures = {
@@ -74,7 +75,7 @@ def check_cube_topics(run: Run) -> Findings:
 
 
 def _is_near(found: ArrayLike, wanted: ArrayLike) -> bool:
-    """Compare numbers of different precision."""
+    """Return whether numbers of single precision agree with numbers of double precision."""
     target = np.asarray(wanted, float)
     # Components that are 0 have an error that is small against the largest one.
     size = np.abs(np.nan_to_num(target))

@@ -25,31 +25,31 @@ from .record import LATEST_NS, Span
 from .samples import HubFault, Samples
 
 EDGE_NS = 5_000_000
-"""Time, in nanoseconds, before and after the begin and the end of a fault in which a sample may
-have the fault or not. The simulator carries faults out late now and then."""
+"""Time, in nanoseconds, before and after the begin and the end of a fault of a pad or hub in which
+a sample may have the fault or not, because the simulator carries faults out late now and then."""
 
 MIN_EQUAL_SHARE = 0.5
-"""Smallest share of a row's pads that must have the expected reading. With fewer, the row is taken
-for another sample of the same number."""
+"""Smallest share of the pads of a row (one cube at one sampling time) that must have the expected
+reading. With fewer, the row counts as one of another sample with the same number."""
 
 CHUNK = 100_000
-"""Maximum number of rows that are compared at a time, so that the memory for intermediate results
-does not grow with the duration of a torture."""
+"""Maximum number of rows (one cube at one sampling time) that are compared at a time, so that the
+memory for intermediate results does not grow with the duration of a run."""
 
 MILLIHERTZ = 1e-3
 
 
 @dataclass(frozen=True)
 class Readings:
-    """Values that N rows should have.
+    """Values that N rows (one cube at one sampling time each) of frequencies should have.
 
     Attributes:
         frequency: Frequency of each pad (N, P), in Hz; NaN where nothing is measured.
-        is_certain: False for pads near the begin or end of a fault (N, P).
+        is_certain: Whether the frequency is certain (N, P); not near the begin or end of a fault.
         temperature: Temperature (N,), in °C; NaN where it is unknown.
         pad_fault: Bit p is set if the hub reports pad p (N,), as far as it is certain.
         is_sound: Whether no pad is broken and the temperature is that of the calibration (N,).
-        instant: Index of the instant of the load (N,).
+        instant: Index of the instant of the load, which repeats (N,).
     """
 
     frequency: Single
@@ -62,7 +62,8 @@ class Readings:
 
 @dataclass(frozen=True)
 class _SoundReadings:
-    """Readings (N, P) of unbroken pads in mHz, warming (N,) in K, and as in `Readings`."""
+    """Readings (N, P) that pads without faults would give, in mHz; warming (N,) of the hub, in K;
+    the others as in `Readings`."""
 
     millihertz: Any
     warming: Array
@@ -71,7 +72,7 @@ class _SoundReadings:
 
 
 class ExpectedReadings:
-    """Computes the readings of a skin's cubes.
+    """Computes what the pads of a simulated skin must read, from its load and its faults.
 
     Attributes:
         truth: Components of the load (instants, cubes, 15), in Pa and Pa/m.
@@ -83,7 +84,13 @@ class ExpectedReadings:
         samples: Samples,
         instants: int,
     ) -> None:
-        """instants: number of instants of the load that the hubs repeat."""
+        """Compute the load.
+
+        Args:
+            skin: The skin.
+            samples: All samples that the hubs took.
+            instants: Number of instants of the load that the hubs repeat.
+        """
         self._samples = samples
         self._millihertz, self.truth = load_tables(skin, instants)
 
@@ -137,7 +144,7 @@ class ExpectedReadings:
 
         warmer = np.zeros(len(cube))
         for fault in samples.faults("temperature"):
-            # A temperature lasts until the next one: the end of the fault does not matter.
+            # A temperature lasts until the next one, so the end of the fault does not matter.
             since = (link == fault.link) & (time_us >= fault.start_us)
             warmer[since] = warming(fault.fault, fault.start_us, time_us[since])
             is_edge = np.abs(time_ns - fault.begin_ns) < EDGE_NS
@@ -158,7 +165,7 @@ class ExpectedReadings:
         """Return the readings of a broken pad (M,), given those of the sound pad, in mHz."""
         first = 0
         if fault.kind == "stuck":
-            # It repeats what it would have read in the first sample of the fault.
+            # A stuck pad repeats what it would have read in the first sample of the fault.
             is_later = self._samples.time_ns >= fault.begin_ns
             is_later &= self._samples.link == fault.link
             later = np.flatnonzero(is_later)
@@ -235,12 +242,12 @@ class ExpectedReadings:
 
 
 def split_in_chunks(index: Index) -> list[Index]:
-    """Split an index into parts of at most `CHUNK`."""
+    """Split indices (N,) into parts of at most `CHUNK`."""
     return np.array_split(index, 1 + len(index) // CHUNK)
 
 
 def load_tables(skin: Skin, instants: int) -> tuple[Any, Array]:
-    """Compute what sound pads read, and the load.
+    """Compute what pads without faults read, and the load.
 
     It takes some seconds, but only once for skins of the same calibrations and poses.
 
@@ -257,7 +264,7 @@ def load_tables(skin: Skin, instants: int) -> tuple[Any, Array]:
 
 
 _tables: dict[Any, tuple[Any, Array]] = {}
-"""Result of `load_tables` for the last skin."""
+"""Result of `load_tables` (readings of sound pads, and the load) for the last skin."""
 
 
 def _compute_tables(skin: Skin, instants: int) -> tuple[Any, Array]:
@@ -276,7 +283,7 @@ def _covers(outer: Span, inner: Span) -> bool:
 
 
 def _is_at_edge(fault: HubFault, time_ns: Index) -> Mask:
-    """Find the times (N,) close to the begin or the end of a fault."""
+    """Find the times (N,) within `EDGE_NS` of the begin or the end of a fault."""
     from_begin_ns = np.abs(time_ns - fault.begin_ns)
     from_end_ns = np.abs(time_ns - fault.end_ns)
     return np.minimum(from_begin_ns, from_end_ns) < EDGE_NS

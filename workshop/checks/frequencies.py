@@ -17,22 +17,23 @@ from .run import Findings, Run, agree, count, find_matched
 from .samples import CUT_FAULTS
 
 RECOVERY_S = 6.0
-"""Time, in seconds, after a cut in which a link delivers again: the driver tries a port at least
-every 5 s."""
+"""Longest time, in seconds, from the end of a cut of a link until the link delivers again. The
+driver tries to open a port at least every 5 s."""
 
 IN_FLIGHT_S = 0.1
-"""Time, in seconds, before a cut whose bytes may still be on their way and are lost, too."""
+"""Length, in seconds, of the span before a cut of a link whose bytes may still be on their way and
+are lost with it."""
 
 RESTART_S = 3.0
-"""Time, in seconds, after a start of the driver until all hubs deliver again."""
+"""Longest time, in seconds, from a start of the driver until all hubs deliver again."""
 
 
 @dataclass(frozen=True)
 class FrequencyFindings(Findings):
-    """Findings, and what other checks need of them.
+    """Findings about the topic `frequencies`, and what other checks need of them.
 
     Attributes:
-        is_checked: Whether a sample was taken in the span of the record (S,).
+        is_checked: Whether each of the S samples was taken in the span of the record (S,).
         missing: Number of rows of each sample that did not arrive (S,), also after that span.
     """
 
@@ -62,7 +63,7 @@ def check_frequencies(run: Run) -> FrequencyFindings:
     arrived = np.unique(keys)
     received = np.bincount(arrived // n_cubes, minlength=len(samples))
     is_checked = record.contains(samples.time_ns)
-    # Before the record begins, the driver was not active.
+    # The driver was not active before the record begins.
     is_recorded = samples.time_ns >= record.begin_ns
     missing = np.where(is_recorded, samples.row_count - received, 0)
     is_lost = is_checked & (missing > 0) & ~_may_be_missing(run)

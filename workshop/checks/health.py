@@ -28,22 +28,24 @@ STATUS_OF_FAULT = {
     "noisy": NOISY,
     "report": REPORTED,
 }
-"""Status bit that names each fault of a pad."""
+"""Status bit of the reconstruction that names each kind of fault of a pad."""
 
 PERMITTED_STATUS = NOISY | RANGE | DRIFT
-"""Status bits that any broken pad may cause as well: it jumps when its fault begins and ends."""
+"""Status bits that any broken pad may cause as well, because its reading jumps when its fault
+begins and ends."""
 
 IMMEDIATE_FAULTS = ("open", "short", "report")
-"""Faults of a pad that a single row shows, without statistics."""
+"""Kinds of faults of a pad that a single row (one sampling time) shows, without statistics."""
 
 DETECTION_NS = round(NS_PER_S * (2 * WINDOW_S + 0.1))
-"""Time, in nanoseconds, from the begin of a fault that needs statistics until it must be flagged.
+"""Longest time, in nanoseconds, from the begin of a fault until it must be flagged, if finding it
+needs statistics.
 
-It is two windows, and the scan that shows that the second one is over.
+The time is two windows, and the scan that shows that the second one is over.
 """
 
 RELEASE_S = 6.0
-"""Time, in seconds, for which a pad that works again may still be left out.
+"""Longest time, in seconds, for which a pad that works again may still be left out.
 
 The reconstruction waits for 2 s of rows, and the link may be cut for 2 s meanwhile.
 """
@@ -56,20 +58,22 @@ MIN_MOVEMENT = 10.0
 stuck pad to be detectable. The diagnosis needs half of it."""
 
 DISTURBANCE_S = 1.0
-"""Time, in seconds, around a cut in which rows come late. Late rows end a window early."""
+"""Time, in seconds, before and after a cut of a link in which rows come late and end a window of
+the statistics early."""
 
 RESTART_S = 2.0
-"""Time, in seconds, around a start of a node in which the statistics are not complete."""
+"""Time, in seconds, before and after a start of a node in which its statistics are not complete."""
 
 NOMINAL_PERIOD_S = 1.5
 """Time, in seconds, before and after the begin of a fault in which the periods of the hubs are
 looked up."""
 
 WINDOW_STEP_NS = 100_000_000
-"""Step, in nanoseconds, between the windows in which movement is looked for."""
+"""Time, in nanoseconds, between the begins of two windows in which movement of pads is looked
+for."""
 
 EXAMPLES = 4
-"""Number of examples of each kind."""
+"""Maximum number of false alarms that are described as examples."""
 
 
 def check_health(run: Run, sample: Index) -> Findings:
@@ -132,7 +136,7 @@ def _is_flagged(
     pad: int,
     bit: int,
 ) -> Mask:
-    """Find the rows (N,) that leave the pad out and name its condition."""
+    """Find the rows (N,) that leave a pad out and have the status bit of its condition."""
     is_left_out = rows.left_out >> np.uint32(pad) & 1 == 1
     return is_left_out & (rows.status & bit != 0)
 
@@ -142,7 +146,7 @@ class _Evidence:
 
     def __init__(self, run: Run) -> None:
         self._run = run
-        self._noise: list[Array] = []  # standard deviation of each pad's frequency, in Hz
+        self._noise: list[Array] = []  # Standard deviation of each pad's frequency, in Hz.
         for calibration in run.record.skin.calibrations:
             rest = calibration.rest_frequency
             slope = stress_slope(rest, rest, calibration.beta, calibration.modulus)
@@ -173,7 +177,8 @@ class _Evidence:
         return fault.kind != "stuck" or self._moves(fault, span)
 
     def _is_disturbed(self, span: Span) -> bool:
-        """Return whether the statistics began again in a span, as after a cut of any link."""
+        """Return whether the statistics of the pads began again in a span of time, as after a cut
+        of any link."""
         cuts = self._run.samples.faults(*CUT_FAULTS)
         starts = self._run.record.actions_of(*NODE_STARTS)
         is_cut = any(cut.overlaps(span, DISTURBANCE_S) for cut in cuts)
@@ -192,7 +197,8 @@ class _Evidence:
         return count(has_arrived) >= MIN_COMPLETENESS * expected
 
     def _moves(self, fault: HubFault, span: Span) -> bool:
-        """Return whether half of the pads of the cube move in every window of a span."""
+        """Return whether half of the pads of the faulty pad's cube move in every window of a
+        span."""
         samples = self._run.samples
         is_chosen = (samples.link == fault.link) & span.contains(samples.time_ns)
         chosen = np.flatnonzero(is_chosen)
@@ -205,7 +211,7 @@ class _Evidence:
             frequency = readings.frequency[is_within]
             if not len(frequency):
                 return False
-            # The lower median: half of the pads move at least that much.
+            # The lower median is a movement that half of the pads have at least.
             movement = np.ptp(frequency, axis=0) / self._noise[fault.cube]
             movement.sort()
             if movement[(len(movement) - 1) // 2] < MIN_MOVEMENT:

@@ -16,16 +16,16 @@ from cube_tensor_driver.messages.codec import AnyRows
 NS_PER_S = 1_000_000_000
 
 DRIVER_KILLS = ("restart driver",)
-"""Actions that kill the driver and start it again."""
+"""Names of the actions that kill the driver and start it again."""
 
 DRIVER_STOPS = ("cycle driver", *DRIVER_KILLS)
-"""Actions during which nobody takes what the hubs send."""
+"""Names of the actions during which nobody takes what the hubs send."""
 
 RECONSTRUCTION_STOPS = ("restart reconstruction", "reconfigure reconstruction")
-"""Actions during which there is no reconstruction."""
+"""Names of the actions during which there is no reconstruction."""
 
 NODE_STARTS = (*RECONSTRUCTION_STOPS, *DRIVER_KILLS)
-"""Actions after which a node begins without a memory of what was before."""
+"""Names of the actions after which a node has forgotten everything before them."""
 
 UNFLUSHED_S = 0.5
 """Length, in seconds, of the span before a driver is killed whose messages may be lost.
@@ -38,7 +38,8 @@ ROWS_AROUND_GAP = 100
 taken."""
 
 GAP_MARGIN_S = 0.05
-"""Largest time, in seconds, between a row in a missing message and the rows around the gap."""
+"""Longest time, in seconds, between the stamp of a row in a missing message and the stamps of the
+rows that arrived before and after the gap."""
 
 EARLIEST_NS = np.iinfo(np.int64).min
 LATEST_NS = np.iinfo(np.int64).max
@@ -72,7 +73,7 @@ class Span:
 
 @dataclass(frozen=True)
 class Received(Generic[AnyRows]):
-    """The rows of a topic, in the order in which they arrived.
+    """The rows (one cube at one sampling time each) of a topic, in the order of arrival.
 
     Attributes:
         rows: All rows (N).
@@ -104,7 +105,9 @@ class Received(Generic[AnyRows]):
             begin_ns = min(int(before), int(after))
             # Everything before the first row that arrived belongs to a gap at the beginning.
             if not row:
-                begin_ns = EARLIEST_NS // 2  # half of it, because a margin is subtracted
+                begin_ns = (
+                    EARLIEST_NS // 2
+                )  # Half of the earliest time, because a margin is subtracted from it.
             gap = Span(begin_ns, int(after))
             inside |= gap.contains(stamp_ns, GAP_MARGIN_S, GAP_MARGIN_S)
         return inside
@@ -137,11 +140,11 @@ class CubeMessages:
 
 @dataclass(frozen=True, kw_only=True)
 class NodeAction(Span):
-    """Something that was done to the nodes, from the request to its end.
+    """Something that was done to the nodes, with the span of time from the request to its end.
 
     Attributes:
         kind: One of `ACTIONS` of `torture/mix.py`.
-        succeeded: Whether the node did it.
+        succeeded: Whether the node did what was requested.
         answer: Answer of the node.
         cubes: Indices of the cubes that were tared.
     """

@@ -20,23 +20,23 @@ from .record import LATEST_NS, NS_PER_S, RECONSTRUCTION_STOPS, NodeAction, Span
 from .run import Run
 
 TRANSPORT_S = 0.1
-"""Longest time, in seconds, that a message takes. So long before a change is requested and after it
-is answered, the old or the new values may be in force."""
+"""Longest time, in seconds, that a message takes. Within this time before a change of rest
+frequencies is requested and after it is answered, the old or the new values may be in force."""
 
 RESTORE_S = 2.0
 """Time, in seconds, after a restart until the tare is restored. The reconstruction waits until
 the driver has stated which cubes there are."""
 
 AVERAGED_S = 2.5
-"""Age, in seconds, of the oldest data in a tare.
+"""Age, in seconds, of the oldest data that a tare (measurement of the rest frequencies) averages.
 
-It averages 1 s in whole windows of 0.5 s and the one that is not over, of data that may be 1 s old.
-"""
+A tare averages 1 s in whole windows of 0.5 s and the one that is not over, of data that may be 1 s
+old. """
 
 
 @dataclass(frozen=True)
 class RestFrequencies:
-    """Rest frequencies that may be in force.
+    """Rest frequencies (of unloaded pads) that the reconstruction may use.
 
     Attributes:
         values: Frequencies (cubes, P), in Hz.
@@ -47,7 +47,8 @@ class RestFrequencies:
     is_known: Mask
 
     def tare(self, cubes: list[int], held: Array | None) -> RestFrequencies:
-        """Return them after a tare of cubes that read `held` (len(cubes), P), None if unknown."""
+        """Return the rest frequencies after a tare of cubes that read `held` (len(cubes), P), in
+        Hz; None if their reading is unknown."""
         values = self.values.copy()
         is_known = self.is_known.copy()
         is_known[cubes] = held is not None
@@ -57,7 +58,7 @@ class RestFrequencies:
 
 
 class RestHistory:
-    """All rest frequencies of a torture, each with its span of time."""
+    """All rest frequencies that were in force in a run, each with its span of time."""
 
     def __init__(self, run: Run) -> None:
         self._run = run
@@ -105,7 +106,8 @@ class RestHistory:
             yield is_unclear | span.contains(sent_ns), rest
 
     def is_calibrated(self, cube: AnyArray, sent_ns: Times) -> Mask:
-        """Find the rows (N,) for which those of the calibrations are certainly in force."""
+        """Find the rows (N,) for which the rest frequencies of the calibrations are certainly in
+        force."""
         applies = np.zeros(len(cube), bool)
         ever_tared = np.zeros(len(self._calibrated.values), bool)
         for is_candidate, rest in self.candidates(sent_ns):
@@ -117,7 +119,8 @@ class RestHistory:
         return applies & ~(self._is_unclear(sent_ns) & ever_tared[cube])
 
     def _is_unclear(self, sent_ns: Times) -> Mask:
-        """Find the times (N,) at which the old or the new values may be in force."""
+        """Find the times (N,) at which either the old or the new rest frequencies may be in
+        force."""
         record = self._run.record
         is_unclear = record.is_during(RECONSTRUCTION_STOPS, sent_ns, TRANSPORT_S, RESTORE_S)
         for action in self._changes():

@@ -16,7 +16,7 @@ from .record import NS_PER_S, Record
 from .samples import Samples
 
 EXAMPLES = 3
-"""Number of examples of each kind of finding."""
+"""Maximum number of lines that describe examples of one kind of finding."""
 
 
 def count(mask: Mask) -> int:
@@ -25,7 +25,7 @@ def count(mask: Mask) -> int:
 
 
 def find_matched(index: Index) -> Index:
-    """Return the places of an index (N,) that are not `NO_MATCH`."""
+    """Return the places at which indices (N,) are not `NO_MATCH` (no sample was found)."""
     return np.flatnonzero(index != NO_MATCH)
 
 
@@ -36,12 +36,12 @@ def agree(found: Real, wanted: Real, allowed: Real | float = 0.0) -> Mask:
 
 
 class Run:
-    """What a torture sent and received.
+    """What the hubs of a torture (run of a simulated skin under faults) sent, and what arrived.
 
     Attributes:
         record: What arrived and what was done.
         samples: All samples that the hubs took, S in number.
-        expected: What the pads should read in them.
+        expected: Computes what the pads should read in these samples.
         sample: Index of the sample of each row of frequencies (N,), or `NO_MATCH`.
     """
 

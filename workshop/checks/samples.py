@@ -31,11 +31,11 @@ or disturb the hub's clock."""
 
 @dataclass(frozen=True, kw_only=True)
 class HubFault(Span):
-    """A fault that was carried out.
+    """A fault of a simulated hub or pad, with the span of time for which it lasted.
 
     Attributes:
-        fault: What was done.
-        start_us: Simulated time of its begin.
+        fault: Kind and values of the fault.
+        start_us: Simulated time of its begin, in µs.
         link: Index of the link in the log.
         cube: Index in the skin of the cube that a fault of a pad is on.
     """
@@ -51,17 +51,17 @@ class HubFault(Span):
 
 
 class Samples:
-    """Columns of all samples (S,): hub after hub, in the order of time.
+    """Columns of all S samples that the hubs took: hub after hub, in the order of time.
 
     Attributes:
         log: The sample log.
         table: Columns that every simulated hub has.
         link, number, time_ns: As in the table (S,).
-        time_us: Simulated time (S,).
+        time_us: Simulated time (S,), in µs.
         boot: Number of restarts of the hub before the sample (S,).
-        period_us: Time from sample to sample (S,).
+        period_us: Time from sample to sample (S,), in µs.
         row_count: Number of the skin's cubes on the link, so the number of rows (S,).
-        is_damaged: Whether the sample was not sent as it was taken (S,).
+        is_damaged: Whether the frame of the sample was damaged or dropped on purpose (S,).
     """
 
     def __init__(self, log: SampleLog) -> None:
@@ -134,5 +134,9 @@ def _join_keys(
     boot: AnyArray,
     number: AnyArray,
 ) -> AnyArray:
-    """Join the columns that identify a sample in one integer each; numbers stay below 2**40."""
+    """Join link, number of restarts and sample number, which identify a sample, in one integer
+    each.
+
+    Sample numbers are below 2**40.
+    """
     return (link << 52) | (boot << 40) | number

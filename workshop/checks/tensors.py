@@ -24,14 +24,16 @@ from .rest import RestFrequencies, RestHistory
 from .run import Findings, Run, agree, count, find_matched
 
 MAX_ERROR = 1e-4
-"""Largest error of a component against the reference, as a share of the component's range.
+"""Largest error of a component (stress or gradient) against the reference, as a share of the range
+of the component under the load.
 
 float32 leaves 1e-6, rounding to mHz 1e-5 and more where few pads are left. A tare that is wrong by
 20 ppm gives 4e-4.
 """
 
 MAX_ERROR_OF_LOAD = 1e-3
-"""Largest error of a component against the load, as a share of the component's range."""
+"""Largest error of a component (stress or gradient) against the load, as a share of the range of
+the component under the load."""
 
 MAX_NOISE_SHARE = 0.1
 """Error of a component that is allowed in addition to `MAX_ERROR`, as a share of its standard
@@ -45,7 +47,8 @@ MAX_RELATIVE_RESIDUAL_ERROR = 1e-3
 residual."""
 
 LIMIT_MARGIN = 0.01
-"""Relative distance from its false-alarm limit at which a residual may be above it or not."""
+"""Relative distance between a residual and its false-alarm limit below which the status may state
+either that the residual is above the limit or that it is not."""
 
 ROW_STATUS = PAD_FAULT | RESIDUAL | INVALID | TEMPERATURE | STAMP
 """Status bits of the row itself; the others describe the condition of the cube's pads."""
@@ -53,7 +56,7 @@ ROW_STATUS = PAD_FAULT | RESIDUAL | INVALID | TEMPERATURE | STAMP
 
 @dataclass(frozen=True)
 class TensorFindings(Findings):
-    """Findings, and what other checks need of them.
+    """Findings about the topic `stress`, and what other checks need of them.
 
     Attributes:
         source: Row of frequencies that each row of stress was made from (M,), or `NO_MATCH`.
@@ -65,7 +68,7 @@ class TensorFindings(Findings):
 
 
 def check_tensors(run: Run) -> TensorFindings:
-    """Compare every row.
+    """Compare every row (one cube at one sampling time) of stress.
 
     The figures are: `wrong_tensors`, rows that differ from the reference or the load, or that were
     made from no row that arrived; `repeated`, rows made from a row that had its tensor already;
@@ -82,7 +85,7 @@ def check_tensors(run: Run) -> TensorFindings:
 
     is_invented = source == NO_MATCH
     is_invented &= ~record.frequencies.is_in_gap(stress.stamp_ns)
-    # The last messages of a driver that was killed may have reached the reconstruction alone.
+    # The last messages of a driver that was killed may have reached the reconstruction only.
     is_invented &= ~record.is_during(DRIVER_KILLS, record.stress.sent_ns, UNFLUSHED_S)
 
     history = RestHistory(run)

@@ -16,20 +16,22 @@ from .samples import CUT_FAULTS
 MS_PER_NS = 1e-6
 
 CLOCK_FAULTS = ("reset", "wrap", "unplug", "rename", "drift")
-"""Faults after which the driver fits the clock of the hub from the start."""
+"""Kinds of faults after which the driver fits the clock of the hub from the start."""
 
 BEFORE_FAULT_S = 0.1
-"""Time, in seconds, before a fault in which samples may already be affected."""
+"""Time, in seconds, before a fault of a hub's clock in which the stamps of samples may already be
+affected."""
 
 CLOCK_SETTLE_S = 6.0
 """Time, in seconds, after a restart of a hub or of the driver from which stamps are checked,
 because the rate of the hub's clock is known then."""
 
 RATE_CHANGE_S = 1.0
-"""Time, in seconds, after a request in which each hub that is not cut must sample at a new rate."""
+"""Longest time, in seconds, from a request until each hub whose link is not cut must sample at the
+new rate."""
 
 BEFORE_CUT_S = 1.0
-"""Time, in seconds, before a cut in which a hub may not have received a request."""
+"""Time, in seconds, before a cut of a link in which the hub may not have received a request."""
 
 
 def measure_stamp_errors(run: Run) -> Array:

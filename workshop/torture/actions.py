@@ -30,50 +30,51 @@ MAX_START_S = 40.0
 """Longest time, in seconds, until a node has started."""
 
 MAX_ANSWER_S = 10.0
-"""Longest time, in seconds, that is waited for one answer of a node."""
+"""Longest time, in seconds, for which this process waits for one answer of a node."""
 
 ANSWER_TRIES = 4
 """Maximum number of requests to a node that does not answer. An answer is lost if the node has not
 yet discovered our client."""
 
 MAX_TARE_S = 3.0
-"""Time, in seconds, for which a tare is requested again, because it is refused while data have a
-gap. The load is held longer."""
+"""Time, in seconds, for which a tare (measurement of the rest frequencies) is requested again after
+a refusal. A tare is refused while data have a gap; the load is held for longer than this time."""
 
 TARE_PERIOD_S = 0.3
-"""Time, in seconds, between two requests of a tare."""
+"""Time, in seconds, between two requests of a tare (measurement of the rest frequencies)."""
 
 MIN_TARED_S = 1.0
 """Shortest time, in seconds, for which a tare stays in force, so that its tensors can be checked
 also where this process is late."""
 
 MIN_RATE_S = 1.1
-"""Time, in seconds, for which a rate stays in force that was set late. It can only be checked if
-the next change does not follow at once."""
+"""Time, in seconds, for which a sampling rate that was set late stays in force. A rate can only be
+checked if the next change does not follow at once."""
 
 MAX_RATE_DELAY_S = 0.05
-"""Delay, in seconds, of a rate above which the next change would follow too early."""
+"""Largest delay, in seconds, of a change of the sampling rate after which the next change is not
+too early for the check."""
 
 MAX_STRESS_AGE_S = 0.5
 """Age, in seconds, of the newest stress above which the host is too busy for a tare, which may be
 refused then."""
 
 MAX_DELAY_S = 0.5
-"""Delay, in seconds, of an action above which a tare may come when its load is not held any
-more."""
+"""Largest delay, in seconds, of an action with which a tare certainly comes while the load is
+held."""
 
 FLUSH_S = 0.3
-"""Time, in seconds, in which the messages arrive that a process sent just before its end."""
+"""Time, in seconds, within which messages arrive that a process sent just before its end."""
 
 DISCOVERY_S = 1.0
-"""Time, in seconds, that is waited between discovery and activation, so that the first sample is
-received too."""
+"""Time, in seconds, between the discovery of all topics and the activation of the driver, so that
+the first sample is received too."""
 
 OTHER_SUBSCRIBER = "markers"
-"""Node that subscribes to stress beside this process."""
+"""Name of the node that subscribes to the topic `stress` beside this process."""
 
 TRANSITIONS = "driver/transition_event"
-"""Topic that the driver has as soon as it can be configured."""
+"""Name of a topic that the driver publishes as soon as it can be configured."""
 
 ActionResult = tuple[bool, str]
 """Whether a node did what was requested, and its answer."""
@@ -83,7 +84,7 @@ UP = (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE)
 
 
 class Actions:
-    """Carries actions out, one after the other.
+    """Carries actions on the nodes out, one after the other.
 
     Attributes:
         done: All actions so far.
@@ -99,7 +100,16 @@ class Actions:
         stress: TopicLog[StressRows],
         on_driver_killed: Callable[[], None],
     ) -> None:
-        """on_driver_killed: called when the driver is dead and its last messages have arrived."""
+        """Create the clients of the nodes' services.
+
+        Args:
+            observer: Node that observes the skin.
+            children: The processes of the skin.
+            processes: How to start each process, by its name.
+            skin: The skin.
+            stress: Log of the topic `stress`.
+            on_driver_killed: Called when the driver is dead and its last messages have arrived.
+        """
         self.done: list[NodeAction] = []
         self.refused: list[str] = []
         self._observer, self._children, self._processes = observer, children, processes
@@ -165,7 +175,7 @@ class Actions:
             self._observer.spin(MIN_RATE_S)
 
     def _pause(self, name: str, seconds: float) -> ActionResult:
-        # A process that is stopped stands for one that does not get a processor.
+        # A stopped process behaves like one that the system gives no processor.
         self._children.pause(name)
         self._observer.spin(seconds)
         self._children.resume(name)

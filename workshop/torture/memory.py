@@ -11,14 +11,14 @@ from cube_tensor_driver.demo.usage import Usage
 from cube_tensor_driver.processes.children import Children
 
 PERIOD_S = 1.0
-"""Time, in seconds, between two measurements."""
+"""Time, in seconds, between two measurements of the memory of the nodes."""
 
 SETTLE_S = 45.0
-"""Time, in seconds, after the start of a process in which its memory grows in steps. Only later
-growth counts."""
+"""Time, in seconds, after the start of a process in which its memory grows in steps. Only growth
+after this time counts."""
 
 MIN_DURATION_S = 60.0
-"""Shortest time, in seconds, over which growth is given."""
+"""Shortest time, in seconds, over which the growth of the memory of a process is computed."""
 
 
 class MemoryMonitor:
@@ -31,7 +31,7 @@ class MemoryMonitor:
         self._sizes: dict[int, list[tuple[float, float]]] = {}
 
     def measure(self) -> None:
-        """Measure if a period is over; to be called again and again."""
+        """Measure the memory if a period is over. The caller calls this repeatedly."""
         now_s = time.monotonic()
         if now_s < self._next_s:
             return
@@ -50,9 +50,8 @@ class MemoryMonitor:
     def growth_mb_per_min(self) -> float | None:
         """Return the growth of the process that grows fastest, None if no process ran long enough.
 
-        It is the median of the slopes between all pairs of times (Theil, Sen), which a single step
-        does not change.
-        """
+        The growth is the median of the slopes between all pairs of times (Theil, Sen), which a
+        single step does not change."""
         slopes = []
         for sizes in self._sizes.values():
             times_s, sizes_mb = np.array(sizes).T

@@ -27,17 +27,18 @@ from cube_tensor_driver.ros.messages import to_ns
 from ..checks.record import CubeMessages, Received, Tensor, Wrench
 
 MESSAGES_PER_DECODING = 500
-"""Number of messages that are decoded together, which takes less time than one by one."""
+"""Number of messages that are decoded together, which takes less time than decoding one by one."""
 
 MESSAGES_PER_SAMPLE = 8
-"""Number of messages of a single cube of which one is kept."""
+"""Number of messages on the topics of a single cube of which one is kept for the checks."""
 
 MAX_CUBE_MESSAGES = 4000
-"""Number of messages of a single cube after which its topics are unsubscribed. To receive all of
-them would take a third of the machine."""
+"""Number of messages on the topics of a single cube after which these are unsubscribed. To receive
+all messages would take a third of the processor time of the machine."""
 
 MAX_MESSAGES_TAKEN = 300
-"""Largest number of messages taken at a time, so that this process does other things, too."""
+"""Maximum number of messages that are taken at a time, so that this process also does other
+things."""
 
 
 class Message(NamedTuple):
@@ -49,7 +50,7 @@ class Message(NamedTuple):
 
 
 class RawSubscription:
-    """Takes the serialised messages of a topic with their numbers."""
+    """Takes the serialised messages of a topic with the numbers that DDS gave them."""
 
     def __init__(
         self,
@@ -67,7 +68,7 @@ class RawSubscription:
         """Return messages that have arrived since the last call."""
         taken: list[Message] = []
         handle = self._subscription.handle
-        # The handle must not be destroyed meanwhile.
+        # The handle of the subscription must not be destroyed meanwhile.
         with handle:
             while len(taken) < MAX_MESSAGES_TAKEN:
                 item = handle.take_message(self._kind, True)
@@ -84,7 +85,7 @@ class RawSubscription:
 
 
 class TopicLog(Generic[AnyRows]):
-    """Collects all rows of one batch topic.
+    """Collects all rows (one cube at one sampling time each) of one batch topic.
 
     Attributes:
         count: Number of messages so far.
@@ -132,7 +133,8 @@ class TopicLog(Generic[AnyRows]):
         return len({cube for rows in self._decoded for cube in rows.cube.tolist()})
 
     def newest_ns(self) -> int:
-        """Return the stamp of the newest message, 0 before the first."""
+        """Return the stamp of the newest row, in ns since the Unix epoch; 0 before the first
+        message."""
         self._decode()
         if not self._decoded:
             return 0
@@ -156,14 +158,15 @@ class TopicLog(Generic[AnyRows]):
         )
 
     def _decode(self) -> None:
-        """Decode what waits: neighbours of one shape together."""
+        """Decode the waiting messages; neighbours with the same number of rows and pads
+        together."""
         waiting, self._waiting = self._waiting, []
         for _, group in groupby(waiting, self._shape_of):
             messages = list(group)
             try:
                 decoded = self._codec.decode(*(message.data for message in messages))
             except MessageError:
-                # The checks report it: a torture must not end here.
+                # The checks report unreadable messages, so the run goes on.
                 self._unreadable += len(messages)
                 continue
             if decoded.frame_id != self._frame_id:

@@ -11,16 +11,16 @@ from cube_tensor_driver.simulation.faults import FRAME_FAULTS, PAD_FAULTS
 from ..checks.samples import CUT_FAULTS
 
 HUBS = 4
-"""Number of hubs."""
+"""Number of simulated hubs of the tortured skin."""
 
 CUBES_PER_HUB = 8
-"""Number of cubes on each hub."""
+"""Number of cubes on each hub of the tortured skin."""
 
 PADS = 8
-"""Number of pads of each cube."""
+"""Number of pads of each cube of the tortured skin."""
 
 RATE = 500.0
-"""Samples per second."""
+"""Sampling rate of all cubes of the tortured skin, in Hz."""
 
 ACTIONS = {
     "stall reconstruction": "stop the process for `seconds`, less than its queue holds",
@@ -33,10 +33,11 @@ ACTIONS = {
     "cycle driver": "deactivate and activate it",
     "restart driver": "kill the process and start it again",
 }
-"""What is done to the nodes."""
+"""Actions on the nodes, each with what is done."""
 
 Event = dict[str, Any]
-"""A fault of a hub, with `kind` as in `simulation.faults`, or an action, with `action`."""
+"""A fault of a hub, with the key `kind` as in `simulation.faults`, or an action on a node, with the
+key `action`; other keys are its values."""
 
 ROUND_S = 30.0
 """Time, in seconds, after which the actions of `ROUND` are repeated."""
@@ -72,13 +73,14 @@ HELD_HUB = 0
 """Hub whose load is held for the tare. It has no other fault meanwhile."""
 
 HELD_CUBES = tuple(range(HELD_HUB * CUBES_PER_HUB, (HELD_HUB + 1) * CUBES_PER_HUB))
-"""Cubes of that hub, which are tared."""
+"""Cubes of the hub whose load is held; these are tared."""
 
 QUIET_BEFORE_S = 4.0
-"""Time, in seconds, before the load is held in which that hub has no other fault."""
+"""Time, in seconds, before the load of a hub is held in which the hub has no other fault."""
 
 QUIET_AFTER_S = 7.0
-"""Time, in seconds, after the load was held in which that hub has no other fault."""
+"""Time, in seconds, after the begin of holding the load of a hub in which the hub has no other
+fault."""
 
 OPENING_HUB = 2
 """Hub on which each fault of a pad occurs once at the beginning, before the first cut."""
@@ -88,10 +90,10 @@ OPENING_CUBES = (3, 4, 2, 5, 1)
 to be found."""
 
 FIRST_CUT_S = 3.5
-"""Time, in seconds, of the earliest cut of a link."""
+"""Time, in seconds after the begin of a torture, of the earliest cut of a link."""
 
 LAST_EVENT_S = 3.5
-"""Time, in seconds, before the end after which no fault begins."""
+"""Length, in seconds, of the last part of a torture, in which no fault begins."""
 
 
 def schedule(duration: float, seed: int) -> list[tuple[float, Event]]:
@@ -127,7 +129,8 @@ class _Mix:
         self.events.append((round(at, 3), event))
 
     def _add_fault(self, at: float, hub: int, **fault: Any) -> None:
-        """Add a fault of a hub unless it would disturb a tare; damage to single frames does not."""
+        """Add a fault of a hub, unless it would disturb a tare. Damage to frames disturbs no
+        tare."""
         disturbs = fault["kind"] not in FRAME_FAULTS and hub == HELD_HUB
         if not (disturbs and _disturbs_tare(at, fault.get("seconds", 0.0))):
             self._add(at, link=f"hub{hub}", **fault)
@@ -181,7 +184,7 @@ class _Mix:
             elif kind == "step":
                 fault["value"] = round(random.uniform(-0.5, 5.0), 3)
             elif kind == "wrap":
-                # The numbers of the samples begin again at 0 after this number of samples.
+                # The sample numbers of the hub begin again at 0 after this number of samples.
                 fault["count"] = int(random.integers(100, 3000))
             self._add_fault(at, hub, **fault)
             # A link that was cut delivers for a while before the next cut.

@@ -26,26 +26,27 @@ from cube_tensor_driver.device.wire import decoder
 from cube_tensor_driver.processes.skin_processes import Process
 
 Patch = Callable[[], None]
-"""Puts a mutation into this process."""
+"""Function that puts a mutation (deliberate programming error) into this process."""
 
 RowsChange = Callable[[Any], Any]
-"""Makes changed rows (`FrequencyRows` or `StressRows`) of the rows of one message."""
+"""Function that makes changed rows (`FrequencyRows` or `StressRows`) from the rows of one
+message."""
 
 ColumnChange = Callable[[Any], Any]
-"""Makes the changed column of rows (an array) of the column as it should be."""
+"""Function that makes the changed column (an array) of rows from the column as it should be."""
 
 MESSAGES_PER_CHANGE = 200
-"""Number of messages of which one is changed, where a mutation does not change all."""
+"""Number of messages of which one is changed, by mutations that do not change all messages."""
 
 CUBES_PER_HUB = 8
 """Number of cubes on each hub of the torture."""
 
 NOISY_CUBE = 5
-"""Cube of the skin that the mutation `ghosts` flags."""
+"""Number of the cube whose first pad the mutation `ghosts` flags although it works."""
 
 
 class Mutation(NamedTuple):
-    """A programming error.
+    """A deliberate programming error that the checks must find.
 
     Attributes:
         node: Name of the node whose process is patched, "driver" or "reconstruction".
@@ -89,7 +90,7 @@ def _wrap(
     name: str,
     mutate: Callable[..., Any],
 ) -> Patch:
-    """Call mutate(original, self, ...) where the function (self, ...) was called."""
+    """Call mutate(original, self, ...) in place of a function (self, ...) of the driver."""
 
     def make(original: Any) -> Any:
         return lambda *arguments, **options: mutate(original, *arguments, **options)
@@ -98,7 +99,7 @@ def _wrap(
 
 
 def _skip(place: str, name: str) -> Patch:
-    """Do nothing where a function was called."""
+    """Do nothing in place of a function of the driver."""
     return _wrap(place, name, lambda *_, **__: None)
 
 
@@ -107,7 +108,7 @@ def _change_result(
     name: str,
     change: Callable[[Any], Any],
 ) -> Patch:
-    """Change what a function returns."""
+    """Change what a function of the driver returns."""
 
     def mutate(original: Any, *arguments: Any, **options: Any) -> Any:
         return change(original(*arguments, **options))
@@ -203,7 +204,7 @@ def _swap_cubes(rows: FrequencyRows) -> FrequencyRows:
     one = np.flatnonzero(rows.cube == 1)
     other = np.flatnonzero(rows.cube == 2)
     frequency = np.array(rows.frequency)
-    # A message may have rows of one of the cubes only.
+    # A message may have rows of only one of the two cubes.
     if len(one) == len(other):
         frequency[np.r_[one, other]] = frequency[np.r_[other, one]]
     return replace(rows, frequency=frequency)
@@ -224,7 +225,7 @@ def _treat_as(found: Arrival, instead: Arrival) -> Patch:
 
 
 def _ignore_checksums() -> None:
-    """Let every frame have the right checksum."""
+    """Let every frame count as one with the right checksum."""
     checksum = SimpleNamespace(crc32=lambda _: decoder._CRC_RESIDUE)
     _replace("device.wire.decoder", "zlib", lambda _: checksum)()
     # Only the decoder in Python has a checksum that can be replaced.
@@ -232,7 +233,7 @@ def _ignore_checksums() -> None:
 
 
 def _leave_thread(original: Any, *arguments: Any) -> None:
-    # A daemon, so that the process can still end.
+    # A daemon thread, so that the process can still end.
     threading.Thread(target=threading.Event().wait, daemon=True).start()
     original(*arguments)
 
@@ -398,11 +399,11 @@ RECONSTRUCTION: dict[str, Patch] = {
     "for ever": _wrap("core.health.diagnosis:Conditions", "end_window", _never_release),
     # Windows of statistics last 2 s.
     "slow": _replace("core.health.health", "WINDOW_NS", lambda _: 2_000_000_000),
-    # Left_out is 0.
+    # The mask of pads that are left out is 0.
     "no mask": _change_stress(left_out=np.zeros_like),
-    # Left_out names the next pad.
+    # The mask of pads that are left out names the next pad.
     "other mask": _change_stress(left_out=lambda mask: mask << np.uint32(1)),
-    # Left-out pads are used.
+    # Pads that are left out are used all the same.
     "mask unused": _wrap("core.pipeline:Pipeline", "process", _use_bad_pads),
     # The residual is 0.
     "no residual": _change_stress(residual=np.zeros_like),
@@ -410,17 +411,17 @@ RECONSTRUCTION: dict[str, Patch] = {
     "residual doubled": _change_stress(residual=lambda value: 2 * value),
     # The status states nothing about residuals.
     "no residual bit": _change_stress(status=lambda status: status & ~np.uint16(RESIDUAL)),
-    # Xx and zz are swapped.
+    # The components xx and zz are swapped.
     "swapped components": _change_stress(stress=lambda stress: stress[:, [2, 1, 0, 3, 4, 5]]),
-    # Zx has the other sign.
+    # The component zx has the other sign.
     "shear sign": _change_stress(stress=lambda stress: stress * [1, 1, 1, 1, -1, 1]),
-    # Compression is positive.
+    # Stress and gradient have the other sign: compression is positive.
     "pressure positive": _change_stress(stress=np.negative, gradient=np.negative),
     # Stress is in kPa.
     "kilopascal": _change_stress(stress=lambda stress: stress / 1e3),
     # Gradients are in Pa/mm.
     "per millimetre": _change_stress(gradient=lambda value: value / 1e3),
-    # Gradients have columns for rows.
+    # The matrix of gradients is transposed.
     "gradient transposed": _change_stress(gradient=_transpose),
     # Components that are not observed are 0.
     "unknown is zero": _change_stress(stress=np.nan_to_num, gradient=np.nan_to_num),
@@ -467,7 +468,7 @@ RECONSTRUCTION: dict[str, Patch] = {
 wrong."""
 
 NEEDS_RESTART = ("tare not restored",)
-"""Mutations that show only when the reconstruction starts again."""
+"""Names of the mutations that show only when the reconstruction starts again."""
 
 MUTATIONS: dict[str, Mutation] = {
     **{name: Mutation("driver", patch) for name, patch in DRIVER.items()},

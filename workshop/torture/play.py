@@ -34,30 +34,31 @@ from .mutations import mutated
 from .recorder import INSTANTS, recording
 
 CUBES_PER_ROW = 8
-"""Number of cubes side by side on the skin."""
+"""Number of cubes side by side on the tortured skin."""
 
 PITCH = 0.012
-"""Distance of the cubes, in m."""
+"""Distance of neighbouring cubes of the tortured skin, in m."""
 
 SETTLE_S = 3.0
-"""Time, in seconds, from the last fault to the end."""
+"""Time, in seconds, from the end of the mix of faults to the end of the torture."""
 
 UNCHECKED_S = 2.0
-"""Time, in seconds, before the end in which samples are not checked."""
+"""Length, in seconds, of the last part of a torture, whose samples are not checked."""
 
 ARRIVAL_S = 2.5
-"""Time, in seconds, from the end of the checked span until its samples have arrived."""
+"""Time, in seconds, within which the last checked samples arrive."""
 
 MAX_DRAIN_S = 60.0
-"""Longest time, in seconds, until everything that was sent has arrived."""
+"""Longest time, in seconds, from the end of the driver until everything that was sent has
+arrived."""
 
 NODES = ("driver", "reconstruction")
-"""Processes whose memory and threads are measured."""
+"""Names of the processes whose memory and threads are measured."""
 
 
 @dataclass(frozen=True)
 class Played:
-    """A torture that is over.
+    """Results of a torture (run of a simulated skin under faults).
 
     Attributes:
         record: What arrived and what was done.
@@ -79,14 +80,14 @@ def play(
     interrupted: Event,
     mutation: str = "",
 ) -> Played:
-    """Torture a skin.
+    """Run a simulated skin under faults, and record what arrives.
 
     Args:
         duration: Time in which faults begin, in seconds.
-        seed: Seed of the mix.
+        seed: Seed of the random mix of faults.
         folder: Folder for all files.
         interrupted: Event that ends the torture.
-        mutation: Mutation of the driver or the reconstruction, if any.
+        mutation: Name of a mutation (deliberate error) of a node; empty: none.
 
     Raises:
         CubeError: A process does not start, or ends.
@@ -118,7 +119,7 @@ def play(
                 logs = "\n".join(children.log(name)[-500:] for name in NODES)
                 raise CubeError(f"no tensor arrived within {MAX_START_S:g} s:\n{logs}")
 
-            # All threads are there when tensors arrive, and further ones are leaks.
+            # All threads exist when tensors arrive; further ones later are leaks.
             threads = memory.count_threads()
             _carry_out(observer, actions, ports / FAULT_PIPE, schedule(duration, seed), duration)
             observer.spin(SETTLE_S - ARRIVAL_S)

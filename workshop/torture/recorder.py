@@ -26,20 +26,21 @@ from .message_log import CubeTopicLog, RawSubscription, TopicLog
 from .mix import CUBES_PER_HUB, OPENING_CUBES, OPENING_HUB, RATE
 
 INSTANTS = 1000
-"""Number of instants of the load that the hubs repeat."""
+"""Number of instants of the load that the simulated hubs repeat."""
 
 RECORDED_CUBE = OPENING_HUB * CUBES_PER_HUB + OPENING_CUBES[0]
-"""Cube whose own topics are recorded, too. One of its pads breaks at the beginning."""
+"""Number of the cube whose own topics are recorded, too. One of its pads breaks at the
+beginning."""
 
 QUIET_S = 1.0
 """Time, in seconds, without a new message after which everything has arrived."""
 
 QUEUE_DEPTH = 20_000
-"""Number of messages that our queues hold, more than those of all others. When this process is
-delayed, nothing may be lost that the driver would be blamed for."""
+"""Number of messages that the queues of this process hold, more than those of all other processes.
+So nothing is lost here, for which the driver would be blamed, when this process is delayed."""
 
 LINK_COUNTERS = ("lost_on_the_way", "dropped_in_hub", "taken", "delivered", "duplicate", "resets")
-"""Counters of the driver for each link that are shown or checked."""
+"""Names of those counters of the driver for each link that are shown or checked."""
 
 
 class TortureRecorder:
@@ -56,7 +57,13 @@ class TortureRecorder:
         node: Node,
         skin: Skin,
     ) -> None:
-        """node: gets the subscriptions without an executor, see `message_log`."""
+        """Subscribe to the topics of a skin.
+
+        Args:
+            observer: Node that observes the skin.
+            node: Node of the subscriptions, which has no executor, see `message_log`.
+            skin: The skin.
+        """
         self.observer, self._skin = observer, skin
         quality = batch_profile(RATE)
         quality.depth = QUEUE_DEPTH
@@ -68,9 +75,9 @@ class TortureRecorder:
 
         self._links: dict[str, dict[str, str]] = {}
         self._totals: dict[str, str] = {}
-        self._earlier_counts: Counter[str] = Counter()  # of drivers that were killed
+        self._earlier_counts: Counter[str] = Counter()  # Of the drivers that were killed.
         self._counted_ns = 0
-        self._messages_lost = [0]  # by the reconstruction, in each of its lives
+        self._messages_lost = [0]  # By the reconstruction, in each of its lives.
         self._n_messages, self._last_message_s = 0, time.monotonic()
         observer.node.create_subscription(
             DiagnosticArray, "/diagnostics", self._on_diagnostics, 1000

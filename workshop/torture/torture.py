@@ -24,12 +24,12 @@ from .mutations import MUTATIONS, NEEDS_RESTART
 from .play import play
 
 MUTATED_S = 10.0
-"""Duration, in seconds, of a torture with a mutation. It is long enough for each kind of fault and
-each action except the restarts."""
+"""Duration, in seconds, of a torture with a mutation (deliberate error in a node): long enough for
+each kind of fault and each action except the restarts."""
 
 RESTARTED_S = 16.0
-"""Duration, in seconds, of a torture with a mutation that shows when the reconstruction starts
-again."""
+"""Duration, in seconds, of a torture with a mutation (deliberate error in a node) that shows only
+when the reconstruction starts again."""
 
 FORBIDDEN = (
     "unreadable",
@@ -47,7 +47,7 @@ FORBIDDEN = (
     "crashes",
     "threads_leaked",
 )
-"""Figures that must be 0."""
+"""Names of the figures of a torture that must be 0."""
 
 LIMITS = {
     **dict.fromkeys(FORBIDDEN, 0.0),
@@ -57,7 +57,7 @@ LIMITS = {
     "stamp_error_p90_ms": 1.5,
     "stamp_error_p99_ms": 10.0,
 }
-"""Largest value of each figure.
+"""Largest allowed value of each checked figure of a torture, by its name.
 
 On a busy host the queues of DDS fill, and memory grows with them. A leak of 200 bytes per message
 would be 6 MB per minute.
@@ -139,7 +139,7 @@ def run_mutations(
 
 
 def _torture_mutated(name: str, seed: int) -> dict[str, Any]:
-    """Return the figures of the torture of one mutation."""
+    """Return the figures of a torture of a skin with one mutation."""
     duration = RESTARTED_S if name in NEEDS_RESTART else MUTATED_S
     return torture(duration, seed, stop_event(), name)
 
