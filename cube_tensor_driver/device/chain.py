@@ -41,12 +41,14 @@ MAX_EVENTS = 100
 """Number of changes of state (open, silent, closed …) of one link that are kept for the next
 `LiveLinks.report`. If there are more, the oldest are discarded."""
 MIN_LAG_S = 0.05
-"""Shortest time, in s, by which reading was behind (data of links waited) at which lost samples are
-put down to this host. The buffers of a serial port hold about that much."""
+"""Minimum time, in s, for which received bytes must have waited without a break to be read by this
+process before samples lost since the last report are attributed to this host. The kernel's buffer
+of a serial port holds about what a hub with many cubes sends in this time."""
 OVERLOAD_S = 0.5
-"""Time, in s, for which reading must have been behind, with samples lost since, before scans (one
-sample of every cube) are dropped because this host is too slow. After a shorter pause it catches up
-by itself. Dropping ends when none was needed for as long."""
+"""Time, in s, for which received bytes must have waited without a break to be read, while samples
+were lost, before this process drops whole scans (one sample of every cube) because the host is too
+slow. After a shorter pause it catches up without loss. Dropping ends when no scan had to be dropped
+for this time."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,7 @@ class _LinkRecord:
     """Data that `LiveLinks` keeps for one link.
 
     Attributes:
-        track: State that each sample of the link changes; account and clock work on it.
+        track: Sample numbers and clock values of the link, on which `account` and `clock` work.
         account: Counters of the samples of the link: delivered, missing, duplicate.
         clock: Conversion of the device times of the hub to host time.
         problems: Texts about the cubes of the hub that do not fit the skin file.
@@ -164,7 +166,8 @@ class LiveLinks:
         self._step_ns = 0
         self._errors = 0
         self._overloaded_until = 0.0  # monotonic time, in s
-        # Number of samples missing at the last look while reading was behind; else None.
+        # Number of missing samples at the last callback if received bytes have always been waiting
+        # for OVERLOAD_S; otherwise None.
         self._missing_before: int | None = None
         self._reader: Reader | None = None
 
@@ -260,7 +263,8 @@ class LiveLinks:
 
         Args:
             received: Frames of the links.
-            usual: Samples that came before them and are counted and stamped already.
+            usual: Samples that came before these frames and that the module in C has counted and
+                stamped already; None if there are none.
         """
         if usual is not None and usual.links and not self._deliver_whole(usual):
             self._add_usual(usual)
@@ -273,8 +277,13 @@ class LiveLinks:
     def _deliver_whole(self, usual: UsualSamples) -> bool:
         """Call `on_rows` at once if these samples are whole scans of all links that deliver.
 
+        A whole scan holds one sample of every such link with all cubes of its hub.
+
+        Args:
+            usual: Samples that are counted and stamped already.
+
         Returns:
-            Whether they are. If not, they must be added to the scans.
+            Whether they are whole scans. If not, the caller must add the samples to the scans.
         """
         scans = self._scans.order_whole(usual, self._scans_per_call, self._max_scans)
         self._rows.received += sum(len(part.cubes) for part in scans)
@@ -286,12 +295,13 @@ class LiveLinks:
         return bool(scans)
 
     def _is_overloaded(self) -> bool:
-        """Return whether this host is too slow, so that scans must be dropped.
+        """Return whether scans (one sample of every cube) must be dropped, as the host is too slow.
 
-        It is if samples are lost although reading has been behind for `OVERLOAD_S`; a host that is
-        only behind delivers all. Whole scans are dropped, the oldest first, so that those that are
-        delivered are complete and late by a few sample periods at most. If kernel and hubs dropped
-        samples instead, at random, scans would have gaps and cost more time than complete ones.
+        This is so if samples were lost while received bytes have been waiting for `OVERLOAD_S`. If
+        bytes wait but no sample is lost, everything is delivered. Whole scans are dropped, the
+        oldest first, so that delivered scans are complete and late by a few sample periods at most.
+        If the kernel and the hubs dropped samples at random instead, scans would have gaps, and
+        they would cost more time than complete ones.
         """
         now = time.monotonic()
         if self._reader is not None and self._reader.behind_s > OVERLOAD_S:
@@ -304,7 +314,11 @@ class LiveLinks:
         return now < self._overloaded_until
 
     def _count_overload(self, n_rows: int) -> None:
-        """Count rows (samples of cubes) dropped because this host is too slow."""
+        """Count rows (samples of cubes) that were dropped because this host is too slow.
+
+        Args:
+            n_rows: Number of rows dropped; 0 if none were.
+        """
         if n_rows:
             self._rows.overload += n_rows
             self._overloaded_until = time.monotonic() + OVERLOAD_S
@@ -318,14 +332,19 @@ class LiveLinks:
                 self._scans.add(link, [sample], [stamp_ns])
 
     def _handle_received(self, received: Sequence[LinkFrames]) -> None:
-        """Handle frames of links that are not all usual samples."""
+        """Handle reads of links that the module in C has left to Python, such as those with HELLO.
+
+        Args:
+            received: Frames of each read.
+        """
         with self._lock:
             now_ns, step_ns = self._check_host_clock()
             is_set = bool(step_ns or self._step_ns)
             for read in received:
                 if is_set:
-                    # The arrival may be a time of the old clock, and a round trip between a
-                    # question for the hub's time and its answer says nothing (0: not used).
+                    # The host's clock was set, so that the arrival may be a time of the old clock.
+                    # A question for the hub's time that was asked before the step and answered
+                    # after it says nothing about the hub's clock (asked_ns = 0: not used).
                     read = read._replace(arrival_ns=now_ns, asked_ns=0)
                 # All rows are counted before any frame is handled, so that rows of the frames
                 # behind a frame that raises an error are counted, too.
@@ -364,7 +383,11 @@ class LiveLinks:
         return now_ns, step_ns
 
     def _handle_frames(self, read: LinkFrames) -> None:
-        """Count the frames of a link and add their samples to the scans."""
+        """Count the frames of one read of a link and add their samples to the scans.
+
+        Args:
+            read: The frames, with their link and arrival time.
+        """
         record = self._records[read.link]
         samples: list[Sample] = []
         for frame in read.frames:
@@ -505,7 +528,8 @@ class LiveLinks:
             link: The link.
             record: Data that is kept for the link.
             logger: Logger of the link, which counts the lines that it left out.
-            lag_s: Longest time by which reading was behind since the last report, in s.
+            lag_s: Longest time since the last report for which received bytes waited to be read,
+                in s.
         """
         counters = record.account.counters()
         notes = [*_loss_notes(record.reported, counters, lag_s)]
@@ -555,12 +579,12 @@ def _period_us(rate: float | None) -> int | None:
 def _loss_notes(before: dict[str, int], now: dict[str, int], lag_s: float) -> list[str]:
     """Return a text about the samples lost since the last report; none if none were lost.
 
-    The text names the place of the loss: this host, the hub, or the line between them.
+    The text states how many were lost and where: in this host, in the hub, or on the line.
 
     Args:
         before: Counters of the samples at the last report; empty at the first.
         now: The counters now.
-        lag_s: Longest time by which reading was behind since the last report, in s.
+        lag_s: Longest time since the last report for which received bytes waited to be read, in s.
     """
     taken, lost, dropped = (
         now[name] - before.get(name, 0) for name in ("taken", "lost_on_the_way", "dropped_in_hub")

@@ -1,7 +1,9 @@
 """State of one link that each of its samples changes: sample numbers, sample period, clock line.
 
-The module in C (native/cube_track.c) handles usual samples and changes this state in place; Python
-handles all others: lost, late, repeated or restarted ones, and those that change the clock line.
+The clock line is host time as a linear function of device time (the hub's clock). The module in C
+(native/cube_track.c) handles usual samples and changes this state in place: samples with the next
+number, all cubes of the hub, and a device time and a delay that fit the sample period and the line.
+Python handles all others, for example those after lost samples or after a restart of the hub.
 """
 
 from __future__ import annotations
@@ -15,9 +17,11 @@ repeated ones. A sample that is older than these and lies in the past of the hub
 since its last restart) is taken for a repeated one."""
 MAX_DEVICE_US = 1 << 51
 """Largest device time (time since power-up by a hub's clock), in µs, that is used: 71 years. Larger
-ones, which only a faulty hub sends, count as this one. In ns it still fits 64 bits."""
+ones, which only a faulty hub sends, are replaced by this one, so that differences of device times
+in ns fit 64 bits."""
 NEVER = -(1 << 62)
-"""Time, in ns, that is earlier than every device time and every host time."""
+"""Time, in ns, that is earlier than every device time (hub's clock) and every host time. It stands
+for the time of a sample before the first one came."""
 
 _TYPES: dict[str, Any] = {
     "int": c_int64,
@@ -30,7 +34,8 @@ _TYPES: dict[str, Any] = {
 class LinkTrack(Structure):
     """Numbers and clock of the samples of one link, in memory that the module in C changes as well.
 
-    Times in ns are relative to the origins `first_us` (device time) and `first_ns` (host time).
+    Device time is the time of the hub's clock. The clock line is host time over device time. Unless
+    stated otherwise, times in ns are counted from `first_us` (device) and `first_ns` (host).
 
     Attributes:
         is_usual: Whether the module in C may take the next samples. It clears this when a read

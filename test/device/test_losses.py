@@ -187,6 +187,7 @@ def test_a_hub_that_announces_fewer_cubes_is_counted_right() -> None:
         link.give(sample(30, n_cubes=40), Stats(31, 31, 0))
         values, losses = link.report()
         assert losses == [] and values["taken"] == values["delivered"] == 30 + 2 * 10 + 1
+        assert values["hub changes"] == 3
         assert link.live.row_counts().unaccounted == 0
     finally:
         link.close()

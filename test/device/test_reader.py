@@ -25,7 +25,7 @@ from cube_tensor_driver.device.links import session as session_module
 from cube_tensor_driver.device.links import tcp
 from cube_tensor_driver.device.links.link import LinkConfig, LinkState
 from cube_tensor_driver.device.links.reader import LinkFrames, LinkRead, Reader, UsualSamples
-from cube_tensor_driver.device.wire import cobs
+from cube_tensor_driver.device.wire import cobs, native
 from cube_tensor_driver.device.wire.decoder import Decoder
 from cube_tensor_driver.device.wire.protocol import (
     Ack,
@@ -238,6 +238,7 @@ def test_one_callback_for_all_that_is_there(start: Start, hub: PtyHub) -> None:
 
 
 @pytest.mark.alone
+@pytest.mark.skipif(native.wire is None, reason="Python waits for nobody")
 @pytest.mark.parametrize("period_us", [1_000, 1_000_000])
 def test_who_comes_first_waits_for_those_that_deliver(
     start: Start, hub: PtyHub, monkeypatch: pytest.MonkeyPatch, period_us: int

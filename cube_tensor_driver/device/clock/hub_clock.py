@@ -89,7 +89,11 @@ class HubClock:
 
     @property
     def is_usual(self) -> bool:
-        """Whether samples in step with their numbers need no decision about the hub's clock."""
+        """Whether the module in C may convert the device times of the next samples.
+
+        It may if the newest sample was the reference of the sample period, and no step of the hub's
+        clock is suspected.
+        """
         track = self._track
         is_newest = 1000 * (track.newest_us - track.first_us) == track.newest_ns
         in_step = is_newest and track.reference_us == track.newest_us and track.period_us > 0
@@ -204,7 +208,7 @@ class HubClock:
             numbers: Numbers of the samples. Without numbers, a step of the hub's clock is found
                 later, and small steps back are not found.
             is_late: Whether this host reads the samples late, because it is too slow. Then their
-                delays show no step of a clock.
+                delays are not used to find steps of a clock.
 
         Returns:
             Stamp (host time) of each sample, in ns.
@@ -235,7 +239,7 @@ class HubClock:
     def _restart(self) -> None:
         """Discard the clock line and all samples; keep the drift and the last stamp (host time)."""
         self._track.first_us = self._track.first_ns = 0
-        self._track.newest_ns = NEVER  # device time of the newest sample, in ns since _first_us
+        self._track.newest_ns = NEVER
         self._line.restart()
         self._timing.restart()
         self._decision: StepDecision | None = None
@@ -415,8 +419,8 @@ class HubClock:
         if not self._is_late:
             was_set = decision.was_set(device_ns, delay, arrival, self._track.jitter_ns)
         elif arrival - decision.since_ns > MAX_DECISION_NS:
-            # The delays of samples that are read late tell nothing. If the clock was set all the
-            # same, the clock line shows it when they are read in time again.
+            # Delays of samples that this host reads late do not tell whether the hub's clock was
+            # set. If it was, the clock line shows that once they are read in time again.
             was_set = False
         if was_set is None:
             return

@@ -154,8 +154,8 @@ class ClockLine:
         Args:
             device_ns: Device time of the sample, in ns since the first point.
             arrival_ns: Host time at which it arrived, in ns since the first point.
-            is_late: Whether the host has read the sample late, because it is too slow. Then its
-                delay shows nothing about the clocks, but still limits the line from above.
+            is_late: Whether the host has read the sample late, because it is too slow. Its delay
+                then does not show that a clock was set, but the line is still not above the point.
 
         Returns:
             Whether the points show that the hub's or the host's clock was set.
@@ -247,7 +247,9 @@ class ClockLine:
         return was_set
 
     def _add_point(self) -> bool:
-        """Fit the line to the kept points and the earliest sample of the bucket that ends now.
+        """Fit the clock line (host time over device time) with the point of one more bucket of 1 s.
+
+        The point is the sample with the smallest delay in this bucket.
 
         Returns:
             Whether the last `MIN_BUCKETS_HIGH` buckets show that a clock was set before them.

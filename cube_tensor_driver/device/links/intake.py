@@ -1,8 +1,9 @@
 """Waiting for data of all links, reading and decoding them, in one step.
 
 With the wire module in C, a single call does all of this without Python's global interpreter lock,
-so that other threads can run meanwhile. It also counts and stamps usual samples (`LinkTrack`), for
-which Python then has nothing left to do but to put them into rows.
+so that other threads can run meanwhile. The same call counts usual samples and computes their
+stamps (host times of sampling). A usual sample has the next number, all cubes of its hub, and a
+device time (hub's clock) that fits its number and the clock line of its link (`LinkTrack`).
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from .link import Link
 
 
 class UsualSamples(NamedTuple):
-    """Samples that are counted and stamped already, in the order of their arrival.
+    """Samples that the module in C has counted and stamped already, in the order of arrival.
 
     Attributes:
         links: Index of the link of each sample.
@@ -34,7 +35,7 @@ class UsualSamples(NamedTuple):
 
 
 class LinkRead(NamedTuple):
-    """Result of reading one link once, if it holds anything but usual samples.
+    """Result of reading one link once, if it is more than samples that were handled in C.
 
     Attributes:
         link: Index of the link.
@@ -48,7 +49,7 @@ class LinkRead(NamedTuple):
 
 
 class Intake:
-    """Waits for data of links and reads them.
+    """Waits until links have received bytes, reads them and decodes them to frames.
 
     Args:
         links: All links; those that are closed are not read.
@@ -69,7 +70,7 @@ class Intake:
         self.update()
 
     def update(self) -> None:
-        """Take over which links are open. It is called after each opening and closing."""
+        """Update the list of open links. It must be called after a link was opened or closed."""
         self._targets = [
             (link.decoder.wire, link.fileno(), ctypes.addressof(link.track))
             for link in self._links
@@ -82,16 +83,16 @@ class Intake:
         gather_s: float,
         expected: int,
     ) -> tuple[bool, UsualSamples, list[LinkRead]]:
-        """Read each link that has data once, and the others for a while.
+        """Wait for bytes, and read and decode the links that have some.
 
         Args:
-            timeout_s: Longest wait for data, in s.
-            gather_s: Longest wait, in s, for frames of the other links after the first ones.
-            expected: Number of links with frames at which this wait ends.
+            timeout_s: Longest wait for the first bytes, in s.
+            gather_s: Longest wait, in s, for frames of the other links after the first frame.
+            expected: Number of links whose frames end this second wait.
 
         Returns:
-            Whether data were there without waiting, so this host is behind; the usual samples; and
-            all other results of reading.
+            Whether bytes had been waiting before the call, so that this host is behind; the samples
+            that were counted and stamped in C; and all other results of reading.
         """
         if wire is None or len(self._targets) < len(self._links):
             return self._read_in_python(timeout_s)
@@ -117,7 +118,7 @@ class Intake:
         return is_late, UsualSamples([], [], []), reads
 
     def _read_ready(self, ready: Sequence[int]) -> list[LinkRead]:
-        """Read and decode the links with these indices once."""
+        """Read the links with these indices once each, and decode their bytes in Python."""
         results: list[bytes | LinkError] = []
         for i in ready:
             try:

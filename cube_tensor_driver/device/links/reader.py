@@ -52,8 +52,8 @@ class LinkFrames(NamedTuple):
         frames: The frames, in order.
         asked_ns: Host time, in ns, at which the hub was asked for its time, if the answer (a TIME
             frame) may be among the frames; 0 if no answer is expected.
-        is_late: Whether this host is behind: further bytes of links had come before these were
-            handled.
+        is_late: Whether these bytes had been waiting for this thread, because it was still busy
+            with earlier ones.
     """
 
     link: int
@@ -77,9 +77,9 @@ class Reader:
 
     Args:
         links: Port of each link, and the hub that is expected there.
-        on_frames: Called each time data were read, with a list of `LinkFrames` and the samples that
-            came before them and are counted and stamped already (`UsualSamples`). The frames of
-            each link are in the order of their arrival.
+        on_frames: Called each time data were read, with a list of `LinkFrames`, and with the
+            samples that came before these frames and were counted and stamped in C
+            (`UsualSamples`). The frames of each link are in the order of their arrival.
         on_state: Called when the state of a link or its reason changes, with the index of the link,
             the state, and the error that is the reason (None if there is none).
         clock_ns: Clock of the arrival times, in ns. It is read after the bytes, so that no arrival
@@ -92,7 +92,8 @@ class Reader:
         links: The links, in the order of the argument.
         failure: Exception that ended the thread; None while it runs or if it ended by `close`.
         callback_errors: Number of exceptions that the callbacks have raised.
-        behind_s: Time, in s, for which data have always been waiting to be read.
+        behind_s: Time, in s, for which received bytes have been waiting without a break when this
+            thread came to read them; about 0 for a host that is fast enough.
 
     Raises:
         LinkError: With the kind `bad_port`: a port is neither a device path nor a TCP address.
@@ -123,7 +124,8 @@ class Reader:
         self._requests: deque[tuple[int, Request]] = deque()
         self._stopping = False
         self._lag_s = 0.0
-        # Number of links that deliver samples, and how long to wait for all of them, in s.
+        # Number of links that deliver samples, and the longest wait for the frames of all of them
+        # after the first frame, in s.
         self._expected, self._gather_s = 0, 0.0
         self._thread: threading.Thread | None = None
         self._wake_lock = threading.Lock()
@@ -170,10 +172,7 @@ class Reader:
         self._wake()
 
     def take_lag_s(self) -> float:
-        """Return the longest time, in s, by which reading was behind since the last call.
-
-        Reading is behind from the time at which no link had data until it has caught up again.
-        """
+        """Return the largest value of `behind_s` since the last call of this method, in s."""
         lag_s, self._lag_s = self._lag_s, 0.0
         return lag_s
 
@@ -240,7 +239,8 @@ class Reader:
             if is_late:
                 self.behind_s = awake_at - in_time_at
             else:
-                # A wait ends within a tick, unless this thread or machine stood still.
+                # The wait is limited to TICK_S. If it took longer, the machine did not let this
+                # thread run, and bytes may have waited meanwhile.
                 self.behind_s = max(0.0, awake_at - now - TICK_S)
                 in_time_at = awake_at
             self._lag_s = max(self._lag_s, self.behind_s)
@@ -301,10 +301,10 @@ class Reader:
         return received, failed
 
     def _plan_gathering(self) -> None:
-        """Determine how many links deliver samples, and how long to wait for all of them.
+        """Determine how many links deliver samples, and the longest wait for all of their frames.
 
-        The wait is limited by the shortest sample period, because no hub must deliver its next
-        sample during it.
+        The wait, which begins with the first frame, is limited by the shortest sample period,
+        because no hub must deliver its next sample during the wait.
         """
         periods_us = [session.actual_us for session in self._sessions if session.is_delivering]
         self._expected = len(periods_us)

@@ -82,7 +82,7 @@ class Session:
         self._retry_at = self._check_port_at = self._hello_at = self._ask_time_at = 0.0
         # Whether the hub supports the request TIME. One that does not answers it by an ACK.
         self._knows_time = True
-        # Counters at the last check of the timers: bytes, and samples that were taken in C.
+        # Numbers of received bytes, and of samples handled in C, at the last check of the timers.
         self._n_bytes = self._n_usual = 0
         self._question = 0  # number of the last request TIME
         self._ports: tuple[object, ...] = ()
@@ -258,7 +258,10 @@ class Session:
             self._on_state(state, error)
 
     def _note_progress(self, now: float) -> None:
-        """Note whether bytes, and samples that were taken in C, have come since the last check.
+        """Store the time at which bytes or samples came last, if there are new ones.
+
+        Samples that the module in C has handled do not come as frames, so they are noticed by their
+        number.
 
         Args:
             now: Monotonic time, in s.

@@ -178,10 +178,10 @@ class CubeTable:
         return cubes[rows].astype(np.uint16), kept
 
     def find_all(self, links: Sequence[int]) -> RowIndex | None:
-        """Return the index in the skin of the cube of each row of one whole sample of these links.
+        """Return the indices in the skin of all cubes of the hubs of some links, link after link.
 
-        A sample is whole if it holds all cubes of its hub. If the skin does not have all of these
-        cubes, or has them with another number of pads, the result is None.
+        If the skin does not have one of these cubes, or has it with another number of pads, the
+        result is None.
 
         Args:
             links: Indices of the links, in order.

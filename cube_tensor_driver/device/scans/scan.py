@@ -230,10 +230,11 @@ class ScanBuilder:
         n_scans: int,
         max_scans: int,
     ) -> list[WholeScans]:
-        """Return samples as whole scans if every link that delivers has given as many of them.
+        """Arrange samples as whole scans, if every link that delivers has given as many of them.
 
-        Then they need not be added and built one by one. If they are no whole scans, or if other
-        samples wait, the list is empty.
+        A whole scan has one sample of every such link, with all cubes of its hub. Whole scans need
+        not be added and built one by one. If other samples wait, or if the samples of a link are
+        missing, the list is empty.
 
         Args:
             usual: The samples, each with all cubes of its hub.
@@ -259,7 +260,8 @@ class ScanBuilder:
         for link, stamp_ns in zip(live, stamps_ns[-width:], strict=True):
             self._built_ns[link] = stamp_ns
         scans = []
-        # The last item is the fullest one, because a host that is too slow drops the others.
+        # The scans are divided from the newest one backwards, because a host that is too slow drops
+        # all items but the last, which should hold as many scans as possible.
         for end in range(count, 0, -max_scans):
             begin = max(0, end - max_scans)
             part = slice(begin * width, end * width)
@@ -438,7 +440,7 @@ def _place(
     raws: list[bytes],
     stamps_ns: list[int],
 ) -> None:
-    """Write the values and stamps of samples into rows, by the wire module in C.
+    """Write the values and stamps (host times) of samples into rows, by the wire module in C.
 
     Args:
         rows: Rows to fill, one for each cube of the samples.

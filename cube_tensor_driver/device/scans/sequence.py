@@ -10,11 +10,11 @@ from ..wire.protocol import Sample, Stats
 
 MAX_GAP = 1 << 20
 """Largest gap in the numbers of successive samples of a hub (17 minutes at 1 kHz) that counts as
-lost samples without a look at the device times. A larger gap counts only if the device time has
-advanced by at least `MIN_PERIOD_US` for each number; otherwise the hub has restarted."""
+lost samples whatever the device times (hub's clock) are. A larger gap counts only if the device
+time has advanced by at least `MIN_PERIOD_US` for each number; otherwise the hub has restarted."""
 MIN_PERIOD_US = 100
-"""Shortest sample period of a hub, in µs: `MAX_RATE` of live.py, the highest rate that can be
-requested, is 10 kHz."""
+"""Shortest sample period of a hub, in µs, because the highest sample rate that can be requested is
+10 kHz (`MAX_RATE` in live.py)."""
 RESTART_US = 1_000_000
 """Largest difference of device time (the hub's clock), in µs, between the newest sample of a hub
 and a sample whose number is below that of the first counted one. With a smaller difference the
@@ -73,7 +73,7 @@ class SequenceCounters:
         return {name: getattr(self, name) for name in self.__slots__}
 
     def add(self, other: SequenceCounters) -> None:
-        """Add the counters of another part of the samples to these."""
+        """Increase each of these counters by the one of the same name in `other`."""
         for name in self.__slots__:
             setattr(self, name, getattr(self, name) + getattr(other, name))
 
@@ -117,7 +117,8 @@ class SequenceTracker:
                 return self._restart(sequence, device_us)
             return self._skip(number, device_us)
 
-        # The number lies behind. A hub that has been started since its newest sample begins anew.
+        # The number is smaller than expected. After START, this shows that the hub has restarted,
+        # because a hub samples only after START.
         if self._started_at == track.next and device_us < track.newest_us:
             return self._restart(sequence, device_us)
         if (number, device_us) in self._seen() or self._is_old_repeat(number, device_us):
@@ -137,9 +138,10 @@ class SequenceTracker:
         return self._deliver(number, device_us, Arrival.LATE)
 
     def note_start(self) -> None:
-        """Take a next sample in the past for the first after a restart, not for a repeated one.
+        """Expect that the hub may have restarted, because it was just sent START.
 
-        It is called when the hub was started, because after power-up it does not sample before.
+        If the number and the device time (hub's clock) of the next sample are then smaller than
+        those of the newest one, it is the first sample after a restart and no repeated one.
         """
         self._started_at = self._track.next
 
@@ -170,7 +172,9 @@ class SequenceTracker:
         return distance if distance < half else distance - _WRAP
 
     def _skip(self, number: int, device_us: int) -> Arrival:
-        """Deliver a sample after a gap in the numbers, or whose device time was set back.
+        """Deliver the next sample, the first one after lost samples, or one after a step of time.
+
+        A device time (hub's clock) earlier than that of the newest sample shows such a step back.
 
         Args:
             number: Unwrapped number of the sample.
@@ -289,8 +293,9 @@ class SampleAccount:
         self._track = LinkTrack() if track is None else track
         self._received = 0
         self.stats_frame: Stats | None = None
-        # One tracker for each part of a sample, by the index of the first cube in its frame; and
-        # the sums of the parts that the hub no longer sends.
+        # A sample of many cubes comes in several frames (parts). There is one tracker for each
+        # part, by the index of the first cube in its frame. The counters of parts that the hub no
+        # longer sends are added to _ended.
         self._trackers: dict[int, SequenceTracker] = {}
         self._ended = SequenceCounters()
         self._n_cubes = 1 << 16  # number of cubes in HELLO; indices have 16 bits
@@ -303,21 +308,28 @@ class SampleAccount:
         tracker = self._trackers.get(frame.first_cube)
         if tracker is None or tracker.n_cubes != frame.n_cubes:
             if frame.first_cube >= self._n_cubes:
-                # The hub has no such cubes. Their rows are left out and counted elsewhere.
+                # HELLO has not reported such cubes, so their rows are left out (`CubeTable`).
                 self._ended.delivered += 1
                 return Arrival.NEW
             tracker = self._begin_part(frame)
         return tracker.update(frame.sequence, frame.device_us)
 
     def announce(self, n_cubes: int, n_pads: int) -> None:
-        """Take over numbers of cubes and pads from HELLO, and end the parts beyond these cubes."""
+        """Store the numbers of cubes and of pads per cube that the hub has reported by HELLO.
+
+        Frames (parts of samples) whose first cube does not exist any more are no longer missed.
+
+        Args:
+            n_cubes: Number of cubes of the hub.
+            n_pads: Number of pads of each cube.
+        """
         self._track.n_cubes, self._track.n_pads = n_cubes, n_pads
         if n_cubes != self._n_cubes:
             self._n_cubes = n_cubes
             self._end_parts(n_cubes, 1 << 16)
 
     def start(self) -> None:
-        """Note that the hub was started: the next sample may be the first after a restart."""
+        """Note that the hub has acknowledged START, so that it may have restarted before."""
         for tracker in self._trackers.values():
             tracker.note_start()
 
@@ -345,21 +357,31 @@ class SampleAccount:
             tracker.count_missing(frame.taken)
 
     def _begin_part(self, frame: Sample) -> SequenceTracker:
-        """Return the tracker of a part of the samples that is new or now has other cubes.
+        """Return the tracker for a frame whose first cube or number of cubes is new.
 
-        Parts whose cubes are now in this one are ended, so that they do not count as missing.
+        A hub with many cubes divides each sample into several frames (parts). Parts whose cubes are
+        in this frame now are ended, so that they do not count as missing.
+
+        Args:
+            frame: The SAMPLE frame.
         """
         first = frame.first_cube
         self._end_parts(first + 1, first + frame.n_cubes)
         if first not in self._trackers:
-            # The module in C takes samples of a single part, which begins with the first cube.
+            # The module in C handles only samples that come in one frame, which begins with the
+            # first cube, so only that part uses the memory which C changes.
             self._trackers[first] = SequenceTracker(None if first else self._track)
         tracker = self._trackers[first]
         tracker.n_cubes = frame.n_cubes
         return tracker
 
     def _end_parts(self, begin: int, end: int) -> None:
-        """End the parts of samples whose first cube has an index from `begin` to `end` - 1."""
+        """Stop counting the parts (frames) of samples whose first cube is in a range of indices.
+
+        Args:
+            begin: Smallest index of the first cube.
+            end: Largest index of the first cube plus one.
+        """
         for first in [first for first in self._trackers if begin <= first < end]:
             self._ended.add(self._trackers.pop(first).counters)
 
@@ -370,13 +392,13 @@ class SampleAccount:
 
     @property
     def is_usual(self) -> bool:
-        """Whether samples have a single part, which holds all cubes of the hub."""
+        """Whether each sample comes in one frame, which holds all cubes of the hub."""
         tracker = self._trackers.get(0)
         return tracker is not None and len(self._trackers) == 1 and tracker.n_cubes == self._n_cubes
 
     @property
     def missing(self) -> int:
-        """Number of samples that have not come."""
+        """Number of samples that the hub has taken, by their numbers, but that have not come."""
         return sum(tracker.counters.missing for tracker in self._trackers.values())
 
     @property

@@ -14,7 +14,8 @@ try:
 except ImportError:
     wire = None  # type: ignore[assignment]
 else:
-    # A module that was built from other sources would write beside the fields of the state.
+    # A module that was built from other sources may place the fields of LinkTrack, which it
+    # changes in memory, elsewhere.
     if getattr(wire, "TRACK_SIZE", 0) != sizeof(LinkTrack):
         wire = None  # type: ignore[assignment]
 
