@@ -33,7 +33,12 @@ DEFAULT_RATE = 100.0
 CUBES_PER_HUB = 8
 """Number of cubes on each simulated hub of the grid that `./cube demo --cubes N` simulates."""
 
-VIEW = Process("view", "cube_tensor_driver.cli", node=False, arguments=("view",))
+VIEW = Process(
+    "view",
+    "cube_tensor_driver.cli",
+    node=False,
+    arguments=("view",),
+)
 """The process `./cube view`, which `./cube demo --view` starts beside the nodes."""
 
 INTERRUPTED = 130
@@ -150,7 +155,8 @@ def choose_skin_file(settings: DemoSettings, folder: Path) -> Path:
 
         return scene_skin(settings.mujoco)
     if settings.cubes is not None:
-        return write_grid(folder / "skin.yaml", settings.cubes, settings.rate or DEFAULT_RATE)
+        rate = settings.rate or DEFAULT_RATE
+        return write_grid(folder / "skin.yaml", settings.cubes, rate)
     return package_data() / "config" / "skin_demo.yaml"
 
 
@@ -191,5 +197,7 @@ def rate_of_file(skin_file: Path) -> float | None:
     The file is not checked here, because the check needs numpy; `watch` checks it later.
     """
     content = read_yaml(skin_file)
-    rate = content.get("rate") if isinstance(content, dict) else None
+    if not isinstance(content, dict):
+        return None
+    rate = content.get("rate")
     return float(rate) if isinstance(rate, (int, float)) else None

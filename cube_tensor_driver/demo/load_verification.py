@@ -72,16 +72,21 @@ class ForceHistory:
         """
         size = np.linalg.norm(self.force, axis=1)
         is_measured = np.isfinite(self.measured_centre).all(axis=1)
-        loaded = (size > LOADED_SHARE * size.max()) & is_measured
-        force_error = np.sqrt(np.mean((self.measured_force - self.force) ** 2, axis=0))
+        is_loaded = size > LOADED_SHARE * size.max()
+        compared = is_loaded & is_measured
 
-        offset, normal = (self.measured_centre - self.centre)[loaded], self.normal[loaded]
+        offset = (self.measured_centre - self.centre)[compared]
+        normal = self.normal[compared]
         height = np.einsum("ti,ti->t", offset, normal)
         along_skin = offset - height[:, None] * normal
         distance = np.linalg.norm(along_skin, axis=1)
+
+        peak = np.abs(self.force).max(axis=0)
+        squares = (self.measured_force - self.force) ** 2
+        error = np.sqrt(squares.mean(axis=0))
         return {
-            "force_peak_n": np.abs(self.force).max(axis=0).round(2).tolist(),
-            "force_error_n": force_error.round(2).tolist(),
+            "force_peak_n": peak.round(2).tolist(),
+            "force_error_n": error.round(2).tolist(),
             "centre_error_mm": round(1e3 * rms(distance), 2),
         }
 
@@ -102,9 +107,11 @@ class LoadVerification:
                 simulated time can be computed, as the simulator does.
         """
         self._skin, self._load = skin, load
-        self._frequencies, self._stress = Arrivals(skin), Arrivals(skin)
+        self._n_cubes = len(skin.cubes)
+        self._frequencies = Arrivals(skin)
+        self._stress = Arrivals(skin)
         self._components: list[AnyArray] = []
-        self._newest_ns = np.zeros(len(skin.cubes), np.int64)
+        self._newest_ns = np.zeros(self._n_cubes, np.int64)
         self._log = SampleLog(0, ())
         self._span_ns = (0, 0)
 
@@ -119,11 +126,13 @@ class LoadVerification:
             rows: The rows.
             received_ns: Time of arrival, in ns since the Unix epoch.
         """
-        np.maximum.at(self._newest_ns, rows.cube, rows.stamp_ns)
+        newest_ns = self._newest_ns
+        np.maximum.at(newest_ns, rows.cube, rows.stamp_ns)
         self._stress.add(rows, received_ns)
         # The rows are stored in the same order as in `Arrivals`, so that indices into its rows can
         # be used here, too.
-        self._components.append(np.concatenate([rows.stress, rows.gradient], axis=1))
+        components = np.hstack([rows.stress, rows.gradient])
+        self._components.append(components)
 
     @property
     def sampled(self) -> bool:
@@ -184,32 +193,37 @@ class LoadVerification:
         Raises:
             MessageError: There is no time at which a tensor of every cube has arrived.
         """
-        cube, components, taken_ns = self._received(self._comparison(self._stress))
+        comparison = self._comparison(self._stress)
+        cube, components, taken_ns = self._received(comparison)
         times_ns, counts = np.unique(taken_ns, return_counts=True)
         # The force on the whole skin can be computed at times with a tensor of every cube.
-        times_ns = thin_out(times_ns[counts == len(self._skin.cubes)])
+        is_complete = counts == self._n_cubes
+        times_ns = thin_out(times_ns[is_complete])
         if not len(times_ns):
             raise MessageError(
                 "no tensors of all cubes at one time have arrived: there are no forces to draw"
             )
 
         # The load is a function of simulated time, which is 0 at the start of the simulator.
-        seconds = (times_ns - self._log.start_time_ns) * 1e-9
-        applied = [self._load.total(time) for time in seconds.tolist()]
+        seconds = self._seconds(times_ns)
+        applied = map(self._load.total, seconds.tolist())
+        force, centre, normal = map(np.array, zip(*applied, strict=True))
         # The contacts are found by interpolating the pressure between the cubes, as the node
         # `contacts` does with the method `interpolation`.
         surface = Surface(self._load.poses, self._load.depth)
         measured = []
         for time_ns in times_ns:
             rows = np.flatnonzero(taken_ns == time_ns)
-            values = np.full((len(self._skin.cubes), len(COMPONENTS)), np.nan)
+            # There is one row of every cube.
+            values = np.empty((self._n_cubes, len(COMPONENTS)))
             values[cube[rows]] = components[rows]
-            measured.append(total_force(surface.contacts(values, CONTACT_PRESSURE)))
+            contacts = surface.contacts(values, CONTACT_PRESSURE)
+            measured.append(total_force(contacts))
+        columns = zip(*measured, strict=True)
+        measured_force, measured_centre = map(np.array, columns)
 
-        force, centre, normal = (np.array(column) for column in zip(*applied, strict=True))
-        measured_force, measured_centre = map(np.array, zip(*measured, strict=True))
         return ForceHistory(
-            seconds=np.asarray(seconds, float),
+            seconds=seconds,
             force=force,
             centre=centre,
             normal=normal,
@@ -231,10 +245,17 @@ class LoadVerification:
             since the Unix epoch.
         """
         first = comparison.first
-        if not len(first):
-            return np.empty(0, np.intp), np.empty((0, len(COMPONENTS))), np.empty(0, np.int64)
         cube = self._stress.columns()[0]
-        return cube[first], np.concatenate(self._components)[first], comparison.taken_ns
+        # The empty array is for the case that nothing has arrived.
+        no_components = np.empty((0, len(COMPONENTS)))
+        components = np.concatenate([no_components, *self._components])
+        return cube[first], components[first], comparison.taken_ns
+
+    def _seconds(self, times_ns: Index) -> Array:
+        """Return the simulated times, in s after the start of the simulator, of times (T,) in ns
+        since the Unix epoch."""
+        elapsed_ns = times_ns - self._log.start_time_ns
+        return np.asarray(elapsed_ns * 1e-9, float)
 
     def _errors(self, comparison: Comparison) -> dict[str, object]:
         """Compute the errors of the tensors that arrived.
@@ -249,27 +270,39 @@ class LoadVerification:
         """
         cube, components, taken_ns = self._received(comparison)
         if not len(cube):
-            return dict.fromkeys(("error_rel_rms", "error_rel_worst", "error_over_noise"), np.nan)
+            return {
+                "error_rel_rms": np.nan,
+                "error_rel_worst": np.nan,
+                "error_over_noise": np.nan,
+            }
         errors, allowed = [], []
         noise = component_noise(self._skin)
-        for time_ns in thin_out(np.unique(taken_ns)):
+        times_ns = thin_out(np.unique(taken_ns))
+        for time_ns, seconds in zip(
+            times_ns,
+            self._seconds(times_ns),
+            strict=True,
+        ):
             rows = np.flatnonzero(taken_ns == time_ns)
-            seconds = (time_ns - self._log.start_time_ns) * 1e-9
+            members = cube[rows]
             truth = self._truth(seconds)
-            errors.append(components[rows] - truth[cube[rows]])
-            allowed.append(noise[cube[rows]])
+            errors.append(components[rows] - truth[members])
+            allowed.append(noise[members])
 
         times = np.linspace(0, self._load.period, RANGE_TIMES)
         script = [self._truth(time) for time in times]
         lowest = np.nanmin(script, axis=(0, 1))
-        span = np.nanmax(script, axis=(0, 1)) - lowest
-        error = np.concatenate(errors)
+        highest = np.nanmax(script, axis=(0, 1))
+        span = highest - lowest
         # A component that is constant under the load has a range of 0 and is left out.
-        relative = error[:, span > 0] / span[span > 0]
+        varies = span > 0
+        error = np.concatenate(errors)
+        relative = error[:, varies] / span[varies]
+        worst = np.nanmax(np.abs(relative))
         over_noise = error / np.concatenate(allowed)
         return {
             "error_rel_rms": rms(relative),
-            "error_rel_worst": float(np.nanmax(np.abs(relative))),
+            "error_rel_worst": float(worst),
             "error_over_noise": rms(over_noise),
         }
 
@@ -309,7 +342,8 @@ def component_noise(skin: Skin) -> Array:
         # The estimator multiplies gradients by half the side of the cube, so that they are in Pa
         # like the stresses; this is undone here.
         scale = np.where(is_stress, 1.0, 1 / calibration.half_side)
-        deviations[rows] = np.sqrt(np.diag(estimator.covariance)) * scale
+        variance = np.diag(estimator.covariance)
+        deviations[rows] = np.sqrt(variance) * scale
     return deviations
 
 
@@ -336,7 +370,8 @@ def total_force(contacts: list[Contact]) -> tuple[Array, Array]:
         return np.zeros(3), np.full(3, np.nan)
     # The common centre of pressure is the mean of the contacts' positions, weighted by their normal
     # forces.
-    weight = np.array([contact.normal_force for contact in contacts])
+    weights = np.array([contact.normal_force for contact in contacts])
     positions = np.array([contact.position for contact in contacts])
-    force = np.sum([contact.force for contact in contacts], axis=0)
-    return force, weight @ positions / weight.sum()
+    forces = [contact.force for contact in contacts]
+    centre = weights @ positions / weights.sum()
+    return np.sum(forces, axis=0), centre

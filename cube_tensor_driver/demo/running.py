@@ -47,12 +47,19 @@ class Observer:
             interrupted: Event that lets `spin` raise Interrupted; None: no such event.
             on_step: Function that `spin` calls repeatedly while it receives messages.
         """
-        self.node, self._executor = node, executor
-        self._children, self._interrupted, self._on_step = children, interrupted, on_step
+        self.node = node
+        self._executor = executor
+        self._children = children
+        self._interrupted = interrupted
+        self._on_step = on_step
         self._checked_s = 0.0
 
     def listen(
-        self, kind: type, topic: str, receive: Callable[[bytes], None], quality: QoSProfile
+        self,
+        kind: type,
+        topic: str,
+        receive: Callable[[bytes], None],
+        quality: QoSProfile,
     ) -> None:
         """Subscribe to a topic.
 
@@ -62,14 +69,24 @@ class Observer:
             receive: Function that is called with each message in its serialised form (CDR).
             quality: Quality of service of the subscription.
         """
-        self.node.create_subscription(kind, topic, receive, quality, raw=True)
+        self.node.create_subscription(
+            kind,
+            topic,
+            receive,
+            quality,
+            raw=True,
+        )
 
     def log_error(self, text: str) -> None:
         """Write an error message to the log of the ROS node."""
         logger: Any = self.node.get_logger()  # type: ignore[no-untyped-call]
         logger.error(text)
 
-    def spin(self, seconds: float, done: Callable[[], bool] = lambda: False) -> None:
+    def spin(
+        self,
+        seconds: float,
+        done: Callable[[], bool] = lambda: False,
+    ) -> None:
         """Receive messages for a time, or until a condition is met.
 
         Args:
@@ -87,8 +104,9 @@ class Observer:
             if self._interrupted is not None and self._interrupted.is_set():
                 raise Interrupted("interrupted")
             # Checking the processes after each message would take longer than the message.
-            if time.monotonic() - self._checked_s > STEP_S:
-                self._checked_s = time.monotonic()
+            now_s = time.monotonic()
+            if now_s - self._checked_s > STEP_S:
+                self._checked_s = now_s
                 self._children.check()
             self._on_step()
 
@@ -127,7 +145,7 @@ def end_simulator(children: Children, log: Path) -> SampleLog:
     """
     children.end(["simulator"])
     if not log.exists():
-        raise CubeError(f"the simulator did not end as asked:\n{children.log('simulator')[-1500:]}")
+        raise CubeError(f"the simulator did not end as asked:\n{children.end_of_log('simulator')}")
     return SampleLog.read(log)
 
 

@@ -26,7 +26,8 @@ class Usage:
             children: The child processes.
             names: Names of the child processes to measure, such as "driver".
         """
-        self._processes = {name: psutil.Process(children.pid(name)) for name in names}
+        pids = {name: children.pid(name) for name in names}
+        self._processes = {name: psutil.Process(pid) for name, pid in pids.items()}
         self._start_s = time.monotonic()
         self._start_cpu_s = self._cpu_seconds()
 
@@ -34,10 +35,9 @@ class Usage:
         """Return the processor time of each process since this object was made, divided by the
         elapsed time, in percent of one core."""
         elapsed_s = time.monotonic() - self._start_s
-        return {
-            name: 100 * (cpu_s - self._start_cpu_s[name]) / elapsed_s
-            for name, cpu_s in self._cpu_seconds().items()
-        }
+        before_s = self._start_cpu_s
+        now_s = self._cpu_seconds()
+        return {name: 100 * (now_s[name] - before_s[name]) / elapsed_s for name in now_s}
 
     def memory_mb(self) -> dict[str, float]:
         """Return the resident memory of each process, in MiB."""
@@ -48,9 +48,13 @@ class Usage:
 
     def threads(self) -> dict[str, int]:
         """Return the number of threads of each process."""
-        return {name: process.num_threads() for name, process in self._processes.items()}
+        processes = self._processes.items()
+        return {name: process.num_threads() for name, process in processes}
 
     def _cpu_seconds(self) -> dict[str, float]:
         # System time counts as well, because messages are sent and received in the kernel.
-        times = {name: process.cpu_times() for name, process in self._processes.items()}
-        return {name: float(time.user + time.system) for name, time in times.items()}
+        seconds = {}
+        for name, process in self._processes.items():
+            times = process.cpu_times()
+            seconds[name] = float(times.user + times.system)
+        return seconds

@@ -31,7 +31,12 @@ class Arrivals:
         rows: Number of rows that have arrived, stored or not.
     """
 
-    def __init__(self, skin: Skin, *, one_per_hub: bool = False) -> None:
+    def __init__(
+        self,
+        skin: Skin,
+        *,
+        one_per_hub: bool = False,
+    ) -> None:
         """Start without rows.
 
         Args:
@@ -48,7 +53,8 @@ class Arrivals:
                 self.row_count[members[0]] = len(members)
         self.rows = 0
         self._keeps_all = not one_per_hub
-        self._parts: list[tuple[Index, ...]] = []
+        no_rows = np.empty((4, 0), np.int64)
+        self._parts: list[Index] = [no_rows]
 
     def keeps(self, cube: AnyArray) -> Mask:
         """Return whether the rows of each of the given cubes are stored (N,).
@@ -71,25 +77,30 @@ class Arrivals:
         cube, sequence, stamp_ns = rows.cube, rows.sequence, rows.stamp_ns
         if not self._keeps_all:
             kept = self.keeps(cube)
-            cube, sequence, stamp_ns = cube[kept], sequence[kept], stamp_ns[kept]
-        # `astype` copies the columns, because the rows may be views of a message whose memory is
-        # reused for the next message.
-        part = (cube.astype(np.int64), sequence.astype(np.int64), stamp_ns.astype(np.int64))
-        self._parts.append((*part, np.full(len(cube), received_ns)))
+            cube = cube[kept]
+            sequence = sequence[kept]
+            stamp_ns = stamp_ns[kept]
+        # The columns are copied, because the rows may be views of a message whose memory is reused
+        # for the next message.
+        part = np.empty((4, len(cube)), np.int64)
+        part[0] = cube
+        part[1] = sequence
+        part[2] = stamp_ns
+        part[3] = received_ns
+        self._parts.append(part)
 
-    def columns(self) -> tuple[Index, ...]:
-        """Return four columns (N,) of the stored rows, in the order of their arrival.
+    def columns(self) -> Index:
+        """Return four columns (4, N) of the stored rows, in the order of their arrival.
 
         Returns:
             Index of the cube; sequence number; stamp and time of arrival, in ns since the Unix
             epoch.
         """
-        if not self._parts:
-            return tuple(np.empty((4, 0), np.int64))
         # The parts of all messages are replaced by the joined one, so that the next call does not
         # have to join them again.
-        self._parts = [tuple(np.concatenate(column) for column in zip(*self._parts, strict=True))]
-        return self._parts[0]
+        joined = np.hstack(self._parts)
+        self._parts = [joined]
+        return joined
 
 
 @dataclass(frozen=True)
@@ -137,19 +148,25 @@ def compare(
     """
     cube, sequence, stamp_ns, received_ns = arrivals.columns()
     sample = taken.match(SampleKeys(cube, sequence, stamp_ns))
-    taken_ns = taken.time_ns[sample] if len(taken) else np.zeros(len(sample), np.int64)
-    in_span = (sample != NO_MATCH) & (taken_ns >= start_ns) & (taken_ns < end_ns)
-    rows = np.flatnonzero(in_span)
+    matched = np.flatnonzero(sample != NO_MATCH)
+    matched_ns = taken.time_ns[sample[matched]]
+    in_span = (matched_ns >= start_ns) & (matched_ns < end_ns)
+    rows = matched[in_span]
 
     row_id = sample[rows] * len(arrivals.row_count) + cube[rows]
-    first = rows[np.sort(np.unique(row_id, return_index=True)[1])]
+    _, indices = np.unique(row_id, return_index=True)
+    first = rows[np.sort(indices)]
+    represented = arrivals.row_count[cube[first]]
+    taken_ns = taken.time_ns[sample[first]]
+    latency_ns = received_ns[first] - taken_ns
+    stamp_error_ns = stamp_ns[first] - taken_ns
     return Comparison(
         sent=taken.rows_taken(start_ns, end_ns),
-        received=int(arrivals.row_count[cube[first]].sum()),
+        received=int(represented.sum()),
         first=first,
-        taken_ns=taken_ns[first],
-        latency_ms=NS_TO_MS * (received_ns[first] - taken_ns[first]),
-        stamp_error_ms=NS_TO_MS * np.abs(stamp_ns[first] - taken_ns[first]),
+        taken_ns=taken_ns,
+        latency_ms=NS_TO_MS * latency_ns,
+        stamp_error_ms=NS_TO_MS * np.abs(stamp_error_ns),
     )
 
 
@@ -160,4 +177,6 @@ def percentile(values: Array, percent: float) -> float:
         values: (N,) the values.
         percent: The percentile, from 0 to 100.
     """
-    return round(float(np.percentile(values, percent)), 3) if len(values) else float("nan")
+    if not len(values):
+        return float("nan")
+    return round(float(np.percentile(values, percent)), 3)

@@ -160,7 +160,11 @@ def watch(
         if settings.duration is None or verification is None:
             watcher.run()
         figures = watcher.measure(verification, settings.duration, log)
-    head = {"cubes": len(skin.cubes), "rate_hz": rate, "duration_s": settings.duration}
+    head = {
+        "cubes": len(skin.cubes),
+        "rate_hz": rate,
+        "duration_s": settings.duration,
+    }
     return DemoResult(head | figures, verification, load)
 
 
@@ -193,7 +197,9 @@ def make_load(skin: Skin, settings: DemoSettings) -> AnyLoad:
         from ..simulation.mujoco.scene import MujocoLoad
 
         return MujocoLoad(settings.mujoco, skin)
-    return Load(skin, default_script() if settings.load is None else read_script(settings.load))
+    if settings.load is not None:
+        return Load(skin, read_script(settings.load))
+    return Load(skin, default_script())
 
 
 class SkinWatcher:
@@ -219,16 +225,17 @@ class SkinWatcher:
             verification: Collects the rows of a measurement; None if nothing is measured.
         """
         self._n_cubes = len(skin.cubes)
-        self._children, self._table, self._observer = children, table, observer
+        self._children = children
+        self._table = table
+        self._observer = observer
         self._verification = verification
         self._sees_other_skin = False
         self._made_s = time.monotonic()
         self._crc_errors: dict[str, int] = {}
-        observer.listen(SkinStress, "stress", self._on_stress, batch_profile(rate))
+        profile = batch_profile(rate)
+        observer.listen(SkinStress, "stress", self._on_stress, profile)
         if verification is not None:
-            observer.listen(
-                SkinFrequencies, "frequencies", self._on_frequencies, batch_profile(rate)
-            )
+            observer.listen(SkinFrequencies, "frequencies", self._on_frequencies, profile)
             observer.node.create_subscription(
                 DiagnosticArray, "/diagnostics", self._on_diagnostics, 10
             )
@@ -243,7 +250,7 @@ class SkinWatcher:
         self._observer.spin(MAX_START_S, self._is_ready)
         self._check_alone()
         if not self._table.seen_all:
-            logs = "\n".join(self._children.log(name)[-1500:] for name in MEASURED_NODES)
+            logs = "\n".join(map(self._children.end_of_log, MEASURED_NODES))
             raise CubeError(
                 f"after {MAX_START_S:g} s only {self._table.seen} of {self._n_cubes} cubes have "
                 f"a tensor.\n{logs}"
@@ -278,14 +285,19 @@ class SkinWatcher:
             ChildError: The view did not print its URL within `MAX_START_S`.
         """
         # `spin` draws the table while it waits for the view to start; `wait_for_line` would not.
-        self._observer.spin(MAX_START_S, lambda: "http://" in self._children.log("view"))
-        address = self._children.wait_for_line("view", "http://", 0.0).split()[0]
+        children = self._children
+        self._observer.spin(MAX_START_S, lambda: "http://" in children.log("view"))
+        line = children.wait_for_line("view", "http://", 0.0)
+        address = line.split()[0]
         self._table.note = f"\n{address} shows it"
         if not self._table.is_on_terminal:
             print(f"{address} shows the skin", file=sys.stderr, flush=True)
 
     def measure(
-        self, verification: LoadVerification, duration: float, log: Path
+        self,
+        verification: LoadVerification,
+        duration: float,
+        log: Path,
     ) -> dict[str, object]:
         """Measure the running skin, and end the simulator.
 
@@ -302,16 +314,19 @@ class SkinWatcher:
         spin = self._observer.spin
         # Otherwise it could count tensors of another skin that is found later.
         spin(self._made_s + ANNOUNCE_S - time.monotonic())
-        start_ns, usage = time.time_ns(), Usage(self._children, MEASURED_NODES)
+        start_ns = time.time_ns()
+        usage = Usage(self._children, MEASURED_NODES)
         spin(duration)
         self._check_alone()
-        cpu, memory = usage.cpu_percent(), usage.memory_mb()
+        cpu = usage.cpu_percent()
+        memory = usage.memory_mb()
         end_ns = start_ns + round(duration * 1e9)
 
         # On a busy machine the simulator takes its samples late. It must not end before it has
         # taken all samples of the measured period.
         spin(MAX_LATE_S, lambda: verification.is_beyond(end_ns))
-        verification.compare(end_simulator(self._children, log), start_ns, end_ns)
+        sent = end_simulator(self._children, log)
+        verification.compare(sent, start_ns, end_ns)
         # The tensors of the last samples may arrive after the simulator has ended.
         spin(MAX_LATE_S, verification.is_complete)
         self._check_alone()
@@ -329,7 +344,8 @@ class SkinWatcher:
             CubeError: Another skin publishes.
         """
         # Messages of a smaller skin look like those of this skin, so publishers are counted, too.
-        if self._sees_other_skin or self._observer.node.count_publishers("stress") > 1:
+        publishers = self._observer.node.count_publishers("stress")
+        if self._sees_other_skin or publishers > 1:
             raise other_skin_error()
 
     def _on_stress(self, data: bytes) -> None:
@@ -340,7 +356,8 @@ class SkinWatcher:
             self._observer.log_error(str(error))
             return
         # A cube index beyond the cubes of this skin can only come from another, larger skin.
-        if int(rows.cube.max(initial=0)) >= self._n_cubes:
+        last_cube = int(rows.cube.max(initial=0))
+        if last_cube >= self._n_cubes:
             self._sees_other_skin = True
             return
         if self._verification is not None:

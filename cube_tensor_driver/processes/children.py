@@ -113,6 +113,10 @@ class Children:
         """Return the text that a process has written to its log file so far."""
         return self._log_file(executable).read_text(errors="replace")
 
+    def end_of_log(self, executable: str) -> str:
+        """Return the last `SHOWN_LINES` lines of a log, which usually state why a process ended."""
+        return "\n".join(self.log(executable).splitlines()[-SHOWN_LINES:])
+
     def wait_for_line(self, executable: str, text: str, seconds: float) -> str:
         """Wait until a process writes a line that contains `text`, and return that line.
 
@@ -142,10 +146,9 @@ class Children:
         """Raise ChildError, with the end of its log, if any of the processes has ended."""
         for executable, process in self._processes.items():
             if process.poll() is not None:
-                # The last lines of a log usually state why the process ended.
-                end_of_log = "\n".join(self.log(executable).splitlines()[-SHOWN_LINES:])
                 raise ChildError(
-                    f"the {executable} ended with code {process.returncode}:\n{end_of_log}"
+                    f"the {executable} ended with code {process.returncode}:\n"
+                    f"{self.end_of_log(executable)}"
                 )
 
     def end(self, executables: Iterable[str]) -> None:
