@@ -109,10 +109,12 @@ class History:
 class SampleRate:
     """Computes the sampling rate of each cube from the numbers and stamps of its samples.
 
-    So it is the rate of the sensor, however many of the samples reach this process.
+    A hub numbers all samples that it takes. So this is the rate of the sensor, however many of the
+    samples reach this process.
 
     Attributes:
-        hertz: (cubes,) samples per second; 0 until a cube has samples over `RATE_PERIOD_S`.
+        hertz: (cubes,) samples per second of each cube; 0 until a cube has been sampled for
+            `RATE_PERIOD_S` (1 s).
     """
 
     def __init__(self, n_cubes: int) -> None:
@@ -122,11 +124,11 @@ class SampleRate:
         self._first_ns = np.zeros(n_cubes, np.int64)
 
     def update(self, rows: StressRows) -> None:
-        """Compute new rates of cubes whose period is over.
+        """Compute the rates of cubes whose last rate is older than `RATE_PERIOD_S`.
 
         Args:
-            rows: New rows (one sample of one cube each); the time between the stamps of the first
-                and the last sample of a period is the sensor's own time.
+            rows: New rows (one sample of one cube each), with the number and the stamp of the
+                sample. Each rate is a difference of numbers divided by a difference of stamps.
         """
         cube = rows.cube
         elapsed_s = 1e-9 * (rows.stamp_ns - self._first_ns[cube])

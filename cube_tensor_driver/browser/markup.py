@@ -193,7 +193,7 @@ def headline(
         paused: Whether the page or the replay is stopped.
         recording: Whether a bag is being recorded.
     """
-    health, contact = scan.health, scan.strongest_contact
+    health = scan.health
     live = int(np.count_nonzero(health < FAULTY))
     if paused:
         colour, word = BLUE, "paused"
@@ -207,16 +207,11 @@ def headline(
         f"<span style='color:{colour}'>⬤</span> <b>{word}</b>",
         f"{live} of {len(health)} cubes",
         f"{scan.rate.max():.0f} Hz",
-        "no load" if contact is None else newtons(contact).replace(" ", "&nbsp;"),
+        newtons(scan.contacts[0]).replace(" ", "&nbsp;") if scan.contacts else "no load",
     ]
     if recording:
         parts.append(f"<b style='color:{RED}'>● recording</b>")
     return box(" · ".join(parts))
-
-
-def action_line(action: str) -> str:
-    """Return a text about the user's last action as HTML, or an empty text if there was none."""
-    return box(escape(action)) if action else ""
 
 
 def legend(

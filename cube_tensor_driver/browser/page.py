@@ -8,6 +8,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from functools import partial
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ import viser
 from ..views.scene import Quantity
 from . import markup
 from .charts import Charts
-from .controls import ColourControls, ReplayControls, ReplayPosition, add_part_controls
+from .controls import ColourControls, ReplayControls, add_part_controls
 from .history import History
 from .markup import PageStatus
 from .scan import Scan
@@ -24,7 +25,9 @@ from .scene_3d import SPAN, Ranges, Update
 from .update import Choices, ShownSkin, build_update
 
 BRAND_COLOUR = (24, 100, 171)
+"""Colour of buttons and check boxes, as red, green and blue from 0 to 255."""
 BACKGROUND = (246, 247, 249)
+"""Colour behind the skin, as red, green and blue from 0 to 255."""
 
 LEFT_WIDTH = 400.0
 """Width, in pixels, of the panel with the plots at the left of the page."""
@@ -33,8 +36,10 @@ RIGHT_WIDTH = 320.0
 """Width, in pixels, of viser's main panel (with the controls) at the right of the page."""
 
 MIN_FREE_SHARE = 0.5
-"""Minimum share of the width of the page that the panels leave free for the skin. In a browser that
-is too narrow for it, the panel with the plots is folded away when the page opens."""
+"""Minimum share of the width of the page that the panels leave free for the skin.
+
+In a browser that is too narrow for that, the panel with the plots is folded away at first.
+"""
 
 CAMERA_POSITION = np.array([0.1, -1.0, 1.05]) * SPAN
 """Position of the camera in the scene, for a picture that is a little higher than wide.
@@ -70,12 +75,16 @@ STOP = "stop recording"
 TARE = "tare"
 CLEAR_TARE = "undo tare"
 HOLD = "hold the replay"
+"""Action of a user: the replay of a bag pauses, or goes on if it was paused."""
 JUMP = "jump"
+"""Action of a user: the replay of a bag jumps to another time."""
 
 Act = Callable[..., None]
-"""Function that a page calls, in threads of viser, when its user wants something. Its arguments are
-`TARE`, `CLEAR_TARE`, `RECORD`, `STOP`, `HOLD` (pauses a replay or lets it go on) or `JUMP`, and for
-the latter a position in the replay, in s after the start of the bag. It returns at once."""
+"""Function that a page calls, in threads of viser, when its user wants something.
+
+Its arguments are the action, `TARE`, `CLEAR_TARE`, `RECORD`, `STOP`, `HOLD` or `JUMP`, and for the
+latter a time in the replay, in s after the start of the bag. It returns at once.
+"""
 
 NOTE_S = 8.0
 """Time, in seconds, for which the page shows a note about an action of the user."""
@@ -106,7 +115,11 @@ class Layout:
 
 
 class Page:
-    """The page that shows a skin in one browser, with the settings of that browser's user."""
+    """The page that shows a skin in one browser, with the settings of that browser's user.
+
+    Attributes:
+        replay: Controls of a replay.
+    """
 
     def __init__(
         self, client: viser.ClientHandle, layout: Layout, skin: ShownSkin, act: Act
@@ -125,14 +138,6 @@ class Page:
         self._make_controls(client.gui, act)
         self._make_panel(client.gui)
 
-    def show_replay(self, replay: ReplayPosition | None) -> None:
-        """Show position and state of a replay.
-
-        Args:
-            replay: State of the replay; None: there is no replay, and its controls are hidden.
-        """
-        self._replay.show(replay)
-
     def show(
         self,
         scan: Scan,
@@ -149,7 +154,8 @@ class Page:
         is_frozen = self._history is not None
         if not self._paused or not is_frozen:
             self._scan, self._ranges_before = scan, self._ranges
-            # The first scan after a pause began is the one that stays.
+            # The first scan after a pause began is the one that stays. Its history is copied,
+            # because the history itself goes on for the other pages.
             self._history = copy.deepcopy(history) if self._paused else None
         self._show_status(status)
         shown_history = self._history or history
@@ -196,18 +202,19 @@ class Page:
             cube=self._cube,
             parts={name for name, box in self._parts.items() if box.value},
             charts=self._charts.choose(history, self._cube),
-            is_paused=self._paused or self._replay.is_held,
+            is_paused=self._paused or self.replay.is_held,
             is_recording=status.recording,
         )
 
     def _show_status(self, status: PageStatus) -> None:
         """Show the result of the last action, and what the next press of a button will do."""
+        # Each button has the text of what it does next.
         view = (GO_ON if self._paused else PAUSE, STOP if status.recording else RECORD)
         if tuple(self._view.options) != view:
             self._view.options = view
         if status.action != self._noted:
             self._noted = status.action
-            self._action.content = markup.action_line(status.action)
+            self._action.content = markup.box(escape(status.action))
             self._client.add_notification(
                 status.title,
                 status.action,
@@ -228,13 +235,14 @@ class Page:
         objects["headline"] = gui.add_html("")
         self._make_buttons(gui, act)
         self._action = gui.add_html("")
-        self._replay = ReplayControls(
+        self.replay = ReplayControls(
             gui,
             partial(act, HOLD),
             partial(act, JUMP),
         )
         self._colours = ColourControls(gui)
-        objects["colour"], objects["legend"] = self._colours.list, self._colours.legend
+        objects["colour"] = self._colours.list
+        objects["legend"] = self._colours.legend
         names = self._skin.names
         self._cube_list = gui.add_dropdown(
             "cube",
@@ -294,6 +302,9 @@ class Page:
 
 def is_same(one: Any, other: Any) -> bool:
     """Return whether two values of a property are equal: numbers, texts, arrays, tuples of them."""
+    # Comparing long texts as arrays would take much longer.
+    if isinstance(one, str):
+        return bool(one == other)
     if isinstance(one, tuple) and isinstance(other, tuple):
         return len(one) == len(other) and all(map(is_same, one, other))
     return bool(np.array_equal(one, other))
@@ -342,14 +353,8 @@ def set_up(
         control_width="medium",
         brand_color=BRAND_COLOUR,
     )
-    client.scene.set_background_image(
-        np.full(
-            (1, 1, 3),
-            BACKGROUND,
-            np.uint8,
-        ),
-        "png",
-    )
+    pixel = np.full((1, 1, 3), BACKGROUND, np.uint8)
+    client.scene.set_background_image(pixel, "png")
     client.gui.set_panel_label(name)
     client.gui.main_panel.dock_right()
 

@@ -59,11 +59,6 @@ class Scan(NamedTuple):
     contacts: list[Contact]
     links: Links = ()
 
-    @property
-    def strongest_contact(self) -> Contact | None:
-        """The contact with the largest force; None if there is no contact."""
-        return self.contacts[0] if self.contacts else None
-
 
 class ScanSynchronizer:
     """Follows the rows of a skin up to the newest instant whose results are complete.
@@ -96,31 +91,35 @@ class ScanSynchronizer:
         rows: StressRows,
         now: float,
     ) -> None:
-        """Add the rows of a `stress` message.
+        """Add the rows (one sample of one cube each) of a `stress` message.
 
         Args:
             stamp_ns: Stamp of the message, in ns.
-            rows: Its rows (one sample of one cube each).
+            rows: Rows of the message. Those of cubes that the skin does not have are ignored.
             now: Time of arrival, in s, on any clock that all calls share.
         """
-        self._waiting.append((stamp_ns, rows, now))
+        is_known = rows.cube < len(self.latest.status)
+        self._waiting.append((stamp_ns, rows.select(is_known), now))
 
     def add_contacts(self, stamp_ns: int, contacts: list[Contact]) -> None:
-        """Add the contacts that belong to the `stress` message with this stamp, in ns."""
+        """Add the contacts that were found from the `stress` message with this stamp, in ns."""
         _add_result(self._contacts, stamp_ns, contacts)
 
     def add_cloud(self, stamp_ns: int, cloud: Array) -> None:
-        """Add the points of `traction` that belong to the `stress` message with this stamp."""
+        """Add the points (M, 6) of the topic `traction` that were computed from the `stress`
+        message with this stamp, in ns."""
         _add_result(self._clouds, stamp_ns, cloud)
 
     def advance(self) -> bool:
-        """Go on to the newest instant whose results are complete.
+        """Go on to the newest waiting rows for which the running nodes have published results.
 
         Returns:
-            Whether there was a newer one.
+            Whether there were such rows.
         """
         if not self._waiting:
             return False
+        # A node whose last result is much older than the newest rows has ended. Results that are
+        # much newer are from the time before a replay jumped back.
         newest_ns = self._waiting[-1][0]
         required = [
             results
@@ -129,6 +128,7 @@ class ScanSynchronizer:
         ]
         if len(self._waiting) > MAX_WAITING_MESSAGES:
             required = []
+        # `count` messages would be taken if those up to this one were; the last possible is chosen.
         complete = [
             count
             for count, (stamp_ns, _, _) in enumerate(self._waiting, 1)
@@ -140,6 +140,7 @@ class ScanSynchronizer:
             self.stamp_ns, rows, arrival = self._waiting.popleft()
             self.latest.update(rows, arrival)
             self.sample_rate.update(rows)
+        # A topic that is not published has no result for this stamp.
         self.contacts = self._contacts.get(self.stamp_ns)
         self.cloud = self._clouds.get(self.stamp_ns)
         return True

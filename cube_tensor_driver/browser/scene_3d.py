@@ -44,7 +44,8 @@ Properties = dict[str, Any]
 """Name of a property of an object on the page (of the 3-D scene or a control) -> its value."""
 
 Update = dict[str, Properties]
-"""Name of an object on the page -> the properties that one scan gives it."""
+"""Name of an object on the page -> the properties that it has while one scan (the values of all
+cubes at one instant) is shown."""
 
 Colour = tuple[int, int, int]
 """A colour as red, green and blue from 0 to 255."""
@@ -85,7 +86,9 @@ DIRECT_LIGHT = 1.7
 """Intensity of the directional light from above, in units of viser."""
 
 DARK: Colour = (40, 44, 52)
+"""Colour of arrows of traction, of marks, of the scale bar and of crosses over stale cubes."""
 BLUE: Colour = (25, 105, 210)
+"""Colour of arrows of the gradient of pressure."""
 EDGE_COLOUR: Colour = (110, 114, 122)
 """Colour of the edges of the cubes."""
 
@@ -104,22 +107,26 @@ MESH_COLOURS: dict[str, Colour] = {
     "contacts": (200, 40, 160),
     **{f"fault {state}": colour for state, colour in FAULT_COLOURS.items()},
 }
-"""Name of a mesh whose shape changes with the scan -> its colour."""
+"""Name of a mesh whose shape depends on the measured values -> its colour."""
 
 ArrowLines = Callable[[CubePoses, Array, float], Array]
-"""Function of poses of N cubes, their values (N, 15) and a length per SI unit that returns tails
-and tips (N, 2, 3) of arrows."""
+"""Function that returns tails and tips (N, 2, 3) of one arrow per cube.
+
+Its arguments are the poses of N cubes, their values (N, 15), 6 stress components in Pa and 9
+gradients in Pa/m, and the length of an arrow per Pa or Pa/m.
+"""
 
 TRACTION_LENGTH = 1.8
 """Length of the longest arrow of traction (force per area on the upper face of a cube), relative to
-the unit length `Placement.arrow`."""
+the unit length of arrows (about the pitch, which is the distance of neighbouring cubes)."""
 
 GRADIENT_LENGTH = 1.2
-"""Length of the longest arrow of the gradient of pressure, relative to the unit length
-`Placement.arrow`."""
+"""Length of the longest arrow of the gradient of pressure, relative to the unit length of arrows
+(about the pitch, which is the distance of neighbouring cubes)."""
 
 MIN_RING = 0.01 * SPAN
-"""Minimum radius of the ring around a contact, in units of the scene."""
+"""Minimum radius of the ring around a contact, in units of the 3-D scene (the longest side of every
+skin is 2 units long)."""
 
 CROSS_HEIGHT = 0.75
 """Height of the crosses of the principal stresses above the centres of the cubes.
@@ -372,14 +379,9 @@ class Scene:
 
         meshes = self._squares.paint(quantity, values, top, visible)
         colours_of_steps = step_colours(quantity).tolist()
-        for step, (mesh, colour) in enumerate(
-            zip(
-                meshes,
-                colours_of_steps,
-                strict=True,
-            )
-        ):
-            update[f"field/{step}"] = _properties(mesh) | {"color": tuple(colour)}
+        for step, mesh in enumerate(meshes):
+            colour = tuple(colours_of_steps[step])
+            update[f"field/{step}"] = _properties(mesh) | {"color": colour}
         return update
 
     def _arrows(
@@ -397,14 +399,8 @@ class Scene:
             length: Length of the arrows, in units of the scene per SI unit of the values.
         """
         placement = self._placement
-        return arrows(
-            lines(
-                placement.poses,
-                values,
-                length,
-            ),
-            placement.arrow,
-        )
+        tails_and_tips = lines(placement.poses, values, length)
+        return arrows(tails_and_tips, placement.arrow)
 
     def _crosses(self, values: Array, longest: float) -> dict[str, Mesh]:
         """Return the meshes of the principal stresses: a cross of three lines above each cube.
@@ -424,11 +420,8 @@ class Scene:
             pitch / longest,
         )
         # `scene.principal_crosses` returns crosses centred on the upper faces; this lifts them.
-        lift = _above(
-            placement,
-            CROSS_HEIGHT,
-            pitch,
-        ) - _above(placement, 1.0)
+        faces = _above(placement, 1.0)
+        lift = _above(placement, CROSS_HEIGHT, pitch) - faces
         lines = lines + lift[:, None, None]
         return {
             "tension": rods(lines[is_tension], 0.02 * pitch),
@@ -439,16 +432,14 @@ class Scene:
         """Return the mesh of a cross over each cube that has this health."""
         chosen = np.flatnonzero(health == state)
         poses = CubePoses(*(column[chosen] for column in self._placement.poses))
-        lines = scene.fault_crosses(poses, health[chosen]).reshape(
-            -1,
-            2,
-            3,
-        )
-        return _properties(rods(lines, 0.03 * self._placement.pitch))
+        crosses = scene.fault_crosses(poses, health[chosen])
+        thickness = 0.03 * self._placement.pitch
+        return _properties(rods(crosses.reshape(-1, 2, 3), thickness))
 
     def _chosen_cube(self, cube: int) -> Properties:
         """Return the mesh of the marks at the corners of the chosen cube."""
         placement = self._placement
+        # The marks stand a little outside of the face; on a large skin they have a minimum size.
         side = max(2.6 * float(placement.poses.half_side[cube]), 0.2 * placement.arrow)
         lines = corner_lines(placement.poses.rotation[cube], side)
         thickness = MIN_THICKNESS + 0.003 * placement.arrow
@@ -460,6 +451,7 @@ class Scene:
         rings = [np.zeros((0, 2, 3))]
         for contact in contacts:
             radius = max(float(np.sqrt(contact.area / np.pi)) * placement.unit, MIN_RING)
+            # The ring lies in the plane of the drawn field, so that it encloses the load there.
             centre = placement.point(contact.position) - self._contact_depth * contact.normal
             rings.append(ring_lines(centre, contact.normal, radius))
         thickness = MIN_THICKNESS + 0.006 * placement.arrow
@@ -510,11 +502,7 @@ class Scene:
             quaternions(poses.rotation),
             poses.position,
             batched_scales=poses.half_side,
-            batched_colors=np.full(
-                (len(poses.position), 3),
-                200,
-                np.uint8,
-            ),
+            batched_colors=np.full_like(poses.position, 200, np.uint8),
             flat_shading=True,
             # By default viser simplifies distant meshes, but a cube cannot have fewer triangles.
             lod="off",
@@ -528,11 +516,7 @@ class Scene:
         lines = poses.position[:, None, None] + poses.half_side[:, None, None, None] * edges
         api.add_line_segments(
             "/edges",
-            lines.reshape(
-                -1,
-                2,
-                3,
-            ),
+            lines.reshape(-1, 2, 3),
             EDGE_COLOUR,
             thickness=1.5,
             thickness_units="screen",
@@ -547,14 +531,8 @@ class Scene:
         poses = self._placement.poses
         front = poses.rotation @ np.array([0.0, -1.2, -1.0]) * poses.half_side[:, None]
         points = poses.position + front
-        for number, (name, point) in enumerate(
-            zip(
-                self._names,
-                points,
-                strict=True,
-            )
-        ):
-            path, position = f"/names/{number}", tuple(point)
+        for number, name in enumerate(self._names):
+            path, position = f"/names/{number}", tuple(points[number])
             api.add_label(
                 path,
                 name,

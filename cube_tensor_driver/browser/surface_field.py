@@ -38,12 +38,12 @@ it is unknown, so that `of` returns NaN.
 
 
 class SurfaceField(NamedTuple):
-    """Pressure and shear at the M points of a skin that the page colours.
+    """Pressure and shear at the M points of a skin that the page colours, at one instant.
 
     Attributes:
         pressure: (M,) pressure in Pa; NaN where it is unknown.
         shear: (M,) magnitude of the shear traction in Pa; NaN where it is unknown.
-        source: Where the values come from, as text for the user.
+        source: Text for the user about where the values are given and who computed them.
         sigma: (M,) standard deviation of the pressure, in Pa; None if it is unknown.
     """
 
@@ -54,14 +54,17 @@ class SurfaceField(NamedTuple):
 
 
 class FieldModel:
-    """Computes the field from the values of the cubes, or from the node `contacts` if it runs.
+    """Computes the field (pressure and shear on the surface) that the page shows.
 
-    The page computes the traction on the surface of the skin itself, with the inverse for an
-    elastomer of infinite thickness. Preparing this inverse takes up to some seconds on a large
-    skin. Until then, and if it is not possible, the field is interpolated between the cubes.
+    If the node `contacts` publishes the field, it is only interpolated to the points of the page.
+
+    Otherwise the page solves the inverse problem of elasticity itself: from the values of the cubes
+    to the traction on the surface of an elastomer of infinite thickness. Preparing this takes up to
+    some seconds on a large skin. Until then, and if it is not possible, the field is interpolated
+    between the cubes.
 
     Attributes:
-        prepared: The inverse, which another thread prepares.
+        prepared: Solver of the inverse problem, which another thread prepares.
     """
 
     def __init__(self, surface: Surface, calibrations: Sequence[Calibration]) -> None:
@@ -74,11 +77,8 @@ class FieldModel:
         self._surface = surface
         self._interpolation: _Interpolation | None = None
         worker = ThreadPoolExecutor(1)
-        self.prepared: Future[SurfaceInverse] = worker.submit(
-            _make_inverse,
-            surface,
-            calibrations,
-        )
+        self.prepared: Future[SurfaceInverse] = worker.submit(_make_inverse, surface, calibrations)
+        # The thread ends when the preparation is done.
         worker.shutdown(wait=False)
 
     def compute(self, values: Array, cloud: Array | None) -> SurfaceField:
@@ -97,24 +97,18 @@ class FieldModel:
                 "on the surface, from the node contacts",
                 sigma,
             )
+        # A failed preparation raises its error in `result`, so that is not called then.
         if self.prepared.done() and self.prepared.exception() is None:
             inverse = self.prepared.result()
             traction = inverse.field(values).traction
+            # The traction is a vector in the frame of the cube below the point; z points outwards.
             columns = np.stack([-traction[:, 2], np.hypot(*traction[:, :2].T)], axis=1)
             pressure, shear = self._interpolate(inverse.points, columns).T
-            return SurfaceField(
-                pressure,
-                shear,
-                "on the surface of a thick elastomer",
-            )
+            return SurfaceField(pressure, shear, "on the surface of a thick elastomer")
         between = self._surface.field(values)
         # A shear component that is unknown (NaN) counts as 0 in the magnitude.
         shear = np.linalg.norm(np.nan_to_num(between.shear), axis=1)
-        return SurfaceField(
-            between.pressure,
-            shear,
-            "between the cubes, at their depth",
-        )
+        return SurfaceField(between.pressure, shear, "between the cubes, at their depth")
 
     def _interpolate(self, points: Array, columns: Array) -> Array:
         # The points of a skin do not move, so the weights of the interpolation are computed once.

@@ -98,7 +98,8 @@ def build_update(
         scan: The instant.
         history: Values of all cubes in the last seconds; the newest are those of the scan.
         choices: What the user has chosen.
-        before: Upper ends of the automatic ranges in the picture of the scan before.
+        before: Upper ends of the automatic ranges in the picture of the scan before, from which
+            they fall slowly.
 
     Returns:
         Name of an object on the page -> its properties; upper ends of the ranges in this picture.
@@ -114,17 +115,10 @@ def build_update(
     ranges = skin.scene.ranges(scan, colouring.top, before)
     update = skin.scene.draw(scan, colouring, choices.parts, cube, ranges)
 
+    # Each text is the content of an HTML element of the same name (page.py).
     texts = {
-        "headline": markup.headline(
-            scan,
-            choices.is_paused,
-            choices.is_recording,
-        ),
-        "legend": markup.legend(
-            choices.quantity,
-            colouring.top,
-            scan.field,
-        ),
+        "headline": markup.headline(scan, choices.is_paused, choices.is_recording),
+        "legend": markup.legend(choices.quantity, colouring.top, scan.field),
         "meaning": markup.explanation(skin.scene.bar, *skin.scene.per_bar(ranges), scan.field),
         "numbers": markup.numbers(scan, cube),
         "health": markup.conditions(skin.names, scan),

@@ -227,7 +227,7 @@ class Viewer:
             self._actions.put(partial(self._act, *arguments))
 
         page = Page(client, layout, self._shown, act)
-        page.show_replay(self._replay.state)
+        page.replay.show(self._replay.state)
         self._pages[client.client_id] = page
 
     def _forget_page(self, client_id: int) -> None:
@@ -275,7 +275,7 @@ class Viewer:
         for client_id, page in self._pages.items():
             if client_id in connected:
                 if not self._replay.is_jumping:
-                    page.show_replay(self._replay.state)
+                    page.replay.show(self._replay.state)
                 page.show(scan, self._history, self._status)
 
     def _update_recording(self) -> None:
