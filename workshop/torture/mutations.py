@@ -378,11 +378,9 @@ RECONSTRUCTION: dict[str, Patch] = {
     # Queues hold 0.1 s, and nobody counts what they drop.
     "losses unseen": _lose_silently,
     # Health finds and flags nothing.
-    "blind": _change_result(
-        "core.health.health:Health", "update", lambda flags: tuple(map(np.zeros_like, flags))
-    ),
+    "blind": _wrap("core.pipeline:Pipeline", "process", _flag_nothing),
     # Health flags a sound pad.
-    "ghosts": _wrap("core.health.health:Health", "update", _flag_sound_pad),
+    "ghosts": _wrap("core.pipeline:Pipeline", "process", _flag_sound_pad),
     # Stuck pads are not found.
     "never stuck": _change_result(
         "core.health.diagnosis:PadDiagnosis", "_find_stuck", np.zeros_like
