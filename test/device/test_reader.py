@@ -781,6 +781,32 @@ def test_close_from_a_callback(hub: PtyHub) -> None:
     reader.close()
 
 
+def test_a_reader_that_is_behind_knows_for_how_long(start: Start, hub: PtyHub) -> None:
+    """A callback takes 0.1 s, and meanwhile the next sample comes."""
+    watch = start(LinkConfig("a", hub.port))
+    hub.greet()
+    watch.frame(Hello)
+    late: dict[int, bool] = {}
+
+    def on_frames(received: list[LinkFrames], usual: UsualSamples) -> None:
+        samples = [frame for read in received for frame in read.frames if isinstance(frame, Sample)]
+        late.update((sample.sequence, received[0].is_late) for sample in samples)
+        if 1 in late and 2 not in late:
+            hub.sample(2)
+            until = time.monotonic() + 0.1
+            while time.monotonic() < until:
+                select.select([], [], [], 0.01)
+        watch._on_frames(received, usual)
+
+    watch.reader.take_lag_s()
+    watch.reader._on_frames = on_frames
+    hub.sample(1)
+    while watch.frame(Sample).sequence != 2:
+        pass
+    assert late[2]
+    assert watch.reader.take_lag_s() >= 0.1
+
+
 def test_starts_once(start: Start, hub: PtyHub) -> None:
     watch = start(LinkConfig("a", hub.port))
     with pytest.raises(LinkError, match="make a new Reader"):
