@@ -20,6 +20,8 @@ typedef struct {
 /* Flags: contiguous, aligned, in the byte order of the machine; and writeable. */
 enum { READABLE = 0x1 | 0x100 | 0x200, WRITEABLE = 0x400 };
 
+static PyObject *attribute; /* the text "__array_struct__", whose hash is computed once */
+
 /* Stores one array in the call. false: it does not fit. */
 static bool store(cube_scan_call *call, size_t number, const array_interface *array) {
     const cube_scan_array *wanted = &cube_scan_arrays[number];
@@ -46,7 +48,7 @@ static PyObject *run(PyObject *module, PyObject *args) {
         const enum cube_scan_use use = cube_scan_arrays[i].use;
         if (object == Py_None && (use == CUBE_SCAN_STATE || use == CUBE_SCAN_OPTION))
             continue;
-        PyObject *capsule = PyObject_GetAttrString(object, "__array_struct__");
+        PyObject *capsule = PyObject_GetAttr(object, attribute);
         const array_interface *array = capsule == NULL ? NULL : PyCapsule_GetPointer(capsule, NULL);
         /* The tuple of arguments holds the array, so that its memory outlives the capsule. */
         if (array != NULL && !store(&call, i, array))
@@ -63,4 +65,7 @@ static PyMethodDef functions[] = {{"run", run, METH_VARARGS, NULL}, {NULL, NULL,
 static struct PyModuleDef module = {
     PyModuleDef_HEAD_INIT, .m_name = "_scan", .m_size = -1, .m_methods = functions};
 
-PyMODINIT_FUNC PyInit__scan(void) { return PyModule_Create(&module); }
+PyMODINIT_FUNC PyInit__scan(void) {
+    attribute = PyUnicode_InternFromString("__array_struct__");
+    return attribute == NULL ? NULL : PyModule_Create(&module);
+}

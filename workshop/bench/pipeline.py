@@ -11,7 +11,7 @@ import numpy as np
 
 from cube_tensor_driver.core.calibration import illustrative
 from cube_tensor_driver.core.oscillator import pad_frequency
-from cube_tensor_driver.core.pipeline import Pipeline
+from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import FrequencyRows
 
 Function = Callable[[], Any]
@@ -27,46 +27,51 @@ LOAD_PA = 5e3
 """Standard deviation of the amplitudes of the modes (linear stress fields) of the load, in Pa."""
 
 
+PERIOD_NS = 1_000_000
+"""Time from one scan to the next, in ns, by the time stamps of the rows."""
+
+
 def bench_pipeline(cubes: int) -> dict[str, Any]:
-    """Time the pipeline and the same pad law and matrix product in bare numpy, in turn.
+    """Time a reconstruction and the same pad law and matrix product in bare numpy, in turn.
 
     Args:
         cubes: Number of cubes.
     """
-    result: dict[str, Any] = {"cubes": cubes}
-    for dtype in (np.float32, np.float64):
-        pipeline_us, floor_us = _time_in_turn(_make_functions(cubes, dtype))
-        result[np.dtype(dtype).name] = {
-            "pipeline_us": pipeline_us,
-            "floor_us": floor_us,
-            "ratio": pipeline_us / floor_us,
-        }
-    return result
+    functions = _make_functions(cubes)
+    times_us = dict(zip(functions, _time_in_turn(list(functions.values())), strict=True))
+    floor_us = times_us["floor"]
+    ratios = {name: time_us / floor_us for name, time_us in times_us.items()}
+    return {"cubes": cubes, "us": times_us, "ratio": ratios}
 
 
-def _make_functions(
-    cubes: int,
-    dtype: Any,
-) -> list[Function]:
-    """Return one call of the pipeline, and one of the bare equations, for one scan."""
+def _make_functions(cubes: int) -> dict[str, Function]:
+    """Return functions that compute one scan: with health, without, and the bare equations."""
     calibration = illustrative(LAYOUT)
     rng = np.random.default_rng(0)
     modes = rng.normal(0, LOAD_PA, (cubes, 7))
     law = calibration.rest_frequency, calibration.beta, calibration.modulus
-    frequency = pad_frequency(modes @ calibration.response.T, *law).astype(dtype)
+    frequency = pad_frequency(modes @ calibration.response.T, *law).astype(np.float32)
 
-    pipeline = Pipeline([calibration] * cubes, dtype)
-    rows = FrequencyRows.of(np.arange(cubes), frequency)
-    rest = np.tile(calibration.rest_frequency, (cubes, 1)).astype(dtype)
+    reconstructor = Reconstructor([calibration] * cubes)
+    rows = FrequencyRows.of(np.arange(cubes, dtype=np.uint16), frequency)
+    rest = np.tile(calibration.rest_frequency, (cubes, 1)).astype(np.float32)
     # Any matrix of the size of an estimator takes the same time.
-    matrix = rng.normal(size=(8, 16)).astype(dtype)
-    beta = dtype(calibration.beta[0])
+    matrix = rng.normal(size=(8, 16)).astype(np.float32)
+    beta = np.float32(calibration.beta[0])
+
+    def compute_with_health() -> Any:
+        rows.stamp_ns[:] += PERIOD_NS
+        return reconstructor.process(rows)
 
     def compute_floor() -> Any:
         ratio = frequency / rest
         return ((ratio - 1) / (1 + beta * (1 - ratio))) @ matrix
 
-    return [lambda: pipeline.process(rows), compute_floor]
+    return {
+        "health and pipeline": compute_with_health,
+        "pipeline": lambda: reconstructor.pipeline.process(rows),
+        "floor": compute_floor,
+    }
 
 
 def _time_in_turn(functions: list[Function]) -> list[float]:
