@@ -328,11 +328,12 @@ class ContactTracker:
             return Work.NONE if region.is_tried else Work.FIT
         changes = (
             abs(region.peak / fit.peak - 1),
-            _difference(region.points, fit.points),
-            _difference(region.others, fit.others),
+            _new_share(region.points, fit.points),
+            _new_share(fit.points, region.points),
+            # Neighbours that have gone do no harm, and those that move are replaced by and by.
+            _new_share(region.others, fit.others) / 2,
         )
-        limit = MAX_CHANGE if fit.hertz is None else MAX_CHANGE_HERTZ
-        if max(changes) > limit:
+        if max(changes) > (MAX_CHANGE if fit.hertz is None else MAX_CHANGE_HERTZ):
             return Work.FIT
         if fit.is_moving:
             return Work.MOVE
@@ -503,8 +504,6 @@ def _is_certain(estimate: ContactEstimate) -> bool:
     return bool(variance < (COARSE_DEVIATION * estimate.force[2]) ** 2)
 
 
-def _difference(first: Index, second: Index) -> float:
-    """Return the number of elements that only one of two sets has, divided by that of both."""
-    one = set(first.tolist())
-    other = set(second.tolist())
-    return len(one ^ other) / max(len(one | other), 1)
+def _new_share(new: Index, old: Index) -> float:
+    """Return the share of the elements of one set that another set does not have."""
+    return 1 - float(np.isin(new, old).mean()) if len(new) else 0.0
