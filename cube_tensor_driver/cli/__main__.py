@@ -5,7 +5,8 @@ import os
 import signal
 import sys
 
-from .main import BROKEN_PIPE, INTERRUPTED, interrupt_again, main
+from ..processes.stop_signals import INTERRUPTED
+from .main import BROKEN_PIPE, interrupt_again, main
 
 if __name__ == "__main__":
     sys.unraisablehook = interrupt_again

@@ -24,7 +24,7 @@ def arguments(parser: Parser) -> None:
         "repair", "make a bag readable that was cut off: killed, disk full, power lost"
     )
     for command in (info, repair):
-        command.add_argument("bag", type=Path, metavar="BAG", help="folder or file of the bag")
+        command.add_bag()
 
 
 def run(options: argparse.Namespace) -> int:
@@ -133,7 +133,7 @@ def show_skin(bag: Bag, topic: str, console: Console) -> None:
     from ..bags.recording import skin_infos
     from ..bags.summary import cube_summaries
     from ..core.errors import BagError
-    from ..views.terminal.output import make_table
+    from ..views.terminal.output import counted, make_table
 
     try:
         info = skin_infos(bag, topic)[-1]
@@ -143,13 +143,14 @@ def show_skin(bag: Bag, topic: str, console: Console) -> None:
         return
     frame, version = info.header.frame_id, info.version
     console.print(
-        f"skin {info.name!r}: {cubes_text(len(info.cubes))} in {frame}, info version {version}",
+        f"skin {info.name!r}: {counted(len(info.cubes), 'cube')} in {frame}, "
+        f"info version {version}",
         markup=False,
     )
     for name, count in Counter(cube.calibration_id for cube in info.cubes).items():
         # All cubes with the same calibration have the same layout, unless a file was edited.
         layouts = sorted({cube.layout for cube in info.cubes if cube.calibration_id == name})
-        cubes = cubes_text(count)
+        cubes = counted(count, "cube")
         console.print(f"  calibration {name}, layout {', '.join(layouts)}: {cubes}")
 
     table = make_table(("cube", "uid"), ("samples", "Hz", "lost", "gaps", "longest gap / ms"))
@@ -173,8 +174,3 @@ def diagnostics_line(status: Any) -> str:
         f"{pair.key} {pair.value}" for pair in status.values if pair.value not in ("0", "0.0", "")
     ]
     return f"{status.name}: {status.message or 'nothing wrong'}; {', '.join(values)}"
-
-
-def cubes_text(count: int) -> str:
-    """Return a number of cubes as text, such as "1 cube" or "5 cubes"."""
-    return f"{count} {'cube' if count == 1 else 'cubes'}"

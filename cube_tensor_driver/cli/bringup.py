@@ -11,7 +11,7 @@ import argparse
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from .parser import Parser, sample_rate
+from .parser import Parser
 
 if TYPE_CHECKING:
     import numpy as np
@@ -54,20 +54,14 @@ nothing. Below the limit the message is that several rotations fit, above it tha
 
 def arguments(parser: Parser) -> None:
     parser.add_argument("port", metavar="PORT", help="device path, or socket://host:port")
-    parser.add_output("-o", "--output", kind="yaml", required=True, help="skin file to write")
+    parser.add_output("-o", "--output", kind="skin", required=True, help="skin file to write")
     parser.add_argument("--name", default="skin", help="name of the skin (default: %(default)s)")
     parser.add_argument(
         "--calibration",
         metavar="FILE",
         help="calibration file or name (default: the shipped one for the number of pads)",
     )
-    parser.add_argument(
-        "--rate",
-        type=sample_rate,
-        default=100.0,
-        metavar="HZ",
-        help="samples per second (default: %(default)g)",
-    )
+    parser.add_rate()
     parser.epilog = (
         "Leave the skin alone for the first 5 s. Then press next to each cube where the command "
         "asks for it. End a driver that has the port open first. docs/build.md says more."
@@ -83,12 +77,9 @@ def run(options: argparse.Namespace) -> int:
     import numpy as np
 
     from ..config.yaml import write_yaml
-    from ..core.errors import ConfigError
     from ..device.live import open_links
     from ..views.terminal.output import say
 
-    if options.output.exists():
-        raise ConfigError(f"-o {options.output}: the file exists; remove it, or name another one")
     data, skin = skin_of_hub(options)
     names = [cube.name for cube in skin.cubes]
     pads = skin.cubes[0].calibration.layout.pads

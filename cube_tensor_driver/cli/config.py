@@ -8,7 +8,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from .parser import Parser, count, positive, sample_rate
+from .parser import Parser, count, positive
 
 
 def arguments(parser: Parser) -> None:
@@ -29,13 +29,7 @@ def arguments(parser: Parser) -> None:
         metavar="N",
         help="hubs that share the cubes (default: %(default)s)",
     )
-    grid.add_argument(
-        "--rate",
-        type=sample_rate,
-        default=100.0,
-        metavar="HZ",
-        help="samples per second (default: %(default)g)",
-    )
+    grid.add_rate()
     grid.add_argument("--name", default="skin", help="name of the skin (default: %(default)s)")
     grid.add_argument(
         "--port",
@@ -53,7 +47,7 @@ def arguments(parser: Parser) -> None:
         metavar="FILE",
         help="calibration file or name (default: that of the package for the layout)",
     )
-    grid.add_output("-o", "--output", kind="yaml", required=True, help="skin file to write")
+    grid.add_output("-o", "--output", kind="skin", required=True, help="skin file to write")
     check = parser.add_subcommand("check", "list what is wrong with a skin file, or what it holds")
     check.add_argument("file", type=Path, metavar="FILE", help="skin file")
 
@@ -66,17 +60,15 @@ def write_grid(options: argparse.Namespace) -> int:
     """Write the skin file of a grid, and return the exit code 0.
 
     Raises:
-        ConfigError: The file exists already, or `./cube config check` would find a mistake in it.
+        ConfigError: `./cube config check` would find a mistake in the file.
     """
     from ..config.grid import grid
     from ..config.pose_check import MAX_SPACED_CUBES, pose_doubts
     from ..config.skin import check_skin_data
     from ..config.yaml import write_yaml
     from ..core.errors import ConfigError
-    from ..views.terminal.output import working
+    from ..views.terminal.output import counted, working
 
-    if options.output.exists():
-        raise ConfigError(f"-o {options.output}: the file exists; remove it, or name another one")
     skin = grid(
         options.name,
         nx=options.nx,
@@ -98,7 +90,7 @@ def write_grid(options: argparse.Namespace) -> int:
         raise ConfigError(f"grid: {mistakes[0]}")
     size = f"{options.nx} x {options.ny} cubes, {1e3 * options.pitch:g} mm apart"
     # The text is printed, and written into the header of the file.
-    text = f"{size}, on {options.links} {'link' if options.links == 1 else 'links'}"
+    text = f"{size}, on {counted(options.links, 'link')}"
     with working(f"writing {len(skin['cubes'])} cubes"):
         write_yaml(options.output, skin, f"{text}. docs/config.md describes the keys.")
     print(f"wrote {options.output}: {text}")
@@ -129,7 +121,7 @@ def check_file(path: Path) -> int:
     from ..config.pose_check import pose_doubts
     from ..config.skin import check_skin
     from ..device.links.line_load import line_doubts
-    from ..views.terminal.output import working
+    from ..views.terminal.output import counted, working
 
     # `working` shows that the command is busy, because a skin of thousands of cubes takes seconds.
     with working(f"checking {path}"):
@@ -145,8 +137,8 @@ def check_file(path: Path) -> int:
     # The cubes are counted by layout, because a skin may have cubes of several layouts.
     layouts = Counter(cube.calibration.layout.name for cube in skin.cubes)
     by_layout = ", ".join(f"{number} {name}" for name, number in layouts.items())
-    cubes = f"{len(skin.cubes)} {'cube' if len(skin.cubes) == 1 else 'cubes'} ({by_layout})"
+    cubes = f"{counted(len(skin.cubes), 'cube')} ({by_layout})"
     rate = "the rate of the hubs" if skin.rate is None else f"{skin.rate:g} Hz"
-    links = f"{len(skin.links)} {'link' if len(skin.links) == 1 else 'links'}"
+    links = counted(len(skin.links), "link")
     print(f"{path}: skin {skin.name!r}: {cubes}, {links}, {rate}: nothing wrong")
     return 0

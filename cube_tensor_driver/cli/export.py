@@ -63,15 +63,11 @@ def arguments(parser: Parser) -> None:
         # The command `reprocess` makes the tables. Its options that these subcommands do not have
         # are set to their defaults.
         table.set_defaults(format=name, contacts=None, scheduler=None)
-        table.add_argument(
-            "--jobs", type=count, metavar="N", help="number of processes (default: one per core)"
-        )
+        table.add_jobs()
 
 
 def _add_common(parser: Parser) -> None:
-    parser.add_argument(
-        "bags", type=Path, nargs="+", metavar="BAG", help="folders or files of bags"
-    )
+    parser.add_bags()
     parser.add_output(
         "-o", "--output", kind="folder", required=True, help="folder, empty or not there yet"
     )

@@ -17,14 +17,12 @@ import threading
 from collections.abc import Sequence
 from typing import Any
 
+from ..processes.stop_signals import INTERRUPTED
 from .parser import Parser, check_outputs, columns, nearest, sentence
 from .table import COMMANDS, GROUPS, PACKAGES
 
 PROGRAM = "./cube"
 """Name of the program in help texts and error messages."""
-
-INTERRUPTED = 130
-"""Exit code after Ctrl-C: by the convention of shells, 128 plus the number of the signal SIGINT."""
 
 BROKEN_PIPE = 141
 """Exit code if the reader of stdout has closed the pipe: 128 plus the number of the signal SIGPIPE,

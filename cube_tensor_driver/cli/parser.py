@@ -28,8 +28,8 @@ class Output:
     Attributes:
         flag: The option, such as "--output".
         name: Name of its value in the parsed options.
-        kind: `file`, `yaml` (a file with the suffix of YAML), `picture` (a file whose suffix names
-            a picture format) or `folder`.
+        kind: `file`, `skin` (a YAML file that must not exist yet), `yaml` (a file with the suffix
+            of YAML), `picture` (a file whose suffix names a picture format) or `folder`.
     """
 
     flag: str
@@ -71,6 +71,32 @@ class Parser(argparse.ArgumentParser):
     def add_json(self) -> None:
         """Add the option --json FILE, which writes the printed results to a file as JSON."""
         self.add_output("--json", help="write the figures to FILE as well")
+
+    def add_bag(self) -> None:
+        """Add the argument BAG, a bag (recording) to read."""
+        self.add_argument("bag", type=Path, metavar="BAG", help="folder or file of the bag")
+
+    def add_bags(self) -> None:
+        """Add the argument BAG ..., several bags to read."""
+        self.add_argument(
+            "bags", type=Path, nargs="+", metavar="BAG", help="folders or files of bags"
+        )
+
+    def add_jobs(self) -> None:
+        """Add the option --jobs N, the number of processes that work at the same time."""
+        self.add_argument(
+            "--jobs", type=count, metavar="N", help="number of processes (default: one per core)"
+        )
+
+    def add_rate(self) -> None:
+        """Add the option --rate HZ, the sample rate in a skin file."""
+        self.add_argument(
+            "--rate",
+            type=sample_rate,
+            default=100.0,
+            metavar="HZ",
+            help="samples per second (default: %(default)g)",
+        )
 
     def add_subcommand(self, name: str, text: str) -> Parser:
         """Add a subcommand, such as `grid` in ./cube config grid, and return its parser.
@@ -197,6 +223,7 @@ def check_outputs(options: argparse.Namespace) -> None:
         ConfigError: A file or folder cannot be written, or its suffix is wrong.
     """
     from ..config.output_files import check_folder, check_outputs, check_yaml
+    from ..core.errors import ConfigError
 
     files: dict[str, Path | None] = {}
     pictures: list[Path] = []
@@ -206,8 +233,13 @@ def check_outputs(options: argparse.Namespace) -> None:
         if callable(value):
             value = value(options)
             setattr(options, output.name, value)
-        if output.kind == "yaml":
+        if output.kind in ("yaml", "skin"):
             check_yaml(output.flag, value)
+        # Users edit skin files, so none is overwritten.
+        if output.kind == "skin" and value.exists():
+            raise ConfigError(
+                f"{output.flag} {value}: the file exists; remove it, or name another one"
+            )
         if output.kind == "folder":
             check_folder(output.flag, value)
         else:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from .parser import Parser, number
 
 
 def arguments(parser: Parser) -> None:
-    parser.add_argument("bag", type=Path, metavar="BAG", help="folder or file of the bag")
+    parser.add_bag()
     parser.add_argument("--cube", metavar="NAME", help="which cube (default: the first)")
     parser.add_argument(
         "--from",

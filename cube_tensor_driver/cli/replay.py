@@ -28,7 +28,7 @@ KEYS = "space: pause, s: step, q: quit"
 
 
 def arguments(parser: Parser) -> None:
-    parser.add_argument("bag", type=Path, metavar="BAG", help="folder or file of the bag")
+    parser.add_bag()
     parser.add_argument(
         "--rate",
         type=positive,
@@ -173,7 +173,7 @@ def browser(bag: Bag, wanted: bool) -> Iterator[Children]:
     from ..core.errors import BagError
     from ..messages.types import PACKAGE
     from ..processes.children import Children
-    from ..processes.skin_processes import Process
+    from ..processes.skin_processes import VIEW
 
     with (
         tempfile.TemporaryDirectory(prefix="cube_replay_") as name,
@@ -188,6 +188,6 @@ def browser(bag: Bag, wanted: bool) -> Iterator[Children]:
                 )
             # The view needs seconds to start. Waiting for its URL makes the replay begin when the
             # page can be opened.
-            children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view",)))
+            children.start(VIEW)
             print(children.wait_for_line("view", "http://", MAX_START_S), file=sys.stderr)
         yield children

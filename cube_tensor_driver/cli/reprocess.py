@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..core.defaults import CONTACT_METHODS
-from .parser import Parser, count, number
+from .parser import Parser, number
 
 if TYPE_CHECKING:
     from ..bags.reprocess.contacts import ContactsOverTime
@@ -19,9 +19,7 @@ if TYPE_CHECKING:
 
 
 def arguments(parser: Parser) -> None:
-    parser.add_argument(
-        "bags", type=Path, nargs="+", metavar="BAG", help="folders or files of bags"
-    )
+    parser.add_bags()
     parser.add_argument(
         "-o",
         "--output",
@@ -44,9 +42,7 @@ def arguments(parser: Parser) -> None:
         help="add contacts and traction, as the node contacts makes them with method:=METHOD and "
         "its other parameters: depth:=0.005 thickness:=0.011 rate:=20",
     )
-    parser.add_argument(
-        "--jobs", type=count, metavar="N", help="number of processes (default: one per core)"
-    )
+    parser.add_jobs()
     parser.add_argument(
         "--scheduler",
         metavar="ADDRESS",

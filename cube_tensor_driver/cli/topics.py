@@ -33,7 +33,9 @@ def cubes_text(cubes: list[str]) -> str:
     Args:
         cubes: Names of the cubes; empty for a topic of the whole skin, which gives an empty text.
     """
+    from ..views.terminal.output import counted
+
     if not cubes:
         return ""
     names = ", ".join(cubes) if len(cubes) < 3 else f"{cubes[0]} … {cubes[-1]}"
-    return f", {len(cubes)} {'cubes' if len(cubes) > 1 else 'cube'}: {names}"
+    return f", {counted(len(cubes), 'cube')}: {names}"

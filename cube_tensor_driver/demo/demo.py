@@ -18,8 +18,8 @@ from ..config.yaml import read_yaml, write_yaml
 from ..core.errors import ConfigError
 from ..processes.children import Children
 from ..processes.domain import is_domain_used
-from ..processes.skin_processes import Process, SimulatedHubs, skin_processes
-from ..processes.stop_signals import stop_event
+from ..processes.skin_processes import VIEW, SimulatedHubs, skin_processes
+from ..processes.stop_signals import INTERRUPTED, stop_event
 
 MAX_CUBES = 4096
 """Maximum number of cubes of a grid that `./cube demo --cubes N` simulates."""
@@ -32,17 +32,6 @@ DEFAULT_RATE = 100.0
 
 CUBES_PER_HUB = 8
 """Number of cubes on each simulated hub of the grid that `./cube demo --cubes N` simulates."""
-
-VIEW = Process(
-    "view",
-    "cube_tensor_driver.cli",
-    node=False,
-    arguments=("view",),
-)
-"""The process `./cube view`, which `./cube demo --view` starts beside the nodes."""
-
-INTERRUPTED = 130
-"""Exit code after Ctrl-C: by the convention of shells, 128 plus the number of the signal SIGINT."""
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,16 @@ class Process:
     program: str = ""
 
 
+VIEW = Process(
+    "view",
+    "cube_tensor_driver.cli",
+    node=False,
+    arguments=("view",),
+)
+"""The process `./cube view`, which shows the skin in the browser. `./cube demo --view` and
+`./cube replay --view` start it."""
+
+
 @dataclass(frozen=True)
 class SimulatedHubs:
     """Options of the simulator, a process that replaces the real hubs of a skin.

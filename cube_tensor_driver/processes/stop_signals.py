@@ -6,6 +6,9 @@ import signal
 import threading
 from collections.abc import Callable
 
+INTERRUPTED = 130
+"""Exit code after Ctrl-C: by the convention of shells, 128 plus the number of the signal SIGINT."""
+
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Signals that ask this process to end: SIGINT comes from Ctrl-C, SIGTERM from another process, and
 SIGHUP when the terminal is closed."""

@@ -15,14 +15,13 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from ...processes.stop_signals import INTERRUPTED
+
 GRACE_S = 0.3
 """Time, in seconds, from Ctrl-C until the process is ended without running `finally` blocks.
 
 Outside of C code, the main thread ends by KeyboardInterrupt within this time and runs them.
 """
-
-INTERRUPTED = 130
-"""Exit code after Ctrl-C: by the convention of shells, 128 plus the number of the signal SIGINT."""
 
 _SHOW_CURSOR = b"\x1b[?25h"
 """Escape sequence that makes a terminal show its cursor again."""

@@ -19,6 +19,7 @@ from ...core.arrays import Array, Index
 from ...core.modes import COMPONENTS, STRESS
 from ...core.rows import StressRows
 from ...core.status import STATUS
+from .output import counted
 
 DRAW_PERIOD_S = 0.1
 """Minimum time, in seconds, from one drawing of the table to the next."""
@@ -249,8 +250,7 @@ class LiveTable:
         return table
 
     def _empty_table(self, form: _Form) -> Table:
-        cubes = len(self._count)
-        count = f"{cubes} {'cube' if cubes == 1 else 'cubes'}"
+        count = counted(len(self._count), "cube")
         title = f"skin {self._skin.name!r}: {count}. Tension is positive; "
         table = Table(title=f"{title}{UNOBSERVED} is not observed{self.note}")
         if not form.has_lines:

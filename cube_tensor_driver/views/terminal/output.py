@@ -37,6 +37,11 @@ def say(
     )
 
 
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun, such as "1 cube" or "5 cubes"."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
 def make_table(names: Iterable[str], numbers: Iterable[str]) -> Table:
     """Make a table without rows, with left-justified columns and then right-justified columns.
 
