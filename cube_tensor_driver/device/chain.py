@@ -411,7 +411,7 @@ class LiveLinks:
                 record.account.stats(frame)
                 record.account_errors = record.account.contradictions()
             elif isinstance(frame, Ack) and frame.request == Command.START:
-                record.account.start()
+                record.account.expect_restart()
         self._add_samples(read, samples)
 
     def _add_samples(self, read: LinkFrames, samples: Sequence[Sample]) -> None:
@@ -498,6 +498,7 @@ class LiveLinks:
         record.was_open |= state is LinkState.OPEN
         if state is not LinkState.OPEN:
             record.track.is_usual = False
+            record.account.expect_restart()
             # A link that is WAITING without an error is about to be opened for the first time,
             # which is no event to report.
             if error is not None or state is LinkState.CLOSED:

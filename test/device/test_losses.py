@@ -14,10 +14,10 @@ from cube_tensor_driver.device import chain
 from cube_tensor_driver.device.chain import LiveLinks
 from cube_tensor_driver.device.clock.hub_clock import HubClock
 from cube_tensor_driver.device.links.intake import UsualSamples
-from cube_tensor_driver.device.links.link import LinkConfig
+from cube_tensor_driver.device.links.link import LinkConfig, LinkState
 from cube_tensor_driver.device.links.reader import LinkFrames
 from cube_tensor_driver.device.scans.cube_table import CubeAddress
-from cube_tensor_driver.device.scans.sequence import Arrival, SampleAccount
+from cube_tensor_driver.device.scans.sequence import SampleAccount
 from cube_tensor_driver.device.wire import native
 from cube_tensor_driver.device.wire.decoder import PythonDecoder
 from cube_tensor_driver.device.wire.protocol import Ack, Command, Hello, Sample, Stats, encode
@@ -151,21 +151,21 @@ def live_duplicates(link: OneLink) -> int:
     return link.live.row_counts().duplicate
 
 
-@pytest.mark.parametrize("told_by", [Ack(Command.START), Stats(1, 0, 0)])
-def test_a_restart_that_repeats_numbers_and_times_is_a_restart(told_by) -> None:
+@pytest.mark.parametrize("told_by", [Ack(Command.START), Stats(1, 0, 0), LinkState.WAITING])
+def test_a_restart_that_repeats_numbers_and_times_is_a_restart(link, told_by) -> None:
     """Soon after power-up the samples of the next run have the numbers and times of the last one.
-    A hub samples after START only, and its uptime begins again."""
-    account = SampleAccount()
-    account.stats(Stats(5, 0, 0))
+    A hub samples after START only, its uptime begins again, or the link was away."""
+    link.give(Stats(5, 0, 0))
     for number in range(200):
-        account.sample(sample(number))
-    if isinstance(told_by, Stats):
-        account.stats(told_by)
+        link.give(sample(number))
+    if isinstance(told_by, LinkState):
+        link.live._on_state(0, told_by, None)
     else:
-        account.start()
-    arrivals = [account.sample(sample(number)) for number in range(3)]
-    assert arrivals == [Arrival.RESET, Arrival.NEW, Arrival.NEW]
-    assert account.resets == 1 and account.counters()["duplicate"] == 0
+        link.give(told_by)
+    for number in range(3):
+        link.give(sample(number))
+    values, _ = link.report()
+    assert (values["resets"], values["duplicate"], values["delivered"]) == (1, 0, 203)
 
 
 def test_a_hub_that_announces_fewer_cubes_is_counted_right() -> None:

@@ -96,7 +96,7 @@ class SequenceTracker:
         self._is_begun = False
         self._first = 0
         self._first_us = 0
-        self._started_at = -1  # number of the next sample when the hub was last started
+        self._restart_at = -1  # number of the next sample when a restart was last expected
 
     def update(self, sequence: int, device_us: int) -> Arrival:
         """Classify one sample as new, late, duplicate or first after a restart, and count it.
@@ -117,9 +117,8 @@ class SequenceTracker:
                 return self._restart(sequence, device_us)
             return self._skip(number, device_us)
 
-        # The number is smaller than expected. After START, this shows that the hub has restarted,
-        # because a hub samples only after START.
-        if self._started_at == track.next and device_us < track.newest_us:
+        # The number is smaller than that of the next sample.
+        if self._restart_at == track.next and device_us < track.newest_us:
             return self._restart(sequence, device_us)
         if (number, device_us) in self._seen() or self._is_old_repeat(number, device_us):
             self.counters.duplicate += 1
@@ -137,13 +136,9 @@ class SequenceTracker:
         self.counters.out_of_order += 1
         return self._deliver(number, device_us, Arrival.LATE)
 
-    def note_start(self) -> None:
-        """Expect that the hub may have restarted, because it was just sent START.
-
-        If the number and the device time (hub's clock) of the next sample are then smaller than
-        those of the newest one, it is the first sample after a restart and no repeated one.
-        """
-        self._started_at = self._track.next
+    def expect_restart(self) -> None:
+        """Note that the hub may have restarted; see `SampleAccount.expect_restart`."""
+        self._restart_at = self._track.next
 
     def count_missing(self, taken: int) -> None:
         """Count samples as missing that the hub has taken but that have not arrived.
@@ -328,10 +323,14 @@ class SampleAccount:
             self._n_cubes = n_cubes
             self._end_parts(n_cubes, 1 << 16)
 
-    def start(self) -> None:
-        """Note that the hub has acknowledged START, so that it may have restarted before."""
+    def expect_restart(self) -> None:
+        """Note that the hub may have restarted, because it was started, silent or not connected.
+
+        If the number and the device time (hub's clock) of the next sample are then smaller than
+        those of the newest one, it is the first sample after a restart and no repeated one.
+        """
         for tracker in self._trackers.values():
-            tracker.note_start()
+            tracker.expect_restart()
 
     def stats(self, frame: Stats) -> None:
         """Take over how many samples the hub has taken and dropped, from its STATS frame.
@@ -348,7 +347,7 @@ class SampleAccount:
             # The hub has restarted. Its sample counter began again at 0 and must not be compared
             # with the last sample, which may be from before the restart.
             self._dropped_before = 0
-            self.start()
+            self.expect_restart()
             return
         dropped = (frame.dropped - self._dropped_before) % _WRAP
         self._dropped += dropped * len(self._trackers)
