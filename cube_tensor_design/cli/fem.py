@@ -194,7 +194,7 @@ def _write(
     model: Model,
     result: Response | SurfaceStudy,
 ) -> None:
-    """Write the calibration, or the influence functions."""
+    """Write the calibration of a response, or the influence functions of a cube on ground."""
     from cube_tensor_driver.mechanics.influence_file import write_influence
 
     from ..fem.fem import Response

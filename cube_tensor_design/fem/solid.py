@@ -138,10 +138,11 @@ class Solid:
         """Assemble the stiffness.
 
         Args:
-            mesh: From mesh.py, lengths in d0. An axis has a mirror where the mesh is positive.
-            body: Lame's constants of the body.
-            cube: Those of the cube in the same unit, or None for a rigid cube.
-            ground: Whether the lower face is held; then the cube must be elastic.
+            mesh: Mesh by mesh.py, with lengths in d0 (half the side of the cube). An axis along
+                which all coordinates are positive has a mirror at 0.
+            body: Lame's constants lambda and mu of the body.
+            cube: Lame's constants of the cube in the same unit; None: the cube is rigid.
+            ground: Whether the lower face is held at rest; then the cube must be elastic.
         """
         self.dim = int(mesh.dim())
         self.order = 4 if self.dim == 2 else 2

@@ -42,8 +42,8 @@ SHEAR_LABELS = {
 ROD_LABEL = "distance of the rod's centre from the cube's / mm"
 """Label of the axis on which the position of the rod is drawn."""
 MIN_SHOWN_SHARE = 1e-3
-"""Share of the largest stress below which a panel shows no values, because they are zero by
-symmetry."""
+"""Share of the largest stress of an experiment below which the amplitudes of a panel count as
+rounding errors of values that are zero by symmetry, and are not shown."""
 
 
 @print_style()

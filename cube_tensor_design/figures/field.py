@@ -90,7 +90,7 @@ def _map_axes(
     rows: int,
     columns: int,
 ) -> Any:
-    """Return axes (rows, columns) of maps with one scale."""
+    """Return panels (rows, columns) for maps of the same square, with labels at the outer ones."""
     axes = figure.subplots(
         rows,
         columns,

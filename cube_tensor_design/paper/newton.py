@@ -46,7 +46,7 @@ class Constraints:
     """Conditions on the unknown displacements.
 
     Attributes:
-        prescribed: (dofs,) values, NaN where an unknown is free.
+        prescribed: (dofs,) prescribed displacements; NaN where an unknown is free.
         row: (dofs,) weights of a combination of the unknowns u that is held, row @ u = 0; None: no
             combination is held.
     """

@@ -89,7 +89,12 @@ class LayoutStudy:
     error: dict[str, Array]
 
     def trusted(self, limit: float = MAX_TRUSTED_ERROR) -> list[TrustedWidth]:
-        """Return the narrowest trusted indenter for each layout, side and observed component."""
+        """Return the narrowest trusted indenter for each layout, side of the cube and observed
+        component.
+
+        Args:
+            limit: Largest error that counts as trusted, relative to the range of the component.
+        """
         rows = []
         for (name, error), (i, side) in itertools.product(
             self.error.items(), enumerate(self.sides)
@@ -141,7 +146,8 @@ class _Passage:
         return contact.field(points, sources, forces, self.poisson)
 
     def components(self) -> Array:
-        """Return the true `COMPONENTS` (15,) at the cube's centre, gradients times d0."""
+        """Return true stress and gradient (15,) at the cube's centre, in Pa; the gradient is times
+        d0, half the side of the cube."""
         stress, gradient = self.field(np.zeros((1, 3)))
         slopes = self.side / 2 * gradient[0, :3]
         return np.concatenate([stress[0], slopes.ravel()])

@@ -46,7 +46,7 @@ LOADS = ("hubs", "simulator")
 """Processes that send the samples: hubs in C, or the simulator where they cannot be built."""
 
 MAX_START_S = 30.0
-"""Longest time, in seconds, until the first tensor arrives."""
+"""Longest time, in seconds, from the start of the processes until the first tensor arrives."""
 
 SETTLE_S = 3.0
 """Time, in seconds, from the first tensor to the begin of the measurement."""
@@ -215,7 +215,7 @@ def _make_processes(
     bench: Bench,
     progress: Progress,
 ) -> list[Process]:
-    """Return the load, followed by the nodes."""
+    """Return the process of the load (hubs that send samples), followed by those of the nodes."""
     ports = path.parent / "ports"
     processes = skin_processes(
         path,

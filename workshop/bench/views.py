@@ -56,7 +56,7 @@ SETTLE_S = 6.0
 """Time, in seconds, from the start of the browser view to the begin of the measurement."""
 
 MEASURE_S = 15.0
-"""Duration of the measurement, in seconds."""
+"""Duration of the measurement of the views, in seconds."""
 
 SHOWN = """(() => {
   window.shown_ = 0
@@ -248,7 +248,7 @@ def make_skin(folder: Path, cubes: int) -> Skin:
 
 
 def stress_rows(stress: np.ndarray, gradient: np.ndarray) -> StressRows:
-    """Return rows as planar cubes would give them, which do not observe all components."""
+    """Return rows of stress in which the components that planar cubes do not observe are NaN."""
     stress = stress.astype(np.float32)
     gradient = gradient[:, :3].reshape(-1, 9).astype(np.float32)
     stress[:, [1, 3, 5]] = np.nan

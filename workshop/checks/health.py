@@ -41,7 +41,7 @@ DETECTION_NS = round(NS_PER_S * (2 * WINDOW_S + 0.1))
 """Longest time, in nanoseconds, from the begin of a fault until it must be flagged, if finding it
 needs statistics.
 
-The time is two windows, and the scan that shows that the second one is over.
+The time is two windows of the statistics (0.5 s each), and the scan that ends the second one.
 """
 
 RELEASE_S = 6.0
@@ -185,7 +185,7 @@ class _Evidence:
         return is_cut or any(start.overlaps(span, RESTART_S) for start in starts)
 
     def _is_complete(self, cube: int, span: Span) -> bool:
-        """Return whether nearly all rows of a cube arrived in a span."""
+        """Return whether nearly all rows of a cube arrived in a span of time."""
         samples = self._run.samples
         rows = self._run.record.stress.rows
         has_arrived = (rows.cube == cube) & span.contains(rows.stamp_ns)

@@ -34,8 +34,8 @@ They wait in its queues, which a busy host empties late.
 """
 
 ROWS_AROUND_GAP = 100
-"""Number of rows before and after a gap in a topic from whose stamps the time of the gap is
-taken."""
+"""Number of rows (one cube at one sampling time) before and after a gap in a topic whose stamps
+give the begin and the end of the gap."""
 
 GAP_MARGIN_S = 0.05
 """Longest time, in seconds, between the stamp of a row in a missing message and the stamps of the
@@ -180,7 +180,7 @@ class Record(Span):
     messages_lost: int
 
     def actions_of(self, *kinds: str) -> list[NodeAction]:
-        """Return the actions of some kinds, in order."""
+        """Return the actions of the given kinds, in the order of time."""
         return [action for action in self.actions if action.kind in kinds]
 
     def is_during(

@@ -115,7 +115,7 @@ class RestHistory:
             is_tared |= ~rest.is_known
             applies |= is_candidate & ~is_tared[cube]
             ever_tared |= is_tared
-        # While two values may be in force, a cube that is ever tared is not certain.
+        # While old or new values may be in force, a cube that is ever tared is not certain.
         return applies & ~(self._is_unclear(sent_ns) & ever_tared[cube])
 
     def _is_unclear(self, sent_ns: Times) -> Mask:

@@ -97,7 +97,7 @@ class Samples:
         return len(self.link)
 
     def faults(self, *kinds: str) -> list[HubFault]:
-        """Return the faults of some kinds, in order."""
+        """Return the faults of the given kinds, in the order of time."""
         records = [record for record in self.log.faults if record.fault.kind in kinds]
         return [self._convert(record) for record in records]
 

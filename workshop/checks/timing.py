@@ -62,7 +62,7 @@ def measure_reconnects(run: Run, frequencies: FrequencyFindings) -> list[float]:
     """Compute the time, in seconds, from the end of each unplugging to the first sample after it
     that arrived."""
     samples = run.samples
-    # One row of a sample is enough to know that the link delivers.
+    # A link delivers if one row of a sample arrived.
     arrived = frequencies.missing < samples.row_count
     arrived &= samples.time_ns < run.record.end_ns
     gaps_s = []

@@ -9,7 +9,7 @@ from typing import Any
 from cube_tensor_driver.cli.parser import Parser, count, not_negative, positive, sample_rate
 
 DEFAULT_COUNTS = [1, 4, 16, 64, 256, 1024, 4096]
-"""Numbers of cubes of `scale`."""
+"""Numbers of cubes for which `./cube bench scale` measures the chain by default."""
 
 
 def arguments(parser: Parser) -> None:

@@ -77,7 +77,7 @@ TRANSITIONS = "driver/transition_event"
 """Name of a topic that the driver publishes as soon as it can be configured."""
 
 ActionResult = tuple[bool, str]
-"""Whether a node did what was requested, and its answer."""
+"""Result of an action: whether the node did what was requested, and the text of its answer."""
 
 DOWN = (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP)
 UP = (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE)
@@ -277,7 +277,7 @@ class Actions:
         return (False, "no answer") if answer is None else (answer.success, answer.message)
 
     def _ask(self, client: Any, request: Any) -> Any:
-        """Return the answer of a service, None if there is none after `ANSWER_TRIES`."""
+        """Return the answer of a service; None if none came after `ANSWER_TRIES` requests."""
         self._observer.spin(MAX_START_S, client.service_is_ready)
         for _ in range(ANSWER_TRIES):
             future = client.call_async(request)

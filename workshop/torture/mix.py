@@ -86,8 +86,8 @@ OPENING_HUB = 2
 """Hub on which each fault of a pad occurs once at the beginning, before the first cut."""
 
 OPENING_CUBES = (3, 4, 2, 5, 1)
-"""Cubes of `OPENING_HUB` whose pads have these faults. The load moves them enough for a stuck pad
-to be found."""
+"""Numbers on `OPENING_HUB` of the cubes of which a pad has a fault at the beginning, one for each
+kind of fault. The load moves these cubes enough for a stuck pad to be found."""
 
 FIRST_CUT_S = 3.5
 """Time, in seconds after the begin of a torture, of the earliest cut of a link."""
@@ -136,7 +136,7 @@ class _Mix:
             self._add(at, link=f"hub{hub}", **fault)
 
     def add_rounds(self) -> None:
-        """Add the actions, and the holds of the load."""
+        """Add the actions on the nodes, and the times at which the load of a hub is held."""
         # A torture that is shorter than its last quiet seconds has one round without events.
         starts = np.arange(0.0, max(self._end, 0.1), ROUND_S)
         for start in starts.tolist():

@@ -199,7 +199,8 @@ def _make_processes(
 
 
 def _write_skin(folder: Path, ports: Path) -> Path:
-    """Write a skin whose links may each be behind every port: only its uid identifies a hub.
+    """Write the file of a skin whose hubs are identified by their uid alone, as every link of the
+    skin may be behind every port.
 
     The last hub is behind a TCP bridge and has the same faults there.
     """
