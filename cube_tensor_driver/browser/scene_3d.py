@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
 
 from ..core.arrays import AnyArray, Array
 from ..core.latest_stress import DOUBTFUL, FAULTY, STALE
@@ -371,7 +370,7 @@ class Scene:
         values, visible = colouring.field, np.full(len(colouring.field), with_field)
         update: Update = {}
         if self._is_solid:
-            colours = linear_light(colouring.colours(colouring.cubes))
+            colours = scene.linear_light(colouring.colours(colouring.cubes))
             update["cubes"] = {"batched_colors": colours}
         else:
             values = np.append(values, colouring.cubes)
@@ -613,17 +612,3 @@ def _add_mesh(
     return api.add_mesh_simple(
         f"/{name}", *NO_MESH, color=colour, flat_shading=True, side="double", **NO_SHADOWS
     )
-
-
-def linear_light(colours: Array) -> NDArray[np.uint8]:
-    """Convert sRGB colours (N, 3) from 0 to 1 into linear intensities from 0 to 255.
-
-    The browser interprets the colours of batched meshes as linear intensities of light. The
-    conversion is the transfer function of sRGB (IEC 61966-2-1).
-    """
-    linear = np.where(
-        colours <= 0.04045,
-        colours / 12.92,
-        ((colours + 0.055) / 1.055) ** 2.4,
-    )
-    return (255 * linear).astype(np.uint8)

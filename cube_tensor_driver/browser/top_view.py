@@ -69,6 +69,7 @@ class TopView:
         colouring: Colouring,
         contacts: Sequence[Contact],
         chosen: int,
+        with_texts: bool,
     ) -> str:
         """Return the drawing as an SVG element.
 
@@ -76,11 +77,13 @@ class TopView:
             colouring: The values that are drawn as colours.
             contacts: The contacts to draw.
             chosen: Index of the chosen cube, which gets a thick outline.
+            with_texts: Whether cubes have tool tips in a skin above `MAX_NAMED_CUBES`, too. They
+                take most of the time and of the data.
         """
         parts = [
             self._heat_map(colouring.colours(colouring.field)),
             self._fixed,
-            *self._cubes(colouring, chosen),
+            self._cubes(colouring, chosen, with_texts or len(self._names) <= MAX_NAMED_CUBES),
             *map(self._contact, contacts),
         ]
         height = self._height + MARGIN
@@ -136,24 +139,29 @@ class TopView:
             parts.append(_text(x, y + half_side * self._scale + 10, name))
         return "".join(parts)
 
-    def _cubes(self, colouring: Colouring, chosen: int) -> list[str]:
-        """Return SVG polygons of the cubes in their colours, with tool tips.
+    def _cubes(
+        self,
+        colouring: Colouring,
+        chosen: int,
+        with_texts: bool,
+    ) -> str:
+        """Return SVG polygons of the cubes in their colours.
 
         Args:
             colouring: The values that are drawn as colours.
             chosen: Index of the chosen cube, which gets a thick outline.
+            with_texts: Whether each cube has a tool tip with its name and value.
         """
-        rgb = (255 * colouring.colours(colouring.cubes)).astype(int).tolist()
-        parts = []
-        for cube, (red, green, blue) in enumerate(rgb):
-            # The thick outline marks the chosen cube, whose numbers the page shows.
-            width = 2.5 if cube == chosen else 0.7
-            parts.append(
-                f"<polygon points='{self._outlines[cube]}' fill='rgb({red},{green},{blue})' "
-                f"stroke='#212529' stroke-width='{width}'>"
-                f"<title>{self._names[cube]}: {colouring.text(cube)}</title></polygon>"
-            )
-        return parts
+        rgb = (255 * colouring.colours(colouring.cubes)).astype(np.uint8)
+        digits = rgb.tobytes().hex()
+        polygons = []
+        for cube, outline in enumerate(self._outlines):
+            colour = digits[6 * cube : 6 * cube + 6]
+            text = f"{self._names[cube]}: {colouring.text(cube)}" if with_texts else ""
+            title = f"<title>{text}</title>"
+            polygons.append(f"<polygon points='{outline}' fill='#{colour}'>{title}</polygon>")
+        mark = f"<polygon points='{self._outlines[chosen]}' fill='none' stroke-width='2.5'/>"
+        return f"<g stroke='#212529' stroke-width='0.7'>{''.join(polygons)}{mark}</g>"
 
     def _contact(self, contact: Contact) -> str:
         """Return SVG of a contact: a circle around its position, and its forces as text.

@@ -84,8 +84,8 @@ class Choices(NamedTuple):
     cube: int
     parts: set[str]
     charts: tuple[tuple[ChartLine, ...], ...]
-    is_paused: bool = False
-    is_recording: bool = False
+    is_paused: bool
+    is_recording: bool
 
 
 def build_update(
@@ -115,6 +115,8 @@ def build_update(
     ranges = skin.scene.ranges(scan, colouring.top, before)
     update = skin.scene.draw(scan, colouring, choices.parts, cube, ranges)
 
+    # A tool tip cannot be read while the page changes ten times a second.
+    above = skin.top_view.draw(colouring, scan.contacts, cube, with_texts=choices.is_paused)
     # Each text is the content of an HTML element of the same name (page.py).
     texts = {
         "headline": markup.headline(scan, choices.is_paused, choices.is_recording),
@@ -122,7 +124,7 @@ def build_update(
         "meaning": markup.explanation(skin.scene.bar, *skin.scene.per_bar(ranges), scan.field),
         "numbers": markup.numbers(scan, cube),
         "health": markup.conditions(skin.names, scan),
-        "from above": skin.top_view.draw(colouring, scan.contacts, cube),
+        "from above": above,
     }
     update |= {name: {"content": text} for name, text in texts.items()}
     for number, lines in enumerate(choices.charts):

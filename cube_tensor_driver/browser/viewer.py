@@ -60,9 +60,11 @@ ALL_ADDRESSES = ("0.0.0.0", "::")
 PICTURE_PERIOD_S = 0.1
 """Period, in seconds, at which the pages get a new scan: picture, numbers and plots together."""
 
-MIN_PAUSE_SHARE = 1.0
-"""Minimum pause after a picture, divided by the time that the picture took. It leaves a process
-that is too slow for the period at least half of its time for messages."""
+MIN_PAUSE_SHARE = 2.0
+"""Minimum pause after a picture, divided by the processor time that the picture took.
+
+So the pictures of a very large skin take at most a third of a core, and come less often.
+"""
 
 WAITING_NOTE_S = 2.0
 """Time, in seconds after the start, at which the terminal prints that no skin is published yet."""
@@ -165,11 +167,14 @@ class Viewer:
                 continue
 
             if self._shown is not None:
+                start_s = time.thread_time()
                 self._callback_errors.catch(self._update)(self._shown)
+                pause_s = MIN_PAUSE_SHARE * (time.thread_time() - start_s)
                 # Pictures that are overdue, for example after the computer slept, are skipped.
-                end_s = time.monotonic()
-                pause_end_s = end_s + MIN_PAUSE_SHARE * (end_s - now_s)
-                next_picture_s = max(next_picture_s + PICTURE_PERIOD_S, pause_end_s)
+                next_picture_s = max(
+                    next_picture_s + PICTURE_PERIOD_S,
+                    time.monotonic() + pause_s,
+                )
             elif now_s >= waiting_note_s:
                 waiting_note_s = math.inf
                 print(markup.waiting(_domain()), flush=True)

@@ -73,6 +73,7 @@ COLOUR_STEPS = 32
 The squares of each colour are a mesh of their own, so more colours take the browser more time.
 """
 
+# Corners of a square with sides of 1 around the origin, and its two triangles.
 _SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
 _SQUARE_FACES = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
 
@@ -162,6 +163,7 @@ def ring_lines(
         normal: (3,) unit vector perpendicular to the plane of the ring.
         radius: Radius of the ring, in the unit of the centre.
     """
+    # Two directions in the plane of the ring.
     first, second = _perpendicular(normal[np.newaxis])
     angle = np.linspace(0, 2 * np.pi, RING_POINTS)[:, None]
     points = centre + radius * (np.cos(angle) * first + np.sin(angle) * second)
@@ -233,6 +235,7 @@ class SquareLayer:
                 lies, to the scene.
             side: (M,) length of the sides of each square, in units of the scene.
         """
+        # The corners never move, so only the choice of squares has to be made for each picture.
         offset = side[:, None, None] * _SQUARE
         corners = points[:, None] + np.einsum(
             "mij,mqj->mqi",

@@ -35,6 +35,7 @@ class Raster:
         """
         flat = points[:, :2]
         extent = np.ptp(flat, axis=0) + 1.4 * reach
+        # A whole number of pixels covers the points, so the image is a little larger than they are.
         columns, rows = np.ceil(extent / pixel).astype(int)
         middle = (flat.min(axis=0) + flat.max(axis=0)) / 2
         half = np.array([columns, rows]) * pixel / 2

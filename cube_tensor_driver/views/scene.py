@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..core.arrays import AnyArray, Array, Mask
 from ..core.latest_stress import FINE
@@ -205,6 +206,20 @@ def colours(
     part = (place - low)[:, None]
     mixed = (1 - part) * table[low] + part * table[low + 1]
     return np.where(np.isfinite(values)[:, None], mixed, GREY)
+
+
+def linear_light(colours: Array) -> NDArray[np.uint8]:
+    """Convert sRGB colours (N, 3) from 0 to 1 into linear intensities from 0 to 255.
+
+    The browser interprets the colours of batched meshes as linear intensities of light. The
+    conversion is the transfer function of sRGB (IEC 61966-2-1).
+    """
+    linear = np.where(
+        colours <= 0.04045,
+        colours / 12.92,
+        ((colours + 0.055) / 1.055) ** 2.4,
+    )
+    return (255 * linear).astype(np.uint8)
 
 
 def _colour_table(hexes: str) -> Array:

@@ -21,7 +21,6 @@ from sensor_msgs.msg import PointCloud2
 from websockets.sync.client import connect
 
 from cube_tensor_driver.browser.page import LEFT_WIDTH, RIGHT_WIDTH, Layout
-from cube_tensor_driver.browser.scene_3d import linear_light
 from cube_tensor_driver.browser.viewer import Viewer
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import read_skin
@@ -230,7 +229,7 @@ def test_all_that_a_browser_receives_at_once_is_of_one_scan(page, ros):
         assert state.tip == state.surface == pytest.approx(-state.zz, abs=5.1)
         assert state.top == pytest.approx(TOP_PA)
         colour = scene.colours(scene.QUANTITIES["pressure"], np.array([-state.zz]), TOP_PA)
-        assert state.colour == linear_light(colour)[0].tolist()
+        assert state.colour == scene.linear_light(colour)[0].tolist()
     # viser applies at most 128 messages at once.
     assert max(page.reader.windows) < 128
 
