@@ -67,7 +67,7 @@ SETTLE_S = 2.3
 AWAY_S = 1.5
 """Time, in seconds, for which the port is closed."""
 
-DURATION_S = 25.0
+DURATION_S = 26.0
 """Approximate duration of a whole conversation, in seconds, for the progress bar."""
 
 ANY_ARGUMENT = 0xFF0D0A40
