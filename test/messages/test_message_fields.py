@@ -20,7 +20,7 @@ from cube_tensor_driver.config.yaml import parse_yaml
 from cube_tensor_driver.core.calibration import Calibration
 from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.core.pipeline import Pipeline
-from cube_tensor_driver.core.rows import FrequencyRows
+from cube_tensor_driver.core.rows import FrequencyRows, StressRows
 from cube_tensor_driver.messages.contacts import contacts_message, traction_message
 from cube_tensor_driver.touch.surface import Contact
 from cube_tensor_driver.touch.tracker.contact_tracker import TrackedContact
@@ -128,6 +128,38 @@ def test_reprocessed_info_says_what_was_used(tmp_path):
     for one, cube in zip(after.cubes, skin.cubes, strict=True):
         assert (one.name, one.calibration_id, one.half_side) == (cube.name, used.id, used.half_side)
         np.testing.assert_array_equal(one.rest_frequency, used.rest_frequency)
+
+
+def test_each_number_of_a_tensor_and_a_wrench_is_in_its_field():
+    pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
+    from std_msgs.msg import Header
+
+    from cube_tensor_driver.ros.messages import tensor_message, wrench_message
+
+    stress, gradient = np.arange(12.0).reshape(2, 6), 100 + np.arange(18.0).reshape(2, 9)
+    rows = StressRows.of(
+        np.arange(2),
+        stress,
+        gradient,
+        residual=np.array([0.25, 0.75]),
+        status=np.array([1, 2050]),
+        observed=np.array([7, 0x7FFF]),
+    )
+    covariance = np.arange(225.0).reshape(15, 15)
+    message = tensor_message(Header(frame_id="hand_c1"), rows, 1, covariance)
+    tensor = message.tensor
+    assert message.header.frame_id == "hand_c1"
+    # In the order xx yy zz yz zx xy of SkinStress.
+    assert (tensor.normal.x, tensor.normal.y, tensor.normal.z) == (6, 7, 8)
+    assert (tensor.shear.x, tensor.shear.y, tensor.shear.z) == (9, 10, 11)
+    np.testing.assert_array_equal(tensor.normal_gradient, gradient[1])
+    np.testing.assert_array_equal(tensor.covariance, covariance.ravel())
+    assert (tensor.residual, tensor.status, tensor.observed) == (0.75, 2050, 0x7FFF)
+
+    message = wrench_message(Header(frame_id="hand_c1"), np.arange(3.0), 10 + np.arange(3.0))
+    force, torque = message.wrench.force, message.wrench.torque
+    assert message.header.frame_id == "hand_c1"
+    assert (force.x, force.y, force.z, torque.x, torque.y, torque.z) == (0, 1, 2, 10, 11, 12)
 
 
 NUMBERS = ("normal_force", "shear_force", "area", "position_uncertainty", "force_uncertainty")
