@@ -336,7 +336,7 @@ def test_a_short_pause_of_the_host_loses_nothing(monkeypatch) -> None:
 
 def test_a_host_that_is_always_behind_but_loses_nothing_drops_nothing(monkeypatch) -> None:
     """As where other processes take most of the machine: it reads seldom, but then all."""
-    host = SlowHost(monkeypatch, 0.9, True)
+    host = SlowHost(monkeypatch, 0.9, False)
     host.BUFFER = 1000
     host.now_s = 0.2
     host.run(3000)

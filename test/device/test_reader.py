@@ -23,7 +23,7 @@ from cube_tensor_driver.core.errors import LinkError
 from cube_tensor_driver.device.links import reader as reader_module
 from cube_tensor_driver.device.links import session as session_module
 from cube_tensor_driver.device.links import tcp
-from cube_tensor_driver.device.links.link import LinkConfig, LinkState
+from cube_tensor_driver.device.links.link import Link, LinkConfig, LinkState
 from cube_tensor_driver.device.links.reader import LinkFrames, LinkRead, Reader, UsualSamples
 from cube_tensor_driver.device.wire import cobs, native
 from cube_tensor_driver.device.wire.decoder import Decoder
@@ -464,6 +464,22 @@ def test_answer_of_the_hub_resets_the_pause(start: Start, hub: PtyHub) -> None:
     hub.greet()
     watch.frame(Hello)
     assert watch.reader.links[0].increase_pause() == 0.25
+
+
+def test_samples_that_are_handled_in_c_are_no_silence(hub: PtyHub) -> None:
+    """They do not come as frames; the session sees their number at its timers."""
+    link = Link(LinkConfig("a", hub.port))
+    session = session_module.Session(link, None, time.time_ns, lambda *_: None)
+    now = time.monotonic()
+    assert session.open(now)
+    session.begin()
+    for second in (0.5, 1.0, 1.5):
+        link.track.usual += 1
+        session.check_timers(now + second)
+        assert link.state is LinkState.OPEN
+    session.check_timers(now + 2.0)
+    assert link.state is LinkState.SILENT
+    link.close()
 
 
 def test_slow_samples_are_not_silence(start: Start, hub: PtyHub) -> None:
