@@ -672,6 +672,12 @@ def test_fit_says_what_a_bag_lacks(bag, tmp_path, capsys):
         assert words in capsys.readouterr().err
 
 
+def test_a_bag_that_cannot_be_reprocessed_leaves_no_full_bar(tmp_path, capsys):
+    assert main(["reprocess", str(tmp_path / "nope"), "-o", str(tmp_path / "out")]) == 1
+    error = " ".join(capsys.readouterr().err.split())
+    assert "nope: no such file or folder" in error and "100%" not in error
+
+
 def test_info_shows_the_diagnostics_of_the_skins_in_the_bag(bag, capsys, monkeypatch):
     """All nodes of a robot publish on /diagnostics, also those of another skin."""
     names = ["/driver: link hub0", "/right/driver: link hub0", "motor: 3"]

@@ -205,6 +205,8 @@ def test_mistakes_on_the_command_line(tmp_path, arguments, words):
 def test_layout_figures(tmp_path):
     done = cube("layout", "cube", "--json", tmp_path / "l.json", "--figure", tmp_path / "l.png")
     assert done.returncode == 0, done.stderr
+    written = f"wrote {tmp_path / 'l.png'} and {tmp_path / 'l.json'}"
+    assert done.stdout.splitlines()[-1] == written
     result = json.loads((tmp_path / "l.json").read_text())
     assert set(result) == {
         "pads",

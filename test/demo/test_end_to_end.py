@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import psutil
@@ -36,10 +37,11 @@ from cube_tensor_driver.core.errors import CubeError
 from cube_tensor_driver.core.forces import Forces
 from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.demo.demo import DemoSettings
-from cube_tensor_driver.demo.watching import DemoResult
+from cube_tensor_driver.demo.watching import DemoResult, SkinWatcher
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress, StressTensorStamped
 from cube_tensor_driver.processes.children import Children, ros_arguments
 from cube_tensor_driver.processes.skin_processes import SimulatedHubs, skin_processes
+from cube_tensor_driver.views.terminal.live_table import LiveTable
 
 SKIN = package_data() / "config" / "skin_demo.yaml"
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -156,6 +158,22 @@ def test_a_demo_without_a_tensor_fails_and_its_figures_are_json(tmp_path):
     with pytest.raises(CubeError, match="no tensor arrived"):
         DemoResult(figures, None, None).publish(settings)
     assert json.loads(settings.json.read_text(), parse_constant=pytest.fail)["error"] == [None]
+
+
+def test_the_address_of_the_view_is_printed_at_once_without_a_terminal(capsys):
+    """A table that is drawn nowhere has no title that could show it."""
+    line = "http://127.0.0.1:8080 shows the skin"
+    children = SimpleNamespace(log=lambda _: line, wait_for_line=lambda *_: line)
+    watcher = SkinWatcher(
+        read_skin(SKIN),
+        100.0,
+        children,
+        LiveTable(read_skin(SKIN), show=False),
+        SimpleNamespace(listen=lambda *_: None, spin=lambda *_: None),
+        None,
+    )
+    watcher.note_address()
+    assert capsys.readouterr().err == "http://127.0.0.1:8080 shows the skin\n"
 
 
 @pytest.mark.alone
