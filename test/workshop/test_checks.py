@@ -103,6 +103,7 @@ def recorded(skin, log, actions=(), rest_after=None):
             "dropped_in_hub": 0,
             "rows published": len(cube),
             "rows of unknown cubes": 0,
+            "rows dropped by a slow host": 0,
             "rows with another number of pads": 0,
             "rows unaccounted": 0,
             "rows lost by errors": 0,
@@ -188,6 +189,17 @@ def test_rows_that_are_missing_or_came_twice_are_found(played):
     assert "repeated" in found(played, frequencies.select(one_twice))
     assert found(played, stress=stress.select(all_but_one)) == {"missing_tensors"}
     assert found(played, stress=stress.select(one_twice)) == {"repeated"}
+
+
+def test_rows_that_the_driver_counts_as_dropped_by_a_slow_host_are_not_lost(played):
+    """As many as it counts, and no more."""
+    frequencies, stress = played[0].frequencies.rows, played[0].stress.rows
+    rest = np.delete(np.arange(len(frequencies)), [ROW, ROW + 1])
+    both = frequencies.select(rest), stress.select(rest)
+    counters = {"rows published": len(rest), "rows dropped by a slow host": 2}
+    assert found(played, *both, **counters) == set()
+    counters["rows dropped by a slow host"] = 1
+    assert found(played, *both, **counters) == {"lost", "miscounted"}
 
 
 TARED_NS, HELD_CUBES = 3_200_000_000, (0, 1)

@@ -12,7 +12,7 @@ from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.core.status import STAMP
 
 from .expected import Readings, split_in_chunks
-from .record import DRIVER_KILLS, DRIVER_STOPS, UNFLUSHED_S
+from .record import DRIVER_KILLS, DRIVER_STOPS, DROPPED_BY_HOST, UNFLUSHED_S
 from .run import Findings, Run, agree, count, find_matched
 from .samples import CUT_FAULTS
 
@@ -46,7 +46,7 @@ def check_frequencies(run: Run) -> FrequencyFindings:
 
     The figures are: `wrong`, rows of which a field differs from the measurement, or which are of no
     sample; `repeated`, rows that arrived before; `lost`, rows sent and not received without an
-    explanation.
+    explanation, beyond those that the driver counts as dropped by a slow host.
     """
     record, samples, sample = run.record, run.samples, run.sample
     rows = record.frequencies.rows
@@ -71,7 +71,7 @@ def check_frequencies(run: Run) -> FrequencyFindings:
     figures = {
         "samples_sent": int(samples.row_count[is_checked].sum()),
         "delivered": int(received[is_checked].sum()),
-        "lost": int(missing[is_lost].sum()),
+        "lost": max(0, int(missing[is_lost].sum()) - record.counters[DROPPED_BY_HOST]),
         "wrong": count(is_wrong | (sample == NO_MATCH)),
         "repeated": len(known) - len(arrived),
     }

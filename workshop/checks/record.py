@@ -27,6 +27,10 @@ RECONSTRUCTION_STOPS = ("restart reconstruction", "reconfigure reconstruction")
 NODE_STARTS = (*RECONSTRUCTION_STOPS, *DRIVER_KILLS)
 """Names of the actions after which a node has forgotten everything before them."""
 
+DROPPED_BY_HOST = "rows dropped by a slow host"
+"""Name of the driver's counter of rows (one cube at one sampling time) that it dropped because the
+host was too slow. The counter does not tell which rows they were."""
+
 UNFLUSHED_S = 0.5
 """Length, in seconds, of the span before a driver is killed whose messages may be lost.
 
