@@ -184,10 +184,10 @@ INLINE bool write_row(const cube_scan_call *call, int64_t row, const float *out,
     memcpy(call->stress + row * CUBE_SCAN_STRESS, out, CUBE_SCAN_STRESS * sizeof *out);
     memcpy(call->gradient + row * (int64_t)n_gradient, out + CUBE_SCAN_STRESS, n_gradient * sizeof *out);
     call->residual[row] = residual;
-    call->row_observed[row] = table < 0 ? 0 : call->observed[table];
-    const bool is_over_limit = table >= 0 && residual > call->limit[table];
+    call->row_observed[row] = call->observed[table];
+    const bool is_over_limit = residual > call->limit[table];
     call->status[row] |= is_over_limit ? RESIDUAL : 0;
-    call->status[row] |= call->row_observed[row] == 0 ? INVALID : 0;
+    call->status[row] |= call->observed[table] == 0 ? INVALID : 0;
     return is_over_limit;
 }
 
@@ -264,15 +264,6 @@ INLINE void add_to_window(const cube_scan_call *call, block *b) {
     }
 }
 
-/* Rows of a cube that the skin does not have. */
-static void write_unknown(const cube_scan_call *call, int64_t row) {
-    float out[CUBE_SCAN_MAX_OUTPUTS];
-    for (int k = 0; k < CUBE_SCAN_MAX_OUTPUTS; k++)
-        out[k] = NAN;
-    write_row(call, row, out, -1);
-    call->status[row] |= call->doubt[row] & STAMP;
-}
-
 /* Processes the rows of a block, or those before the first whose table is missing. */
 INLINE int64_t process_block(const cube_scan_call *call, block *b) {
     const int64_t n = call->length[P];
@@ -313,8 +304,8 @@ CLONES static int64_t process(const cube_scan_call *call, int64_t start, int64_t
         b.cube = cube[b.row];
         b.n_rows = 1;
         if (b.cube >= call->length[C]) {
-            write_unknown(call, b.row);
-            continue;
+            *request = CUBE_SCAN_UNKNOWN_CUBE;
+            return b.row;
         }
         /* A scan begins where the cube number does not rise. */
         const bool is_begin = b.row == 0 || cube[b.row] <= cube[b.row - 1];

@@ -31,7 +31,7 @@
 #define CUBE_SCAN_DONE (-1)
 #define CUBE_SCAN_WINDOW (-2)       /* the next scan lies outside the window of health */
 #define CUBE_SCAN_CONDITION (-3)    /* a pad of this row has a condition that is not found yet */
-#define CUBE_SCAN_UNKNOWN_CUBE (-4) /* no cube of the skin; health cannot be found */
+#define CUBE_SCAN_UNKNOWN_CUBE (-4) /* the row is of no cube of the skin */
 
 /* State of the health of one cube: CUBE_STATE in core/kernel/contract.py. */
 typedef struct {

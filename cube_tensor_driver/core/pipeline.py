@@ -45,6 +45,7 @@ from .kernel.run import run
 from .modes import GRADIENT, STRESS
 from .oscillator import highest_frequency
 from .rows import FrequencyRows, StressRows
+from .status import INVALID, STAMP
 
 MAX_CACHED_ESTIMATORS = 1024
 """Maximum number of estimators and matrices (from the pads of a cube to components of stress) for
@@ -225,8 +226,11 @@ class Pipeline:
         while row < len(rows):
             row, request = run(row, self._n_residuals, self._tables, sums, columns, results)
             if request == UNKNOWN_CUBE:
-                raise self._misfit(rows)
-            if request == NEEDS_WINDOW and watch:
+                if watch:
+                    raise self._misfit(rows)
+                _fill_unknown(out, rows, row)
+                row += 1
+            elif request == NEEDS_WINDOW and watch:
                 watch.advance()
             elif request == NEEDS_CONDITION and watch:
                 watch.find_conditions(self._tables, columns, row)
@@ -511,3 +515,17 @@ class Pipeline:
         self._tables.matrix[number] = matrix * self._stiffness[group][:, None]
         self._tables.limit[number] = limit
         self._tables.observed[number] = pack_bits(estimator.observed)
+
+
+def _fill_unknown(out: StressRows, rows: FrequencyRows, row: int) -> None:
+    """Write a row of stress for a cube that the skin does not have.
+
+    Args:
+        out: Rows to write into.
+        rows: Rows of frequencies, whose status states whether a time stamp is doubtful.
+        row: Number of the row.
+    """
+    for column in (out.stress, out.gradient, out.residual):
+        column[row] = np.nan
+    out.observed[row] = 0
+    out.status[row] |= INVALID | rows.status[row] & STAMP

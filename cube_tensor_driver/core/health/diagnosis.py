@@ -115,13 +115,14 @@ class Conditions:
             cube: Numbers of different cubes (n,).
             bits: Conditions of their pads (n, P), bits of `status.py`.
         """
-        cubes = self._sums.cubes
-        bits = np.where(self._recent[0][cube] & SHOWN, 0, bits)
-        self._recent[0][cube] |= bits
+        cubes, present = self._sums.cubes, self._recent[0]
+        is_first = present[cube] & SHOWN == 0
+        new_bits = np.where(is_first, bits, 0)
+        present[cube] |= new_bits
         pads = pack_bits(bits > 0)
         cubes["found"][cube] |= pads
         cubes["mask"][cube] |= pads
-        cubes["status"][cube] |= np.bitwise_or.reduce(bits, axis=1)
+        cubes["status"][cube] |= np.bitwise_or.reduce(new_bits, axis=1)
 
     def end_window(self, found: StatusBits, has_rows: Mask) -> None:
         """Add the conditions that the statistics of a window show, and start the next window.

@@ -34,8 +34,8 @@ NEEDS_CONDITION = -3
 fault of it, and no condition of this pad was found in the present window yet; find it."""
 
 UNKNOWN_CUBE = -4
-"""Request of the kernel: a row has the number of a cube that the skin does not have, so its health
-cannot be found. No row of the call is processed."""
+"""Request of the kernel: the next row has the number of a cube that the skin does not have; skip
+it. If health is asked for, any such row ends the call before a row is processed."""
 
 CUBE_STATE = np.dtype(
     {

@@ -44,23 +44,26 @@ def run(
     results: Results,
 ) -> tuple[int, int]:
     """Process rows, scan by scan; `run.run` states arguments and results."""
-    n_cubes = len(tables.calibration)
-    if health is not None and (columns.cube[start:] >= n_cubes).any():
+    unknown = np.flatnonzero(columns.cube[start:] >= len(tables.calibration))
+    if health is not None and len(unknown):
         return start, UNKNOWN_CUBE
+    n_rows = start + int(unknown[0]) if len(unknown) else len(columns.cube)
     # A scan begins where the cube number does not rise.
     begins_scan = np.ones(len(columns.cube) + 1, bool)
     begins_scan[1:-1] = columns.cube[1:] <= columns.cube[:-1]
-    while start < len(columns.cube):
+    while start < n_rows:
         end = start + MAX_ROWS
         if health is not None:
             end = start + 1 + int(np.argmax(begins_scan[start + 1 :]))
-        scan = slice(start, end)
+        scan = slice(start, min(end, n_rows))
         if health is not None and begins_scan[start] and not _is_in_window(health, columns, scan):
             return start, NEEDS_WINDOW
         with np.errstate(all="ignore"):
             start, request = _process(scan, n_residuals, tables, health, columns, results)
         if request != DONE:
             return start, request
+    if len(unknown):
+        return start, UNKNOWN_CUBE
     return start, DONE
 
 
@@ -152,8 +155,7 @@ def _process(
         As `run`.
     """
     rows, out = columns.select(scan), results.select(scan)
-    is_unknown = rows.cube >= len(tables.calibration)
-    cube = np.where(is_unknown, 0, rows.cube).astype(np.intp)
+    cube = rows.cube.astype(np.intp)
     calibration = tables.calibration[cube]
     has_new_condition = np.zeros(len(cube), bool)
     if health is not None:
@@ -166,7 +168,7 @@ def _process(
 
     v, is_good = apply_law(tables, cube, rows.frequency, rows.temperature)
     is_bad = mask_bits(tables, calibration, out.left_out) | _lack(tables, calibration, is_good)
-    bad = pack_bits(is_bad & ~is_unknown[:, None])
+    bad = pack_bits(is_bad)
     v[is_bad] = 0
     table, key = _find_tables(tables, calibration, bad)
     stops = np.flatnonzero(has_new_condition | (key != DONE))
@@ -177,14 +179,13 @@ def _process(
     table = table[:end]
 
     outputs = multiply(v[:end], tables.matrix[table])
-    outputs[is_unknown[:end]] = np.nan
     squares = np.zeros(end, outputs.dtype)
     for column in range(N_COMPONENTS, N_COMPONENTS + n_residuals):
         squares += outputs[:, column] * outputs[:, column]
     residual = np.sqrt(squares)
     is_over_limit = residual > tables.limit[table]
-    observed = np.where(is_unknown[:end], 0, tables.observed[table])
-    is_thermal = ~np.isnan(tables.reference[calibration]) & ~is_unknown
+    observed = tables.observed[table]
+    is_thermal = ~np.isnan(tables.reference[calibration])
     is_cold = is_thermal & ~np.isfinite(rows.temperature)
 
     out.stress[:end] = outputs[:, : len(STRESS)]
