@@ -24,7 +24,7 @@ from .tracker.contact_tracker import ContactTracker, TrackedContact
 
 INTERPOLATION, INVERSE = CONTACT_METHODS
 """Names of the two methods that find contacts: interpolation of the pressure between the cubes, and
-fits of Hertz contacts to the values of all cubes."""
+fits of the traction in each contact to the values of the cubes around it."""
 
 
 @dataclass(frozen=True)

@@ -29,16 +29,19 @@ from .pressure_regions import PressureRegions
 from .region_fit import MIN_FACING, RegionFit
 
 MAX_CUBES = 48
-"""Largest number of cubes from whose values a region is fitted. Regions that need more are not
-fitted."""
+"""Largest number of cubes from whose values the traction in one region of contact is fitted. A
+wider region, such as that of a palm, is not fitted; its contact is the integral of the linear
+field."""
 
 CUBE_REACH_PITCHES = (2.0, 1.0)
-"""Distances from the region, divided by the pitch (distance of neighbouring cubes), within which
-cubes take part in its fit. The second one serves if the first one gives too many cubes."""
+"""Distances from a region of contact, divided by the pitch (distance of neighbouring cubes), within
+which cubes take part in its fit. The second, smaller one is used if the first one gives more than
+`MAX_CUBES` cubes."""
 
 NEIGHBOUR_REACH_PITCHES = 3.0
-"""Distance from the region, divided by the pitch (distance of neighbouring cubes), within which
-other contacts take part in its fit."""
+"""Distance from a region of contact, divided by the pitch (distance of neighbouring cubes), within
+which other regions take part in its fit, with coarse unknown tractions of their own. The response
+to regions farther away is subtracted from the values before the fit."""
 
 MAX_NEIGHBOUR_NODES = 30
 """Largest number of nodes (small contacts) that represent other contacts in the fit of a region."""
@@ -47,38 +50,54 @@ MAX_REGIONS = 32
 """Largest number of regions of contact on one skin; those with the largest pressure are kept."""
 
 MAX_WORK_PER_SCAN = 100
-"""Number of nodes (small contacts that make up the traction of a region) after which no further fit
-is made or improved in the same scan. It bounds the time of a scan; what remains is done in the next
-scans."""
+"""Work after which no further fit is made or improved in the same scan (set of values of all
+cubes).
+
+The unit is a node, one of the small contacts whose sum is the traction of a region: a new fit of 80
+nodes is a work of 80. The limit bounds the time of a scan; what remains is done in the next scans.
+"""
 
 MAX_PIECES_OF_WORK = 12
-"""Largest number of times that the fit of a region is improved in one scan, on average."""
+"""Largest number of steps (new fits and improvements of fits) per region of contact in one scan
+(set of values of all cubes). It ends scans that may do any amount of work."""
 
 MAX_CHANGE = 0.25
-"""Relative change of the largest pressure of a region, or of the set of its points, after which the
-region is fitted again. The fit depends on the pressure, because errors of the pads' gains are
-proportional to it."""
+"""Relative change since the last fit of a region of contact above which the region is fitted again.
+
+It is the larger one of two changes: that of the largest pressure, and the share of surface points
+that have joined or left the region. The fit depends on the pressure, because the assumed errors of
+the pads' gains are proportional to the stress.
+"""
 
 MAX_CHANGE_HERTZ = 0.6
-"""Like `MAX_CHANGE`, for regions whose Hertz contacts follow the bodies that press."""
+"""Relative change of pressure or points, as in `MAX_CHANGE`, above which a region is fitted again
+if its traction is a Hertz contact. It is larger than `MAX_CHANGE`, because the position of a Hertz
+contact follows the body that presses."""
 
 MAX_MISFIT_GROWTH = 1.3
-"""Factor by which the misfit (squared deviation of the values from the fit, divided by that of
-their noise) grows before a region is fitted again. It grows when a contact moves."""
+"""Growth of the misfit since the last fit of a region above which the region is fitted again. The
+misfit is the squared deviation of the values from the fit, divided by the value that their noise
+causes. It grows when a contact moves or changes its shape."""
 
 MATCH_PITCHES = 1.0
 """Largest distance that a contact moves between two scans, divided by the pitch (distance of
 neighbouring cubes). A contact farther away from all previous ones is a new one."""
 
 COARSE_DEVIATION = 0.1
-"""Standard deviation of the force, divided by the force, of a contact that is not fitted yet.
-Beside other contacts, the integral of the field also replaces a fit that is less certain than this.
-The errors of integrals of the field are 1 to 9 % for balls, punches and rods at pitches of two and
-three depths."""
+"""Standard deviation of the force, divided by the force, that is stated for a contact whose force
+is the integral of the linear field, because its region is not fitted yet.
+
+Such integrals were off by 1 to 9 % for balls, punches and rods at distances of the cubes of two and
+three depths. Beside other contacts, the integral also replaces a fit with a larger deviation.
+"""
 
 
 class Work(IntEnum):
-    """What is done next for a region of contact, the most urgent first."""
+    """Next step of the fit of a region of contact; the step with the smallest number comes first.
+
+    FIT makes a new fit. MOVE lets a Hertz contact follow the body that presses. SHARPEN improves a
+    fit for the same values. NONE: nothing is to be done.
+    """
 
     FIT = 0
     MOVE = 1
@@ -277,8 +296,7 @@ class ContactTracker:
         return near, np.concatenate([np.zeros(0, np.intp), *(found[k][::step] for k in near)])
 
     def _without_others(self, region: _Region, regions: list[_Region]) -> Array:
-        """Return the values (cubes, C) minus the response to regions that do not take part in a
-        fit."""
+        """Return the values (cubes, C) in Pa minus the response to regions outside of a fit."""
         rest = self._scaled
         for number, other in enumerate(regions):
             if other is not region and number not in region.near:
@@ -330,7 +348,8 @@ class ContactTracker:
             abs(region.peak / fit.peak - 1),
             _new_share(region.points, fit.points),
             _new_share(fit.points, region.points),
-            # Neighbours that have gone do no harm, and those that move are replaced by and by.
+            # Neighbours that have gone do no harm. Half of the share of new ones counts, because
+            # otherwise every neighbour that moves would cause new fits.
             _new_share(region.others, fit.others) / 2,
         )
         if max(changes) > (MAX_CHANGE if fit.hertz is None else MAX_CHANGE_HERTZ):

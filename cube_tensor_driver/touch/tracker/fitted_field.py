@@ -13,8 +13,8 @@ from .local_values import unroll_points
 from .region_fit import RegionFit
 
 _NODE_RINGS = 4
-"""Number of rings of point forces by which the pressure of a node is distributed over the
-points."""
+"""Number of rings of point forces that represent a node (small Hertz contact) when its force is
+shared out among the points of the surface."""
 
 
 def add_fits(

@@ -22,16 +22,16 @@ from .contact_estimate import ContactEstimate
 from .node_fit import NodeFit
 
 SIZE_DEVIATION = 1.0
-"""Prior standard deviation of the natural logarithm of the radius of a contact, whose prior mean is
-`USUAL_SIZE`."""
+"""Prior standard deviation of the natural logarithm of the radius of a Hertz contact."""
 
 USUAL_SIZE = 0.8
 """Prior mean (of the logarithm) of the radius of a contact, divided by the depth of the cubes'
 centres below the surface."""
 
 MAX_START_SIZE = 2.0
-"""Largest radius at the start of a fit, divided by the depth of the cubes' centres. From a radius
-that is much too large, Gauss-Newton steps do not find their way to a small one."""
+"""Largest radius of a Hertz contact at the start of its fit, divided by the depth of the cubes'
+centres below the surface. From a radius that is much too large, Gauss-Newton steps do not converge
+to a small one."""
 
 FORCE_DEVIATION = 1e2
 """Prior standard deviation of each component of the force of a contact, in N; the prior mean is 0.

@@ -44,8 +44,10 @@ class LocalValues:
         stresses = pad_stresses(by_pad, self.known, values)
         gain_variance = (GAIN_ERROR * stresses[:, None]) ** 2
         noise = (by_pad * (1 + gain_variance)) @ by_pad.swapaxes(1, 2)
-        # A 1 on the diagonal keeps the matrices of cubes with unknown values invertible.
-        noise += np.eye(noise.shape[1]) * ~self.known[:, None]
+        # A 1 on the diagonal keeps the matrices of cubes with unknown values invertible, and the
+        # tiny increase those of components that are almost dependent.
+        identity = np.eye(noise.shape[1])
+        noise += identity * ~self.known[:, None] + 1e-9 * identity * noise
         root = np.linalg.inv(np.linalg.cholesky(noise))
         self._whitening = root * self.known[:, None]
 

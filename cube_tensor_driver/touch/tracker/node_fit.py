@@ -49,11 +49,13 @@ BORDER_REACH_PITCHES = 1.5
 nodes are placed beyond the border of the skin, where no field is computed."""
 
 ENVELOPE_FLOOR = 0.03
-"""Smallest prior standard deviation of a node (small contact that makes up the traction), divided
-by that of the strongest node."""
+"""Smallest prior standard deviation of the force of a node (one of the small contacts whose sum is
+the traction), divided by that of the strongest node, in a fit whose prior was made narrower."""
 
 MIN_SCORE_GAIN = 1.0
-"""Smallest decrease of -2 ln(evidence) for which a narrower prior is used."""
+"""Smallest decrease of -2 ln(evidence) for which a narrower prior of the traction replaces the
+present one. The evidence is the probability of the values, with the traction integrated over its
+prior."""
 
 _NODE_RADIUS = 0.9
 """Radius of the Hertz contact of a node, divided by the distance of neighbouring nodes."""
@@ -63,26 +65,28 @@ _PEAK_WIDTH = 0.5
 counted, divided by the depth of the cubes' centres."""
 
 _POINT_MARGIN = 0.75
-"""Distance from a point of the surface within which nodes belong to this point, divided by the
-distance of neighbouring points. Half of the diagonal of a point's square is 0.71."""
+"""Largest distance of a node (one of the small contacts whose sum is the traction) from the nearest
+point of its region of contact, divided by the distance of neighbouring points of the surface. Half
+of the diagonal of the square that a point represents is 0.71."""
 
 _LENGTHS = np.array([0.2, 0.8, 3.0])
 """Correlation lengths of the pressure in a contact, divided by the depth of the cubes' centres: for
 narrow, medium and wide contacts."""
 
 _SHARES = np.array([0.4, 0.4, 0.2])
-"""Shares of the variance of the pressure that have the correlation lengths `_LENGTHS`."""
+"""Shares (3,) of the prior variance of the pressure that have the correlation lengths `_LENGTHS`,
+from the narrowest to the widest."""
 
 _SCALES = AMPLITUDE * np.geomspace(0.01, 100, 41)
-"""Standard deviations of the pressure, in Pa, of which the one with the greatest evidence is
-used."""
+"""Prior standard deviations (41,) of the pressure, in Pa. The one with the greatest evidence
+(probability of the values) is used."""
 
 _DEVIATIONS = np.array([SHEAR_RATIO, SHEAR_RATIO, 1.0])
 """Prior standard deviations of the traction along x, y and z, divided by that of the pressure."""
 
 
 class Posterior(NamedTuple):
-    """Posterior of the forces of q nodes.
+    """Posterior of the forces of q nodes (small contacts whose sum is the traction of a region).
 
     Attributes:
         forces: Forces (3, q) of the nodes along x, y and z, in N.

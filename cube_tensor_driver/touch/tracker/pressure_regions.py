@@ -18,26 +18,29 @@ DETECTION_FRACTION = 0.2
 An absolute threshold applies in addition."""
 
 RELEASE_FRACTION = 0.75
-"""Factor of both thresholds for points that belonged to a contact in the previous scan, so that
-noise does not change the regions in every scan."""
+"""Factor of the two thresholds of the pressure (relative and absolute) for points that belonged to
+a contact in the previous scan. It keeps noise from changing the regions of contact in every
+scan."""
 
 JOIN_PITCHES = 1.25
-"""Largest distance of two regions, divided by the pitch (distance of neighbouring cubes), at which
-they are treated as one, because the same cubes measure both."""
+"""Largest distance of two regions of contact, divided by the pitch (distance of neighbouring
+cubes), at which they are fitted as one region, because the same cubes measure both."""
 
 MAX_JOINED_CUBES = 12
-"""Largest number of cubes below a region that is joined of several ones. Beyond it, they stay
-apart, so that each one can be fitted."""
+"""Largest number of cubes below several regions of contact that are fitted as one region. If there
+are more cubes, the regions stay apart, so that each one is small enough to be fitted."""
 
 VALLEY = 0.8
-"""Lowest pressure between two peaks, divided by the pressure at the lower peak, below which the
-peaks are two contacts."""
+"""Threshold of the ratio of the lowest pressure between two peaks to the pressure at the lower
+peak. Below it, the two peaks are two contacts, if the fall is also significant (`MIN_FALL`)."""
 
 MIN_FALL = 4.0
-"""Smallest fall of the pressure between two contacts, divided by its standard deviation."""
+"""Smallest fall of the pressure from the lower one of two peaks to the lowest pressure between
+them, in units of the standard deviation of this fall, at which the peaks are two contacts."""
 
 MIN_PEAK = 0.2
-"""Smallest peak of a contact, divided by the largest peak of its region."""
+"""Smallest pressure at a peak that counts as a contact of its own, divided by the largest pressure
+in the same region of contact."""
 
 
 class PressureRegions:

@@ -19,18 +19,21 @@ MIN_FACING = 0.5
 responds to a contact above the other. On a bent skin, cubes that face away do not respond."""
 
 MAX_HERTZ_ASPECT = 4.0
-"""Largest ratio of length to width of a contact, as fitted on nodes, for which the fit of a Hertz
-contact is tried."""
+"""Largest ratio of length to width of a contact for which the fit of a round Hertz contact is
+tried. Length and width are those that the fit on nodes (small contacts on a grid) has found."""
 
 HERTZ_WORK = 40
-"""Work of the first fit of a Hertz contact, in nodes of a new fit that take as long."""
+"""Work of the first fit of a Hertz contact, in the unit of `MAX_WORK_PER_SCAN`: it takes as long as
+a new fit with this number of nodes."""
 
 MOVE_WORK = 15
-"""Work of following a Hertz contact that moves, in nodes of a new fit that take as long."""
+"""Work of one step by which a Hertz contact follows a body that moves, in the unit of
+`MAX_WORK_PER_SCAN`: it takes as long as a new fit with this number of nodes."""
 
 MAX_UNFOLLOWED_STEP = 0.1
-"""Largest distance from the position at which the response to a Hertz contact was linearised,
-divided by the depth of the cubes' centres, at which the contact is not linearised again."""
+"""Largest change of a Hertz contact since its response was linearised at which the linearised
+response is still used. The change is the larger one of two numbers: the shift divided by the depth
+of the cubes' centres below the surface, and the change of the natural logarithm of the radius."""
 
 MAX_STEPS = 10
 """Largest number of Gauss-Newton steps in the first fit of a Hertz contact."""
