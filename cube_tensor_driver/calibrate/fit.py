@@ -238,7 +238,9 @@ def fit(
     if n_free and is_open.all():
         raise FitError(f"these loads determine no coefficient: {'; '.join(advice)}")
 
-    residuals = model.residuals(theta, design, y) / scale
+    fitted = model.predict(theta, design)
+    whitened = (y - fitted) / sigma
+    residuals = whitened.ravel() / scale
     covariance = robust_covariance(jacobian, residuals, scale)
     # Coefficients that the loads do not determine have an unknown variance (NaN). The covariance is
     # computed with a pseudo-inverse, which gives them a small one.
@@ -263,9 +265,8 @@ def fit(
         """Return values (K,) of the coefficients by the names of the coefficients."""
         return dict(zip(structure.names, values.tolist(), strict=True))
 
-    fitted = model.predict(theta, design)
     is_used = weights > 0
-    whitened = (y - fitted) / sigma
+    used = whitened[is_used]
     n_determined = jacobian.shape[1] - null.shape[1]
     return Fit(
         structure=structure,
@@ -275,7 +276,7 @@ def fit(
         gain=gain,
         gain_deviation=np.sqrt(gain_variance),
         scale=float(scale),
-        chi2=float(np.sum(whitened[is_used] ** 2)),
+        chi2=float(np.sum(used**2)),
         dof=int(is_used.sum()) - n_determined,
         held_out=_cross_validate(model, design, y, is_used),
         fitted=fitted,
@@ -345,7 +346,11 @@ class _Model:
         by_coefficient = np.tensordot(x, basis, axes=(1, 2))
         return np.moveaxis(by_coefficient, 1, 2)
 
-    def predict(self, theta: Array, design: Array) -> Array:
+    def predict(
+        self,
+        theta: Array,
+        design: Array,
+    ) -> Array:
         """Return the stresses on P pads under N loads (N, P), in Pa, that the model predicts.
 
         Args:
@@ -356,24 +361,11 @@ class _Model:
         readings: Array = gain * (design @ coefficients)
         return readings
 
-    def residuals(
+    def jacobian(
         self,
         theta: Array,
         design: Array,
-        y: Array,
     ) -> Array:
-        """Return the residuals (measured minus predicted pad stress) divided by the noise (N P,).
-
-        Args:
-            theta: Parameters (coefficients, then coordinates of the gains).
-            design: Result of `design` for the loads (N, P, K), in Pa.
-            y: Measured pad stresses (N, P), in Pa.
-        """
-        difference = y - self.predict(theta, design)
-        residuals: Array = difference / self.noise
-        return residuals.ravel()
-
-    def jacobian(self, theta: Array, design: Array) -> Array:
         """Return the derivatives of the predicted pad stresses with respect to the parameters.
 
         Args:
@@ -388,7 +380,8 @@ class _Model:
         by_coefficient = free * gain[:, None]
         at_gain_1 = design @ coefficients
         by_gain = at_gain_1[:, :, None] * self.gains
-        derivatives = np.concatenate([by_coefficient, by_gain], axis=2)
+        parts = [by_coefficient, by_gain]
+        derivatives = np.concatenate(parts, axis=2)
         whitened: Array = derivatives / self.noise[:, None]
         return whitened.reshape(-1, theta.size)
 
@@ -407,13 +400,15 @@ class _Model:
             Parameters, weights of the readings (N, P) from 0 to 1, and scatter (standard deviation)
             of the residuals in units of the noise.
         """
-        n_parameters = len(self.free) + self.gains.shape[1]
+        n_coordinates = self.gains.shape[1]
+        n_parameters = len(self.free) + n_coordinates
         theta = np.zeros(n_parameters)
         weights = np.ones(y.size)
         scale = 1.0
         for stage, tolerance in STAGES.items():
             for _ in range(MAX_STEPS):
-                r = self.residuals(theta, design, y)
+                difference = y - self.predict(theta, design)
+                r = (difference / self.noise).ravel()
                 if stage == "huber":
                     # Tukey's stage keeps the last scatter (standard deviation of the residuals) of
                     # Huber's, because with a new one in each step it might not converge.
@@ -429,7 +424,8 @@ class _Model:
                 theta = theta + step
                 # The tolerance is relative to the parameters. If they are near 0, the 1 makes it
                 # absolute.
-                limit = tolerance * (1 + np.linalg.norm(theta))
+                size = np.linalg.norm(theta)
+                limit = tolerance * (1 + size)
                 if np.linalg.norm(step) <= limit:
                     break
         return theta, weights.reshape(y.shape), scale
@@ -457,8 +453,9 @@ def _check_inputs(
         sigma = np.array(noise, dtype=float)
     except (TypeError, ValueError):
         raise FitError("loads, measured stresses and noise must be numbers") from None
-    has_loads = x.ndim == 2 and len(x) > 0 and x.shape[1] == n_modes
-    if not has_loads or y.shape != (len(x), n_pads):
+    n_loads = len(x) if x.ndim else 0
+    fits = x.shape == (n_loads, n_modes) and y.shape == (n_loads, n_pads)
+    if not n_loads or not fits:
         raise FitError(
             f"loads have shape {x.shape} and readings {y.shape}; layout {structure.layout.name!r} "
             f"needs (loads, {n_modes}) and (loads, {n_pads}) with at least one load"
@@ -519,7 +516,8 @@ def _cross_validate(
         Ratio of the rms error of predicted pad stresses to the rms of measured ones; NaN with fewer
         than two loads.
     """
-    if len(y) < 2 or not np.any(y[is_used]):
+    used = y[is_used]
+    if len(y) < 2 or not used.any():
         return float("nan")
     n_folds = min(FOLDS, len(y))
     errors = np.empty_like(y)
@@ -534,7 +532,7 @@ def _cross_validate(
         errors[is_out] = y[is_out] - predicted
     # Outliers are excluded, because they would dominate the mean squares of errors and readings.
     mean_square_error = np.mean(errors[is_used] ** 2)
-    mean_square_reading = np.mean(y[is_used] ** 2)
+    mean_square_reading = np.mean(used**2)
     return float(np.sqrt(mean_square_error / mean_square_reading))
 
 
@@ -584,7 +582,8 @@ def _advise(
             # the fewest independent changes of the parameters that change no reading.
             left = (new_open.sum(), new_null.shape[1], mode)
             results.append((left, candidate, new_null, new_open))
-        (_, n_left, best), loads, new_null, new_open = min(results, key=itemgetter(0))
+        best = min(results, key=itemgetter(0))
+        (_, n_left, mode), loads, new_null, new_open = best
         if n_left >= null.shape[1]:
             advice.append(
                 f"no load determines {', '.join(names[is_open])}: "
@@ -595,7 +594,7 @@ def _advise(
         # sentence then names all undetermined coefficients.
         settled = names[is_open & ~new_open]
         subject = settled if len(settled) else names[is_open]
-        name = model.structure.modes.names[best]
+        name = model.structure.modes.names[mode]
         advice.append(
             f"these loads do not determine {', '.join(subject)}: add a load of {name} "
             f"alone, {describe_mode(name)}, of about {size:.3g} Pa"

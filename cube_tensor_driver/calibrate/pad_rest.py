@@ -66,9 +66,9 @@ def measure_pads_at_rest(frequency: Array, seconds: Array) -> PadsAtRest:
     # Second differences remove drift, which would count as noise in a standard deviation.
     second = np.diff(frequency, n=2, axis=0)
     squares = np.ma.masked_invalid(second**2)
-    n_squares = np.maximum(squares.count(axis=0), 1)
+    n_squares = squares.count(axis=0)
     sum_squares = squares.sum(axis=0).filled(0)
-    noise = np.sqrt(sum_squares / (6 * n_squares))
+    noise = np.sqrt(sum_squares / np.maximum(6 * n_squares, 1))
 
     # Slope of the straight line that is fitted to the measured samples of each pad.
     centred = seconds - seconds.mean()
@@ -94,7 +94,8 @@ def measure_pads_at_rest(frequency: Array, seconds: Array) -> PadsAtRest:
     for cube in cubes:
         of_varying = relative_noise[cube, varies[cube]]
         usual[cube] = np.median(of_varying)
-    noisy = varies & (relative_noise > NOISY_ENTER * usual[:, None])
+    limit = NOISY_ENTER * usual[:, None]
+    noisy = varies & (relative_noise > limit)
     return PadsAtRest(
         frequency=scale,
         noise=relative_noise,

@@ -220,7 +220,12 @@ def expected_presses(
         scaled_gradient.reshape(-1, 3, 3, 3),
     )
     on_pads: Array = state @ calibration.response.T
-    shape = (len(rotations), len(SIDES), len(distances), -1)
+    shape = (
+        len(rotations),
+        len(SIDES),
+        len(distances),
+        -1,
+    )
     return on_pads.reshape(shape)
 
 
@@ -252,8 +257,8 @@ class Explanation:
         """Numbers of the wires of the hub that lead to another pad than the layout of the cube
         states."""
         intended = np.arange(len(self.places))
-        swapped: list[int] = np.flatnonzero(self.places != intended).tolist()
-        return swapped
+        swapped = np.flatnonzero(self.places != intended)
+        return [int(wire) for wire in swapped]
 
     @property
     def is_clear(self) -> bool:
@@ -311,7 +316,8 @@ def _find_order(
     swaps = np.arange(len(first))
     (lowest,) = _misfit(measured, expected, places[None])
     while len(swaps):
-        candidates = np.tile(places, (len(swaps), 1))
+        copies = (len(swaps), 1)
+        candidates = np.tile(places, copies)
         candidates[swaps, first] = places[second]
         candidates[swaps, second] = places[first]
         misfits = _misfit(measured, expected, candidates)
@@ -357,7 +363,8 @@ def _misfit(
     explained = projection**2 / squares
     unexplained = total[:, None, None] - explained
     # Rounding can leave a value just below 0.
-    at_best_distance = np.maximum(0, unexplained.min(axis=1))
+    lowest = unexplained.min(axis=1)
+    at_best_distance = np.maximum(0, lowest)
     share = at_best_distance.sum(axis=0) / total.sum()
     misfit: Array = np.sqrt(share)
     return misfit

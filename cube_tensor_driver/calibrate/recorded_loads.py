@@ -79,7 +79,8 @@ def read_recorded_loads(
         calibration = settings.calibrations[number]
         calibration.check(layout)
         rest = settings.rest_frequency[number, : layout.n_pads]
-        stamp_ns, frequency, temperature = _read_samples(source, number, layout.n_pads)
+        samples = _read_samples(source, number, layout.n_pads)
+        stamp_ns, frequency, temperature = samples
         reference_ns, state = _read_reference(
             source.bag,
             reference,
@@ -95,7 +96,8 @@ def read_recorded_loads(
     steps = np.diff(reference_ns)
     max_step = MAX_STEP_RATIO * np.median(steps)
     is_close = steps[following - 1] <= max_step
-    is_within = (stamp_ns >= reference_ns[0]) & (stamp_ns <= reference_ns[-1])
+    begin_ns, end_ns = reference_ns[[0, -1]]
+    is_within = (stamp_ns >= begin_ns) & (stamp_ns <= end_ns)
     is_complete = np.isfinite(frequency).all(axis=1)
     used = is_within & is_close & is_complete
     if not used.any():
@@ -106,7 +108,6 @@ def read_recorded_loads(
 
     # Times are computed in seconds from the first message, because a float does not hold the
     # nanoseconds since 1970 exactly.
-    begin_ns = reference_ns[0]
     seconds = (stamp_ns[used] - begin_ns) / SECOND
     known = (reference_ns - begin_ns) / SECOND
     by_mode = [np.interp(seconds, known, amplitude) for amplitude in state.T]
@@ -159,7 +160,8 @@ def _read_samples(
     parts = []
     for rows in source:
         is_of_cube = rows.cube == number
-        chosen = rows.select(is_of_cube & (rows.pad_fault == 0))
+        is_good = rows.pad_fault == 0
+        chosen = rows.select(is_of_cube & is_good)
         part = (
             chosen.stamp_ns,
             chosen.frequency[:, :n_pads],
@@ -202,10 +204,17 @@ def _read_reference(
     if msgtype == BATCH_TYPE:
         stamp_ns, values = _read_batches(bag, topic, number)
     elif msgtype in (WRENCH_TYPE, TENSOR_TYPE):
-        messages = [message for _, message in bag.decoded({topic})]
-        read = _read_force if msgtype == WRENCH_TYPE else _read_components
-        stamp_ns = np.array([header_stamp_ns(message) for message in messages], np.int64)
-        values = np.array([read(message) for message in messages])
+        entries = bag.decoded({topic})
+        messages = [message for _, message in entries]
+        stamps = [header_stamp_ns(message) for message in messages]
+        stamp_ns = np.array(stamps, np.int64)
+        if msgtype == WRENCH_TYPE:
+            rows = [_axes(message.wrench.force) for message in messages]
+        else:
+            tensors = [message.tensor for message in messages]
+            # The 15 components in the order of `COMPONENTS`, in Pa and Pa/m.
+            rows = [[*_axes(t.normal), *_axes(t.shear), *t.normal_gradient] for t in tensors]
+        values = np.array(rows)
     else:
         topics = ", ".join(sorted(types))
         raise BagError(
@@ -267,20 +276,9 @@ def _read_batches(
     return stamp_ns, values
 
 
-def _read_force(message: Any) -> list[float]:
-    """Return the force x, y, z of a WrenchStamped, in N."""
-    force = message.wrench.force
-    return [force.x, force.y, force.z]
-
-
-def _read_components(message: Any) -> list[float]:
-    """Return the 15 components of a StressTensorStamped, in Pa and Pa/m, in the order of
-    `COMPONENTS`."""
-    tensor = message.tensor
-    normal, shear = tensor.normal, tensor.shear
-    normal_stress = [normal.x, normal.y, normal.z]
-    shear_stress = [shear.x, shear.y, shear.z]
-    return [*normal_stress, *shear_stress, *tensor.normal_gradient]
+def _axes(vector: Any) -> list[float]:
+    """Return the numbers x, y, z of a Vector3 message."""
+    return [vector.x, vector.y, vector.z]
 
 
 def _average_neighbours(values: AnyArray, size: int) -> Array:

@@ -59,7 +59,8 @@ def estimate_scatter(r: Array) -> float:
     The median is hardly changed by outliers. The result is at least 1e-12, so that residuals can be
     divided by it even if all of them are 0.
     """
-    median = float(np.median(np.abs(r)))
+    size = np.abs(r)
+    median = float(np.median(size))
     return max(NORMAL_MEDIAN_RATIO * median, 1e-12)
 
 
@@ -125,7 +126,8 @@ def find_undetermined(null: Array, count: int) -> Mask:
     Returns:
         For each examined parameter, whether one of these changes alters it (count,).
     """
-    part = np.linalg.norm(null[:count], axis=1)
+    examined = null[:count]
+    part = np.linalg.norm(examined, axis=1)
     undetermined: Mask = part > DIRECTION_TOLERANCE
     return undetermined
 
@@ -167,7 +169,8 @@ def robust_covariance(
     scaled, size = _scale_columns(jacobian)
     # The singular values of J'J are the squares of those of J, so the tolerance is squared, too.
     normal_matrix = scaled.T @ scaled
-    inverse = np.linalg.pinv(normal_matrix, rcond=DIRECTION_TOLERANCE**2)
+    tolerance = DIRECTION_TOLERANCE**2
+    inverse = np.linalg.pinv(normal_matrix, rcond=tolerance)
     of_scaled = scale**2 * factor * inverse
     covariance: Array = of_scaled / np.outer(size, size)
     return covariance

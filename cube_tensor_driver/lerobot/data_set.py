@@ -251,7 +251,8 @@ class DataSet:
         window = (self.depth, cubes)
         axes = ["sample", "cube", "component"]
         about = describe_skin(self._skin) | {"calibrations": self.calibrations}
-        tactile = _feature("float32", (*window, len(COMPONENTS)), axes)
+        shape = (*window, len(COMPONENTS))
+        tactile = _feature("float32", shape, axes)
         features = {TACTILE: tactile | {"info": about}}
         for name, kind in WINDOW_COLUMNS.items():
             dtype = np.dtype(kind).name

@@ -294,7 +294,9 @@ def _write_bag(
         report: Function that displays progress.
     """
     with Bag(plan.path) as bag:
-        sources = {topic.key: topic.open(bag) for topic in topics}
+        sources = {}
+        for topic in topics:
+            sources[topic.key] = topic.open(bag)
         waiting = []
         for episode in plan.episodes:
             writer = EpisodeWriter(data_set, episode, sources)

@@ -128,7 +128,8 @@ class Episode:
         self._since_ns, self._until_ns, self.task = span
         self._fps, self._max_frames = fps, max_frames
         self.begin_ns = self.rows = 0
-        self.counts: AnyArray = np.zeros((0, n_cubes), np.uint32)
+        shape = (0, n_cubes)
+        self.counts: AnyArray = np.zeros(shape, np.uint32)
 
     def contains(self, stamp_ns: Times) -> Mask:
         """Return whether each stamp (N,), in ns since the Unix epoch, lies in the episode."""

@@ -106,7 +106,8 @@ class Signal:
         latest = dict.fromkeys(topic.names, np.nan)
         shape = (len(messages) + 1, len(latest))
         self._values: Single = np.full(shape, np.nan, np.float32)
-        for row, (_, numbers) in zip(self._values[1:], messages, strict=True):
+        rows = self._values[1:]
+        for row, (_, numbers) in zip(rows, messages, strict=True):
             latest |= numbers
             row[:] = list(latest.values())
 
@@ -175,7 +176,8 @@ def find_topics(
             f"{', '.join(sorted(existing)) or 'none'}"
         )
     # JointState messages may contain no joints; such a topic has no numbers and is left out.
-    used = [topic for topic in found.values() if topic.names or topic.is_image]
+    topics = found.values()
+    used = [topic for topic in topics if topic.names or topic.is_image]
     joints = [topic.name for topic in used if topic.msgtype == JOINT_STATE_TYPE]
     # If there are several topics of joint states, only the user can decide which one is the state.
     others = [name for name in joints if name != choices.action]

@@ -13,13 +13,13 @@ hubs in the same way as real ones::
 from __future__ import annotations
 
 import threading
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..config.skin import Skin
-from ..core.arrays import Array
 from ..core.errors import ConfigError
 from .load import StressField
 from .simulator import Simulator, StopRequest
@@ -54,7 +54,9 @@ class BackgroundHubs:
             ConfigError: Cubes of one hub have different numbers of pads, or the folder cannot be
                 used.
         """
-        self._load = _SetLoad(len(skin.cubes))
+        cubes = len(skin.cubes)
+        unloaded = np.zeros((cubes, 6)), np.zeros((cubes, 6, 3))
+        self._load = _SetLoad(unloaded)
         self._simulator = Simulator(
             skin,
             self._load,
@@ -80,10 +82,14 @@ class BackgroundHubs:
         Raises:
             ConfigError: Stress or gradient has another shape.
         """
-        self._load.set(
-            np.array(stress, float),
-            np.array(gradient, float),
-        )
+        new = np.array(stress, float), np.array(gradient, float)
+        shapes = [part.shape for part in new]
+        needed = [part.shape for part in self._load.field]
+        if shapes != needed:
+            raise ConfigError(f"stress and gradient have the shapes {shapes}; allowed: {needed}")
+        # A single assignment of both arrays is atomic in Python, so the thread of the simulator,
+        # which reads them, needs no lock and never mixes two loads.
+        self._load.field = new
 
     def close(self) -> None:
         """Stop the hubs and remove their ports."""
@@ -99,41 +105,13 @@ class BackgroundHubs:
         self.close()
 
 
+@dataclass
 class _SetLoad:
-    """Stress and gradient at the cubes (`load.Fields`) that another thread sets.
+    """A load (`load.Fields`) whose stress and gradient at the cubes another thread sets."""
 
-    Stress and gradient are replaced together, so that the reading thread never mixes two loads.
-    """
-
+    field: StressField
     repeats: float | None = None
-    period = 0.0
-
-    def __init__(self, cubes: int) -> None:
-        self._field: StressField = (
-            np.zeros((cubes, 6)),
-            np.zeros((cubes, 6, 3)),
-        )
-
-    def set(self, stress: Array, gradient: Array) -> None:
-        """Replace stress and gradient.
-
-        Args:
-            stress: Stress (cubes, 6) in Pa, in the frames of the cubes.
-            gradient: Gradient (cubes, 6, 3) in Pa/m.
-
-        Raises:
-            ConfigError: Stress or gradient has another shape.
-        """
-        cubes = len(self._field[0])
-        fits = stress.shape == (cubes, 6) and gradient.shape == (cubes, 6, 3)
-        if not fits:
-            raise ConfigError(
-                f"the load has a stress of shape {stress.shape} and a gradient of shape "
-                f"{gradient.shape}; a skin of {cubes} cubes takes ({cubes}, 6) and ({cubes}, 6, 3)"
-            )
-        # A single assignment of both arrays is atomic in Python, so the thread that reads them
-        # needs no lock.
-        self._field = stress, gradient
+    period: float = 0.0
 
     def at(self, seconds: float) -> StressField:
-        return self._field
+        return self.field
