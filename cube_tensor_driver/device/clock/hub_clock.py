@@ -64,9 +64,9 @@ class HubClock:
         problems: Texts of problems, which the caller reports and removes.
     """
 
-    # Inside, device times are in ns since _first_us, and arrival times in ns since _first_ns,
-    # because a float would round absolute times to 256 ns. When one of the clocks was set, its
-    # origin (_first_us or _first_ns) is moved by the step, so that the line still holds.
+    # Inside, device times are in ns since track.first_us, and arrival times in ns since
+    # track.first_ns, because a float would round absolute times to 256 ns. When one of the clocks
+    # was set, its origin (first_us or first_ns) is moved by the step, so that the line still holds.
 
     def __init__(self, track: LinkTrack | None = None) -> None:
         self._track = LinkTrack() if track is None else track
@@ -266,9 +266,9 @@ class HubClock:
         """
         if not times:
             return []
+        track = self._track
         # Of samples that arrive together the newest one has the smallest delay. Only the smallest
         # delays determine the line, so the others need not be added to it.
-        track = self._track
         is_usable = self._learn(max(times), arrival_ns)
         offset, drift = track.bounded_offset, track.drift
         stamps = []

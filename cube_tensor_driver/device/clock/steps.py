@@ -40,9 +40,9 @@ MIN_DECISION_READS = 8
 """Number of reads after a suspected step of the hub's clock before the smallest delay decides. The
 samples of a few reads may all be delayed."""
 UNLIKELY_DELAY = 8.0
-"""Ratio of the delay of a sample to the mean delay that hardly any sample exceeds (both are counted
-from the smallest delay). A step of the hub's clock that is larger than this is not confused with a
-delayed sample."""
+"""Ratio of the delay of a sample to the mean delay, both minus the smallest delay, that hardly any
+sample exceeds. A step of the hub's clock that is longer than the mean delay by this factor is not
+confused with a delayed sample. (The delay is the time from sampling to arrival.)"""
 MIN_HOST_STEP_NS = 1_000_000
 """Smallest step of the host's clock, in ns, that is detected. The host's and the monotonic clock
 are read one after the other, so that smaller differences of the two are not certain."""

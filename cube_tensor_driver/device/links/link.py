@@ -119,10 +119,10 @@ class Link:
 
     Args:
         config: Port of the link, and the hub that is expected there.
-        track: State of the samples of the link; None for a new one.
+        track: Sample numbers and clock values of the link; None for new ones.
 
     Attributes:
-        track: State of the samples of the link, which is kept when the link is reopened.
+        track: Sample numbers and clock values of the link, which are kept when it is reopened.
         state: State of the link; `Session` sets it.
         error: Reason of the state; None if there is none. `Session` sets it.
         period_problem: Text about a sample period of the hub that differs from the requested one;

@@ -86,7 +86,7 @@ class Reader:
             time is earlier than the true one.
         period_us: Sample period to set on every hub, in µs; with None the hubs keep their own.
         on_end: Called in this thread as its last step, also after an error.
-        tracks: State of the samples of each link; None for new ones.
+        tracks: Sample numbers and clock values of each link; None for new ones.
 
     Attributes:
         links: The links, in the order of the argument.

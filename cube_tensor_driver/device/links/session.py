@@ -23,7 +23,7 @@ SILENT_S = 0.2
 three sample periods if they are longer."""
 TICK_S = 0.02
 """Period, in s, at which the reader checks the timers of all links: for silence, for the next
-attempt to open the port, and for the next request to the hub."""
+attempt to open the port, for the next request to the hub, and for bytes that wait to be sent."""
 HELLO_S = 1.0
 """Period, in s, at which the request HELLO is repeated while a hub is silent or has not sent HELLO
 since its port was opened."""
