@@ -20,6 +20,7 @@ from ..core.rows import FrequencyRows
 from ..core.tensor import rpy_from_quaternion
 from ..messages.codec import SECOND
 from ..messages.skin_info import cube_calibrations
+from ..messages.types import INFO
 from .read import Bag
 from .recorded_health import RecordedHealthReader
 
@@ -154,11 +155,10 @@ def skin_infos(bag: Bag, topic: str) -> list[Any]:
     """
     skin = topic.removesuffix("frequencies")
     own, of_driver = f"{skin}info", f"{skin}driver/info"
-    recorded = {one.topic for one in bag.connections if one.msgcount}
     try:
         infos = bag.infos(own)
     except BagError:
-        if of_driver not in recorded:
+        if of_driver not in bag.topics(INFO):
             raise
         infos = bag.infos(of_driver)
     reconstructed = [info for info in infos if info.sender == "reconstruction"]

@@ -206,10 +206,7 @@ class BagWriter:
             self.close()
             self._attempt(self._begin_part)
             part = self._open_part()
-        try:
-            part.file.write(part.channels[topic], time_ns, data)
-        except WRITE_ERRORS as error:
-            self._fail(error)
+        self._attempt(lambda: part.file.write(part.channels[topic], time_ns, data))
         part.count(topic, time_ns, len(data))
         self.messages += 1
         self.bytes += len(data)
