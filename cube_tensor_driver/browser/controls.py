@@ -22,10 +22,10 @@ PARTS = {
     "principal": "principal stresses",
     "names": "names of cubes",
 }
-"""Part of the 3-D view -> text of the check box that shows or hides it."""
+"""Name of a part of the 3-D view -> text of the check box that shows or hides this part."""
 
 FIRST_PARTS = {"field", "traction", "gradient"}
-"""Those of `PARTS` that are shown when the page opens."""
+"""Names of the parts of the 3-D view that are shown when the page opens."""
 
 
 class ReplayPosition(Protocol):

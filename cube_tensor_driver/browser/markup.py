@@ -20,9 +20,13 @@ from .scan import Scan
 from .surface_field import DEVIATION, SurfaceField
 
 GREEN = "#2b8a3e"
+"""Colour of the mark before the first line while all cubes are live."""
 AMBER = "#e67700"
+"""Colour of that mark while some cubes are not live, and of warnings about a link."""
 RED = "#c92a2a"
+"""Colour of that mark while no cube is live, of errors of a link, and of a running recording."""
 BLUE = "#1864ab"
+"""Colour of that mark while the page or a replay is paused."""
 
 LEVEL_COLOURS = ("inherit", AMBER, RED, RED)
 """Colour of the text about a link for each level of its diagnostics: OK, WARN, ERROR and STALE."""
@@ -75,7 +79,7 @@ wide as the screen and limits its height to 45 % of the screen, so that the skin
 
 @dataclass
 class PageStatus:
-    """What the page shows besides a scan: recording, and the result of the last action.
+    """What the page shows besides measured values: recording, and the result of the last action.
 
     Attributes:
         action: Text about the result of the user's last action, such as a tare.

@@ -69,11 +69,17 @@ camera must be further away to show the whole skin in a narrow picture.
 """
 
 PAUSE = "pause the page"
+"""Text of the button that stops the updates of the page."""
 GO_ON = "go on"
+"""Text of the button that lets the updates of the page continue."""
 RECORD = "record"
+"""Text of the button that begins to record a bag."""
 STOP = "stop recording"
+"""Text of the button that ends the recording."""
 TARE = "tare"
+"""Text of the button that takes the present load as zero load."""
 CLEAR_TARE = "undo tare"
+"""Text of the button that undoes all tares."""
 HOLD = "hold the replay"
 """Action of a user: the replay of a bag pauses, or goes on if it was paused."""
 JUMP = "jump"
@@ -144,10 +150,12 @@ class Page:
         history: History,
         status: PageStatus,
     ) -> None:
-        """Show a scan; a paused page shows what it has shown, with the choices of its user.
+        """Show a scan; a paused page goes on to show the last scan before the pause.
+
+        A paused page still follows its user's choice of colour, cube and parts of the view.
 
         Args:
-            scan: The newest instant.
+            scan: The values of all cubes at the newest instant.
             history: Values of all cubes in the last seconds; the newest are those of the scan.
             status: Recording, and result of the user's last action.
         """

@@ -17,16 +17,19 @@ from .surface_field import SurfaceField
 
 MAX_RESULT_DELAY_NS = 1_000_000_000
 """Maximum difference, in ns, of the stamps of the newest `stress` message and of the newest message
-of the node `contacts`. A larger one means that the node has ended."""
+of the node `contacts`, which copies the stamp of the `stress` message that it has processed.
+
+A larger difference means that the node has ended.
+"""
 
 MAX_WAITING_MESSAGES = 300
-"""Maximum number of `stress` messages that wait for a result of the node `contacts`.
+"""Maximum number of `stress` messages that wait until the node `contacts` has processed one.
 
-It bounds the memory if results come for none of them: 30 MB for a skin of 1260 cubes.
+It bounds the memory if the node processes none of them: 30 MB for a skin of 1260 cubes.
 """
 
 MAX_RESULTS = 64
-"""Number of newest results of the node `contacts` that are kept, per topic."""
+"""Number of newest messages that are kept of each topic of the node `contacts`."""
 
 
 Links = tuple[tuple[str, int], ...]
@@ -61,16 +64,17 @@ class Scan(NamedTuple):
 
 
 class ScanSynchronizer:
-    """Follows the rows of a skin up to the newest instant whose results are complete.
+    """Pairs rows (samples of one cube each) with the contacts that were found in the same rows.
 
-    The node `contacts` publishes results some time after the rows that they belong to, with the
-    same stamp. While the node runs, later rows wait until a result for one of them has come.
+    The node `contacts` publishes contacts and traction some time after the rows in which it found
+    them, with the stamp of these rows. While the node runs, newer rows wait here until it has
+    processed one of them. So rows, contacts and traction are always of the same instant.
 
     Attributes:
-        stamp_ns: Stamp of the newest `stress` message at the instant, in ns; 0 before the first.
-        latest: Latest row of each cube at the instant.
-        sample_rate: Samples per second of each cube at the instant.
-        contacts: Contacts for these rows; None if the node does not run.
+        stamp_ns: Stamp of the newest `stress` message at this instant, in ns; 0 before the first.
+        latest: Latest row of each cube at this instant.
+        sample_rate: Samples per second of each cube at this instant.
+        contacts: Contacts in these rows; None if the node does not run.
         cloud: Points (M, 6) of the topic `traction` for these rows: position in m, pressure, shear
             and standard deviation of the pressure in Pa; None if it is not published.
     """
@@ -111,7 +115,7 @@ class ScanSynchronizer:
         _add_result(self._clouds, stamp_ns, cloud)
 
     def advance(self) -> bool:
-        """Go on to the newest waiting rows for which the running nodes have published results.
+        """Go on to the newest waiting rows that the node `contacts` has processed, if it runs.
 
         Returns:
             Whether there were such rows.

@@ -27,7 +27,10 @@ MAX_PIXELS_PER_SIDE = 256
 """Maximum number of pixels of the heat map along the longer side of the skin."""
 
 MAX_NAMED_CUBES = 100
-"""Maximum number of cubes of a skin whose names are written below the cubes."""
+"""Maximum number of cubes of a skin whose names are written below the cubes.
+
+In a larger skin, cubes have tool tips only while the page is paused.
+"""
 
 TICKS = 5
 """Approximate number of ticks (marks with a number) on the longer axis of the drawing."""

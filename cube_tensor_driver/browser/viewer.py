@@ -58,19 +58,19 @@ ALL_ADDRESSES = ("0.0.0.0", "::")
 """Values of --host with which the server listens on all addresses of this machine (IPv4, IPv6)."""
 
 PICTURE_PERIOD_S = 0.1
-"""Period, in seconds, at which the pages get a new scan: picture, numbers and plots together."""
+"""Period, in seconds, at which picture, numbers and plots of all pages are updated together."""
 
 MIN_PAUSE_SHARE = 2.0
-"""Minimum pause after a picture, divided by the processor time that the picture took.
+"""Minimum pause after an update of the pages, divided by the processor time that the update took.
 
-So the pictures of a very large skin take at most a third of a core, and come less often.
+So the updates of a very large skin take at most a third of a core, and come less often.
 """
 
 WAITING_NOTE_S = 2.0
 """Time, in seconds after the start, at which the terminal prints that no skin is published yet."""
 
 NEVER_STALE_S = 1e9
-"""Maximum age, in seconds, of a cube's latest row while a replay is paused.
+"""Maximum age, in seconds, of a cube's latest row (sample) while a replay of a bag is paused.
 
 A paused replay publishes nothing. The limit is so high that no cube is shown as stale then.
 """
@@ -257,7 +257,7 @@ class Viewer:
             self._toggle_recording()
 
     def _update(self, skin: ShownSkin) -> None:
-        """Show the newest scan in all browsers."""
+        """Show the newest scan (the values of all cubes at one instant) in all browsers."""
         # After a jump of the replay, the plots would connect values of two different times.
         if self._replay.update():
             self._history.clear()
@@ -352,14 +352,14 @@ def make_scan(
     health: Index,
     links: Links,
 ) -> Scan:
-    """Return the present instant, with field and contacts.
+    """Return everything that the pages show of the present instant.
 
     Contacts that the node `contacts` does not find are found here, by interpolation between the
     cubes.
 
     Args:
         skin: The skin.
-        scans: Latest rows and results of the node `contacts`.
+        scans: Latest row (sample) of each cube, and what the node `contacts` found in these rows.
         health: (N,) health of the cubes at this instant.
         links: Line of text and level of the diagnostics of each link (connection to a hub).
     """

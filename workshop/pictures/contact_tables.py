@@ -25,17 +25,18 @@ Table = dict[str, Any]
 """A table: what it is about, its columns, its rows."""
 
 WIDTHS = [2e-3, 5e-3, 10e-3, 20e-3]
-"""Widths of the contacts, in m."""
+"""Widths of the simulated contacts, in m; each table has one line for each width."""
 WRONG_WIDTHS = [5e-3, 15e-3]
 """Widths of the contacts for the table of wrong assumptions, in m."""
 BALL_LOADS = 100
-"""Number of balls for each line."""
+"""Number of random loads by a ball from which one line of a table is computed."""
 PAD_LOADS = 40
-"""Number of loads for each line about cubes as points and as pads."""
+"""Number of random loads from which one line of the table is computed that compares cubes modelled
+as points and as pads."""
 FEW_LOADS = 6
-"""Number of loads for each line of the other tables."""
+"""Number of random loads from which one line of the other tables is computed."""
 SEED = 7031
-"""Seed of the random loads, with which nothing was chosen."""
+"""Seed of the random loads. No setting of the methods was chosen by results with this seed."""
 
 METHOD_COLUMNS = [
     "contact width, mm",

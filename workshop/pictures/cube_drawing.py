@@ -15,13 +15,13 @@ from cube_tensor_driver.views.figures.style import print_style
 PITCH_MM = 12.0
 """Distance between the cubes that `./cube config grid` writes, in mm."""
 FOAM_MM = 0.2
-"""Thickness of the foam, in mm."""
+"""Thickness of the foam of a pad, in mm."""
 DEPTH_MM = 1e3 * SURFACE_DEPTH
 """Depth of the cubes' centres below the surface, in mm."""
 MARGIN_MM = 8.0
 """Width of the skin beside the two cubes, in mm."""
 MARGIN_IN = 0.15
-"""Width of the margin of the picture, in inches."""
+"""Width of the empty margin of the picture, in inches."""
 CENTRE_LINE: dict[str, Any] = {"color": "0.6", "lw": 0.6, "ls": ":"}
 """Style of a line through the centre of a cube."""
 

@@ -17,13 +17,13 @@ from cube_tensor_driver.touch.surface import Surface
 from cube_tensor_driver.views.figures.style import print_style
 
 ARROW_KPA = 1.0
-"""Shear of the arrow in the key, in kPa."""
+"""Shear stress that the arrow in the key of the picture stands for, in kPa."""
 ARROW_MM = 5.0
-"""Length of that arrow, in mm."""
+"""Length of the arrow in the key of the picture, in mm on the finger."""
 COLOURS = "Wistia"
 """Colour map of the pressure. All of its colours are so light that black arrows are seen."""
 SURFACE_SIDE = 6
-"""Number of points along the side of a cube's patch."""
+"""Number of points along the side of the square around each cube in which pressure is drawn."""
 
 
 @print_style()

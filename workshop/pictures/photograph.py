@@ -41,11 +41,14 @@ return found ? -Number(found[1]) : 0"""
 """JavaScript: the pressure on the chosen cube, in kPa."""
 
 MIN_PRESSURE_KPA = 6.0
-"""Pressure above which the load presses the chosen cube."""
+"""Pressure on the chosen cube, in kPa, above which the load counts as pressing it."""
 
 MAX_CHANGE_KPA = 0.3
-"""Change of the pressure within `STEADY_S` up to which the load rests. The picture is taken while
-it rests, so that all numbers belong to the picture."""
+"""Maximum change of the pressure, in kPa, within `STEADY_S` of a load that rests.
+
+The picture is taken while the load rests, because a browser that draws on the processor shows the
+3-D view some pictures later than the numbers.
+"""
 
 STEADY_S = 0.6
 """Time between the two pressures that are compared, in seconds."""
@@ -57,8 +60,10 @@ POLL_S = 0.02
 """Period at which the page is looked at while a step is waited for, in seconds."""
 
 TOUCHES = 2
-"""Number of times that the load comes before the picture is taken. When it presses the second time
-the plots are full."""
+"""Number of times that the load presses before the picture is taken.
+
+When it presses for the second time, the plots of 10 s are full.
+"""
 
 
 @contextmanager

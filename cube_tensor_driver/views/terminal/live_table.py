@@ -218,7 +218,14 @@ class LiveTable:
             left_out += [] if form.has_residual else ["residual"]
             too_narrow = [f"too narrow for {', '.join(left_out)}"] if left_out else []
             table.caption = "; ".join([*notes, *too_narrow])
-            if Measurement.get(self._console, options, table).maximum <= width:
+            if (
+                Measurement.get(
+                    self._console,
+                    options,
+                    table,
+                ).maximum
+                <= width
+            ):
                 break
         return table
 
@@ -261,7 +268,11 @@ class LiveTable:
             table.add_column("pressure", width=BAR_WIDTH)
         for name in form.components:
             unit = "kPa/mm" if is_gradient(name) else "kPa"
-            table.add_column(f"{_label(name)}\n{unit}", justify="right", min_width=7)
+            table.add_column(
+                f"{_label(name)}\n{unit}",
+                justify="right",
+                min_width=7,
+            )
         if form.has_residual:
             table.add_column("residual", justify="right")
         table.add_column("Hz", justify="right", min_width=4)
