@@ -131,10 +131,10 @@ class RegionFit:
             Work that this took, in nodes of a new fit.
         """
         self.waited = 0
-        work = MOVE_WORK
         if self.hertz is not None:
             self.hertz.follow(self._white)
-        elif self._is_hertz_due:
+            return MOVE_WORK
+        if self._is_hertz_due:
             self._is_hertz_due = False
             self._fit_hertz()
             work = HERTZ_WORK
