@@ -65,14 +65,15 @@ class _HubCubes:
             (once a second), the cube of this hub is used.
         cubes: Index in the skin of each cube of the hub (n_cubes,); `ABSENT` for cubes that are not
             in the skin file.
-        is_complete: Whether all cubes of the hub are in the skin, with as many pads.
+        complete: The indices as uint16 and the shape (n_cubes, n_pads) of a sample of all cubes of
+            the hub, if every one of them is in the skin; else None.
     """
 
     hello: Hello | None = None
     is_present: bool = False
     waits_for_cube: bool = False
     cubes: HubIndex = field(default_factory=lambda: np.empty(0, np.int32))
-    is_complete: bool = False
+    complete: tuple[RowIndex, tuple[int, int]] | None = None
 
 
 class CubeTable:
@@ -125,7 +126,8 @@ class CubeTable:
         hub.cubes = cubes
         is_known = cubes != ABSENT
         fits = self._pads[cubes] == hello.n_pads
-        hub.is_complete = bool((is_known & fits).all())
+        shape = hello.n_cubes, hello.n_pads
+        hub.complete = (cubes.astype(np.uint16), shape) if (is_known & fits).all() else None
 
         known_uids = hello.cube_uids[is_known].tolist()
         uids = dict(self.uids)
@@ -154,6 +156,12 @@ class CubeTable:
             Index in the skin of the cube of each kept row, and the sample with only these rows.
         """
         hub = self._hubs[link]
+        # Usually a sample holds all cubes of the hub and all of them are in the skin, so that the
+        # indices stored by `learn` can be returned without a search.
+        if hub.complete is not None and sample.first_cube == 0:
+            whole, shape = hub.complete
+            if sample.shape == shape:
+                return whole, sample
         end = sample.first_cube + sample.n_cubes
         cubes = hub.cubes[sample.first_cube : end]
         is_known = cubes != ABSENT
@@ -188,10 +196,9 @@ class CubeTable:
         """
         key = tuple(links)
         if key not in self._whole:
-            hubs = [self._hubs[link] for link in links]
-            is_whole = all(hub.is_complete for hub in hubs)
-            cubes = np.concatenate([hub.cubes for hub in hubs]).astype(np.uint16)
-            self._whole = {key: cubes if is_whole else None}
+            found = [self._hubs[link].complete for link in links]
+            cubes = [hub[0] for hub in found if hub is not None]
+            self._whole = {key: np.concatenate(cubes) if len(cubes) == len(links) else None}
         return self._whole[key]
 
     def _match(self, link: int, hello: Hello) -> tuple[HubIndex, list[str]]:
