@@ -24,7 +24,7 @@ from serial.tools import list_ports
 
 from conftest import free_domain
 from cube_tensor_driver.cli.echo import reading_json, reading_line
-from cube_tensor_driver.cli.main import main
+from cube_tensor_driver.cli.main import BROKEN_PIPE, main
 from cube_tensor_driver.config.grid import grid
 from cube_tensor_driver.config.yaml import parse_yaml, write_yaml
 from cube_tensor_driver.device.wire.protocol import Command
@@ -157,7 +157,7 @@ def test_echo_of_other_topics_is_yaml_or_json(skin, capfd):
 
 def test_echo_ends_well_by_ctrl_c_and_when_its_reader_has_enough(skin):
     command = [sys.executable, "-m", "cube_tensor_driver.cli", "echo", "stress"]
-    for how in ("ctrl-c", "reader"):
+    for how, code in (("ctrl-c", 0), ("reader", BROKEN_PIPE)):
         with subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         ) as process:
@@ -167,7 +167,7 @@ def test_echo_ends_well_by_ctrl_c_and_when_its_reader_has_enough(skin):
                 process.stdout.read()
             else:
                 process.stdout.close()
-            assert process.stderr.read() == "" and process.wait(10) == 0, how
+            assert process.stderr.read() == "" and process.wait(10) == code, how
 
 
 def test_echo_of_nothing_says_so_in_one_line(nobody, capfd):
