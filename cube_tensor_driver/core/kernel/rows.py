@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..arrays import AnyArray, Array, Index, Mask, PadMasks, Real, Single, Times, multiply
+from ..arrays import Array, Index, Mask, PadMasks, Real, Single, Times, multiply
 from ..health.statistics import GAP_NS, MAX_JITTER_RATIO
 from ..modes import COMPONENTS, STRESS
 from ..oscillator import rest_ratio
@@ -105,8 +105,15 @@ def temperature_factor(tables: Tables, calibration: Numbers, temperature: Real) 
     return rest_ratio(tables.coefficients[calibration], known_change)
 
 
-def mask_bits(tables: Tables, calibration: Numbers, mask: AnyArray) -> Mask:
-    """Return whether the cube has a pad and its bit in a mask is set (N, P).
+def find_existing(tables: Tables, calibration: Numbers) -> Mask:
+    """Return whether cubes with these calibrations (N,) have each pad (N, P)."""
+    pads = np.arange(tables.rest.shape[1])
+    exists: Mask = pads < tables.pads[calibration][:, None]
+    return exists
+
+
+def mask_bits(tables: Tables, calibration: Numbers, mask: PadMasks) -> Mask:
+    """Return whether a cube has a pad and the bit of the pad is set in a mask (N, P).
 
     Args:
         tables: Tables of the skin.
@@ -114,9 +121,8 @@ def mask_bits(tables: Tables, calibration: Numbers, mask: AnyArray) -> Mask:
         mask: Bit masks of pads (N,).
     """
     pads = np.arange(tables.rest.shape[1])
-    exists = pads < tables.pads[calibration][:, None]
-    is_set: Mask = mask[:, None] >> pads & 1 > 0
-    return exists & is_set
+    is_set = mask[:, None] >> pads & 1 > 0
+    return find_existing(tables, calibration) & is_set
 
 
 def pack_bits(bits: Mask) -> PadMasks:
@@ -167,7 +173,8 @@ def _process(
         has_new_condition = shown & ~state["found"] != 0
 
     v, is_good = apply_law(tables, cube, rows.frequency, rows.temperature)
-    is_bad = mask_bits(tables, calibration, out.left_out) | _lack(tables, calibration, is_good)
+    is_lacking = find_existing(tables, calibration) & ~is_good
+    is_bad = is_lacking | mask_bits(tables, calibration, out.left_out)
     bad = pack_bits(is_bad)
     v[is_bad] = 0
     table, key = _find_tables(tables, calibration, bad)
@@ -206,12 +213,6 @@ def _process(
     return scan.start + end, request
 
 
-def _lack(tables: Tables, calibration: Numbers, is_good: Mask) -> Mask:
-    """Return whether the cube has a pad and the pad is not good (N, P)."""
-    all_pads = np.full(len(calibration), 0xFFFFFFFF)
-    return mask_bits(tables, calibration, all_pads) & ~is_good
-
-
 def _find_tables(tables: Tables, calibration: Numbers, bad: PadMasks) -> tuple[Numbers, Times]:
     """Find the tables of rows.
 
@@ -243,7 +244,7 @@ def find_impossible(tables: Tables, health: HealthState, rows: Columns, cube: In
     f = rows.frequency.astype(np.float32)
     low, high = health.pads("low")[cube], health.pads("high")[cube]
     calibration = tables.calibration[cube]
-    is_impossible = _lack(tables, calibration, (f > low) & (f < high))
+    is_impossible = ~((f > low) & (f < high)) & find_existing(tables, calibration)
     # The device may set the bit of a pad that the cube does not have.
     is_reported = mask_bits(tables, calibration, rows.pad_fault)
     return is_impossible | is_reported
