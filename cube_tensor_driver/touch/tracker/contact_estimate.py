@@ -14,12 +14,12 @@ from ...core.arrays import Array, Mask
 from .node_fit import NodeFit
 
 _MIN_NORMAL_FORCE = 1e-12
-"""Smallest absolute value, in N, of a normal force by which moments are divided to get a position.
-It avoids a division by 0."""
+"""Smallest absolute value, in N, of a normal force by which the first moment of the pressure is
+divided to get the position of a contact. It avoids a division by 0."""
 
 _HERTZ_MOMENT = 0.2
-"""Second moment of the pressure of a Hertz contact along one axis, divided by force and square of
-the radius."""
+"""Second moment of the pressure of a Hertz contact about its centre along one axis, divided by the
+force and the square of the radius: 1/5 for the pressure sqrt(1 - r^2 / a^2)."""
 
 
 class ContactEstimate(NamedTuple):
@@ -49,7 +49,7 @@ class ContactEstimate(NamedTuple):
 
 
 def estimate_contact(fit: NodeFit, chosen: Mask) -> ContactEstimate:
-    """Integrate the traction over one contact.
+    """Integrate the traction on nodes (small contacts on a grid) over one contact.
 
     Args:
         fit: Posterior of the traction in the region of the contact.

@@ -87,8 +87,9 @@ COARSE_DEVIATION = 0.1
 """Standard deviation of the force, divided by the force, that is stated for a contact whose force
 is the integral of the linear field, because its region is not fitted yet.
 
-Such integrals were off by 1 to 9 % for balls, punches and rods at distances of the cubes of two and
-three depths. Beside other contacts, the integral also replaces a fit with a larger deviation.
+Such integrals were off by 1 to 9 % for balls, punches and rods on skins whose cubes are two or
+three depths (of their centres below the surface) apart. Beside other contacts, the integral also
+replaces a fit with a larger deviation.
 """
 
 
@@ -335,12 +336,12 @@ class ContactTracker:
             self._update_response(region, regions)
 
     def _update_response(self, region: _Region, regions: list[_Region]) -> None:
-        """Compute the response to a fit, if there are other regions, which need it."""
+        """Set `response` of a region with a fit. With a single region, no other fit needs it."""
         if region.fit is not None and len(regions) > 1:
             region.response = region.fit.respond()
 
     def _next_work(self, region: _Region) -> Work:
-        """Return what is to be done next for a region."""
+        """Return the next step of the fit of a region of contact."""
         fit = region.fit
         if fit is None:
             return Work.NONE if region.is_tried else Work.FIT
@@ -363,7 +364,7 @@ class ContactTracker:
     def _fit_region(
         self, region: _Region, regions: list[_Region], pressure: Array
     ) -> RegionFit | None:
-        """Fit the traction in one region.
+        """Make a new fit of the traction in one region of contact.
 
         Args:
             region: The region.
@@ -401,11 +402,11 @@ class ContactTracker:
     def _integrate_field(
         self, regions: list[_Region], coarse: list[int], field: TractionField
     ) -> list[TrackedContact]:
-        """Estimate contacts by integrals of the field over their regions.
+        """Estimate contacts by integrals of the traction field over their regions of contact.
 
         Args:
             regions: All regions.
-            coarse: Numbers of the regions whose contacts are to be estimated.
+            coarse: Indices in `regions` of those whose contacts are to be estimated.
             field: Traction on the surface.
         """
         inverse = self._inverse

@@ -20,7 +20,7 @@ shared out among the points of the surface."""
 def add_fits(
     inverse: SurfaceInverse, residual: TractionField, fits: list[RegionFit]
 ) -> TractionField:
-    """Add the traction of fits to the residual field, which the fits do not explain.
+    """Add the traction of fits of regions to the residual field, which the fits do not explain.
 
     The traction of a fit is averaged over the square that each point represents, so that the sum
     over all points times the area of a square is the force.
@@ -37,7 +37,7 @@ def add_fits(
 
 
 def fit_variances(inverse: SurfaceInverse, fits: list[RegionFit]) -> Array:
-    """Compute the variances of the pressure of some fits.
+    """Compute the variances of the pressure that the fits of regions of contact describe.
 
     Returns:
         Variances (M, 2) in Pa^2 at the points of the surface: of the pressure on the surface, and

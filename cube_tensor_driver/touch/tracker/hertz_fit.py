@@ -56,8 +56,8 @@ _MAX_STEP = 0.5
 change of the natural logarithm of its radius."""
 
 _DIFFERENCE_STEP = 1 / 50
-"""Step of the numerical derivatives with respect to the centre of a contact, divided by the depth
-of the cubes' centres below the surface."""
+"""Shift of a Hertz contact in each direction for the numerical derivatives by its centre, divided
+by the depth of the cubes' centres below the surface."""
 
 _N_PARAMETERS = 7
 """Number of parameters of a contact: force f_x, f_y, f_z, centre c_x, c_y, logarithm ln a of the
@@ -84,8 +84,8 @@ class HertzFit:
         """Start at the contacts that the fit on nodes found.
 
         Args:
-            region: Fit on nodes.
-            starts: Its contacts.
+            region: Fit of the same values on nodes (small contacts on a grid).
+            starts: Contacts that this fit has found.
             depth: Distance from the centres of the cubes to the surface, in m.
         """
         self._region = region
@@ -122,7 +122,7 @@ class HertzFit:
         """Linearise at the parameters that the last step has found, and make another step.
 
         Args:
-            white: Whitened values (n C,).
+            white: Whitened values (n C,) as from `LocalValues.whiten`.
         """
         self.forces, self.centres = self.found_forces, self.found_centres
         self.log_sizes = self.found_sizes
@@ -145,7 +145,10 @@ class HertzFit:
         self._log_determinant = float(np.linalg.slogdet(scaled)[1])
 
     def step(self, white: Array) -> None:
-        """Change the parameters by one Gauss-Newton step, and compute the evidence.
+        """Find parameters by one Gauss-Newton step from the last linearisation, and the evidence.
+
+        The result is stored in `found_forces` (J, 3) in N, `found_centres` (J, 2) in m and
+        `found_sizes` (J,), the logarithms of the radii in m.
 
         Args:
             white: Whitened values (n C,) as from `LocalValues.whiten`.
@@ -195,6 +198,11 @@ class HertzFit:
     def _derivatives(self, centre: Array, size: float, force: Array) -> Array:
         """Compute the derivatives of the whitened values by the parameters of one contact.
 
+        Args:
+            centre: Centre (2,) of the contact in m, on the skin laid flat.
+            size: Radius in m.
+            force: Force (3,) in N.
+
         Returns:
             Derivatives (n C, 7). The first three columns are the response to unit forces.
         """
@@ -214,6 +222,11 @@ class HertzFit:
         return np.concatenate([moved[:, :, 0], *slopes], axis=1)
 
     def _respond(self, centres: Array, size: float) -> Array:
-        """Return the whitened response (n C, 3, K) to forces of 1 N on K contacts."""
+        """Return the whitened response (n C, 3, K) to 1 N along x, y and z on K Hertz contacts.
+
+        Args:
+            centres: Centres (K, 2) of the contacts in m, on the skin laid flat.
+            size: Radius of all contacts in m.
+        """
         _, white = self._region.values.respond(centres, size)
         return np.asarray(white.reshape(len(white), 3, -1))

@@ -63,7 +63,11 @@ class LocalValues:
         return np.array_equal(known, self.known) and np.array_equal(by_pad, self._by_pad)
 
     def whiten(self, scaled: Array) -> Array:
-        """Return the values (n C,) of these cubes, divided by their noise; 0 where unknown."""
+        """Return the values (n C,) of these cubes, transformed so that their noise has variance 1.
+
+        Args:
+            scaled: Values (cubes of the skin, C) in Pa. Unknown values give 0.
+        """
         values = np.where(self.known, scaled[self.cubes], 0.0)
         return np.asarray((self._whitening @ values[:, :, None]).ravel())
 

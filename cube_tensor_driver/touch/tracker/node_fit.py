@@ -61,8 +61,9 @@ _NODE_RADIUS = 0.9
 """Radius of the Hertz contact of a node, divided by the distance of neighbouring nodes."""
 
 _PEAK_WIDTH = 0.5
-"""Standard deviation of the Gaussian that smooths the pressure in which the peaks of a region are
-counted, divided by the depth of the cubes' centres."""
+"""Standard deviation of the Gaussian that smooths the fitted pressure before its peaks are counted,
+divided by the depth of the cubes' centres below the surface. Every peak of a region is a
+contact."""
 
 _POINT_MARGIN = 0.75
 """Largest distance of a node (one of the small contacts whose sum is the traction) from the nearest
@@ -160,7 +161,7 @@ class NodeFit:
         self._decomposition = self._decompose(np.ones(q))
 
     def solve(self, white: Array) -> None:
-        """Compute the posterior for new values of the same cubes.
+        """Set `posterior` and `misfit` for new values of the same cubes.
 
         Args:
             white: Values (n C,) divided by their noise, as from `LocalValues.whiten`.
@@ -202,14 +203,18 @@ class NodeFit:
         self.label_peaks()
 
     def label_peaks(self) -> None:
-        """Assign the nodes to the peaks of the pressure, each of which is a contact."""
+        """Set `labels`: assign each node to one of the peaks of the pressure, which are
+        contacts."""
         smoothing = np.exp(-self._squares / (2 * self._peak_width**2))
         pressure = -smoothing @ self.posterior.forces[2]
         root = smoothing @ self.posterior.root[2]
         self.labels = split_peaks(pressure, root, self._squares < (1.5 * self.step) ** 2)
 
     def response_to_others(self) -> Array:
-        """Return the response (n C, 3 m) to the nodes of other contacts, per prior deviation."""
+        """Return the whitened response (n C, 3 m) of the cubes to the m nodes of other contacts.
+
+        The force on each node is one prior standard deviation, along x, then y, then z.
+        """
         q = len(self.places)
         deviation = self._scale * np.sqrt(np.diag(self._covariance)[q:])
         scaled = self._white_response[:, :, q:] * deviation * _DEVIATIONS[:, None]

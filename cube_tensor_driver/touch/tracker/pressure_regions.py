@@ -44,7 +44,8 @@ in the same region of contact."""
 
 
 class PressureRegions:
-    """Finds connected regions of significant pressure in every scan."""
+    """Finds connected regions of significant pressure in every scan (set of values of all
+    cubes)."""
 
     def __init__(self, inverse: SurfaceInverse, min_pressure: float) -> None:
         """Find the pairs of neighbouring points.
@@ -102,7 +103,9 @@ class PressureRegions:
 
 
 def split_peaks(pressure: Array, root: Array, is_neighbour: Mask) -> Index:
-    """Assign the nodes of a region to the peaks of the pressure that are separated by valleys.
+    """Assign the nodes of a region to peaks of the pressure that are separated by valleys.
+
+    Nodes are small contacts on a grid. `VALLEY`, `MIN_FALL` and `MIN_PEAK` define what a peak is.
 
     Args:
         pressure: Pressure (q,) at the nodes.

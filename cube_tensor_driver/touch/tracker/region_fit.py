@@ -1,4 +1,9 @@
-"""Fit of one region of contact: traction on nodes, or Hertz contacts where they are likelier."""
+"""Fit of one region of contact: traction on nodes, or Hertz contacts where they are likelier.
+
+Nodes are small contacts on a grid, whose forces are unknown (node_fit.py). A Hertz contact has a
+few parameters: force, centre, radius and flatness (hertz_fit.py). Whitened values are the values of
+the cubes, transformed so that their noise has variance 1 and no correlation.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +45,7 @@ MAX_STEPS = 10
 
 
 class RegionFit:
-    """Fit of the traction in one region of contact.
+    """Fit of the traction in one region of contact to the values of the cubes around it.
 
     Attributes:
         points: Indices (n,) of the points of the surface that form the region.
@@ -63,7 +68,7 @@ class RegionFit:
         values: LocalValues,
         scaled: Array,
     ) -> None:
-        """Fit the traction on nodes.
+        """Fit the forces of nodes (small contacts on a grid); Hertz contacts are tried later.
 
         Args:
             inverse: Poses, points, noise and kernels of the skin.
@@ -100,13 +105,14 @@ class RegionFit:
 
     @property
     def is_final(self) -> bool:
-        """Whether further work cannot improve the fit for the same values."""
+        """Whether `improve` cannot make the fit more exact as long as the values stay the same."""
         is_sharp = self.nodes.is_sharp and not self._is_hertz_due
         return is_sharp or self.hertz is not None
 
     @property
     def is_moving(self) -> bool:
-        """Whether a Hertz contact has moved away from where its response was linearised."""
+        """Whether a Hertz contact has changed by more than `MAX_UNFOLLOWED_STEP` (position, radius)
+        since its response was linearised, so that `improve` must linearise it again."""
         return self.hertz is not None and self.hertz.last_step > MAX_UNFOLLOWED_STEP
 
     def update(self, scaled: Array) -> None:
@@ -128,7 +134,7 @@ class RegionFit:
         and once when the prior of the nodes is as narrow as possible.
 
         Returns:
-            Work that this took, in nodes of a new fit.
+            Work that this took, in the unit of `MAX_WORK_PER_SCAN`.
         """
         self.waited = 0
         if self.hertz is not None:
@@ -146,7 +152,7 @@ class RegionFit:
         return work
 
     def _fit_hertz(self) -> None:
-        """Fit Hertz contacts that start at those on nodes, and keep them if they are likelier."""
+        """Fit one Hertz contact for each contact on nodes, and keep them if they are likelier."""
         starts = self._estimate_on_nodes()
         if max(one.aspect for one in starts) > MAX_HERTZ_ASPECT:
             return
@@ -156,15 +162,17 @@ class RegionFit:
             self.hertz = hertz
 
     def estimate_contacts(self) -> list[ContactEstimate]:
-        """Return the contacts in the region."""
+        """Return force, position, moment and area of each contact in the region."""
         estimates = self._estimate_on_nodes()
         if self.hertz is None:
             return estimates
         return [self.hertz.estimate(j, one) for j, one in enumerate(estimates)]
 
     def respond(self) -> Array:
-        """Return the values (cubes, C) in Pa that all cubes measure under the traction of the
-        fit."""
+        """Return the values (cubes, C) in Pa that the traction on the nodes causes at all cubes.
+
+        C is the number of components that some cube of the skin observes.
+        """
         force = self.nodes.posterior.forces.sum(axis=1)
         total = np.zeros(self._inverse.observed.shape)
         far, response = self._far_response
@@ -174,9 +182,10 @@ class RegionFit:
 
     @cached_property
     def _far_response(self) -> tuple[Index, Array]:
-        """Cubes (n,) that do not take part in the fit, and their response (n, C, 3) to 1 N.
+        """Indices (n,) of the cubes outside of the fit, and their response (n, C, 3) in Pa/N.
 
-        They are far from the region, so that the traction acts on them like a single Hertz contact.
+        The response is that to a force of 1 N on the region along x, y and z. These cubes are so
+        far away that the traction acts on them like a single Hertz contact.
         """
         inverse = self._inverse
         poses = inverse.poses
@@ -195,5 +204,6 @@ class RegionFit:
         return far, response[:, inverse.columns]
 
     def _estimate_on_nodes(self) -> list[ContactEstimate]:
+        """Return the integrals of the traction on nodes over each contact of the region."""
         labels = self.nodes.labels
         return [estimate_contact(self.nodes, labels == one) for one in range(labels.max() + 1)]
