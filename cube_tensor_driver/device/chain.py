@@ -117,8 +117,8 @@ class LiveLinks:
         links: Port of each link, and the unique number of the hub that must answer there.
         cubes: For each cube of the skin, the unique number or the link and index to find it by.
         on_rows: Called in the reader's thread with the rows of complete scans (one sample of every
-            cube). If `make_rows`
-            returns the same memory again, the rows are valid only until the call returns.
+            cube). If `make_rows` returns the same memory again, the rows are valid only until the
+            call returns.
         rate: Sample rate to request from the hubs, in Hz; with None the hubs keep their own rate.
         scans_per_call: Number of complete scans that one call of `on_rows` waits for.
         make_rows: Function that makes the arrays into which rows are written.
@@ -324,7 +324,7 @@ class LiveLinks:
             self._overloaded_until = time.monotonic() + OVERLOAD_S
 
     def _add_usual(self, usual: UsualSamples) -> None:
-        """Add samples that are counted and stamped already to the scans."""
+        """Add samples that the module in C has counted and stamped already to the scans."""
         samples = unpack_all(usual.raws)
         for link, sample, stamp_ns in zip(usual.links, samples, usual.stamps_ns, strict=True):
             if isinstance(sample, Sample):
@@ -438,7 +438,7 @@ class LiveLinks:
         """Call `on_rows` with the rows (samples of cubes) of all complete scans.
 
         A scan (one sample of every cube) that holds no cube of the skin has no rows and is
-        discarded.
+        discarded. If this host is too slow, the oldest scans are dropped and counted instead.
         """
         if self._is_overloaded():
             self._count_overload(self._scans.drop_oldest(self._max_scans))

@@ -272,7 +272,7 @@ class Reader:
 
         Args:
             reads: Results of reading since the last callback.
-            is_late: Whether this host is behind with reading.
+            is_late: Whether the bytes of these reads had been waiting to be read.
 
         Returns:
             The frames to deliver; and, by index, the links that must be closed with their errors.

@@ -269,7 +269,7 @@ class ScanBuilder:
         return scans[::-1]
 
     def build_whole(self, scans: WholeScans, make_rows: MakeRows) -> FrequencyRows:
-        """Convert whole scans to rows.
+        """Convert whole scans (one sample of each link, all cubes of its hub) to rows.
 
         Args:
             scans: The scans.
@@ -302,7 +302,7 @@ class ScanBuilder:
         return sum(len(part.cubes) for part in parts)
 
     def _take_scans(self, max_scans: int | None) -> list[_SampleRows]:
-        """Remove the oldest scans (one sample of each link); find the cube of each of their rows.
+        """Remove the oldest scans (one sample of each link), and return their samples that have rows.
 
         Args:
             max_scans: Largest number of scans to remove; None for all that can be built.
@@ -321,7 +321,11 @@ class ScanBuilder:
         return parts
 
     def _remove_scans(self, n_scans: int) -> list[dict[int, _SampleRows]]:
-        """Remove the oldest pending scans (one sample of each link), and return them."""
+        """Remove the oldest pending scans (one sample of each link), and return them.
+
+        Args:
+            n_scans: Number of scans to remove.
+        """
         scans = self._pending[:n_scans]
         del self._pending[:n_scans]
         del self._pending_ns[:n_scans]

@@ -33,7 +33,8 @@ class Arrival(str, Enum):
     Attributes:
         NEW: The next sample, or the first one after a gap in the numbers.
         LATE: A sample that comes after one with a larger number; it was counted as missing before.
-        DUPLICATE: A sample that has come before and must not be delivered again.
+        DUPLICATE: A sample that has come before and must not be delivered again, or one so old that
+            this cannot be excluded.
         RESET: The first sample after a restart of the hub.
         SET_BACK: The next sample, or the first after a gap, with an earlier device time than the
             sample before, because the hub's clock was set back.
@@ -83,7 +84,8 @@ class SequenceTracker:
 
     Attributes:
         counters: Numbers of delivered, missing and duplicate samples.
-        n_cubes: Number of cubes in the frames of this part of the samples.
+        n_cubes: Number of cubes in each frame whose samples are tracked. A hub with many cubes
+            divides each sample into several frames, which have a tracker each.
     """
 
     # The 32-bit numbers of samples wrap to 0. In the attributes below they are unwrapped, so that
