@@ -302,7 +302,7 @@ class ScanBuilder:
         return sum(len(part.cubes) for part in parts)
 
     def _take_scans(self, max_scans: int | None) -> list[_SampleRows]:
-        """Remove the oldest scans (one sample of each link), and return their samples that have rows.
+        """Remove the oldest scans (one sample of each link); return their samples that have rows.
 
         Args:
             max_scans: Largest number of scans to remove; None for all that can be built.
