@@ -16,12 +16,12 @@ __all__ = ["Checked", "check", "in_order", "rules"]
 
 @dataclass(frozen=True)
 class Checked:
-    """What a check found.
+    """Results of the check of one hub.
 
     Attributes:
         port: Port of the hub.
         hello: Last HELLO of the hub; None: none came.
-        results: Number of a rule -> its result.
+        results: Number of a rule of docs/protocol.md, such as S7 -> whether the hub keeps it.
     """
 
     port: str
@@ -29,7 +29,7 @@ class Checked:
     results: dict[str, RuleResult]
 
     def count(self, outcome: Outcome) -> int:
-        """Return the number of rules with an outcome."""
+        """Return the number of rules with an outcome: passed, failed or not tried."""
         return sum(result.outcome is outcome for result in self.results.values())
 
     def failed(self) -> list[str]:
@@ -39,7 +39,7 @@ class Checked:
         ]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the content of the JSON file."""
+        """Return the results as plain values, for the JSON file of `./cube check --json`."""
         hello = self.hello
         return {
             "port": self.port,
@@ -76,6 +76,6 @@ def check(wire: Wire, report: Report = lambda done, total, what: None) -> Checke
 
 
 def in_order() -> list[Rule]:
-    """Return all rules in the order of the page."""
+    """Return all rules in the order of docs/protocol.md."""
     sections = list(SECTIONS)
     return sorted(RULES.values(), key=lambda one: (sections.index(one.number[0]), one.number))

@@ -27,78 +27,91 @@ from cube_tensor_driver.device.wire.protocol import (
 from .transcript import CheckStep, FrameListener, Transcript
 
 ANSWER_S = 1.0
-"""Time, in seconds, that a hub may take to answer. The driver asks again after that."""
+"""Longest time, in seconds, that the check waits for the answer of a hub to a request. The driver
+sends a request again after this time."""
 
 GRACE_S = 0.15
-"""Time, in seconds, for which a step listens on after the answers, for answers too many."""
+"""Time, in seconds, for which the check listens on after the expected answers, so that it notices
+superfluous ones."""
 
 PERIOD_US = 40_000
-"""Sample period, in µs, that every hub can do, on any line, and in an emulator."""
+"""Sample period, in µs, of most of the check: so long that every hub keeps it, on a slow line and
+in an emulator, too."""
 
 SLOWER_US = 60_000
-"""A slower sample period, in µs, that every hub can do, too."""
+"""Longer sample period, in µs, to which the check changes while samples flow."""
 
 FAST_US = 1_000
-"""Sample period, in µs, at which the line and all buffers are soon full when nobody reads."""
+"""Shortest sample period, in µs, that the check asks for. At this period the buffers of hub and
+line are full after a moment in which the host does not read."""
 
 QUIET_S = 3.4
-"""Time, in seconds, for which a stopped hub is listened to. Three of the frames that come once a
-second arrive."""
+"""Time, in seconds, for which the check listens to a stopped hub. Three HELLOs and three STATS,
+which a hub sends once a second, arrive in it."""
 
 FLOW_S = 4.4
-"""Time, in seconds, for which samples are listened to. Three of the frames that come once a second
-arrive, and 100 samples."""
+"""Time, in seconds, for which the check listens to samples of the period `PERIOD_US` (40 ms). About
+100 samples arrive in it, and three HELLOs and STATS, which come once a second."""
 
 NEW_PERIOD_S = 0.8
-"""Time, in seconds, for which samples with a new period are listened to."""
+"""Time, in seconds, for which the check listens after a change of the sample period to 60 ms."""
 
 SECOND_S = 1.2
-"""Time, in seconds, after which a frame that comes once a second must have arrived."""
+"""Time, in seconds, in which at least one HELLO and one STATS arrive, which a hub sends once a
+second."""
 
 STOPPED_S = 0.3
-"""Time, in seconds, in which samples after a STOP would be noticed."""
+"""Time, in seconds, for which the check listens after a STOP. Of a hub that did not stop, several
+samples would arrive in it."""
 
 UNREAD_S = 3.0
-"""Time, in seconds, for which nobody reads what the hub sends."""
+"""Time, in seconds, for which the check does not read what the hub sends, so that buffers
+overflow."""
 
 SETTLE_S = 2.3
-"""Time, in seconds, that the hub has afterwards to empty its buffers and send two STATS."""
+"""Time, in seconds, for which the check reads after buffers have overflowed. A hub empties its
+buffers in it and sends two STATS."""
 
 AWAY_S = 1.5
-"""Time, in seconds, for which the port is closed."""
+"""Time, in seconds, for which the check closes the port while samples flow."""
 
 DURATION_S = 26.0
 """Approximate duration of a whole conversation, in seconds, for the progress bar."""
 
 ANY_ARGUMENT = 0xFF0D0A40
-"""An argument whose bytes Telnet, terminals and flow control treat in their own way."""
+"""Argument of requests whose argument hubs must ignore. Its bytes FF, 0D and 0A are special to
+Telnet and to terminals, so a bridge or a terminal driver that changes bytes is noticed."""
 
 BETWEEN_START_S = 0.212
-"""Time between repeated STARTs, in seconds. It is no whole number of periods, so that each START
-falls into another part of a period."""
+"""Time between two STARTs of a hub that has started, in seconds. It is no multiple of the sample
+period of 40 ms, so that each START comes at another phase of the period."""
 
 MAX_FRAMES = 200_000
-"""Number of frames after which a check gives up: far more than a hub is asked for, and they are
-kept in memory."""
+"""Largest number of frames from a hub that a check keeps in memory. It is far more than a check
+asks for; a hub that exceeds it ends the check with an error."""
 
 DAMAGED = {231: "that is cut off", 232: "with a wrong CRC", 233: "of version 2"}
-"""Request that is sent damaged -> how. No hub knows these numbers, so that an ACK tells which of
-them was taken for a valid request."""
+"""Number of a request that is sent damaged -> how it is damaged. No hub knows these numbers, so an
+ACK with one of them shows which damage the hub did not notice."""
 
 AFTER_DAMAGE = 234
-"""Unknown request that is sent behind the damaged ones."""
+"""Number of a request that no hub knows, sent intact behind the damaged requests."""
 
 AFTER_WRONG_WAY = 235
-"""Unknown request that is sent behind frames that only hubs send."""
+"""Number of a request that no hub knows, sent behind frames that only hubs send."""
 
 UNKNOWN = 236
-"""Unknown request that is sent alone."""
+"""Number of a request that no hub knows, sent alone."""
 
 N_FIRST_BYTES = 16
-"""Number of bytes of the beginning that are kept."""
+"""Number of bytes from the beginning of the connection that are kept, to recognise Telnet and
+TLS."""
 
 XON = b"\x11\0"
+"""Byte with which software flow control lets a sender continue, closed by a zero byte."""
 XOFF = b"\x13\0"
+"""Byte with which software flow control stops a sender, closed by a zero byte. A hub without flow
+control ignores it."""
 
 
 class Wire(Protocol):
@@ -129,11 +142,12 @@ class Wire(Protocol):
 
 
 Report = Callable[[float, float, str], None]
-"""Shows the progress: time done, whole time, and name of the step."""
+"""Function that shows the progress of a check. Its arguments are the time that has passed and the
+whole duration, both in seconds, and the name of the step."""
 
 
 class Conversation:
-    """Goes once through all steps of a check."""
+    """Talks to a hub: goes once through all steps of a check and notes what the hub sends."""
 
     def __init__(self, wire: Wire, report: Report) -> None:
         """Prepare the conversation.

@@ -9,11 +9,13 @@ from enum import Enum
 from .transcript import Transcript
 
 ANY_FRAME = object
-"""A value for `Rule.needs`: any frame will do."""
+"""Value in `Rule.needs` (kinds of frames without which a rule cannot be checked) for a frame of any
+kind."""
 
 
 class Outcome(str, Enum):
-    """Whether a hub keeps a rule. NOT_TRIED: the conversation does not show it."""
+    """Whether a hub keeps a rule. NOT_TRIED states that the conversation with the hub does not
+    show it."""
 
     PASSED = "passed"
     FAILED = "failed"
@@ -29,22 +31,22 @@ class RuleResult:
 
 
 def passed(text: str) -> RuleResult:
-    """Return that the rule is kept."""
+    """Return the result for a rule that the hub keeps; `text` says what was measured."""
     return RuleResult(Outcome.PASSED, text)
 
 
 def failed(text: str) -> RuleResult:
-    """Return that the rule is broken."""
+    """Return the result for a rule that the hub breaks; `text` says what came instead."""
     return RuleResult(Outcome.FAILED, text)
 
 
 def not_tried(text: str) -> RuleResult:
-    """Return why the rule could not be checked."""
+    """Return the result for a rule that could not be checked; `text` says why."""
     return RuleResult(Outcome.NOT_TRIED, text)
 
 
 Checker = Callable[[Transcript], RuleResult]
-"""Function that looks for a rule in a conversation."""
+"""Function that finds out from a conversation with a hub whether the hub keeps a rule."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +98,13 @@ def rule(
     says: str,
     needs: tuple[type, ...] = (ANY_FRAME,),
 ) -> Callable[[Checker], Checker]:
-    """Decorate a function that checks a rule, and enter the rule into `RULES`."""
+    """Decorate a function that checks a rule, and enter the rule into `RULES`.
+
+    Args:
+        number: Number of the rule on docs/protocol.md, for example S7.
+        says: The words of the page.
+        needs: Kinds of frames; without one of each, the rule is not tried.
+    """
 
     def enter(function: Checker) -> Checker:
         RULES[number] = Rule(number, says, needs, function)
@@ -106,5 +114,11 @@ def rule(
 
 
 def never_tried(number: str, says: str, why: str) -> None:
-    """Enter a rule that no conversation shows into `RULES`, with the reason."""
+    """Enter a rule into `RULES` that cannot be checked in a conversation with a hub.
+
+    Args:
+        number: Number of the rule on docs/protocol.md, for example H5.
+        says: The words of the page.
+        why: Why it cannot be checked, as the check prints it.
+    """
     rule(number, says, needs=())(lambda transcript: not_tried(why))

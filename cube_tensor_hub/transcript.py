@@ -20,7 +20,7 @@ FrameType = TypeVar(
 )
 
 REOPENING_STEP = "gone"
-"""Name of the step in which the port is closed and opened again."""
+"""Name of the step of a check in which the port is closed and opened again while samples flow."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,21 +60,21 @@ class CheckStep:
     damaged: int = 0
 
     def frames(self, kind: type[FrameType]) -> list[FrameType]:
-        """Return the frames of a kind."""
+        """Return the frames of a kind, such as `Sample`, in the order of arrival."""
         return [heard.frame for heard in self.heard if isinstance(heard.frame, kind)]
 
     @property
     def acks(self) -> list[Ack]:
-        """The ACKs that came."""
+        """ACKs (answers to requests) that came in this step, in the order of arrival."""
         return self.frames(Ack)
 
     @property
     def n_answers(self) -> int:
-        """Number of answers. Only the request for TIME is answered by a TIME instead of an ACK."""
+        """Number of answers to requests: ACKs, and TIMEs, which answer the request for TIME."""
         return len(self.acks) + len(self.frames(Time))
 
     def ack(self, request: int) -> Ack | None:
-        """Return the first ACK of a request."""
+        """Return the first ACK (answer) to a request with this number; None: there is none."""
         return next((ack for ack in self.acks if ack.request == request), None)
 
 
@@ -88,7 +88,8 @@ class Transcript:
         steps: The steps by name, in the order in which they were made.
         first_bytes: The first bytes that came, at most 16.
         damage: Counter of `Decoder` -> number of damaged runs that it counted.
-        other_version: Version of frames that are not of ours; None: there were none.
+        other_version: Protocol version of frames with a version that is not ours; None: there were
+            none.
     """
 
     port: str
@@ -110,7 +111,11 @@ class Transcript:
 
     @property
     def first_visit(self) -> list[str]:
-        """Names of the steps before the port was closed. What the kernel holds then is lost."""
+        """Names of the steps before the port was closed for the first time.
+
+        Rules that count samples use only these, because bytes that the kernel holds are lost when
+        the port is closed.
+        """
         return list(itertools.takewhile(lambda name: name != REOPENING_STEP, self.steps))
 
     @property
@@ -134,7 +139,11 @@ class FrameListener:
         self.reopen()
 
     def reopen(self) -> None:
-        """Start again after the port was opened: the first run may lack its beginning."""
+        """Forget unfinished bytes after the port was opened.
+
+        The first bytes that come then may be the end of a frame that was sent before. They do not
+        count as damaged.
+        """
         self._tail = b""
         self._is_first = True
         self._follows_frame = False

@@ -124,10 +124,10 @@ def open_storage(path: Path) -> McapReader | SqliteReader:
 
 
 def check_storage_path(path: Path) -> None:
-    """Check that a path leads to a file whose name is that of a storage file.
+    """Check that a path leads to a regular file whose name ends in .mcap or .db3.
 
     Raises:
-        BagError: It does not.
+        BagError: There is no file, it is a device or pipe, or its name has another ending.
     """
     if not path.exists():
         raise BagError(f"{path}: no such file or folder; name a bag")
@@ -153,7 +153,7 @@ def make_message(kind: str, **fields: Any) -> Any:
 
 
 def serialise(message: Any) -> bytes:
-    """Return the bytes (CDR) of a message that `make_message` made or `Bag.decode` read."""
+    """Return the bytes (CDR) of a message that `make_message` made or `Bag.decoded` read."""
     return bytes(typestore().serialize_cdr(message, message.__msgtype__))
 
 
@@ -338,7 +338,7 @@ class Bag:
         error: Exception,
         count: int = 1,
     ) -> None:
-        """Count messages that are left out, and log the first ones of each topic.
+        """Count messages that are left out because they are damaged, and log the first of a topic.
 
         Args:
             topic: Topic of the messages.
@@ -451,6 +451,7 @@ class Bag:
         shape = b""
 
         def decode_waiting() -> Iterator[tuple[Any, Times]]:
+            """Decode the collected messages together or, if one is damaged, each alone."""
             try:
                 yield decode(*waiting), np.array(times_ns)
             except MessageError:

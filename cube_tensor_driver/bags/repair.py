@@ -65,7 +65,8 @@ storage file."""
 
 
 METADATA_ROOM = 1 << 16
-"""Space, in bytes, that a repair leaves free on the disk for metadata.yaml."""
+"""Space, in bytes, that the repair of an MCAP file leaves free on a disk that is full. The bag's
+metadata.yaml, which is written after it, needs a few kB."""
 
 
 class Repaired(NamedTuple):
@@ -200,10 +201,16 @@ def _repair_mcap(path: Path, keep_rest: bool) -> tuple[int, int]:
 
 
 def _complete(path: Path, salvaged: _Salvaged) -> int:
-    """Replace everything in a file after its last complete chunk (block of messages) by a summary.
+    """Replace everything in an MCAP file after its last complete chunk by a new summary.
+
+    A chunk is a block of messages; the summary lists topics and offsets of chunks.
+
+    Args:
+        path: The MCAP file.
+        salvaged: Its complete chunks.
 
     Returns:
-        0, or the space in bytes that a disk without room must get first.
+        0 if the summary is written; otherwise the free space, in bytes, that the disk lacks for it.
     """
     # Without a buffer, a write that fails leaves nothing behind that would be written later.
     with path.open("r+b", buffering=0) as stream:
@@ -219,7 +226,10 @@ def _complete(path: Path, salvaged: _Salvaged) -> int:
 
 
 def _check_not_recorded(path: Path) -> None:
-    """Raise BagError if a process has a file open for writing: its recording would be spoilt."""
+    """Raise BagError if a process has a storage file open for writing, because it records into it.
+
+    A repair would cut off what that process writes next.
+    """
     with path.open("rb") as stream:
         # The kernel grants a read lease (fcntl(2)) only if nobody has the file open for writing.
         try:

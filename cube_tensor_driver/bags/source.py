@@ -92,7 +92,12 @@ class BagSource:
         return {"messages": self.messages, "rows": self.rows, "skipped": skipped}
 
     def skip(self, segment: Segment, error: Exception) -> None:
-        """Count the messages of a segment as left out, because they cannot be reconstructed."""
+        """Count the messages of a segment as left out instead of delivered.
+
+        Args:
+            segment: Messages of frequencies that the reconstruction refused.
+            error: Why it refused them.
+        """
         count = len(segment.messages)
         self.messages -= count
         self.rows -= len(segment.messages.rows)

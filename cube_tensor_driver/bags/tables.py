@@ -53,9 +53,10 @@ def report_write_errors(path: Path) -> Iterator[None]:
 
 
 class BufferedTable:
-    """A table of stress that is written in large parts; a context manager that completes it."""
+    """Base class of tables of stress, which collects rows (samples of cubes) to large parts."""
 
     def __init__(self, path: Path) -> None:
+        """Prepare the table; `path` is the file or folder that errors name."""
         self._path = path
         self._waiting: list[StressRows] = []
         self._waiting_rows = 0
@@ -74,13 +75,14 @@ class BufferedTable:
             self._flush()
 
     def _flush(self) -> None:
+        """Write all collected rows (samples of cubes) as one part of the table."""
         if self._waiting:
             with report_write_errors(self._path):
                 self._append(concatenate(self._waiting))
         self._waiting, self._waiting_rows = [], 0
 
     def _append(self, rows: StressRows) -> None:
-        """Write rows as one part of the table."""
+        """Write rows (samples of cubes) as one part of the table; subclasses override it."""
         raise NotImplementedError
 
 

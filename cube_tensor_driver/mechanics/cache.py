@@ -26,7 +26,8 @@ MAX_CACHE_BYTES = 1 << 30
 removed."""
 
 _CONTENT = "content"
-"""Name of the array in each cached file that lists the other arrays with their types and shapes."""
+"""Name of the array in each cached file that lists the file's other arrays with their types and
+shapes, by which a file that has lost an array is recognised."""
 
 _CODE = (
     "mechanics/layer.py",
@@ -119,7 +120,7 @@ def _load(path: Path) -> Arrays | None:
 
 
 def _describe(arrays: Arrays) -> AnyArray:
-    """Return name, type and shape of each array, as texts."""
+    """Return name, type and shape of each array as an array of texts, such as "one <f8 (300,)"."""
     return np.array([f"{name} {one.dtype.str} {one.shape}" for name, one in arrays.items()])
 
 

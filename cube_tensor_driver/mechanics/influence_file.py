@@ -26,10 +26,13 @@ MAX_INTEGER = 30_000
 integers; their rounding error is a tenth of the error of the finite elements."""
 
 _NUMBERS = ("pad_size", "side", "depth", "thickness", "poisson", "step")
+"""Names of the arrays of a file of influence functions that hold one number each."""
 _TABLES = ("positions", "normals", "place", "pads")
+"""Names of the arrays of a file of influence functions that hold tables of numbers."""
 
 _PARSE_ERRORS = (OSError, KeyError, TypeError, ValueError)
-"""Errors for a file that cannot be read, lacks an array, or has one of another type or shape."""
+"""Errors of a file of influence functions that cannot be read, lacks an array, or has an array of
+another type or shape."""
 
 
 def write_influence(

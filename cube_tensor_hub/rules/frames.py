@@ -9,7 +9,8 @@ from ..rule import RuleResult, failed, not_tried, passed, rule
 from ..transcript import Transcript
 
 OVERFULL = ("unread", "gone")
-"""Steps in which damaged frames are checked by S9: buffers overflow there."""
+"""Names of the steps of a check in which buffers overflow. Damaged frames there are for rule S9
+(a full buffer) to report."""
 
 
 @rule("F1", "A sender puts a zero before and behind each frame.")

@@ -12,23 +12,25 @@ from ..rule import RuleResult, failed, never_tried, not_tried, passed, rule
 from ..transcript import CheckStep, Heard, Transcript
 
 MAX_BEHIND_ACK_S = 0.3
-"""Time, in seconds, after an ACK within which a HELLO counts as its answer. A later one may be the
-HELLO that comes once a second."""
+"""Longest time, in seconds, from the ACK of request 1 (hello) to the HELLO that answers it. A later
+HELLO may be one of those that a hub sends once a second without a request."""
 
 MAX_FIRST_HELLO_S = 0.9
-"""Time, in seconds, after power-up within which a HELLO is not yet one of those once a second."""
+"""Longest time, in seconds, from power-up of a hub to its first HELLO. A later one would be the
+first of those that a hub sends once a second."""
 
 MAX_PADS = 32
-"""Number of bits in the mask of pad faults."""
+"""Largest number of pads of a cube, which is the number of bits in the mask of pad faults of a
+SAMPLE."""
 
 
 def once_a_second(heard: list[Heard], name: str, what: str) -> str:
-    """Return what is wrong with frames that must come once a second, empty if nothing is.
+    """Return what is wrong with the times of frames that must come once a second; "" if nothing is.
 
     Args:
         heard: The frames.
-        name: Their name.
-        what: State of the hub, in words.
+        name: Name of the frames, such as HELLO, for the text.
+        what: State of the hub, such as "while stopped", for the text.
     """
     if len(heard) < 3:
         return f"{len(heard)} {name} {what} in a time in which 3 were due"
@@ -66,7 +68,10 @@ def hello_is_behind_ack(step: CheckStep) -> bool:
 
 
 def is_late_after_power_up(transcript: Transcript) -> bool:
-    """Return whether the power came on while the port was open, and HELLO only a second later."""
+    """Return whether a hub that was switched on during the check sent no HELLO at power-up.
+
+    The moment of power-up follows from the uptime in STATS.
+    """
     stats = of_kind(transcript, Stats, "opened")
     hellos = of_kind(transcript, Hello, "opened")
     if not stats or not isinstance(stats[0].frame, Stats):

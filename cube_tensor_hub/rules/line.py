@@ -17,7 +17,8 @@ TLS_RECORD = b"\x15\x03"
 """Beginning of the alert that a TLS server sends to a client that does not speak TLS."""
 
 MIN_TAKEN_SHARE = 0.7
-"""Share of the samples that are due while the port is closed, below which the hub has stopped."""
+"""Smallest ratio of the samples that a hub took while its port was closed to those that were due in
+this time. Below it, the hub has stopped sampling."""
 
 
 @rule("L1", "no flow control, neither RTS/CTS nor XON/XOFF")

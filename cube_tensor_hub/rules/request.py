@@ -13,23 +13,25 @@ from ..transcript import CheckStep, Transcript
 from .sample import first_frames, periods_us
 
 MAX_SHIFT = 0.1
-"""Largest shift of samples that a busy machine can cause, as a share of the period."""
+"""Largest shift of the sampling times, as a share of the sample period, that is taken for the delay
+of a hub on a busy machine. A larger one means that a request has moved the samples."""
 
 PERIOD_TOLERANCE = 0.01
-"""Largest relative difference between the period in force and the measured one."""
+"""Largest relative difference between the sample period that a hub states and the median of the
+measured ones."""
 
 MIN_PERIODS = 3
-"""Number of periods that a rule about them needs."""
+"""Smallest number of measured sample periods from which a rule draws a conclusion."""
 
 
 def in_force(step: CheckStep) -> int:
-    """Return the period that the hub answered, in µs; 0: it did not answer."""
+    """Return the sample period in the ACK of SET_PERIOD in a step, in µs; 0: there was no ACK."""
     ack = step.ack(Command.SET_PERIOD)
     return 0 if ack is None else ack.argument
 
 
 def behind_ack(step: CheckStep, request: int) -> list[Sample]:
-    """Return the samples behind the first ACK of a request."""
+    """Return the samples of a step that came behind the first ACK (answer) to a request."""
     frames = [heard.frame for heard in step.heard]
     for at, frame in enumerate(frames):
         if isinstance(frame, Ack) and frame.request == request:
@@ -66,7 +68,7 @@ def one_ack_each(transcript: Transcript) -> RuleResult:
 
 
 def words(numbers: list[int]) -> str:
-    """Return numbers as a list in a sentence."""
+    """Return numbers as text for a sentence, such as "1, 3", or "none"."""
     return ", ".join(map(str, numbers)) or "none"
 
 
@@ -116,7 +118,7 @@ def period_is_kept(transcript: Transcript) -> RuleResult:
 
 
 def _other_period(transcript: Transcript) -> str:
-    """Return what is wrong with the period in a HELLO, empty if nothing is."""
+    """Return where a HELLO states another sample period than the ACK before it; "" if none does."""
     period_us = 0
     for name in transcript.first_visit:
         step = transcript.steps[name]
@@ -202,7 +204,7 @@ def start_and_stop_again(transcript: Transcript) -> RuleResult:
 
 
 def phases(samples: list[Sample], period_us: int) -> Array:
-    """Return the position of each sample within the period, 0 to 1."""
+    """Return the phase (0 to 1) of the device time of each sample within the sample period."""
     times = [sample.device_us for sample in first_frames(samples)]
     return np.array(times) % max(1, period_us) / max(1, period_us)
 
@@ -225,7 +227,10 @@ def new_period_at_once(transcript: Transcript) -> RuleResult:
 
 @rule("R8", "After power-up a hub has stopped, until START.")
 def stopped_until_start(transcript: Transcript) -> RuleResult:
-    """Samples before START are wrong if the power came on after the port was opened."""
+    """Check that a hub that was switched on, or restarted, during the check sends no samples.
+
+    If it was switched on before the check, samples may be those of an earlier START.
+    """
     restarted = transcript.frames(Stats, "back")
     visit = transcript.frames(Stats, *transcript.first_visit)
     if restarted and visit and restarted[-1].uptime_ms < visit[-1].uptime_ms:

@@ -20,31 +20,33 @@ from ..transcript import Transcript
 from .hello import frames_per_sample, of_kind, once_a_second
 
 HALF = 1 << 31
-"""Half of the range of sequence numbers."""
+"""Half of the number of different sequence numbers of samples, which have 32 bits."""
 
 MAX_STATS_GAP_S = 2.5
-"""Time between two STATS, in seconds, above which the hub has waited. A hub on a busy machine is
-not so slow."""
+"""Largest difference of the uptimes in two successive STATS, in seconds, which a hub sends once a
+second. A larger one means that the hub has waited for the host to read."""
 
 MIN_TAKEN_SHARE = 0.1
-"""Share of the samples that are due below which the hub has waited."""
+"""Smallest ratio of the samples that a hub took while the host did not read to those that were due.
+Below it, the hub has waited for the host to read."""
 
 MAX_UPTIME_DIFFERENCE_S = 5.0
-"""Largest difference between device time and uptime, in seconds: both count from power-up."""
+"""Largest difference between the device time in SAMPLE and the uptime in STATS, in seconds. Both
+count from power-up, but a hub may start them one after the other."""
 
 MIN_MILLIHERTZ = 10_000_000
-"""Frequency, in mHz, below which the median of all pads has another unit: no oscillator of a pad is
-so slow."""
+"""Smallest credible median of the frequencies of all pads, in mHz (10 kHz). Oscillators of pads run
+at 50 kHz and more, so a smaller number has another unit, for example Hz."""
 
 MAX_FREQUENCY_RATIO = 2.0
-"""Largest ratio of two frequencies of a pad during a check, of the median pad. A press changes them
-by less; a wrong order of bytes by more."""
+"""Largest credible ratio of the highest to the lowest frequency of a pad during a check, as the
+median over the pads. A press changes a frequency by less, bytes in the wrong order by more."""
 
 NOT_MEASURED = 0xFFFFFFFF
 """Frequency that some firmware sends for a pad that was not measured, instead of 0."""
 
 MIN_DRIFT_SAMPLES = 20
-"""Number of samples that a comparison of the clocks needs."""
+"""Smallest number of samples from which the rates of the clocks of hub and host are compared."""
 
 
 def forward(later: int, earlier: int) -> int:
@@ -70,7 +72,7 @@ def periods_us(samples: list[Sample]) -> Array:
 
 
 def sample_rate(samples: list[Sample]) -> float:
-    """Return the median rate of samples by their device time, in Hz; 0 if it is not known."""
+    """Return the median rate of samples by their device times, in Hz; 0 if it is not known."""
     gaps = periods_us(samples)
     median = float(np.median(gaps)) if len(gaps) else 0.0
     return 1e6 / median if median > 0 else 0.0

@@ -13,14 +13,14 @@ from .hello import of_kind
 from .request import in_force
 
 MAX_RATE_DIFFERENCE = 0.02
-"""Largest relative difference between the clocks of hub and host. It is wide, because S2 checks the
-rate of the hub's clock."""
+"""Largest relative difference between the rates of the clocks of hub and host in the rules about
+TIME. It is wide, because rule S2 checks the rate of the hub's clock exactly."""
 
 RESOLUTION_S = 2e-6
 """Sum of the rounding errors of two TIMEs, in seconds."""
 
 NOT_KNOWN = "this hub does not know request 6: see T4"
-"""Why rules about TIME are not tried."""
+"""Reason, as the check prints it, why rules about TIME are not tried."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def time_exchanges(transcript: Transcript, state: str) -> list[TimeExchange]:
 
 
 def knows_time(transcript: Transcript) -> bool:
-    """Return whether the hub has ever sent a TIME."""
+    """Return whether the hub has sent a TIME during the check, which answers request 6."""
     return bool(transcript.frames(Time))
 
 

@@ -52,10 +52,10 @@ FIND_PERIOD_S = 0.2
 """Time, in seconds, between two searches for publishers of the topics to record."""
 
 MAX_CONNECT_S = 3.0
-"""Longest time, in seconds, from the connection to the first publisher until messages are kept.
+"""Longest time, in seconds, from the connection to the first publisher until recording begins.
 
-Recording begins as soon as every topic is connected to a publisher, so that the stress of all
-recorded frequencies is recorded, too. Topics without a publisher are not waited for any longer.
+Recording begins as soon as every topic to record is connected to a publisher, so that each recorded
+stress has its frequencies in the bag, too. After this time it begins without the other topics.
 """
 
 SHOW_PERIOD_S = 1.0
@@ -142,7 +142,9 @@ class Recorder:
             self._begin(now)
 
     def _begin(self, now: float) -> None:
-        """Drop what came before all topics were connected, and write from now on.
+        """Drop the messages that came before all topics were connected, and write from now on.
+
+        Messages of latched topics, which come only once, are kept.
 
         Args:
             now: Time of the monotonic clock, in seconds.
