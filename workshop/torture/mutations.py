@@ -278,10 +278,11 @@ def _never_release(
     found: Any,
     came: Any,
 ) -> None:
-    # `_recent` holds the conditions of the last windows, the newest first. They must not age.
+    # `_recent` holds the conditions of the present window (row 0) and of those before it. What was
+    # known becomes a condition of the window that ends, so that it does not age.
     kept = conditions.state | found
     original(conditions, found, came)
-    conditions._recent[0] |= kept
+    conditions._recent[1] |= kept
 
 
 def _use_bad_pads(
@@ -302,6 +303,12 @@ def _undo_tare(original: Any, reconstructor: Any, *arguments: Any) -> Any:
     rest = original(reconstructor, *arguments)
     reconstructor.rest_frequency, reconstructor.rest_changes = before
     return rest
+
+
+def _lengthen_windows() -> None:
+    """Let windows of statistics last 2 s, and the latest row twice as long."""
+    _replace("core.health.health", "WINDOW_NS", lambda _: 2_000_000_000)()
+    _replace("core.health.health", "MAX_BACKWARD_NS", lambda _: 4_000_000_000)()
 
 
 def _lose_silently() -> None:
@@ -396,7 +403,7 @@ RECONSTRUCTION: dict[str, Patch] = {
     # A pad is never used again.
     "for ever": _wrap("core.health.diagnosis:Conditions", "end_window", _never_release),
     # Windows of statistics last 2 s.
-    "slow": _replace("core.health.health", "WINDOW_NS", lambda _: 2_000_000_000),
+    "slow": _lengthen_windows,
     # The mask of pads that are left out is 0.
     "no mask": _change_stress(left_out=np.zeros_like),
     # The mask of pads that are left out names the next pad.
