@@ -47,17 +47,19 @@ The ratio can be above 1, because a bag may be recorded from a replay at several
 """
 
 MAX_DEPTH_RATIO = 10
-"""Largest allowed ratio of the number of a cube's samples in one frame (time step) to the usual.
+"""Largest allowed ratio of the number of a cube's samples in one frame (time step) to the number
+that follows from the sample rate.
 
 Every frame of a data set has room for as many samples as the fullest frame. If wrong stamps put
 many samples into one frame, the size of the whole data set would be multiplied.
 """
 
 ALWAYS_ALLOWED_COUNT = 100
-"""Number of frames (time steps) of an episode, and of samples of a cube in a frame, that is allowed
-in addition to what `MAX_STAMP_RATIO` and `MAX_DEPTH_RATIO` allow.
+"""Number that is added to the largest allowed number of frames (time steps) of an episode, and to
+that of samples of a cube in one frame.
 
-In a short recording, a few late samples would already exceed these ratios.
+In a short recording, a few late samples would already exceed what the ratios `MAX_STAMP_RATIO` and
+`MAX_DEPTH_RATIO` allow.
 """
 
 Report = Callable[[float, float, str], None]

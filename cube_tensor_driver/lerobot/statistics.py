@@ -20,8 +20,9 @@ QUANTILES = {
 the values that lie below it."""
 
 MAX_SAMPLE_ROWS = 20_000
-"""Approximate number of rows of a feature from which its quantiles in the whole data set are
-computed. Quantiles, unlike means, require all values in memory, so the rows are chosen at random.
+"""Approximate number of rows of a feature (column of a data set) from which its quantiles in the
+whole data set are computed. Quantiles, unlike means, require all values in memory, so they are
+computed from rows that are chosen at random.
 """
 
 
@@ -47,7 +48,7 @@ class Statistics:
         self._sample: list[Array] = []
 
     def add(self, rows: AnyArray) -> None:
-        """Add n rows of the feature to the statistics.
+        """Add n rows (values of the feature, such as one per frame) to the statistics.
 
         Args:
             rows: (n, …) values, n at least 1. NaN and infinite values are left out. All calls must

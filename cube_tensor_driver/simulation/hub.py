@@ -39,8 +39,8 @@ _BUFFER_SIZE = 5000
 hub's counters); it is constant."""
 
 _UINT32_MASK = 0xFFFFFFFF
-"""Mask that reduces a counter of the simulation, which does not wrap around, to 32 bits, which the
-counters in the frames (messages of a hub) have."""
+"""Mask of the lowest 32 bits of a counter. Counters in the frames (messages of a hub) have 32 bits
+and wrap around; those of the simulation do not."""
 
 
 @dataclass
@@ -178,7 +178,7 @@ class SimulatedHub:
             frequency: Frequencies (cubes, pads) in mHz.
 
         Returns:
-            The SAMPLE frame.
+            The SAMPLE frame (message with one sample of all pads).
         """
         self._log_sample()
         sequence = self.sequence & _UINT32_MASK

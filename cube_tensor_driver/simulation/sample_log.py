@@ -136,7 +136,8 @@ class SampleLog:
             raise ConfigError(
                 f"{path}: {error.strerror}; a simulator writes its sample log when it ends"
             ) from None
-        except (ValueError, TypeError, KeyError) as error:  # other JSON, or another version
+        # A file with other JSON, or of another version, raises one of these errors.
+        except (ValueError, TypeError, KeyError) as error:
             raise ConfigError(f"{path}: no sample log of this version ({error!r})") from None
 
     @classmethod

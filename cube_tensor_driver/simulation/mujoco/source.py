@@ -239,11 +239,11 @@ class MujocoSkin:
         rows: Index,
         side: int,
     ) -> Touch | None:
-        """Return the contact of one pair of bodies; None if it is not on the side of the cubes.
+        """Return the contact of one pair of bodies; None if no force presses on the skin's surface.
 
         Args:
             part: Body of the skin and its cubes.
-            rows: Contact points of the pair in MuJoCo's list.
+            rows: Numbers (n,) of the contact points of the pair in MuJoCo's list.
             side: 0 if the body with the skin is the first of the two bodies, 1 if it is the second.
                 MuJoCo's contact forces act on the second one.
         """
