@@ -19,16 +19,18 @@ from cube_tensor_driver.simulation.cubes import HubCubes
 from cube_tensor_driver.simulation.load import AnyLoad, LoadMemory
 
 COUNTER_HZ = 25_000_000
-"""Frequency of the counter of the board, in Hz."""
+"""Frequency of the counter with which the emulated board (MPS2-AN386) measures pads, in Hz."""
 
 WINDOW_US = 2_500
-"""Length of a measuring window, in µs."""
+"""Length of the window in which the emulated board counts the periods of all pads, in µs."""
 
 EDGES = np.dtype([("first", "<u2"), ("last", "<u2"), ("periods", "<u2")])
 """Captures of one pad: ticks of the counter from the beginning of the window to the first and to
 the last edge, and the number of periods between these two."""
 
 _QUESTION = struct.Struct("<IQI")
+"""Layout of the bytes with which the emulated hub asks for captures: number of the question, device
+time of the middle of the window in µs, and CRC-32 of both."""
 
 
 def edges(
@@ -110,6 +112,11 @@ class Oscillators:
                 line.sendall(self.answer(data))
 
     def _edges(self, middle_us: int) -> NDArray[np.void]:
+        """Return what the counter captures of all pads in one measuring window.
+
+        Args:
+            middle_us: Device time of the middle of the window, in µs.
+        """
         stress, gradient = self._memory.at(middle_us)
         # Boards have no common clock with the pads, so that the first edge comes at any phase.
         millihertz = self.hub.frequency(stress, gradient, middle_us * 1e-6).ravel()

@@ -195,6 +195,7 @@ class Conversation:
         return self._transcript
 
     def _requests(self) -> None:
+        """Send all kinds of requests and bytes that are no requests to a stopped hub."""
         self._ask("stop", Request(Command.STOP))
         self._ask("quiet", seconds=QUIET_S)
         self._ask(
@@ -213,6 +214,7 @@ class Conversation:
         self._send_bytes("XON", XON, Command.STOP)
 
     def _samples(self) -> None:
+        """Start the hub, start it again, change its sample period, and stop it."""
         self._ask("impossible period", Request(Command.SET_PERIOD, 0))
         self._ask("after impossible period", Request(Command.HELLO))
         self._ask("period", Request(Command.SET_PERIOD, PERIOD_US))
@@ -229,6 +231,7 @@ class Conversation:
         self._ask("start after stop", Request(Command.START), seconds=SECOND_S)
 
     def _host_that_does_not_read(self) -> None:
+        """Let buffers overflow without reading, then close and open the port."""
         self._ask("fast", Request(Command.SET_PERIOD, FAST_US), seconds=SECOND_S)
         # At this rate the buffers overflow while nobody reads.
         self._begin("unread")
@@ -241,6 +244,7 @@ class Conversation:
         self._ask("back", Request(Command.HELLO), seconds=SECOND_S)
 
     def _leave_as_found(self) -> None:
+        """Stop the hub, open its port once more, and restore its sample period."""
         self._ask("end", Request(Command.STOP))
         # A hub that was stopped when its port was closed must not send samples to the next host.
         self._begin("gone while stopped")
@@ -289,6 +293,7 @@ class Conversation:
         self._listen(GRACE_S)
 
     def _begin(self, name: str, *requests: Request) -> CheckStep:
+        """Begin a step; what comes from now on belongs to it."""
         now = self._wire.now()
         done = min(now - self._begin_s, DURATION_S)
         self._report(done, DURATION_S, name.rstrip(" 0123456789"))

@@ -17,16 +17,16 @@ PACKAGES = {
     "arm-none-eabi-gcc": "gcc-arm-none-eabi libnewlib-arm-none-eabi",
     "qemu-system-arm": "qemu-system-arm",
 }
-"""Program -> Debian packages that contain it."""
+"""Program that builds or runs the firmware -> Debian packages that contain it."""
 
 MACHINE = "mps2-an386"
-"""The board that QEMU emulates."""
+"""Name of the board (Cortex-M4) that QEMU emulates, as its option -M takes it."""
 
 ANY_ADDRESS = ("127.0.0.1", 0)
-"""An address of this machine, with any free TCP port."""
+"""TCP address of this machine with port 0, for which the kernel chooses a free port."""
 
 MAX_END_S = 2.0
-"""Time, in seconds, that QEMU may take to end; then it is killed."""
+"""Longest time, in seconds, from the signal SIGTERM to the end of QEMU; after it QEMU is killed."""
 
 
 class FirmwareError(CubeError):

@@ -10,11 +10,11 @@ from cube_tensor_driver.core.errors import LinkError
 from cube_tensor_driver.device.links.link import Link, LinkConfig
 
 RETRY_PERIOD_S = 0.01
-"""Period, in seconds, of the attempts to open a port."""
+"""Time, in seconds, between two attempts to open the port of a hub."""
 
 MAX_REOPEN_S = 5.0
-"""Time, in seconds, for which opening the port again is tried. A board on USB that restarts when
-its port is opened is away for some seconds."""
+"""Longest time, in seconds, for which the check tries to open a port again that it has closed. The
+port of a board on USB that restarts when it is opened is missing for some seconds."""
 
 
 class PortWire:

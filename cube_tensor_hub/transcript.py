@@ -167,6 +167,12 @@ class FrameListener:
         return heard
 
     def _hear_run(self, run: bytes, at_s: float) -> list[Heard]:
+        """Decode one run of bytes between two zeros, and note the zeros before it.
+
+        Args:
+            run: The bytes, without zeros.
+            at_s: Time on the host's clock at which their last byte had come, in seconds.
+        """
         opened = self._opening_zeros > 0 if self._follows_frame else None
         frames = self.decoder.feed(run + b"\0")
         # The first run may be the end of a frame that was sent before the port was opened.

@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from cube_tensor_driver.simulation.cubes import HubCubes
 
 OUT = ROOT / ".cube" / "firmware"
-"""Folder for what is built."""
+"""Folder for the built firmware, inside of the checkout."""
 
 SOURCE = ROOT / "firmware"
-"""Folder of the sources."""
+"""Folder of the C sources of the firmware."""
 
 EMULATED_HUB = (4, 8)
-"""Number of cubes of the emulated hub, and of pads of each cube."""
+"""Number of cubes of the emulated hub, and number of pads of each of them."""
 
 
 def arguments(parser: Parser) -> None:

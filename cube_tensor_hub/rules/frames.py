@@ -44,6 +44,7 @@ def goes_on_behind_damage(transcript: Transcript) -> RuleResult:
 
 @rule("F3", "A frame that goes the wrong way, or that nobody waits for, is ignored.")
 def ignores_the_wrong_way(transcript: Transcript) -> RuleResult:
+    """Check that frames which only hubs send are not answered, and a request behind them is."""
     step = transcript.steps["wrong way"]
     if step.ack(AFTER_WRONG_WAY) is None:
         return failed("no answer to a request behind frames that only hubs send")
@@ -55,6 +56,7 @@ def ignores_the_wrong_way(transcript: Transcript) -> RuleResult:
 
 @rule("F4", "Flags and spare bytes are sent as 0")
 def flags_are_0(transcript: Transcript) -> RuleResult:
+    """Check the bytes of HELLO and SAMPLE that version 1 of the protocol does not use."""
     flags = [hello.flags for hello in transcript.frames(Hello) if hello.flags]
     if flags:
         return failed(f"flags of HELLO are 0x{flags[0]:02x}")

@@ -88,6 +88,7 @@ def is_late_after_power_up(transcript: Transcript) -> bool:
     needs=(),
 )
 def hello_comes(transcript: Transcript) -> RuleResult:
+    """Check the HELLOs (descriptions of the hub) at power-up, on request, and once a second."""
     if not transcript.first_bytes and not transcript.is_tcp:
         return not_tried("nothing came: see L2")
     if not any(transcript.heard()):
@@ -105,6 +106,7 @@ def hello_comes(transcript: Transcript) -> RuleResult:
 
 @rule("H2", "All other uids of a hub differ", needs=(Hello,))
 def uids_differ(transcript: Transcript) -> RuleResult:
+    """Check that the uids (unique numbers) of hub and cubes are unique and stay the same."""
     hellos = transcript.frames(Hello)
     hubs = list(dict.fromkeys(hello.hub_uid for hello in hellos))
     if len(hubs) > 1:
@@ -127,6 +129,7 @@ def uids_differ(transcript: Transcript) -> RuleResult:
 
 @rule("H3", "A hub has 1 to 32 pads per cube", needs=(Hello,))
 def pads_fit_the_mask(transcript: Transcript) -> RuleResult:
+    """Check the number of pads in each HELLO; the mask of pad faults has 32 bits."""
     for hello in transcript.frames(Hello):
         if hello.n_cubes and not 1 <= hello.n_pads <= MAX_PADS:
             return failed(f"HELLO says {hello.n_pads} pads per cube")

@@ -31,6 +31,7 @@ def no_flow_control(transcript: Transcript) -> RuleResult:
 
 @rule("L2", "must send while DTR is set", needs=())
 def sends_while_dtr_is_set(transcript: Transcript) -> RuleResult:
+    """Check that anything comes from a serial port, whose DTR line the check has set."""
     if transcript.is_tcp:
         return not_tried("TCP has no DTR")
     if not transcript.first_bytes:
@@ -41,6 +42,7 @@ def sends_while_dtr_is_set(transcript: Transcript) -> RuleResult:
 
 @rule("L3", "The bytes are those of a serial port and nothing else: no Telnet, no TLS.", needs=())
 def nothing_but_the_bytes(transcript: Transcript) -> RuleResult:
+    """Check that a TCP connection does not begin with bytes of Telnet or TLS."""
     if not transcript.is_tcp:
         return not_tried("this is no TCP link")
     first = transcript.first_bytes

@@ -79,6 +79,7 @@ def words(numbers: list[int]) -> str:
     needs=(Ack,),
 )
 def arguments_that_are_0(transcript: Transcript) -> RuleResult:
+    """Check argument and result of the ACKs (answers) of all requests but SET_PERIOD."""
     acks = [ack for ack in transcript.frames(Ack) if ack.request != Command.SET_PERIOD]
     for ack in acks:
         if ack.argument:
@@ -98,6 +99,7 @@ def arguments_that_are_0(transcript: Transcript) -> RuleResult:
     needs=(Ack, Hello),
 )
 def period_is_kept(transcript: Transcript) -> RuleResult:
+    """Check that ACK, HELLO and samples agree on the sample period."""
     ack = transcript.steps["period"].ack(Command.SET_PERIOD)
     if ack is None or ack.result == Result.REFUSED:
         return not_tried(f"the hub did not take a period of {PERIOD_US} µs")
@@ -141,6 +143,7 @@ def _other_period(transcript: Transcript) -> str:
     needs=(Ack, Hello),
 )
 def impossible_period(transcript: Transcript) -> RuleResult:
+    """Check that a sample period of 0 changes nothing, whether the hub has started or not."""
     ack = transcript.steps["impossible period"].ack(Command.SET_PERIOD)
     if ack is None:
         return not_tried("request 4 was not answered: see R1")
@@ -177,6 +180,7 @@ never_tried("R5", "A HELLO with a period that is neither the one asked for", "a 
     needs=(Ack,),
 )
 def start_and_stop_again(transcript: Transcript) -> RuleResult:
+    """Check that a second START or STOP is answered 0 (done) and moves no sample."""
     # START is sent three times, at different places within a period.
     again = [name for name in transcript.steps if name.startswith("start again")]
     asked = [(Command.START, name) for name in again]
@@ -211,6 +215,7 @@ def phases(samples: list[Sample], period_us: int) -> Array:
 
 @rule("R7", "A new period counts at once, also while samples flow.", needs=(Sample, Ack))
 def new_period_at_once(transcript: Transcript) -> RuleResult:
+    """Check the times of the samples behind the ACK of a new sample period."""
     period_us = in_force(transcript.steps["slower"])
     if not period_us or period_us == in_force(transcript.steps["period"]):
         return not_tried("the hub did not take another period")

@@ -173,6 +173,7 @@ def drift_of(host: Array, device: Array) -> tuple[float, float, float]:
     needs=(Sample,),
 )
 def frames_of_a_sample(transcript: Transcript) -> RuleResult:
+    """Check the frames of samples that do not fit one frame: order, split and device time."""
     samples = transcript.frames(Sample, *transcript.first_visit)
     if len({sample.first_cube for sample in samples}) == 1:
         return not_tried("each sample of this hub fits one frame")
@@ -243,6 +244,7 @@ def drops_are_counted(transcript: Transcript) -> RuleResult:
     needs=(Hello, Sample),
 )
 def samples_fit_hello(transcript: Transcript) -> RuleResult:
+    """Check that the samples have the pads and cubes that HELLO states, each cube once."""
     hello: Hello | None = None
     seen: set[tuple[int, int]] = set()
     for heard in transcript.heard(*transcript.first_visit):
@@ -331,6 +333,7 @@ def taken_is_the_next_number(transcript: Transcript) -> RuleResult:
 
 @rule("S8", "A hub sends STATS once a second, started or not.", needs=(Hello,))
 def stats_come(transcript: Transcript) -> RuleResult:
+    """Check that STATS (counters of the hub) come once a second, started or not."""
     for name, what in (("quiet", "while stopped"), ("start", "while started")):
         wrong = once_a_second(of_kind(transcript, Stats, name), "STATS", what)
         if wrong:
@@ -344,6 +347,7 @@ def stats_come(transcript: Transcript) -> RuleResult:
     needs=(Sample, Stats),
 )
 def full_buffer(transcript: Transcript) -> RuleResult:
+    """Check that a hub whose host does not read drops whole samples and does not wait."""
     step = transcript.steps["unread"]
     # Damage in other steps comes from the line and says nothing about the buffer.
     if sum(other.damaged for other in transcript.steps.values()) > step.damaged:

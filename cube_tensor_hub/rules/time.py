@@ -17,7 +17,8 @@ MAX_RATE_DIFFERENCE = 0.02
 TIME. It is wide, because rule S2 checks the rate of the hub's clock exactly."""
 
 RESOLUTION_S = 2e-6
-"""Sum of the rounding errors of two TIMEs, in seconds."""
+"""Largest sum of the rounding errors of two times on the hub's clock, in seconds; TIME has a
+resolution of 1 µs."""
 
 NOT_KNOWN = "this hub does not know request 6: see T4"
 """Reason, as the check prints it, why rules about TIME are not tried."""
@@ -87,6 +88,7 @@ def clock_is_read_between(transcript: Transcript) -> RuleResult:
 
 @rule("T2", "Each sound request 6 gets one TIME with the request's argument, started or not.")
 def one_time_each(transcript: Transcript) -> RuleResult:
+    """Check that each request for TIME has one answer, with the number of the request."""
     if not knows_time(transcript):
         return not_tried(NOT_KNOWN)
     for step in transcript.steps.values():
@@ -131,6 +133,7 @@ def clock_of_samples(transcript: Transcript) -> RuleResult:
     "A hub that does not know request 6 answers it with ACK and result 1, as any unknown request.",
 )
 def unknown_time(transcript: Transcript) -> RuleResult:
+    """Check how a hub answers that does not know the request for TIME."""
     if knows_time(transcript):
         return not_tried("this hub knows request 6")
     ack = transcript.steps["time stopped 0"].ack(Command.TIME)
