@@ -33,7 +33,7 @@ def run(options: argparse.Namespace) -> int:
                 print(to_json(item))
             else:
                 print(f"{to_yaml(item)}---")
-        # Without this, Python would hold messages back if stdout is a pipe.
+        # Without flushing, Python would hold messages back if stdout is a pipe.
         sys.stdout.flush()
     return 0
 

@@ -25,8 +25,11 @@ PROGRAM = "./cube"
 """Name of the program in help texts and error messages."""
 
 BROKEN_PIPE = 141
-"""Exit code if the reader of stdout has closed the pipe: 128 plus the number of the signal SIGPIPE,
-by which other programs end then."""
+"""Exit code if the reader of the standard output has closed the pipe, as in `./cube topics | head`.
+
+It is 128 plus the number of the signal SIGPIPE: shells report it for programs that this signal has
+ended.
+"""
 
 RESEND_S = 0.01
 """Time, in seconds, from a Ctrl-C that Python has lost until SIGINT is sent again."""

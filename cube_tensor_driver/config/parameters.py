@@ -69,7 +69,7 @@ class Parameter(NamedTuple):
         if self.span is not None:
             low, high = self.span
             is_zero = self.minimum is not None and value == 0
-            # NaN fails this comparison, too.
+            # The comparison is false for NaN, so that NaN is refused, too.
             if not (is_zero or (self.minimum or low) <= value <= high):
                 allowed = f"{low:g} to {high:g}"
                 if self.minimum:
@@ -85,7 +85,7 @@ AUTOSTART = Parameter(
     "With true the node configures and activates itself when it starts. With false it waits for "
     "lifecycle transitions.",
 )
-"""Parameter of every node."""
+"""Declaration of the ROS parameter `autostart`, which every node of this package has."""
 
 RELIABILITY = Parameter(
     "qos_reliability",
@@ -93,7 +93,7 @@ RELIABILITY = Parameter(
     "Reliability (quality of service) of the topics `frequencies`, `stress` and `forces`.",
     choices="reliable, best_effort",
 )
-"""Parameter of the nodes `driver` and `reconstruction`."""
+"""Declaration of the ROS parameter `qos_reliability` of the nodes `driver` and `reconstruction`."""
 
 FRAME_PREFIX = Parameter(
     "frame_prefix",
@@ -101,7 +101,7 @@ FRAME_PREFIX = Parameter(
     "Text in front of the frame ids of the skin and its cubes, such as left_ for one of two skins "
     "with the same skin file.",
 )
-"""Parameter of the nodes `driver` and `reconstruction`."""
+"""Declaration of the ROS parameter `frame_prefix` of the nodes `driver` and `reconstruction`."""
 
 DRIVER = (
     AUTOSTART,
@@ -138,7 +138,7 @@ DRIVER = (
     ),
     RELIABILITY,
 )
-"""Parameters of the node `driver`, which reads the hubs."""
+"""Declarations of the ROS parameters of the node `driver`, which reads the hubs."""
 
 RECONSTRUCTION = (
     AUTOSTART,
@@ -193,7 +193,8 @@ RECONSTRUCTION = (
         live=True,
     ),
 )
-"""Parameters of the node `reconstruction`, which computes stress from frequencies."""
+"""Declarations of the ROS parameters of the node `reconstruction`, which computes stress tensors
+from the frequencies of pads."""
 
 SKIN_SUBSCRIBER = (
     AUTOSTART,
@@ -204,7 +205,7 @@ SKIN_SUBSCRIBER = (
         span=(0.1, 100.0),
     ),
 )
-"""Parameters that the nodes `markers` and `contacts` have in common."""
+"""Declarations of the ROS parameters that the nodes `markers` and `contacts` have in common."""
 
 MARKERS = (
     *SKIN_SUBSCRIBER,
@@ -227,7 +228,8 @@ MARKERS = (
         "With true the principal stresses of each cube are drawn as three crossing lines.",
     ),
 )
-"""Parameters of the node `markers`, which draws the skin for RViz and Foxglove."""
+"""Declarations of the ROS parameters of the node `markers`, which draws the skin for RViz and
+Foxglove."""
 
 CONTACTS = (
     *SKIN_SUBSCRIBER,
@@ -275,4 +277,5 @@ CONTACTS = (
         problem=influence_problem,
     ),
 )
-"""Parameters of the node `contacts`, which computes positions and forces of contacts."""
+"""Declarations of the ROS parameters of the node `contacts`, which computes positions and forces of
+contacts."""

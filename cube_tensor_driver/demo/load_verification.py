@@ -214,7 +214,7 @@ class LoadVerification:
         measured = []
         for time_ns in times_ns:
             rows = np.flatnonzero(taken_ns == time_ns)
-            # There is one row of every cube.
+            # At these times there is a row of every cube, so all values are set.
             values = np.empty((self._n_cubes, len(COMPONENTS)))
             values[cube[rows]] = components[rows]
             contacts = surface.contacts(values, CONTACT_PRESSURE)
@@ -246,7 +246,7 @@ class LoadVerification:
         """
         first = comparison.first
         cube = self._stress.columns()[0]
-        # The empty array is for the case that nothing has arrived.
+        # `np.concatenate` needs at least one array, also if no message has arrived.
         no_components = np.empty((0, len(COMPONENTS)))
         components = np.concatenate([no_components, *self._components])
         return cube[first], components[first], comparison.taken_ns

@@ -34,7 +34,8 @@ if TYPE_CHECKING:
 __all__ = ["DemoResult", "Interrupted", "watch"]
 
 MAX_START_S = 20.0
-"""Maximum time, in seconds, from the start until a tensor of every cube must have arrived."""
+"""Maximum time, in seconds, from the start of the demo's processes until a stress tensor of every
+cube must have arrived."""
 
 CHECK_PERIOD_S = 1.0
 """Period, in seconds, at which a demo without measurement checks that no other skin publishes in
@@ -312,7 +313,8 @@ class SkinWatcher:
         from .usage import Usage
 
         spin = self._observer.spin
-        # Otherwise it could count tensors of another skin that is found later.
+        # The measurement begins when DDS (the middleware of ROS 2) has found all nodes, because
+        # otherwise it could count tensors of another skin that is found later.
         spin(self._made_s + ANNOUNCE_S - time.monotonic())
         start_ns = time.time_ns()
         usage = Usage(self._children, MEASURED_NODES)

@@ -10,7 +10,8 @@ from contextlib import contextmanager
 from ..core.errors import ConfigError
 
 VARIABLE = "ROS_DOMAIN_ID"
-"""Environment variable with the number of the DDS domain."""
+"""Name of the environment variable with the number of the DDS domain. ROS nodes find only nodes of
+their own domain."""
 
 RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 """Environment variable that states where ROS nodes search for each other, such as LOCALHOST."""
@@ -53,7 +54,11 @@ def check_domain() -> None:
 
 
 def is_domain_used() -> bool:
-    """Return whether a node of this host seems to run in the domain of ROS_DOMAIN_ID."""
+    """Return whether a ROS node of this host runs in the DDS domain of this process.
+
+    It looks at the UDP port that the first node of a domain uses. The result is wrong if that node
+    has ended while others run, or if another program uses the port.
+    """
     socket_of_first = _bind(int(os.environ.get(VARIABLE) or 0), PARTICIPANT_OFFSET)
     if socket_of_first is not None:
         socket_of_first.close()

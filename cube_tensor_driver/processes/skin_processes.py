@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 Value = str | float | bool
-"""Value of a ROS parameter of a node."""
+"""Type of the value of a ROS parameter."""
 
 RECORDED = ("frequencies", "stress", "info", "driver/info", "/diagnostics")
 """Topics of a skin that `./cube record` records by default.

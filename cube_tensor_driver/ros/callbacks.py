@@ -15,8 +15,8 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 
 MAX_CHARACTERS = 1000
-"""Maximum number of characters of a text in a response that quotes the request, so that a request
-of megabytes is not answered and logged with megabytes."""
+"""Maximum number of characters of a text that a service returns and logs. A longer text is cut: it
+quotes the request of a client, which may have megabytes."""
 
 LOG_PERIOD_S = 5.0
 """Minimum time, in seconds, between two log messages about errors that occur repeatedly."""
@@ -96,7 +96,7 @@ def explain_failure(request: Any, response: Any, reason: str) -> Any:
 
 
 def shorten(text: str) -> str:
-    """Return a text for a response or a log; of a text above `MAX_CHARACTERS` its beginning."""
+    """Return a text as it is; of one above `MAX_CHARACTERS` its beginning and its length."""
     if len(text) <= MAX_CHARACTERS:
         return text
     return f"{text[:MAX_CHARACTERS]}… ({len(text)} characters)"

@@ -54,7 +54,7 @@ RECORD_QOS = _CONFIG / "record_qos.yaml"
 """Path of the file that lists the recorded topics and the quality of service (QoS) of each."""
 
 PARAMETERS = {parameter.name: parameter for parameter in (*RECONSTRUCTION, *DRIVER)}
-"""Name of a parameter of the nodes `driver` and `reconstruction` -> the parameter."""
+"""Name of a ROS parameter of the nodes `driver` and `reconstruction` -> its declaration."""
 
 NEEDED_PACKAGES = {
     "rviz": ("rviz2", "robot_state_publisher"),

@@ -63,8 +63,8 @@ have to wait that long for the lock whenever the main thread computes.
 GC_THRESHOLDS = (20_000, 20, 20)
 """Thresholds of the three generations of Python's garbage collector (`gc.set_threshold`).
 
-Processing a scan leaves no cyclic garbage. With the default of 700 new objects the collector would
-run at every scan or every second one for nothing.
+Processing a scan (one sample of every cube) leaves no cyclic garbage. With the default threshold of
+700 new objects the collector would run at every scan or every second one without finding any.
 """
 
 Entity = TypeVar("Entity", Publisher, Subscription, Timer, Service)

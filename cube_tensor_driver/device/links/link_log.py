@@ -62,7 +62,8 @@ class LinkLogger:
         self._allowed = float(MAX_BURST)
         self._updated_at = clock()
         self._reported_left_out = 0
-        # Clock time until which further silences are left out, and whether the last one was.
+        # Time of `clock` until which further silences (no samples come) are left out of the log,
+        # and whether the last silence was left out.
         self._silences_until = -math.inf
         self._left_out_silence = False
 

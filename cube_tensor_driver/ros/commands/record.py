@@ -217,7 +217,7 @@ class Recorder:
             while not is_last:
                 is_last = self._closing.wait(WRITE_PERIOD_S)
                 with self._lock:
-                    # Without a beginning, all that has come is better than nothing.
+                    # If the topics were never all connected, the messages that have come are kept.
                     if self.has_begun or is_last:
                         self._write_waiting()
                     if time.monotonic() - flushed >= FLUSH_PERIOD_S:

@@ -318,7 +318,7 @@ class Taring:
                 f"no cube {', '.join(map(repr, unknown))} in the skin; "
                 f"its cubes: {', '.join(self._skin.names)}"
             )
-        # A name that is repeated counts once, as each cube means writing a file.
+        # A cube that is named repeatedly is tared once, because each tare writes a file.
         return list({index[name]: None for name in names or index})
 
     def _keep_tares(self, cubes: list[int], rest: Array) -> str:
