@@ -20,8 +20,9 @@ from ..core.modes import STRESS
 from .layer import FIELD
 
 Orders = NDArray[np.int64]
-"""Array of the orders m of circular components: a rotation of the frame by an angle multiplies a
-component of order m by exp(-i m angle)."""
+"""Array of the orders m of circular components. A circular component of order m is a combination of
+stresses and gradients that a rotation of the frame about z by an angle multiplies by exp(-i m
+angle)."""
 
 
 def _define_components() -> tuple[Complex, Orders]:
@@ -71,7 +72,8 @@ def _define_components() -> tuple[Complex, Orders]:
 
 CIRCULAR_FROM_FIELD, ORDERS = _define_components()
 """Matrix (14, 24) from the stresses and gradients `FIELD` to the circular components, and the order
-m (14,) of each component: rotating the frame by an angle multiplies it by exp(-i m angle)."""
+m (14,) of each one. A circular component is a combination of stresses and gradients that a rotation
+of the frame about z by an angle multiplies by exp(-i m angle)."""
 
 FIELD_FROM_CIRCULAR = np.linalg.pinv(
     np.concatenate([CIRCULAR_FROM_FIELD.real, CIRCULAR_FROM_FIELD.imag])
@@ -86,7 +88,7 @@ Row vectors are multiplied from the left: ``parts @ FIELD_FROM_CIRCULAR``.
 def sum_rotated(
     circular: NDArray[np.complex64], rotation: NDArray[np.complexfloating]
 ) -> tuple[Array, Array]:
-    """Sum fields that are given as circular components in rotated frames.
+    """Sum the stresses and gradients of several loads, given as circular components.
 
     Args:
         circular: Circular components (N, L, 14) of L fields at N cubes, each in its own frame.

@@ -46,7 +46,8 @@ _AIRY_COMPONENTS = ((0, 1, 1, 1.0), (1, 0, 0, 1.0), (5, 0, 1, -1.0))
 the two axes of the derivative, and its sign: xx = g_yy, yy = g_xx, xy = -g_xy."""
 
 _THIRD_DERIVATIVES = ((0, 0, 0), (0, 0, 1), (0, 1, 1), (1, 1, 1))
-"""Axes (0: x, 1: y) of the four different third derivatives in a plane: xxx, xxy, xyy, yyy."""
+"""Axes (0: x, 1: y) of the four different third derivatives of the Airy function g (file
+head) along the surface: xxx, xxy, xyy, yyy."""
 
 
 def field(

@@ -40,8 +40,9 @@ from .layer import Layer
 from .spectra import layer_spectra, tabulate_bessel
 
 CONTACT_SIZES = np.geomspace(0.1, 5.0, 23)
-"""Radii of the tabulated round contacts, divided by the depth of the cubes. Other radii are rounded
-to the nearest one; within the range, this changes them by at most 10 %."""
+"""Radii of the tabulated round contacts, divided by the depth of the cubes' centres below the
+surface. Other radii are rounded to the nearest one; within the range, this changes them by at most
+10 %."""
 
 GRID_STEP = 1 / 16
 """Step of the grid of the polygon tables, in asinh(d) and in asinh(t / sqrt(1 + d**2)). d is the
@@ -52,8 +53,8 @@ function asinh makes the grid fine near the cube and coarse far away."""
 MAX_LEG_RATIO = 50.0
 """Largest tabulated t / sqrt(1 + d**2). d is the distance of the line through a polygon's edge from
 the point of the surface above the cube, t the length along this line from its nearest point, both
-divided by the depth of the cubes. Longer edges are cut off there, because traction
-farther away hardly causes any stress at the cube."""
+divided by the depth of the cubes' centres. Longer edges are cut off there, because traction farther
+away hardly causes any stress at the cube."""
 
 _LAST_DISTANCE = REACH_DEPTHS * POINTS_PER_DEPTH
 """Index of the largest tabulated distance between a round contact and a cube."""
@@ -71,8 +72,8 @@ _GRID_COLUMNS = 2 * _CENTRE_COLUMN + 1
 through a polygon's edge. t is negative on one side of the point that is nearest to the cube."""
 
 _ORIGIN_TOLERANCE = 1e-12
-"""Length of a polygon's edge, divided by the depth of the cubes, below which the edge counts as a
-point and has no effect. The limit avoids a division by 0."""
+"""Length of a polygon's edge, divided by the depth of the cubes' centres below the surface, below
+which the edge counts as a point and has no effect. The limit avoids a division by 0."""
 
 
 class _ContactTables:
@@ -137,7 +138,7 @@ class _ContactTables:
 
 
 class DiscTables(_ContactTables):
-    """Tables of round contacts for cubes at one depth in a layer.
+    """Tables of the stress under round contacts, for cubes at one depth in a layer.
 
     The first set-up for a depth takes a second or two; cache.py keeps the tables.
     """
@@ -232,7 +233,10 @@ class DiscTables(_ContactTables):
 
 
 class PolygonTables(_ContactTables):
-    """Tables of right triangles, of which polygons are sums, for cubes at one depth in a layer.
+    """Tables of the stress under right triangles of traction, for cubes at one depth in a layer.
+
+    The traction is uniform or turns about the point of the surface above the cube. Every polygon is
+    a sum of such triangles (file head).
 
     The first set-up for a depth takes a second or two; cache.py keeps the tables.
     """

@@ -34,37 +34,41 @@ from .spectra import BesselTable, Spectra, layer_spectra, tabulate_bessel
 
 PRIOR_LENGTHS = (0.2, 0.8)
 """Correlation lengths of the random traction that serves as prior, divided by the depth of the
-cubes. They are close to the pair of lengths with the smallest errors for contacts of 2 to 20 mm in
-a half space at a depth of 5 mm."""
+cubes' centres below the surface. They are close to the pair of lengths with the smallest errors for
+contacts of 2 to 20 mm in a half space at a depth of 5 mm."""
 
 SHEAR_RATIO = 0.5
 """Prior standard deviation of the shear traction along x and along y, divided by the prior standard
 deviation of the pressure."""
 
 DISC_SIZES = np.geomspace(0.1, 5.0, 44)
-"""Radii of the tabulated round contacts (discs), divided by the depth of the cubes. The error of
-the interpolation between them in `Kernels.response` is at most a hundredth of the largest value; it
-is largest for wide discs."""
+"""Radii of the tabulated round contacts (discs), divided by the depth of the cubes' centres below
+the surface. The error of the interpolation between them in `Kernels.response` is at most a
+hundredth of the largest value; it is largest for wide discs."""
 
 POINTS_PER_DEPTH = 32
-"""Number of tabulated distances between load and cube per length of one depth of the cubes. The
-error of the cubic interpolation between them is 1e-4 of the largest value."""
+"""Number of tabulated distances between load and cube per length of one depth (of the cubes'
+centres below the surface). The error of the cubic interpolation between them is 1e-4 of the largest
+value."""
 
 REACH_DEPTHS = 20
-"""Largest tabulated distance from a load to a cube, divided by the depth of the cube. Responses and
-covariances at larger distances count as zero."""
+"""Largest tabulated distance along the surface from a load to a cube, divided by the depth of the
+cubes' centres below the surface. Responses and covariances at larger distances count as zero."""
 
 _OBSERVED = np.array([FIELD.index(name) for name in COMPONENTS])
-"""Indices (15,) in `FIELD` (24 stresses and gradients) of the `COMPONENTS` that cubes measure."""
+"""Indices (15,) of the `COMPONENTS` that cubes measure (six stresses, nine gradients of normal
+stresses) in `FIELD`, the names of all 24 stresses and gradients."""
 
 _IS_GRADIENT = np.arange(len(COMPONENTS)) >= len(STRESS)
 """Whether each of the 15 `COMPONENTS` is a gradient in Pa/m; the others are stresses in Pa."""
 
 _FIELD_ZZ = FIELD.index("zz")
-"""Index in `FIELD` of the stress zz, whose negative is the pressure."""
+"""Index in `FIELD` (names of 24 stresses and gradients) of the stress zz, the negative pressure."""
 
 _CIRCULAR_ZZ = int(np.argmax(CIRCULAR_FROM_FIELD[:, _FIELD_ZZ].real))
-"""Index of the circular component that is the stress zz alone."""
+"""Index of the circular component that is the stress zz alone. A circular component is a
+combination of stresses and gradients that only changes its phase if the frame is rotated about
+z."""
 
 
 class MeasurementModel(NamedTuple):

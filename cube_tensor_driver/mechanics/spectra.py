@@ -43,12 +43,13 @@ BesselTable = Callable[[int], Array]
 distances r (one for each position) and wavenumbers k (one for each wave)."""
 
 MAX_WAVENUMBER_TIMES_DEPTH = 25.0
-"""Upper limit of integrals over the wavenumber k, multiplied by the depth of the cubes' centres. At
-this depth, the stress of a wave with this wavenumber has decayed by a factor of about exp(-25)."""
+"""Upper limit of integrals over the wavenumber k of traction on the surface, multiplied by the
+depth of the cubes' centres below the surface. At this depth, the stress under a wave of traction
+with this wavenumber has decayed by a factor of about exp(-25)."""
 
 N_WAVENUMBERS = 256
 """Number of Gauss points in integrals over the wavenumber k. They resolve the Bessel functions
-J(k r) up to distances r of 20 depths of the cubes."""
+J(k r) up to distances r from the load of 20 depths (of the cubes' centres below the surface)."""
 
 
 @dataclass(frozen=True, eq=False)
