@@ -3,16 +3,20 @@
 #include <math.h>
 #include <string.h>
 
-/* The compiler also makes a version with the vector instructions of AVX2, and the loader chooses.
- * Both give the same bits. LANES states that the passes of a loop do not depend on each other. */
-#if defined(__x86_64__) && defined(__GLIBC__) && !defined(__clang__) && !defined(__SANITIZE_ADDRESS__)
-#define CLONES __attribute__((target_clones("avx512f", "avx2", "default")))
+/* On x86, GCC also makes versions with the vector instructions of AVX-512 and AVX2, and the loader
+ * chooses one. All give the same bits. LANES states that the passes of a loop are independent. */
+#if defined(__GNUC__) && !defined(__clang__)
 #define INLINE static inline __attribute__((always_inline))
 #define LANES _Pragma("GCC ivdep") _Pragma("GCC unroll 1")
+#if defined(__x86_64__) && defined(__GLIBC__) && !defined(__SANITIZE_ADDRESS__)
+#define CLONES __attribute__((target_clones("avx512f", "avx2", "default")))
+#endif
 #else
-#define CLONES
 #define INLINE static inline
 #define LANES
+#endif
+#ifndef CLONES
+#define CLONES
 #endif
 
 /* Bits of core/status.py, and limits of core/health/statistics.py. */

@@ -48,10 +48,11 @@ from .rows import FrequencyRows, StressRows
 from .status import INVALID, STAMP
 
 MAX_CACHED_ESTIMATORS = 1024
-"""Maximum number of estimators and matrices (from the pads of a cube to components of stress) for
-cubes with bad pads that are kept in memory.
+"""Maximum number of matrices, from the stresses on the pads of a cube to components of stress, that
+are kept in memory for cubes with bad pads.
 
-There is one for each combination of a calibration and a set of bad pads that has occurred.
+There is one for each pair of a calibration and a set of bad pads that has occurred. If there is no
+room for another one, all of them are removed.
 """
 
 MIN_BETA = 1e-12
@@ -63,24 +64,34 @@ strain of the pad by 1e-12.
 """
 
 NO_KEY = np.iinfo(np.int64).max
-"""Key (see `Tables.keys`) of the places for tables that are not used yet; larger than any other."""
+"""Entry of `Tables.keys` (calibration and bad pads of each matrix) where no matrix is stored yet.
+
+It is larger than any other entry, so that the entries stay in rising order.
+"""
 
 UNKNOWN = np.iinfo(np.uint16).max
-"""Cube number that stands for all numbers that no cube of a skin can have."""
+"""Cube number that replaces all numbers below 0 or above 65534, because the kernel (the loop over
+rows) takes numbers of 16 bits. No skin has a cube with this number."""
 
 
 class Watch(Protocol):
-    """The health of the pads, which the rows update while their stress is computed."""
+    """The health of the pads, as `Pipeline.process` updates it with each row of frequencies."""
 
     @property
     def sums(self) -> HealthState:
-        """State that the kernel changes."""
+        """Sums and times of the present window of 0.5 s, which the kernel changes."""
 
     def advance(self) -> None:
-        """End the present window, because the next scan lies outside it, and start another."""
+        """End the present window of 0.5 s, because the next scan lies outside, and open another."""
 
     def find_conditions(self, tables: Tables, columns: Columns, row: int) -> None:
-        """Find conditions of pads that a row and the next ones of its scan show."""
+        """Add the conditions of pads that a row and all later rows of its scan show.
+
+        Args:
+            tables: Tables of the skin.
+            columns: Rows of frequencies.
+            row: Number of the row.
+        """
 
 
 class Pipeline:

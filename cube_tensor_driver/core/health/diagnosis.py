@@ -83,7 +83,8 @@ The shift is measured from the mean frequency at the time at which the cube came
 
 
 SHOWN = OPEN | SHORT | RANGE | REPORTED
-"""Conditions of a pad that a single row (sample of a cube) shows."""
+"""Conditions of a pad, as a bit mask, that a single row (sample of a cube) shows: open, short, out
+of range, reported by the device. All others need the statistics of a window of 0.5 s."""
 
 
 class Conditions:
@@ -93,6 +94,12 @@ class Conditions:
     """
 
     def __init__(self, sums: HealthState, exists: Mask) -> None:
+        """Start without conditions.
+
+        Args:
+            sums: State of the kernel, whose masks and conditions of cubes are kept up to date.
+            exists: Whether each cube has each pad (cubes, P).
+        """
         self._sums = sums
         # Row 0 holds the conditions found in the present window, the next rows those of the windows
         # before it.
@@ -107,9 +114,10 @@ class Conditions:
         return state
 
     def add(self, cube: Index, bits: StatusBits) -> None:
-        """Add conditions that rows of the present window show.
+        """Add conditions that rows of the present window of 0.5 s show.
 
-        Only the first condition of a pad in a window is added: a broken pad shows it in every row.
+        Only the first one of a pad in a window is added, because a broken pad shows its condition
+        in every row, and the kernel asks only for the first.
 
         Args:
             cube: Numbers of different cubes (n,).

@@ -66,7 +66,8 @@ class Health:
 
     Attributes:
         pipeline: Pipeline with the calibrations and the rest frequencies.
-        sums: State that the kernel changes with each row.
+        sums: Sums and times of the present window, which the kernel (the loop over rows of
+            frequencies) changes with each row.
         high_residual: Whether the residual of a cube is high by `has_high_residual` (cubes,).
         history: Statistics of the last `HISTORY_WINDOWS` windows that have ended.
         closed: Number of windows that have ended so far.
@@ -83,8 +84,9 @@ class Health:
         self.high_residual = np.zeros(n_cubes, bool)
         self.history: deque[Window] = deque(maxlen=HISTORY_WINDOWS)
         self.closed = 0
-        # Number of rows before the present window since the last call of `collect` (negative if
-        # that was within this window), and whether the residual was high since.
+        # Number of rows of each cube from the last call of `collect` to the begin of the present
+        # window; negative if the call was within this window. And whether the residual was high
+        # since that call.
         self._uncollected_rows = np.zeros(n_cubes, int)
         self._had_high_residual = np.zeros(n_cubes, bool)
         self.refresh()
@@ -171,9 +173,9 @@ class Health:
         """Add the conditions OPEN, SHORT, RANGE and REPORTED that rows of one scan show.
 
         Args:
-            tables: Tables of the skin.
-            columns: Rows.
-            row: Number of the first row that shows a condition, and of its scan on.
+            tables: Tables of the skin, with the number of pads of each calibration.
+            columns: Rows of frequencies.
+            row: Number of the first row to check; all rows of its scan after it are checked, too.
         """
         is_end = columns.cube[row + 1 :] <= columns.cube[row:-1]
         count = int(np.argmax(is_end)) if is_end.any() else len(is_end)
@@ -215,5 +217,5 @@ class Health:
         self._conditions.end_window(found, window.rows > 0)
 
     def _set_bound(self) -> None:
-        """Set the limit to which squared second differences are cut in the next window."""
+        """Set the limit to which squared second differences of a frequency are cut from now on."""
         self.sums.pads("bound")[:] = np.nan_to_num(self._diagnosis.bound)

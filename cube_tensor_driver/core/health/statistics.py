@@ -110,7 +110,7 @@ def make_state(rest_frequency: Array) -> HealthState:
 
 
 def clear_sums(state: HealthState) -> None:
-    """Set all sums to zero, to start a new window."""
+    """Start a new window: set all sums, counts and gaps of the state to zero, in place."""
     for name in ("first_squares", "second_squares", "bounded_squares", "sum"):
         state.pads(name)[:] = 0
     state.pads("lowest")[:] = np.inf
@@ -120,7 +120,7 @@ def clear_sums(state: HealthState) -> None:
 
 
 def make_window(state: HealthState) -> Window:
-    """Return the statistics of the present window so far."""
+    """Compute the statistics of the rows that the present window has so far."""
     rows = state.cubes["rows"]
     count = np.maximum(rows, 1)[:, None]
     base, lowest, highest = (state.pads(name) for name in ("base", "lowest", "highest"))

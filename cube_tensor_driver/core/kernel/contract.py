@@ -1,7 +1,7 @@
 """Arrays that the kernel reads and writes, in the order in which it takes them.
 
 The kernel computes stress from the frequencies of rows (samples of one cube), and adds the rows to
-the sums from which the health of the pads is found. It exists in C (native/cube_scan.c) and in
+the sums from which the health of the pads is judged. It exists in C (native/cube_scan.c) and in
 numpy (`rows.py`), with the same bits. N is the number of rows, C that of the cubes of the skin, P
 the largest number of pads of a cube. "real" is the precision of the computation, float32 or
 float64.
@@ -17,25 +17,39 @@ from numpy.typing import NDArray
 from ..arrays import AnyArray, Array, Mask, PadMasks, Real, Single, StatusBits, Times
 
 BLOCK = 16
-"""Number to a multiple of which the columns of each matrix are padded with zeros, because the
-kernel in C computes this number of outputs side by side."""
+"""Number of outputs (15 components of stress and gradient, then residuals) that the kernel in C
+computes side by side.
+
+The columns of each matrix from pad stresses to outputs are padded with zeros to a multiple of it.
+"""
 
 Numbers = NDArray[np.int32]
-"""Numbers of calibrations or tables."""
+"""Numbers, from 0 on, of calibrations or of matrices, which index other arrays."""
 
 DONE = -1
-"""Request of the kernel: none, all rows are processed."""
+"""Result of the kernel (the loop over rows of frequencies): all rows are processed."""
 
 NEEDS_WINDOW = -2
-"""Request of the kernel: the next scan lies outside the present window of health; open another."""
+"""Result of the kernel (the loop over rows of frequencies) that stops before a scan whose newest
+time stamp lies outside the present window of 0.5 s over which the health of pads is judged.
+
+The caller ends this window, opens another, and calls the kernel again from that scan on.
+"""
 
 NEEDS_CONDITION = -3
-"""Request of the kernel: a pad of the next row has an impossible frequency, or the device reports a
-fault of it, and no condition of this pad was found in the present window yet; find it."""
+"""Result of the kernel (the loop over rows of frequencies) that stops before a row with a pad that
+is broken by its frequency or by the report of the device, for the first time in a window of 0.5 s.
+
+The caller finds the condition of the pad (open, short, out of range or reported), and calls the
+kernel again from that row on.
+"""
 
 UNKNOWN_CUBE = -4
-"""Request of the kernel: the next row has the number of a cube that the skin does not have; skip
-it. If health is asked for, any such row ends the call before a row is processed."""
+"""Result of the kernel (the loop over rows of frequencies) that stops before a row with the number
+of a cube that the skin does not have.
+
+If the health of pads is updated, the kernel stops before the first row, and no row is processed.
+"""
 
 CUBE_STATE = np.dtype(
     {
@@ -56,11 +70,15 @@ CUBE_STATE = np.dtype(
     },
     align=True,
 )
-"""State of the health of one cube: newest time stamp and interval between the newest two rows, in
-ns; longest gap before and within the present window, in ns; number of rows in the window, and of
-those with a residual above its limit; masks of the pads that are not used, and of those with a
-condition that a row of the window showed; temperature in °C; conditions of all pads; and whether
-the newest time stamp is doubtful."""
+"""Layout in memory of the state of one cube from which the health of its pads is judged.
+
+Fields: newest time stamp and interval between the newest two rows, in ns; longest interval of at
+least `GAP_NS` before the first row of the present window of 0.5 s and within the window, in ns;
+number of rows in the window, and of those with a residual above its limit; bit masks of the pads
+that are not used, and of those for which a row of the window showed a condition; temperature in °C;
+conditions of all pads together; and whether the newest time stamp is doubtful. The struct
+cube_state in C has the same layout.
+"""
 
 PAD_QUANTITIES = (
     "last",
@@ -76,31 +94,38 @@ PAD_QUANTITIES = (
     "low",
     "high",
 )
-"""Quantities in the state of the health of a pad, in their order: newest frequency and difference
-to the one before; the sums of `statistics.py` over the present window; lowest and highest frequency
-in it; the frequency that is subtracted before summing; the limit of squared second differences; and
-the limits of the possible frequencies, in Hz."""
+"""Names of the quantities that the kernel keeps of each pad, in their order in memory.
+
+They are the newest frequency f and its difference to the one before, in Hz; the sums over the
+present window of 0.5 s of squared first differences, of squared second differences, of these cut to
+the limit "bound", and of f minus "base"; the lowest and highest f in the window, in Hz; "base", the
+frequency without load at the start of the program, in Hz; "bound", in Hz²; and the limits of the
+frequencies that are possible, in Hz.
+"""
 
 
 class Tables(NamedTuple):
-    """Tables of a skin: what the stress of a row is computed from.
+    """Arrays from which the stress of a row (sample of one cube) is computed.
 
-    A table of rows (pad stresses to outputs) belongs to a calibration and a set of bad pads. The
-    first G tables are those of the G calibrations without bad pads.
+    There is one matrix for each of the G calibrations without bad pads, and after these one for
+    each pair of a calibration and a set of bad pads that has occurred; T is their number. D is the
+    degree of the temperature models, K the number of outputs of a matrix, E the number of places
+    for matrices with bad pads.
 
     Attributes:
         calibration: Number of the calibration of each cube (C,).
         pads: Number of pads of each calibration (G,).
         rest: Frequencies without load (C, P), in Hz; NaN where a cube has no such pad.
-        highest: Upper limits of the frequencies by the pad law (C, P), in Hz; likewise.
+        highest: Upper limits of the frequencies by the pad law (C, P), in Hz; NaN likewise.
         reference: Reference temperature of each calibration (G,), in °C; NaN without a model.
         coefficients: Coefficients of the temperature models (G, D, P), in 1/K^d, the linear first.
         matrix: Maps (T, P, K) from v (pad stress / stiffness) to outputs: 15 components, then
             residuals whose sum of squares is chi-square / degrees of freedom, then zeros.
         limit: Limits of the residual (T,).
         observed: Bit masks of the components that the pads determine (T,).
-        keys: Calibration * 2**32 + mask of the bad pads, of each table with bad pads, rising (E,).
-        numbers: Number of the table of each key (E,).
+        keys: Number of the calibration * 2**32 + bit mask of the bad pads, for each matrix with
+            bad pads, in rising order (E,).
+        numbers: Number of the matrix of each key (E,).
     """
 
     calibration: Numbers
@@ -117,12 +142,13 @@ class Tables(NamedTuple):
 
 
 class HealthState(NamedTuple):
-    """State of the health of a skin, which the kernel changes with each row.
+    """State from which the health of the pads is judged; the kernel changes it with each row.
 
     Attributes:
         words: Memory of `cubes` (C, 8), because numpy passes no structured arrays to C.
         quantities: Quantities of each pad (12, C, P), in the order of `PAD_QUANTITIES`.
-        window_ns: Begin and end of the present window, and newest time stamp of the last scan (3,).
+        window_ns: Begin and end of the present window of 0.5 s, and newest time stamp of the last
+            scan (3,), in ns.
     """
 
     words: Times
@@ -136,7 +162,7 @@ class HealthState(NamedTuple):
         return view
 
     def pads(self, name: str) -> Single:
-        """Return the quantity of all pads (C, P) with a name of `PAD_QUANTITIES`, as a view."""
+        """Return one quantity of all pads (C, P), as a view; `PAD_QUANTITIES` has the names."""
         view: Single = self.quantities[PAD_QUANTITIES.index(name)]
         return view
 
@@ -151,7 +177,8 @@ class Columns(NamedTuple):
         pad_fault: Bit masks of the pads that the device reports as broken (N,).
         stamp_ns: Time stamps (N,), in ns.
         doubt: Status bits (N,) of which STAMP (doubtful time stamp) is used.
-        known: Whether `Results` already hold the mask and conditions of a row (N,); None: no row.
+        known: Whether `left_out` and `status` of `Results` hold the health of a row before the call
+            (N,); None stands for False in all rows.
     """
 
     cube: NDArray[np.uint16]
@@ -163,16 +190,16 @@ class Columns(NamedTuple):
     known: Mask | None
 
     def select(self, rows: slice) -> Columns:
-        """Return some of the rows."""
+        """Return the columns of some successive rows, as views."""
         columns = (None if column is None else column[rows] for column in self)
         return Columns(*columns)  # type: ignore[arg-type]
 
 
 class Results(NamedTuple):
-    """Columns of N rows that the kernel writes; `StressRows` defines them.
+    """Columns of N rows (samples of one cube) that the kernel writes; `StressRows` defines them.
 
-    Where the health is not found, `left_out` and `status` must hold the mask of pads and the
-    conditions before the call.
+    Before a call, `left_out` and `status` must hold the mask of the pads that are not used and the
+    conditions of the pads, for all rows whose health is not judged in this call.
     """
 
     stress: Real
@@ -183,5 +210,5 @@ class Results(NamedTuple):
     left_out: PadMasks
 
     def select(self, rows: slice) -> Results:
-        """Return some of the rows, as views."""
+        """Return the columns of some successive rows, as views."""
         return Results(*(column[rows] for column in self))  # type: ignore[arg-type]

@@ -1,7 +1,7 @@
 """The kernel in numpy: the specification to read, and the kernel where no C compiler was.
 
-The rows of one scan (at most one row of each cube) are processed together; the kernel in C takes
-one row after the other. Both give the same bits on every processor, because each operation is one
+The rows of one scan (at most one row of each cube) are processed together; the kernel in C takes up
+to 32 rows of a scan. Both give the same bits on every processor, because each operation is one
 of + - * / sqrt, which IEEE 754 rounds correctly, and the terms of a sum are added in a fixed order.
 A matrix product of numpy (BLAS) would choose the order by processor and shape.
 """
@@ -29,10 +29,14 @@ from .contract import (
 )
 
 N_COMPONENTS = len(COMPONENTS)
+"""Number of components of stress and its gradient in a row of results: 15."""
 
 MAX_ROWS = 4096
-"""Maximum number of rows that are processed together where their health is not found, so that one
-matrix for each of them fits into memory."""
+"""Maximum number of rows (samples of one cube) that numpy computes together.
+
+Each row takes a copy of the matrix of its cube, up to 6 kB, so the copies take up to 25 MB. Where
+the health of pads is judged, a scan (at most one row per cube) is computed at a time instead.
+"""
 
 
 def run(
@@ -43,7 +47,10 @@ def run(
     columns: Columns,
     results: Results,
 ) -> tuple[int, int]:
-    """Process rows, scan by scan; `run.run` states arguments and results."""
+    """Process rows of frequencies until the caller has to do something.
+
+    Arguments and results are those of the function `run` in `kernel/run.py`.
+    """
     unknown = np.flatnonzero(columns.cube[start:] >= len(tables.calibration))
     if health is not None and len(unknown):
         return start, UNKNOWN_CUBE
@@ -126,13 +133,25 @@ def mask_bits(tables: Tables, calibration: Numbers, mask: PadMasks) -> Mask:
 
 
 def pack_bits(bits: Mask) -> PadMasks:
-    """Convert truth values (..., count) to bit masks (...); value p becomes bit p of a mask."""
+    """Convert truth values (..., count) to bit masks (...), for up to 32 values.
+
+    Value p becomes bit p of a mask.
+    """
     weights = np.uint32(1) << np.arange(bits.shape[-1], dtype=np.uint32)
     masks: PadMasks = (bits * weights).sum(axis=-1, dtype=np.uint32)
     return masks
 
 
 def _is_in_window(health: HealthState, columns: Columns, scan: slice) -> bool:
+    """Return whether the newest time stamp of a scan lies in the present window of 0.5 s.
+
+    The newest time stamp is also stored in the state.
+
+    Args:
+        health: State of the health, with begin and end of the window.
+        columns: Rows of frequencies.
+        scan: The rows of the scan.
+    """
     begin_ns, end_ns, _ = health.window_ns.tolist()
     newest_ns = int(columns.stamp_ns[scan].max())
     health.window_ns[2] = newest_ns
@@ -147,18 +166,19 @@ def _process(
     columns: Columns,
     results: Results,
 ) -> tuple[int, int]:
-    """Process the rows of one scan up to the first with a request.
+    """Process the rows of one scan, up to the first for which the caller has to do something.
 
     Args:
-        scan: The rows.
-        n_residuals: Number of outputs that are residuals.
+        scan: The rows of the scan (at most one row of each cube).
+        n_residuals: Number of outputs of a matrix that are residuals.
         tables: Tables of the skin.
-        health: State of the health, or None.
-        columns: Rows to process.
-        results: Rows to write.
+        health: State of the health, which is changed; None: health is not judged.
+        columns: All rows of frequencies.
+        results: All rows of stress to write.
 
     Returns:
-        As `run`.
+        Number of the first row that is not processed, and what the caller has to do: `DONE`,
+        `NEEDS_CONDITION`, or the key (see `Tables.keys`) of a matrix that must be added.
     """
     rows, out = columns.select(scan), results.select(scan)
     cube = rows.cube.astype(np.intp)
@@ -214,7 +234,7 @@ def _process(
 
 
 def _find_tables(tables: Tables, calibration: Numbers, bad: PadMasks) -> tuple[Numbers, Times]:
-    """Find the tables of rows.
+    """Find the matrices of rows, by their calibrations and bad pads.
 
     Args:
         tables: Tables of the skin.
@@ -222,7 +242,8 @@ def _find_tables(tables: Tables, calibration: Numbers, bad: PadMasks) -> tuple[N
         bad: Bit masks of the bad pads (N,).
 
     Returns:
-        Numbers of the tables (N,), and keys of missing tables, or `DONE` (N,).
+        Numbers of the matrices (N,), and keys (see `Tables.keys`) of the matrices that do not
+        exist yet, `DONE` for all others (N,).
     """
     key = calibration.astype(np.int64) << 32 | bad
     place = np.searchsorted(tables.keys, key)

@@ -13,6 +13,7 @@ except ImportError:
     native = None  # type: ignore[assignment]
 
 _NO_HEALTH = (None,) * len(HealthState._fields)
+"""Arguments of the kernel in C instead of a `HealthState`, where health is not judged."""
 
 
 def run(
@@ -23,20 +24,20 @@ def run(
     columns: Columns,
     results: Results,
 ) -> tuple[int, int]:
-    """Process rows, from one on, until the kernel has a request.
+    """Process rows of frequencies, from one row on, until the caller has to do something.
 
     Args:
         start: Number of the first row to process.
-        n_residuals: Number of outputs of the matrices that are residuals.
+        n_residuals: Number of outputs of a matrix (see `Tables.matrix`) that are residuals.
         tables: Tables of the skin.
-        health: State of the health, which is changed; None: health is not asked for.
+        health: State of the health, which is changed; None: health is not judged.
         columns: Rows to process.
         results: Rows to write.
 
     Returns:
-        Number of the first row that is not processed, and the request: `DONE`, `NEEDS_WINDOW`,
-        `NEEDS_CONDITION`, `UNKNOWN_CUBE`, or the key (see `Tables.keys`) of a table that must be
-        added.
+        Number of the first row that is not processed, and what the caller has to do: `DONE`,
+        `NEEDS_WINDOW`, `NEEDS_CONDITION`, `UNKNOWN_CUBE`, or the key (see `Tables.keys`) of a
+        matrix that must be added.
     """
     # The kernel in C computes in float32, the precision of messages.
     if native is None or columns.frequency.dtype != np.float32:
