@@ -23,9 +23,10 @@ if TYPE_CHECKING:
     from ..device.live import LinkSource
 
 REST_S = 5.0
-"""Duration, in seconds, of the measurement of the pads without load, which precedes the presses.
+"""Duration, in seconds, of the measurement of the pads without load.
 
-It determines the rest frequency, noise and drift of each pad.
+It precedes the presses beside each cube, and determines the rest frequency (frequency without
+load), noise and drift of each pad.
 """
 
 AVERAGE_S = 0.25

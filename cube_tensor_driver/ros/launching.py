@@ -61,7 +61,7 @@ NEEDED_PACKAGES = {
     "state_publisher": ("robot_state_publisher",),
     "record": ("ros2bag", "rosbag2_storage_mcap"),
 }
-"""Launch argument -> the ROS packages that must be installed if the argument is true."""
+"""Name of a launch argument -> the ROS packages that must be installed if the argument is true."""
 
 
 def declare_text(

@@ -49,8 +49,8 @@ MAX_BUFFERS = 4
 """Number of different message sizes for which a publisher keeps a buffer to use it again."""
 
 STEP_S = 0.2
-"""Maximum duration, in seconds, of one step of the executor. A signal that asks the process to end
-takes effect after at most this time."""
+"""Maximum duration, in seconds, of one step of the executor, which calls callbacks of a node. A
+signal that asks the process to end takes effect after at most this time."""
 
 THREAD_SWITCH_S = 1e-3
 """Time, in seconds, after which a thread must release Python's global interpreter lock (GIL) if

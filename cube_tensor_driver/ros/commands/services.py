@@ -51,7 +51,7 @@ EXPECTED = {
     float: "a number",
     str: "a text",
 }
-"""Type of a parameter -> description of its values, for error messages."""
+"""Python type of the value of a ROS parameter -> description of its values, for error messages."""
 
 
 @dataclass(frozen=True)

@@ -36,10 +36,10 @@ GRADIENT_LENGTH = 0.8
 neighbouring cubes)."""
 
 TRACTION_COLOUR: Colour = (1.0, 1.0, 1.0)
-"""Colour of the arrows of traction."""
+"""Colour of the arrows of traction (force per area on the upper face of a cube)."""
 
 GRADIENT_COLOUR: Colour = (0.2, 0.6, 1.0)
-"""Colour of the arrows of the gradient."""
+"""Colour of the arrows of the gradient of normal stress (its change per distance)."""
 
 
 class ArrowScale(NamedTuple):
