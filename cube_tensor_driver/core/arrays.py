@@ -9,13 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+"""Array of real numbers in double precision (float64)."""
 Single = NDArray[np.float32]
+"""Array of real numbers in single precision (float32), which messages have."""
 Real = NDArray[np.floating[Any]]
 """Array of float32 or float64, whichever precision the caller chose for the computation of
 stress."""
 Complex = NDArray[np.complex128]
+"""Array of complex numbers in double precision."""
 Index = NDArray[np.intp]
+"""Array of integers that number or count the entries of another array, from 0 on."""
 Mask = NDArray[np.bool_]
+"""Array of truth values."""
 Times = NDArray[np.int64]
 """Times or durations, in nanoseconds."""
 PadMasks = NDArray[np.uint32]
@@ -23,6 +28,7 @@ PadMasks = NDArray[np.uint32]
 StatusBits = NDArray[np.uint16]
 """Status bits (defined in `status.py`), per row (sample of one cube) or per pad."""
 AnyArray = NDArray[Any]
+"""Array of any type of numbers."""
 
 
 def pad_table(

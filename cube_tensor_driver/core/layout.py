@@ -17,7 +17,8 @@ from .arrays import Array
 from .errors import LayoutError
 
 AXES = "xyz"
-"""Names of the axes of the cube frame."""
+"""Names of the axes of the cube frame: z points out of the skin, x and y lie along it, the origin
+is the centre of the cube."""
 
 MAX_PADS = 32
 """Maximum number of pads of a cube, because a hub sends the faults of pads as a mask of 32 bits."""
@@ -272,10 +273,13 @@ def _make_layout(name: str, pads: str) -> Layout:
 
 
 _QUAD_PADS = "+z-x +z+x -z-x -z+x"
-# Names of the pads of the layout "planar": V1 to V8 of the paper by Kiyota & Shinoda, in that
-# order.
+"""Names of the pads of the layout "quad": the face that carries the pad, then the side of this face
+on which the pad lies."""
 _PLANAR_PADS = f"{_QUAD_PADS} +x-z +x+z -x-z -x+z"
+"""Names of the pads of the layout "planar": V1 to V8 of the paper by Kiyota & Shinoda, in that
+order."""
 _NEXT_AXES = str.maketrans("xyz", "yzx")
+"""Table that renames the axes x, y, z in the name of a pad to y, z, x."""
 # The layout "cube" has the eight pads of "planar" in each of the planes z-x, x-y and y-z. The names
 # of the pads in the next plane follow by renaming the axes.
 _SECOND_SECTION = _PLANAR_PADS.translate(_NEXT_AXES)

@@ -39,12 +39,16 @@ FIELD_SIZE = 9 + 27
 (3, 3, 3)."""
 
 _ROWS = [AXES.index(name[0]) for name in STRESS]
+"""Row in the stress tensor (3, 3) of each component xx, yy, zz, yz, zx, xy."""
 _COLUMNS = [AXES.index(name[1]) for name in STRESS]
+"""Column in the stress tensor (3, 3) of each component xx, yy, zz, yz, zx, xy."""
 _COMPONENT_NUMBERS = [
     [0, 5, 4],
     [5, 1, 3],
     [4, 3, 2],
 ]
+"""Number of the component, in the order xx, yy, zz, yz, zx, xy, at each place of the symmetric
+stress tensor (3, 3)."""
 
 Float = TypeVar("Float", bound=np.floating[Any])
 
@@ -287,6 +291,7 @@ def _make_modes(
 
 
 _PLANE_GRADIENTS = ("zz_x", "zz_z", "xx_z", "xx_x")
+"""Names of the modes in the plane z-x in which a normal stress varies along z or x."""
 
 PLANE = _make_modes(("zz", "zx", "xx", *_PLANE_GRADIENTS), "zx")
 """The seven modes of the plane z-x.
@@ -302,6 +307,8 @@ Moment equilibrium makes the two equal, so these modes serve only for comparison
 """
 
 _SHEAR_GRADIENTS = ("yz_x", "zx_y", "xy_z", "xy_y-zx_z", "yz_z-xy_x", "zx_x-yz_y")
+"""Names of the modes of space in which only shear stresses vary. In each of the last three, two
+shear gradients with opposite signs are in equilibrium."""
 
 SPACE = _make_modes((*STRESS, *GRADIENT, *_SHEAR_GRADIENTS), "xyz")
 """The 21 modes of space: all linear stress fields in equilibrium.

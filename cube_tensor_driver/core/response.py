@@ -32,7 +32,11 @@ demonstrations; a real cube needs a calibration with fitted or computed values.
 """
 
 _FREE_SHEAR_Z = 0.4
+"""Freely chosen response of the pad +z-x to the mode zx_x-yz_y, in Pa per Pa; a value
+for demonstrations."""
 _FREE_SHEAR_X = 0.2
+"""Freely chosen response of the pad +z-x to the mode xy_y-zx_z, in Pa per Pa; a value
+for demonstrations."""
 
 ILLUSTRATIVE_CUBE = {
     "+z-x:zz": 1.4,
@@ -56,6 +60,8 @@ plane z-x are chosen so that the pads in this plane respond as `ILLUSTRATIVE` st
 """
 
 _LARGEST_SYMMETRY = {"quad": "slab", "planar": "full", "cube": "full"}
+"""Name of the largest symmetry group of each built-in layout, under which its illustrative
+coefficients are given."""
 MAX_LISTED_NAMES = 6
 """Maximum number of names that an error message lists; of further names it states the number."""
 

@@ -31,17 +31,21 @@ _QUARTER_TURN_Z = (
     (1, 0, 0),
     (0, 0, 1),
 )
+"""Rotation by 90 degrees about z: the axis x becomes y, and y becomes -x."""
 _CYCLE_AXES = (
     (0, 0, 1),
     (1, 0, 0),
     (0, 1, 0),
 )
+"""Rotation by 120 degrees about the diagonal of the cube: x becomes y, y becomes z, z becomes x."""
 _MIRRORS = (
     ((-1, 0, 0), (0, 1, 0), (0, 0, 1)),
     ((1, 0, 0), (0, -1, 0), (0, 0, 1)),
     ((1, 0, 0), (0, 1, 0), (0, 0, -1)),
 )
+"""Reflections that reverse x, y and z."""
 Matrix = Sequence[Sequence[int]]
+"""Matrix of integers, as nested sequences of its rows."""
 
 GENERATORS: dict[str, tuple[Matrix, ...]] = {
     "full": (_QUARTER_TURN_Z, _CYCLE_AXES, *_MIRRORS),
@@ -58,7 +62,6 @@ first. The symmetry is that of the cube with its surroundings.
 - none (1): nothing is known, and every entry of the response is a coefficient of its own.
 """
 
-# Kiyota & Shinoda name the response of pad V1 to each mode by a letter with this sign (eq. 1).
 _LETTERS = {
     "zz": ("a", 1),
     "xx": ("b", -1),
@@ -68,7 +71,10 @@ _LETTERS = {
     "zz_z": ("g", -1),
     "xx_x": ("h", 1),
 }
+"""Letter, and its sign, by which Kiyota & Shinoda (eq. 1) name the response of the pad V1 to each
+mode. The mode zx has equal stresses sigma_zx and sigma_xz, so its response is c + d."""
 _PAPER_LETTERS = _LETTERS | {"zx": ("c", -1), "xz": ("d", -1)}
+"""The same letters for the modes of the paper, which treat sigma_zx and sigma_xz as independent."""
 
 
 def generate_group(generators: Sequence[Matrix]) -> Index:

@@ -17,8 +17,9 @@ from .arrays import AnyArray, Array, Real
 from .errors import CubeError
 from .modes import to_matrix, to_voigt
 
-# The name by which transforms3d means roll, pitch and yaw about fixed axes, as in URDF and REP 103.
 _FIXED_AXES = "sxyz"
+"""Name by which the library transforms3d means roll, pitch and yaw about fixed axes, as in URDF and
+REP 103."""
 
 
 def principal_stresses(stress: Real) -> tuple[Array, Array]:

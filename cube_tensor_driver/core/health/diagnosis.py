@@ -44,7 +44,7 @@ MAX_SECOND_DIFFERENCE = 60.0
 the noise is computed, as a multiple of the pad's usual noise.
 
 One jump of the frequency gives two large second differences. Cut to this limit, they raise the
-noise of `MIN_ROWS` rows by less than `NOISY_ENTER`, so one jump does not make a pad noisy.
+noise of 20 rows to less than 10 times the usual noise, above which a pad is reported as noisy.
 """
 
 STUCK_MIN_SPAN = 5.0
@@ -72,11 +72,14 @@ of a thousand.
 
 RESIDUAL_LEAVE = 0.1
 """Fraction of the rows of a window (0.5 s) with a residual above its limit at or below which a cube
-is no longer reported with a high residual."""
+is no longer reported with a high residual.
+
+The residual measures how far the signals of a cube's pads contradict each other.
+"""
 
 DRIFT_LIMIT = 2e-4
-"""Shift of a pad's frequency, relative to its rest frequency and to the median shift of the cube's
-pads, above which the pad is reported as drifting.
+"""Shift of a pad's frequency, divided by its rest frequency (frequency without load), minus the
+median of such shifts of the cube's pads, above which the pad is reported as drifting.
 
 The shift is measured from the mean frequency at the time at which the cube came to rest.
 """

@@ -22,7 +22,8 @@ from .diagnosis import Conditions, PadDiagnosis, has_high_residual
 from .statistics import WINDOW_S, Window, clear_sums, make_state, make_window
 
 WINDOW_NS = round(1e9 * WINDOW_S)
-"""Length of a window over which statistics of the pads are formed, in ns."""
+"""Length of a window over which statistics of the pads are formed, in ns: 0.5 s by the time stamps
+of the rows."""
 
 MAX_BACKWARD_NS = 2 * WINDOW_NS
 """Longest time, in ns, by which the time stamp of a row may precede the end of the present window

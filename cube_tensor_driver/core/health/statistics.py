@@ -49,11 +49,12 @@ GAP_NS = 50_000_000
 """Interval between the time stamps of two rows of a cube, in ns, from which on the interval counts
 as a gap: how the frequencies changed within it is unknown.
 
-Statistics need at least `MIN_ROWS` rows in 0.5 s, so intervals are usually at most 25 ms.
+Statistics need at least 20 rows in a window of 0.5 s, so intervals are usually at most 25 ms.
 """
 
 MAX_JITTER_RATIO = 1.5
-"""Ratio of two successive intervals between rows up to which the intervals count as equal.
+"""Ratio of the longer to the shorter one of two successive intervals between the rows (samples) of
+a cube up to which the intervals count as equal.
 
 The jitter of time stamps changes intervals by less, and a missing row doubles an interval.
 """

@@ -25,8 +25,10 @@ from .health import HISTORY_WINDOWS, Health
 from .statistics import WINDOW_S, Window
 
 MAX_DURATION_S = HISTORY_WINDOWS * WINDOW_S
-"""Longest duration over which a tare can average, in s, limited by the windows that `Health`
-keeps."""
+"""Longest duration over which a tare (measurement of frequencies without load) can average, in s.
+
+It is limited by the number of windows of 0.5 s whose statistics `Health` keeps.
+"""
 
 MAX_SPAN_RATIO = 12.0
 """Span (highest minus lowest frequency of a pad) above which a tare is refused because the load
@@ -57,8 +59,8 @@ as the reason, and not the noise.
 MAX_GAP_S = 0.25
 """Longest gap between two rows of a cube, in s, with which a tare is accepted.
 
-The load might have changed during a longer gap. Where rows come slowly, `MAX_GAP_ROWS` replaces
-this limit.
+The load might have changed during a longer gap. Where rows come more rarely than 16 times a second,
+the limit is 4 mean intervals between rows instead.
 """
 
 MAX_GAP_ROWS = 4.0
