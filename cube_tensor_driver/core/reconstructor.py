@@ -169,7 +169,14 @@ class Reconstructor:
         out: StressRows | None,
         health: Health | None,
     ) -> StressRows:
-        """Compute stress, and update the health if it is given; arguments as of `process`."""
+        """Compute the stress of rows, and update the health of the pads if it is given.
+
+        Args:
+            rows: Rows of one scan, or of several scans one after the other.
+            recorded: Health of the pads from a recording; None: none is known.
+            out: Rows to write into; None makes new ones.
+            health: Health of the pads to update with each row; None: the pads are not examined.
+        """
         out = self.pipeline.make_rows(rows) if out is None else out
         left_out = known = None
         if recorded is not None:
