@@ -43,8 +43,8 @@ MAX_BATCH_ROWS = 1 << 13
 """Largest number of rows (samples of cubes) decoded by one call of numpy.
 
 This many rows of stress (82 bytes each) fit the processor's cache. Frequencies and stress have the
-same limit in rows, not in bytes, so that their batches contain the same samples; then the stress of
-a batch of frequencies is found without a search.
+same limit in rows, not in bytes, so that their batches contain the same samples. Then the stress of
+the samples in the n-th batch of frequencies is in the n-th batch of stress.
 """
 
 MAX_MESSAGE_BYTES = 64 << 20

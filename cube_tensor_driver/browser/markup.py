@@ -22,11 +22,13 @@ from .surface_field import DEVIATION, SurfaceField
 GREEN = "#2b8a3e"
 """Colour of the mark before the first line while all cubes are live."""
 AMBER = "#e67700"
-"""Colour of that mark while some cubes are not live, and of warnings about a link."""
+"""Colour of the mark before the first line while some cubes are not live, and of warnings about a
+link."""
 RED = "#c92a2a"
-"""Colour of that mark while no cube is live, of errors of a link, and of a running recording."""
+"""Colour of the mark before the first line while no cube is live, of errors of a link, and of a
+running recording."""
 BLUE = "#1864ab"
-"""Colour of that mark while the page or a replay is paused."""
+"""Colour of the mark before the first line while the page or a replay is paused."""
 
 LEVEL_COLOURS = ("inherit", AMBER, RED, RED)
 """Colour of the text about a link for each level of its diagnostics: OK, WARN, ERROR and STALE."""

@@ -313,6 +313,8 @@ shear gradients with opposite signs are in equilibrium."""
 SPACE = _make_modes((*STRESS, *GRADIENT, *_SHEAR_GRADIENTS), "xyz")
 """The 21 modes of space: all linear stress fields in equilibrium.
 
-The divergence of a mode such as zz_z is balanced half by sigma_zx and half by sigma_yz. With equal
-halves, every rotation or mirror of a cube acts on the modes as a signed permutation.
+In the mode zz_z, sigma_zz grows linearly along z, which alone would not be in equilibrium.
+Gradients of sigma_zx along x and of sigma_yz along y balance it, each half of it, and likewise in
+the other modes. With equal halves, every rotation or mirror image of a cube exchanges modes or
+changes their signs, and does not mix them.
 """

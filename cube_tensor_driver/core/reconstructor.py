@@ -214,6 +214,8 @@ class Reconstructor:
     def measure_rest(self, cubes: Sequence[int], duration: float) -> Array:
         """Return the rest frequencies of all cubes (cubes, P), in Hz, that `tare` would set.
 
+        Cubes that are not tared keep their present rest frequencies.
+
         Args:
             cubes: Numbers of the cubes to tare.
             duration: Duration of the newest data to average, in s.

@@ -153,7 +153,9 @@ class LoadVerification:
         start_ns: int,
         end_ns: int,
     ) -> None:
-        """Set the samples with which `result` and `forces` compare the rows.
+        """Set the samples with which the received rows of stress will be compared.
+
+        The methods `result` and `forces` compute and return the comparison.
 
         Args:
             log: Log of the simulator, which contains the samples that its hubs took.

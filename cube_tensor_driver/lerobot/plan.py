@@ -58,8 +58,9 @@ ALWAYS_ALLOWED_COUNT = 100
 """Number that is added to the largest allowed number of frames (time steps) of an episode, and to
 that of samples of a cube in one frame.
 
-In a short recording, a few late samples would already exceed what the ratios `MAX_STAMP_RATIO` and
-`MAX_DEPTH_RATIO` allow.
+The ratios `MAX_STAMP_RATIO` and `MAX_DEPTH_RATIO` bound these numbers relative to what the sample
+rate lets expect. In a recording of a few frames, a few samples that were stamped late would already
+exceed the ratios, although nothing is wrong.
 """
 
 Report = Callable[[float, float, str], None]

@@ -42,10 +42,12 @@ class Influence:
         """Interpolate the pad stresses between the positions of the grid, with cubic splines.
 
         Args:
-            place: Positions (m, dim - 1) of forces, in m.
+            place: Positions (m, dim - 1) of forces on the surface, in m from the point above the
+                cube's centre.
 
         Returns:
-            Stress (P, m, dim) of each pad per unit force; 0 for positions outside of the grid.
+            Stress (P, m, dim) of each pad per unit force, where the last index is the direction of
+            the force; 0 for positions outside of the grid.
         """
         # The grid contains all combinations of its x and y coordinates, sorted by x, then by y.
         axes = [np.unique(column) for column in self.place.T]

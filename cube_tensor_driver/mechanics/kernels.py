@@ -403,6 +403,7 @@ class Kernels:
     ) -> Array:
         """Compute the prior covariance of measured components with the pressure below one point.
 
+        The components are those that a cube measures: 6 stresses, and 9 gradients of normal stress.
         The pressure is taken at the depth of the cubes, below one point of the surface.
 
         Args:

@@ -229,8 +229,9 @@ class Layer:
         decay = np.exp(-k * depth)
         cosh = sinh = decay
         if np.isfinite(self.thickness):
-            # cosh(eta) / cosh(h) and sinh(eta) / cosh(h), written with decaying exponentials, which
-            # cannot overflow for large k
+            # With the layer's thickness t, `cosh` is cosh(k (t - depth)) / cosh(k t), and `sinh` is
+            # sinh(k (t - depth)) / cosh(k t). They are written with exponentials of negative
+            # numbers, which cannot overflow for large k.
             reflected = np.exp(-2 * k * (self.thickness - depth))
             base = decay / (1 + np.exp(-2 * k * self.thickness))
             cosh = base * (1 + reflected)

@@ -50,8 +50,10 @@ class Raster:
     def image(self, colours: Array) -> NDArray[np.uint8]:
         """Return the pixels (rows, columns, 4) as red, green, blue and opacity from 0 to 255.
 
+        Each pixel has the colour of the nearest point that was given at the construction.
+
         Args:
-            colours: (M, 3) colours of the points, from 0 to 1; NaN is transparent.
+            colours: Colours (M, 3) of these M points, from 0 to 1; NaN is transparent.
         """
         table = np.zeros((len(colours) + 1, 4), np.uint8)
         table[:-1, :3] = np.round(255 * np.nan_to_num(colours))

@@ -35,9 +35,10 @@ It is light at zero and becomes darker on both sides: blue for negative, red for
 GREY = (0.55, 0.55, 0.55)
 """Colour of unknown values, as red, green and blue from 0 to 1."""
 RED = (0.85, 0.1, 0.1)
-"""Colour of the cross over a cube without a tensor, as red, green and blue from 0 to 1."""
+"""Colour of the cross over a cube whose stress is unknown because too many of its pads are broken,
+as red, green and blue from 0 to 1."""
 ORANGE = (0.95, 0.55, 0.0)
-"""Colour of the cross over a cube with a doubtful tensor, as red, green and blue from 0 to 1."""
+"""Colour of the cross over a cube whose stress is doubtful, as red, green and blue from 0 to 1."""
 WHITE = (0.95, 0.95, 0.95)
 """Colour of the cross over a cube from which nothing arrives, as red, green and blue from 0 to 1.
 """

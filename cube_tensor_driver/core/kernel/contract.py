@@ -37,8 +37,11 @@ The caller ends this window, opens another, and calls the kernel again from that
 """
 
 NEEDS_CONDITION = -3
-"""Result of the kernel (the loop over rows of frequencies) that stops before a row with a pad that
-is broken by its frequency or by the report of the device, for the first time in a window of 0.5 s.
+"""Result of the kernel (the loop over rows of frequencies) that stops before a row with a pad whose
+frequency is impossible, or which the device reports as broken.
+
+The health of pads is judged over windows of 0.5 s, so the kernel stops at the first such row of a
+cube in a window only.
 
 The caller finds the condition of the pad (open, short, out of range or reported), and calls the
 kernel again from that row on.

@@ -369,8 +369,8 @@ class SampleAccount:
         first = frame.first_cube
         self._end_parts(first + 1, first + frame.n_cubes)
         if first not in self._trackers:
-            # The module in C handles only samples that come in one frame, which begins with the
-            # first cube, so only that part uses the memory which C changes.
+            # The module in C counts only samples that come whole in one frame, which begins with
+            # cube 0. Only the tracker of such frames shares its memory with C (`self._track`).
             self._trackers[first] = SequenceTracker(None if first else self._track)
         tracker = self._trackers[first]
         tracker.n_cubes = frame.n_cubes

@@ -332,8 +332,8 @@ class Taring:
         self.created.update(dict.fromkeys(cubes, created))
         if self._folder is None:
             return "; not kept"
-        # The first error of the disk ends the loop. Cubes without a uid come first, because their
-        # tares are only noted and no file is written yet.
+        # An error of the disk ends the loop. The tare of a cube whose uid is unknown is kept in
+        # memory until then, which cannot fail, so these cubes come first and are never skipped.
         for number in sorted(cubes, key=lambda number: number in self.uids):
             try:
                 self._decide(number, rest, created)
