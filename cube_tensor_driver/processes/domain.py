@@ -58,7 +58,11 @@ def is_domain_used() -> bool:
 
     It looks at the UDP port that the first node of a domain uses. The result is wrong if that node
     has ended while others run, or if another program uses the port.
+
+    Raises:
+        ConfigError: The environment variable ROS_DOMAIN_ID is no number of a DDS domain.
     """
+    check_domain()
     socket_of_first = _bind(int(os.environ.get(VARIABLE) or 0), PARTICIPANT_OFFSET)
     if socket_of_first is not None:
         socket_of_first.close()

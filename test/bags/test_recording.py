@@ -397,7 +397,7 @@ def test_a_node_in_a_domain_that_is_none_ends_with_one_line(domain, monkeypatch)
     monkeypatch.setenv("ROS_DOMAIN_ID", "abc")
     command = [sys.executable, "-m", "cube_tensor_driver.ros.nodes.driver"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
-    assert done.returncode == 1
+    assert done.returncode == os.EX_CONFIG
     assert done.stderr == (
         "cube_tensor_driver: ROS_DOMAIN_ID is 'abc', allowed: 0 to 232; set it or unset it\n"
     )
