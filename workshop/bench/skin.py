@@ -166,7 +166,8 @@ def _measure_both(
         "duration_s": bench.duration,
         **skin,
         "echo_cpu_percent": round(echo, 1),
-        "ratio_to_echo": round(sum(used) / echo, 3),
+        # A run of a fraction of a second can cost less than the clock of CPU time resolves.
+        "ratio_to_echo": round(sum(used) / echo, 3) if echo else None,
     }
 
 
