@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Driver for the cubic stress tensor sensor: pad frequencies in, stress tensors and gradients out.
 
     import cube_tensor_driver as ctd

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Simulated captures of the pads' oscillators, for firmware in an emulator without them.
 
 An emulated hub asks for each measuring window over a separate line, and receives the edges that

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """What a check sends to a hub, step by step, and how long it listens.
 
 Every step has a name, by which the rules find what they check. A step with requests first waits

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Build of the firmware, and a hub that QEMU emulates."""
 
 from __future__ import annotations

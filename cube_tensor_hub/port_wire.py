@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """A hub on a port of this machine, or on TCP."""
 
 from __future__ import annotations

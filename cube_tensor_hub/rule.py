@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """A rule of the protocol, and what a check says about it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """What was asked and what was heard in a conversation with a hub."""
 
 from __future__ import annotations

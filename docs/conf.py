@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Sphinx settings: ./cube docs builds the pages, and every warning is an error.
 
 The tables of message fields and of parameters are generated from the code. A page asks for one

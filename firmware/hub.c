@@ -1,3 +1,6 @@
+// Copyright 2026 cube_tensor_driver authors
+// SPDX-License-Identifier: Apache-2.0
+
 /* See hub.h. One thing is sent at a time: while frames of a sample wait for room, requests and the
  * frames of the second wait behind them. So STATS follows the samples that it counts, and no sample
  * follows the ACK of STOP. */

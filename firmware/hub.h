@@ -1,3 +1,6 @@
+// Copyright 2026 cube_tensor_driver authors
+// SPDX-License-Identifier: Apache-2.0
+
 /* A hub of docs/protocol.md: answers requests, takes samples, drops what finds no room.
  *
  * It has no heap, no clock and no I/O of its own: port.h has those. A program makes a hub and calls

@@ -1,3 +1,6 @@
+// Copyright 2026 cube_tensor_driver authors
+// SPDX-License-Identifier: Apache-2.0
+
 /* What a hub needs of the board it runs on. hub.c calls it; every port defines struct port.
  *
  * None of these functions waits. Interrupts may run at any time beside them.

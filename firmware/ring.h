@@ -1,3 +1,6 @@
+// Copyright 2026 cube_tensor_driver authors
+// SPDX-License-Identifier: Apache-2.0
+
 /* Bytes from one writer to one reader, of which either may be an interrupt. Nothing is locked: each
  * side changes its own index only, after the bytes are in place. */
 #ifndef RING_H

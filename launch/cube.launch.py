@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Starts a single cube on one port.
 
 It includes skin.launch.py and takes the same arguments; the default of `config` is the skin file of

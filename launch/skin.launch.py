@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Starts all cubes of a skin file, on real or simulated hubs.
 
 It starts the nodes `driver` and `reconstruction`. Arguments of the launch file add the nodes

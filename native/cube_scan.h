@@ -1,3 +1,6 @@
+// Copyright 2026 cube_tensor_driver authors
+// SPDX-License-Identifier: Apache-2.0
+
 /* The rows of a scan: from frequencies of pads to stress, status and the sums of health windows.
  *
  * One row is one sample of one cube, one scan at most one row of each cube. The readable

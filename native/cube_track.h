@@ -1,3 +1,6 @@
+// Copyright 2026 cube_tensor_driver authors
+// SPDX-License-Identifier: Apache-2.0
+
 /* Numbers and clock of the samples of one link: what the usual sample changes.
  *
  * The structure is cube_tensor_driver/device/track.py's `LinkTrack`, whose memory the interpreter

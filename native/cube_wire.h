@@ -1,3 +1,6 @@
+// Copyright 2026 cube_tensor_driver authors
+// SPDX-License-Identifier: Apache-2.0
+
 /* The wire of cube hubs, version 1: its frames and their bytes, for hubs and hosts.
  *
  * Written from docs/protocol.md, which explains the fields. Portable C11 without heap, operating

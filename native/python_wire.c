@@ -1,3 +1,6 @@
+// Copyright 2026 cube_tensor_driver authors
+// SPDX-License-Identifier: Apache-2.0
+
 /* The Python module cube_tensor_driver._wire: cube_wire.h for cube_tensor_driver/device/wire/native.py.
  *
  * Plain C API of Python, limited to the stable ABI of 3.10: one build serves all later versions.

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Bags of known content, made without ROS and without the code that reads them: by rosbags' own
 serialiser."""
 

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Fixtures: a DDS domain of its own for every test that runs ROS, kept to this host."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Error of a curved skin that is laid flat, on a cylinder whose stress is known exactly.
 
 A line force presses on a solid cylinder and another one on its far side holds it. Its stress is

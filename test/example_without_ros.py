@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """README's example with each source: a bag, a simulated skin, live links on pseudo-terminals.
 
 .ci/run runs it where nothing is installed but `pip install ".[bags]"`:

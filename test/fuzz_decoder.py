@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Coverage-guided fuzzing of decoder and account, by hand: `pip install atheris`, then in the
 environment
 

@@ -1,3 +1,6 @@
+// Copyright 2026 cube_tensor_driver authors
+// SPDX-License-Identifier: Apache-2.0
+
 /* Coverage-guided fuzzing of native/cube_wire.c, by hand:
  *
  *     clang -g -O1 -fsanitize=fuzzer,address,undefined -Inative native/cube_wire.c \

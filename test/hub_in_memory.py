@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """A hub in this process, on a line without delay, in simulated time: the `Wire` of a check."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """A hub that a test plays: the near end of a pseudo-terminal whose far end is the driver's port."""
 
 from __future__ import annotations

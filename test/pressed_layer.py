@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """A rigid round punch on an elastic layer, by finite elements: an independent check of layer.py.
 
 The punch is flat and has no friction; the layer is bonded to rigid ground. Everything is symmetric

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """python -m rclpy_without FEATURE MODULE [ARGUMENT ...]: runs a module where rclpy lacks a feature.
 
 What is taken away is what Humble lacks, which does not exist as wheels.

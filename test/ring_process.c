@@ -1,3 +1,6 @@
+// Copyright 2026 cube_tensor_driver authors
+// SPDX-License-Identifier: Apache-2.0
+
 /* Two threads and a ring between them: every byte arrives, once and in order. */
 #include <pthread.h>
 #include <stdio.h>

@@ -1,3 +1,6 @@
+// Copyright 2026 cube_tensor_driver authors
+// SPDX-License-Identifier: Apache-2.0
+
 /* The kernel of a scan as a process, for test/core/test_kernel.py: it reads calls from standard input
  * and writes their results to standard output, as long as there are calls.
  *

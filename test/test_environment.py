@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Set-up: what is missing is said before any work, an interrupted step is done again, nothing is
 left running."""
 

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The package as a whole: what is installed, which way imports point, what is documented and
 pinned."""
 
@@ -311,3 +313,17 @@ def test_every_field_of_a_message_stands_under_a_comment():
                 )
             elif not line.strip():
                 comment = False
+
+
+def test_every_source_file_names_its_license():
+    folders = [*PRODUCTS, "firmware", "launch", "native", "scripts", "test", "tools"]
+    files = [path for folder in folders for path in (ROOT / folder).rglob("*") if path.is_file()]
+    source = [
+        path
+        for path in files
+        if (path.suffix in (".py", ".c", ".h") and path.stat().st_size)
+        or path.parent.name == "scripts"
+    ]
+    assert len(source) > 400
+    line = "SPDX-License-Identifier: Apache-2.0"
+    assert not [path for path in source if line not in path.read_text()[:200]]

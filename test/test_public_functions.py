@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The public functions in Python: arguments that cannot be used are an error of the package, which
 names the value and the fix; a path stands for the skin that it leads to."""
 

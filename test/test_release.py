@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """A release to apt: bloom makes the Debian files of this package from package.xml."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+// Copyright 2026 cube_tensor_driver authors
+// SPDX-License-Identifier: Apache-2.0
+
 /* Lets test_native_wire.py drive the C wire: commands come on standard input, answers go out.
  *
  * A command is a letter, a u32 and so many bytes:

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Set up the environment that ./cube runs in, then run the command in it.
 
 A sourced ROS 2 (Humble or newer) is used as it is. Elsewhere a private environment is made in

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """./cube fem: the response of a cube's pads by finite elements, as tables, files and pictures."""
 
 from __future__ import annotations

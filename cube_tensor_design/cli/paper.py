@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """./cube paper: the pictures and numbers of docs/paper.md, except those of the study."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """./cube study: the narrowest contact for which each layout can be trusted."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The body in which a cube sits, the checks of what can be computed, and its meshes."""
 
 from __future__ import annotations

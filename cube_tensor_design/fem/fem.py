@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The response matrix of a cube by finite elements: the mean stress of each pad under each mode (a
 linear stress field in equilibrium).
 

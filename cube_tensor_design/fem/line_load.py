@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Stress in a layer under forces on lines along y, which is a state of plane strain.
 
 With the transfer functions T(k) of layer.py for waves along x of both signs, the modes at x are::

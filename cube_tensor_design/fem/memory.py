@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """A check, before any work, that the solver of a mesh fits into the memory."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Meshes of a box with a cube |x_k| <= 1 in it, or of the positive part where a mirror allows that.
 
 Lengths are in d0, the half side of the cube. The stress is infinite at the corner (in space, at the

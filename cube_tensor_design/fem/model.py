@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Model files of `./cube fem`: geometry, material and layout of one cube in its body.
 
 A model is a YAML file in SI units. Every key may be left out; `config/fem/planar_slab.yaml` lists

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Mean stress on a pad from the nodal reactions of a finite element solution.
 
 A bonded interface transmits to node i the reaction r_i = int phi_i t ds, with the nodal function

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Influence functions of the pads: their stress under a force anywhere on the surface.
 
 With the stiffness K of body and cube, K_b of the body alone and the weights w of pads.py, the mean

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Linear elasticity of a box with a bonded cube, solved in its positive part.
 
 Where box and cube are symmetric under the mirrors x_k -> -x_k, every load splits into parts of one

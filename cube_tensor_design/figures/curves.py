@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Curves with labels, as most pictures of this folder draw them."""
 
 from __future__ import annotations

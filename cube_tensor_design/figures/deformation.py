@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Pictures of σzz on the deformed section of a body, with the cube in it."""
 
 from __future__ import annotations

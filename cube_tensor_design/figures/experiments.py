@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Pictures of the source paper's experiments on the virtual bench."""
 
 from __future__ import annotations

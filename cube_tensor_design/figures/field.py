@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Pictures of the pressure between the cubes as different methods compute it, and of its study."""
 
 from __future__ import annotations

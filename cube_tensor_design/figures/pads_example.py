@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Pictures of docs/stress_tensor.md: loads on a cube, its pads' stresses, two pads' wrong shear."""
 
 from __future__ import annotations

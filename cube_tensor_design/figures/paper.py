@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Pictures and numbers of docs/paper.md: figure 4 of the source paper, its experiments, a rod."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Pictures of a computed response matrix, and of influence functions."""
 
 from __future__ import annotations

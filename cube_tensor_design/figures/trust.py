@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The picture of `./cube study`: where each layout can be trusted."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The source paper's section 3 (Fig. 4) and section 4 (Figs. 7 and 8) on the virtual bench.
 
 Numbers only; `figures/experiments.py` and `figures/deformation.py` draw them. The paper does not

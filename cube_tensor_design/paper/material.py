@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Elastomer in plane strain or stress, for small and for finite strain.
 
 F (2, 2, ...) is the gradient of the deformation, W the energy per volume of the undeformed body:

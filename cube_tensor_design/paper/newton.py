@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Newton's method for displacements u (dofs,) at which forces balance, some of them prescribed.
 
 Each step lowers the energy (by Armijo's rule) or the forces out of balance. One linear combination

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Parts of the fall of the signal P_normal in the paper's experiment (b): a pressed body is
 sheared.
 

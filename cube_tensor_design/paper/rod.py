@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """A rigid rod pressed into the top of the bench's body: smooth, without friction, rounded edges.
 
 The rod's lower side is z = h(x). What lies above it by g = z - h(x) is pushed back with the

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Parts of P_shear under the paper's rod, by superposition; linear, in a plane.
 
 Without the cube the rod makes a field u0 in the cube's place. The same body with the cube is in

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Shear that is recovered under the paper's rod, by eq. 4, a cube's tensor, points and pads.
 
 The rod presses on the linear bench with a bonded bottom. *Points* and *pads* take the traction t on

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Finite elements of a plane section: quadratic triangles, a linear or a neo-Hookean material.
 
     nodal forces = ∫ P(F) : grad w dV,       F = 1 + grad u

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """A virtual bench: plates and rods move the surface of the elastomer, and pads measure the stress.
 
 It is a section of the body with the cube, or without it for the true field, of a linear or a

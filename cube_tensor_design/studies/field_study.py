@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """What gradients gain: error of the pressure field that is interpolated between the cubes.
 
 Three kinds of skin are compared: values alone; cubes that observe all of stress and gradient;

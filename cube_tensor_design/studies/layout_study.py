@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """How far each layout can be trusted under contacts that are not wide compared with the cube.
 
 An indenter of growing width moves over a cube. The stress and gradient recovered from the pads are

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Pad stresses of one planar cube under simple loads, and the shear that two pads alone would give.
 
 The numbers are for docs/stress_tensor.md. The response is that of the shipped planar calibration,

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Contacts on a thin layer, with the cubes taken for points or for pads.
 
 The true stress of the pads is the sum of influence functions (stress under a unit force) over the

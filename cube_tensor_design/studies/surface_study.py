@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """What a cube in a layer on rigid ground measures of balls on the surface, against the true stress.
 
 A response matrix R is that of a body loaded on all its sides. In a layer the surface and the ground

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Accuracy of the surface's traction from all cubes: errors and predicted deviations against truth.
 
 Contacts press anywhere in the cell between four cubes of a flat skin. Their stress comes from the

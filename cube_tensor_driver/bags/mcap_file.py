@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """MCAP files of bags, read and written with the library mcap.
 
 An MCAP file is a sequence of chunks (blocks of messages, each with a checksum), followed by a

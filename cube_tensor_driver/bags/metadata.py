@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The file metadata.yaml of a bag: its storage files, topics, times and numbers of messages.
 
 The format is that of rosbag2, version 9. The library rosbags provides the definitions of message

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Bags (a rosbag2 folder, or one .mcap or .db3 file) read without ROS.
 
 Whatever is wrong with a file of a bag is reported as a `BagError` of one line. A message that

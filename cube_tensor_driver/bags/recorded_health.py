@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The health of the pads that the reconstruction found while a bag was recorded, row by row.
 
 The health is which pads were left out as faulty, and why. It cannot be computed again exactly from

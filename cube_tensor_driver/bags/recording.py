@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The calibrations, rest frequencies and health of the pads that a bag states for its frequencies.
 
 Calibrations and rest frequencies are in the SkinInfo messages, each of which applies from its stamp

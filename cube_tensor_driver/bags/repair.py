@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Repair, in place, of recordings that were cut off (process killed, disk full, power lost).
 
 An MCAP file is a sequence of records. Messages lie in chunk records (blocks of messages), each of

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """A bag as a source: the recorded frequencies of one skin, delivered like those of a device."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """SQLite files of bags (.db3), read and written with Python's sqlite3."""
 
 from __future__ import annotations

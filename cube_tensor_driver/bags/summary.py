@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Summary of a bag: sample rates, losses and gaps of each cube, and the last diagnostics."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Tables of stress in Parquet or CSV: one row per sample of a cube, units in the columns' names."""
 
 from __future__ import annotations

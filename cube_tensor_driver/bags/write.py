@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Writing of bags in the format of rosbag2: a folder with metadata.yaml and storage files.
 
 The storage files contain the definitions of the message types, so that a bag can be read without

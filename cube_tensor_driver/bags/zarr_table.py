@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Tables of stress as a Zarr group (folder of arrays): one array per column of the table."""
 
 from __future__ import annotations

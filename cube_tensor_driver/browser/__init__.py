@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The page that `./cube view` serves: a skin in 3-D, its numbers and plots, tare, record, replay.
 
 Only this folder imports viser, the library that shows the page. The arrays and meshes that are

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Recording of a bag from the page: `./cube record` as a child process."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Plots over the last seconds, of any cubes and any component, on the page and as files."""
 
 from __future__ import annotations

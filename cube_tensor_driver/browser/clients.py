@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """ROS clients of the page: calls of services, and control of a replay."""
 
 from __future__ import annotations

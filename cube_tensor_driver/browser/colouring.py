@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The values that the colours of one picture of a skin stand for."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Controls of the page: parts of the 3-D view, quantity of the colours, position of a replay."""
 
 from __future__ import annotations

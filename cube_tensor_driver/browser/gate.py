@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Which requests the server of the page answers.
 
 A server that listens on this machine only answers a browser of this machine that shows this page.

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Values of all cubes in the last seconds, and the sampling rate of each cube."""
 
 from __future__ import annotations

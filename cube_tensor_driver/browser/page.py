@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The page of the browser view: the skin in 3-D, controls, plots, and the skin from above.
 
 It uses viser but not ROS. Each browser has a page of its own, with its own settings.

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """One instant of a skin: rows of the topic `stress`, with the contacts and the field of these rows.
 
 Everything that the page shows at a time comes from one `Scan`.

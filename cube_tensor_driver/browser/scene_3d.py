@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The skin in 3-D on the page: cubes, field, arrows, crosses, contact.
 
 A computer without a graphics card draws each instance of a batched mesh separately, and a thousand

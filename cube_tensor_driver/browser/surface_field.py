@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Pressure and shear at the points of a skin that the page colours."""
 
 from __future__ import annotations

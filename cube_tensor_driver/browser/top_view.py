@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The skin seen from above, as an SVG drawing: field as a heat map, cubes and contacts."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """What one scan puts on the page: a pure function of the scan and of what the user has chosen."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The node and the web server of `./cube view`, whose page shows the running skin.
 
 They run in a process of their own, so that they do not slow down the driver and the other nodes.

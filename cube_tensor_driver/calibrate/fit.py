@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Fit of a calibration to known loads: the symmetric coefficients, and one gain per pad.
 
     v_np = g_p sum_k c_k (B_k s_n)_p + noise

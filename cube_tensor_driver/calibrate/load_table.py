@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Tables (CSV) of known loads and the frequencies measured under them, the input of a fit."""
 
 from __future__ import annotations

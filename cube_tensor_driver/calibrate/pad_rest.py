@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Behaviour of the pads while nothing touches them: frequency, noise, drift and faults.
 
 noise    sqrt(mean(e²) / 6),   e[n] = f[n] - 2 f[n-1] + f[n-2]    (`core/health/statistics.py`)

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Presses of a finger beside a cube, from which its rotation and the order of its pads are found.
 
 When a new cube is brought up, it may be mounted in a rotated orientation, and the wires of its pads

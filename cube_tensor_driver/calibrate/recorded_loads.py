@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Recorded loads, the input of a fit: the frequencies of a cube in a bag (recording), and the loads
 that a reference sensor measured at the same times."""
 

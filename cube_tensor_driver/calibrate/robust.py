@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Robust least squares: weights that suppress outliers, and parameters that data do not determine.
 
 A residual is the difference of a measured and a predicted value. Residuals are divided by their

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The command line: one module per command, with its arguments, its work and what it prints.
 
 `table.py` lists the commands; `main.py` parses the command line and turns errors into exit codes.

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """`python -m cube_tensor_driver.cli`: what `./cube` runs."""
 
 import errno

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """./cube bag info, ./cube bag repair: show what a bag holds, make a damaged bag readable."""
 
 from __future__ import annotations

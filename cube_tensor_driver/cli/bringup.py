@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """./cube bringup: check the pads of a new hub, find swapped ones by presses, write a skin file.
 
 The command first measures the pads without load, then asks the user to press beside each cube. From

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """./cube config grid, ./cube config check: write the skin file of a grid, check a skin file."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """./cube demo: run simulated hubs, driver and reconstruction, and compare them with the load."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """./cube echo: print what comes on a topic of a running skin."""
 
 from __future__ import annotations

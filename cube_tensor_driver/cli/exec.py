@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """./cube exec: run any command inside the environment that ./cube has made."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """./cube export: write bags in the formats of machine learning and data analysis, without ROS."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """./cube fit: compute a calibration from known loads and the frequencies measured under them."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """./cube inject: inject a fault into simulated hubs that run in another process."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """./cube layout: show what the pads of a layout can measure, in numbers and as a picture."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Main function of the command line, which runs a command and turns errors into exit codes.
 
 The exit code is 0 after success, 1 after an error (CubeError) or a failed check, 2 if the command

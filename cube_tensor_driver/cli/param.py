@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """./cube param: list, read or set parameters of running nodes."""
 
 from __future__ import annotations

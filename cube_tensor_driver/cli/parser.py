@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Parser for the options of a command, with short error messages, and types of arguments."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """./cube plot: draw one cube of a bag over time."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """./cube ports: list the serial ports, and which of them answer as hubs."""
 
 from __future__ import annotations

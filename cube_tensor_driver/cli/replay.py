@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """./cube replay: publish a bag, with keys to pause, step and quit, and with the browser view."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """./cube reprocess: compute the stress of bags again, in parallel, here or on a Dask cluster.
 
 It needs no ROS. From the same frequencies and calibrations, it computes exactly the same numbers

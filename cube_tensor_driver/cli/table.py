@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The table of commands, which ./cube --help prints. Each command has a module of the same name."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """./cube topics: list the topics that are published, with types and rates."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """./cube urdf: print the frames of a skin for the description of a robot."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Skin files for flat grids of cubes, as plain values for `write_yaml`."""
 
 from __future__ import annotations

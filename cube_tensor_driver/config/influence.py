@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Files of influence functions, found by the name that a parameter or an option gives.
 
 Influence functions state what each pad measures of a unit force at points of the skin's surface;

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Reads input files of any format, and refuses devices, pipes and files above a maximum size."""
 
 from __future__ import annotations

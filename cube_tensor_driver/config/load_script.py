@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Load scripts: YAML files that state which forces indenters exert on a simulated skin over time.
 
 An indenter is a rigid disc or sphere. docs/simulation.md describes the keys of a script.

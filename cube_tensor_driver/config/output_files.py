@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Output files: written completely or not at all, and checked before a command starts its work."""
 
 from __future__ import annotations

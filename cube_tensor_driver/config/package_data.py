@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The folder of the data files that are installed with the package: skins, calibrations, launch
 files."""
 

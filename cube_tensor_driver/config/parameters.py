@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Parameters of the nodes, as tables of plain data.
 
 The nodes declare these ROS parameters, commands that run without ROS take some of them as options,

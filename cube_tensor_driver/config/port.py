@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Ports: texts that state where a hub is connected.
 
 A port is a device path, a pattern of device paths such as /dev/ttyACM*, or a TCP address.

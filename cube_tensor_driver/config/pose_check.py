@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Warnings about poses in a skin file that are valid YAML but most likely typing errors."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Checks of plain values (the content of a YAML file) against a JSON schema.
 
 Each mistake becomes one line that names the key, the value found there and the values that are

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Skin files: links (connections to hubs) of a skin, and its cubes with poses and calibrations.
 
 docs/config.md describes the keys.

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Tare files: the measured rest frequencies (frequencies without load) of one cube each.
 
 The name of a file is the uid (unique number) of the cube; the file also names the calibration under

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The URDF (robot description) of a skin, by which it is attached to the URDF of a robot."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Reads and writes YAML files, and refuses unsafe or ambiguous ones.
 
 Refused are tags other than those of plain values (numbers, texts, lists, mappings), files above a

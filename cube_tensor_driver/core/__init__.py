@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The physics: from pad frequencies to stress and its gradient, and what is measured to get there.
 
 The folder needs numpy, and transforms3d for rotations. It has no input or output, no clock, no

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Array types that signatures name, and the padded table of values per pad."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Calibration: the values that turn the frequencies of a cube into stress, with an id."""
 
 from __future__ import annotations

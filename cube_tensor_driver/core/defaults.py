@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Default values that several parts of the package share, in SI units."""
 
 from __future__ import annotations

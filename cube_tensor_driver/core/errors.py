@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """All errors of the package. Each message names the value found, the limit and the fix."""
 
 

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Inversion of a response by weighted least squares, and the residual that shows broken pads.
 
 The pads measure the stresses v = A s, where A is the response (pads x modes) and the state s holds

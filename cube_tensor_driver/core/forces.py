@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Forces on the cubes of a skin, in the frame of the skin."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The latest stress of each cube of a skin, and whether it is usable."""
 
 from __future__ import annotations

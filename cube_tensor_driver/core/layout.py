@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Layouts: the positions and face normals of the pads (capacitive sensors) of a cube.
 
 Frame of the cube: z points out of the skin, x and y lie along it, the origin is the centre of the

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Search for the row of one table that is the same sample of a cube as a row of another table.
 
 A sample is identified by its cube and its sequence number. A hub that restarts gives the same

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Modes: linear stress fields in equilibrium, whose amplitudes a cube recovers.
 
 Mode m is the field ``sigma_ij(x) = S_ij + G_ijk x_k / d0``, where x is the position relative to the

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The pad law: from the frequency of a pad's oscillator to the normal stress on the pad.
 
     r = f / f0,   d/d0 = r / (1 + beta (1 - r)),   v = E (d/d0 - 1)

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Pipeline: from frequencies of pads to stresses of cubes.
 
 A row (sample of one cube) is computed in two steps: the pad law (`oscillator.py`) gives the stress

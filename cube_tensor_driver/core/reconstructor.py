@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Reconstructor: from frequencies of pads to stresses of cubes, the central step of the program.
 
 It combines the health of the pads (which of them are broken), the pipeline (the computation of the

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Response matrix A of a cube (pads x modes, Pa per Pa).
 
 The stresses on the pads are v = A s, where s holds the amplitudes of the modes (linear stress

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Rows: the tables of frequencies and of stress that the steps of the program pass on.
 
 One row is one sample: all pads of one cube at one instant. A scan has at most one row per cube, all

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Status bits of rows and conditions of pads, with the values that SkinStress.msg states."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Symmetry: the response matrices that a cube can have, given the symmetry of its surroundings.
 
 The response A (pads x modes) gives the stresses on the pads per amplitude of each mode (linear

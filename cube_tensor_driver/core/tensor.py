@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Tensor algebra over rows: invariants, tractions, rotations and forces of stress tensors.
 
 A stress (..., 6) has the components xx, yy, zz, yz, zx, xy (Voigt order), tension positive. A

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """`./cube demo`: start simulated hubs, driver and reconstruction, and watch what they publish.
 
 The processes need almost a second for their own imports. They are therefore started before this

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Comparison of the tensors that arrived with the load on the simulated skin.
 
 Only the demo needs this. The module `verification`, which `./cube bench` and the tests use too,

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """A node that observes a skin in other processes; `./cube demo`, torture and bench use it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Comparison of the samples that simulated hubs sent with the rows of messages that arrived.
 
 `./cube demo` and `./cube bench` collect the rows in `Arrivals`, and `compare` them with the log of

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The part of the demo that runs beside its processes: live table, and measurement of arrivals."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """From the bytes of hubs to `FrequencyRows`: protocol, links, clocks, counting, scans.
 
 A hub is the microcontroller that samples one or more cubes and sends its samples over one link (a

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The chain from bytes to rows: reader, sample counters, clocks and scans of all links of a skin.
 
 `LiveLinks` calls back with rows in the thread of the reader. The driver node publishes them in that

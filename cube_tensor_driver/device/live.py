@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The live source: an iterable of the rows that the hubs of a skin send, without ROS."""
 
 from __future__ import annotations

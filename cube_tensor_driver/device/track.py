@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """State of one link that each of its samples changes: sample numbers, sample period, clock line.
 
 The clock line is host time as a linear function of device time (the hub's clock). The module in C

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Export of bags to a LeRobot data set (LeRobotDataset v3.0: Parquet files and metadata for robot
 learning).
 

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The files of a LeRobot data set, version 3.0: Parquet in data/ and meta/, and JSON in meta/.
 
 Source of the format: `lerobot.datasets` in the package lerobot 0.4.4.

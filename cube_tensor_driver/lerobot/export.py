@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Export of bags to one data set: all bags are planned, then each is reconstructed and written."""
 
 from __future__ import annotations

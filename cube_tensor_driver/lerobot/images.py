@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Conversion of a bag's images for a data set: compressed ones are kept, raw ones become PNG."""
 
 from __future__ import annotations

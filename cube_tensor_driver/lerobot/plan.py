@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """First pass over a bag: it finds the episodes and counts the samples of each cube in every frame.
 
 A frame is one time step of a data set. Frame k of an episode contains the samples with stamps t::

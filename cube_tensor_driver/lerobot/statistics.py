@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Statistics of a feature (column of a LeRobot data set), with which policies normalise its values.
 
 NaN, which stands for an unknown value, is left out of all statistics.

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Topics other than stress that become features of a data set: images, joint states and other
 messages of numbers with a stamp.
 

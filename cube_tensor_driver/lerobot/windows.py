@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Arrangement of stress in windows: all samples of every cube in one frame of a data set."""
 
 from __future__ import annotations

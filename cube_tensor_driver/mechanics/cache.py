@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Cache of arrays that take seconds to compute, in the user's cache folder.
 
 The name of a file contains a hash of everything its arrays depend on, the source code included. So

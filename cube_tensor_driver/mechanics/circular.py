@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Circular components: combinations of stress and gradient that only change phase under rotation.
 
 A rotation of the frame about z by an angle multiplies a circular component c of order m (0 to 3) by

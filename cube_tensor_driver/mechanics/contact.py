@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Stress and stress gradient in a half space under contact loads on its surface.
 
 The skin is the half space z <= 0: z points out of the skin, its surface is z = 0 and a cube is at z

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Tables of the stress and gradient at cubes under contacts, fast enough for every simulation step.
 
 `DiscTables` are for round contacts, `PolygonTables` for polygons of uniform traction. Both hold

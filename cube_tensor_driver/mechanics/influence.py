@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Influence functions: stress of each pad of a cube under a unit force, by the force's position."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Files (.npz) of influence functions: stress of each pad of a cube under a unit force."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Response of cubes at one depth to traction on the surface, and covariances of random traction.
 
 A layer is the same everywhere and in all directions. Quantities that depend on the offset p = r

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Stress in an elastic layer under traction on its surface, in wavenumber space.
 
 The layer fills -thickness < z < 0. The traction t acts on its surface z = 0, and its bottom is

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Response of circular components to waves of traction, independent of the direction of the wave.
 
 A circular component (circular.py) of order m is a combination of stresses and gradients at a point

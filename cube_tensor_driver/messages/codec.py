@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The codec of SkinFrequencies and SkinStress: serialised bytes to rows, rows to serialised bytes.
 
 Each of these messages holds many rows (one row is one sample of one cube). Two messages with the

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Messages of contacts and surface traction, made in the same way by a node and by reprocessing.
 
 The caller passes the function that constructs a message: a node passes one that uses the classes of

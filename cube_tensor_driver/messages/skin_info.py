@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Reading of a SkinInfo message: poses and calibrations of the cubes of a skin.
 
 The message may be an object of rclpy or of the bag library.

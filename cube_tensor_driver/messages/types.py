@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Names of the ROS message types whose messages the package publishes and records."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Starts and watches the processes of a skin as child processes, and ends them in every case."""
 
 from __future__ import annotations

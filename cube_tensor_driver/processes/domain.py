@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The DDS domain (number that separates groups of ROS nodes) of this process and its children."""
 
 from __future__ import annotations

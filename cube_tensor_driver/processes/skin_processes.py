@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The processes that a skin needs, with their arguments, as `./cube demo` starts them.
 
 launch/skin.launch.py starts the same processes with ROS launch.

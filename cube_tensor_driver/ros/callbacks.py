@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Wrappers of a node's callbacks that catch all exceptions, so that none ends the process.
 
 An exception in a callback is logged at most every `LOG_PERIOD_S`, counted, and shown in the

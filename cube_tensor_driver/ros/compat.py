@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Features of rclpy that some releases of ROS 2 lack, with a replacement for each.
 
 The code tests for the feature and not for the name of the release, so that a feature which was

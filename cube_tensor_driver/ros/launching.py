@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Functions of the launch files: they check launch arguments and make texts from the skin file.
 
 This module imports the package `launch`, which every installation of ROS 2 has, but not the Python

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Makes and reads rclpy messages: SkinInfo, tensors and wrenches of single cubes, time stamps.
 
 The messages SkinFrequencies and SkinStress, which hold the rows of all cubes, are not made here:

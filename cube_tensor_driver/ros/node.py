@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The base class of all nodes (parameters, lifecycle, clean-up), and `run`, which runs nodes."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Quality of service (QoS) of all topics and services of the package.
 
 The batch topics are `frequencies`, `stress` and `forces`, whose messages hold rows of all cubes.

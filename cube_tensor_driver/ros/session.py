@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Starts and ends rclpy, and spins executors; nodes and commands share these functions."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Subscribes to the topics `info` and `stress` of a skin and keeps the newest values.
 
 It serves nodes that display the skin, or compute something from its newest stress at a low rate.

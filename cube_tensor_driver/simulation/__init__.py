@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Simulation of a skin: loads on it, pads of its cubes, hubs, lines to the host, and faults.
 
 A simulated skin is either a source of frequencies in this process (`source`), or a process of its

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Simulated hubs in the background of a program that computes the load itself.
 
 An example is a program that simulates a robot with its controller. The driver reads the simulated

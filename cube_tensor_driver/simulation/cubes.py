@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Simulated cubes: frequencies of their pads under a stress field, and the cubes of each hub.
 
 The response matrix and the law from stress to frequency are those of the driver's core.

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Kinds of faults of simulated hubs, and how they are written in YAML.
 
 A fault is a table with the key `kind` and further keys where the kind needs them; `Fault` lists

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """A simulated hub: it answers requests of the host, takes samples and logs them.
 
 Like the protocol code, this code reads no port and no clock: its caller passes bytes and the time.

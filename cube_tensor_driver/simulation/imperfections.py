@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Deviations of real pads from their calibrations: spread of gains, creep with hysteresis, failure.
 
 The foam of the pads creeps: under a constant stress, its strain keeps growing, and so does the

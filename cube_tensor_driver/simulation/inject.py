@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Sends a fault to simulated hubs that run in another process: `./cube inject`."""
 
 from __future__ import annotations

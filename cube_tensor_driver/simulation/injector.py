@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Carries out faults on simulated hubs, at given times or at once, and records them."""
 
 from __future__ import annotations

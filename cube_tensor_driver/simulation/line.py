@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Line between a simulated hub and the host: a pseudo-terminal.
 
 The faults of injector.py can unplug it, stall it, or let it send in bursts.

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Loads on a simulated skin: the contacts of a load script and the stress at each cube."""
 
 from __future__ import annotations

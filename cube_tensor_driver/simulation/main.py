@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Process that simulates all hubs of a skin on pseudo-terminals under a load.
 
 The port of each link appears as PORTS/<link name>. On SIGINT or SIGTERM, the simulator ends and

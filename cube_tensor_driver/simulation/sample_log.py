@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Log of a simulator: the samples that its hubs took, and the faults that were carried out.
 
 The simulator writes the log when it ends. Checks compare it with the samples that arrived.

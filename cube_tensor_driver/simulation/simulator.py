@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Simulates all hubs of a skin in one process, under a load and faults, and logs their samples.
 
 The hubs are connected to the host by pseudo-terminals.

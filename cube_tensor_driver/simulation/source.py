@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """A simulated skin as a source of frequencies, without ports, threads and waiting."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Cubic splines through points at equal intervals.
 
 They are computed here, because importing scipy.interpolate would more than double the time that the

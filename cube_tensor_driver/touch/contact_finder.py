@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Common interface of the two methods that find the contacts of a skin: interpolation, inverse."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Hermite interpolation between cubes by radial basis functions.
 
 Every cube has a patch, a grid of points around it. The quantity p (for example the pressure) at

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Inverse problem of a skin: the traction on its surface from the measured values of all cubes.
 
 The measured values y depend linearly on the traction t (force per area on the surface) and have an

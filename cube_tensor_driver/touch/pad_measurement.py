@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Measurement model of cubes in an elastic layer, from the influence functions of their pads.
 
 The influence function of a pad (one of a cube's sensing elements) is the stress that it measures

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Noise of the components (stresses and their gradients) that a cube measures.
 
 It has two causes: the noise of the cube's pads (sensing elements) and the errors of their gains. B

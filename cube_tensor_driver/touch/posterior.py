@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Posterior of the traction on the surface, from windows of neighbouring cubes.
 
 K are prior covariances (prior.py) of the traction t (force per area on the surface) and of the

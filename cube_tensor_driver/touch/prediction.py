@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Prediction of missing values of a cube from its neighbours.
 
 A window (a cube and its nearest neighbours) has the gain matrix G from values to traction and the

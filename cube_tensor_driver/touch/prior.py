@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Prior covariance of the values that several cubes measure under a random surface traction."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Pressure and shear over a skin by interpolation between its cubes, and the contacts in it.
 
 The pressure p = −σzz in the plane of the cubes' centres, `depth` below the surface, is interpolated

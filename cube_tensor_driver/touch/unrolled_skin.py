@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Unrolling of bent skins: neighbours of a cube are laid flat and keep their distance from it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Triangle meshes of the 3-D view as arrays: prisms, arrows, marks and coloured squares."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Images of values at scattered points, for views from above."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Round numbers for axes and scale bars."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Colours, arrows and crosses that show the stress of each cube, as arrays for all viewers.
 
 The values of N cubes are an array (N, 15) in the order of COMPONENTS, in Pa and Pa/m, in the frames

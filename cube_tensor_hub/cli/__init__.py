@@ -1,1 +1,3 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The commands check and firmware."""

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """./cube check: test whether a hub keeps every rule of docs/protocol.md."""
 
 from __future__ import annotations

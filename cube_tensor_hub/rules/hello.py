@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Rules of HELLO: H1 to H5."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Rules of the line: L1 to L5."""
 
 from __future__ import annotations

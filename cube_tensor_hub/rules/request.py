@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Rules of REQUEST and ACK: R1 to R8."""
 
 from __future__ import annotations

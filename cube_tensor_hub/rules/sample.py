@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Rules of SAMPLE and STATS: S1 to S9.
 
 Samples are counted until the port is closed, because what the kernel holds then is lost.

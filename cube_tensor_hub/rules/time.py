@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Rules of TIME: T1 to T5."""
 
 from __future__ import annotations

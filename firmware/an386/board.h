@@ -1,3 +1,6 @@
+// Copyright 2026 cube_tensor_driver authors
+// SPDX-License-Identifier: Apache-2.0
+
 /* MPS2 with the image AN386: Cortex-M4, 25 MHz. QEMU runs it as mps2-an386.
  * Registers: ARM, Cortex-M System Design Kit, technical reference manual. */
 #ifndef BOARD_H

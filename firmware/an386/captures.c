@@ -1,3 +1,6 @@
+// Copyright 2026 cube_tensor_driver authors
+// SPDX-License-Identifier: Apache-2.0
+
 /* Windows and captures of a board without oscillators.
  *
  * What timers would capture comes over UART1: the hub asks for each window, and whoever plays the

@@ -1,3 +1,6 @@
+// Copyright 2026 cube_tensor_driver authors
+// SPDX-License-Identifier: Apache-2.0
+
 /* A hub on MPS2-AN386, which QEMU emulates.
  *
  * captures.c, which stands in for the timers of a board with pads, has the rest of the port. */

@@ -1,3 +1,6 @@
+// Copyright 2026 cube_tensor_driver authors
+// SPDX-License-Identifier: Apache-2.0
+
 /* A UART with a ring in each direction, moved by interrupts. */
 #ifndef SERIAL_H
 #define SERIAL_H

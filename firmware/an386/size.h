@@ -1,3 +1,6 @@
+// Copyright 2026 cube_tensor_driver authors
+// SPDX-License-Identifier: Apache-2.0
+
 /* What the hub carries, and how long it counts. */
 #ifndef SIZE_H
 #define SIZE_H

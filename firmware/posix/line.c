@@ -1,3 +1,6 @@
+// Copyright 2026 cube_tensor_driver authors
+// SPDX-License-Identifier: Apache-2.0
+
 /* See line.h. */
 #define _GNU_SOURCE
 #include "line.h"

@@ -1,3 +1,6 @@
+// Copyright 2026 cube_tensor_driver authors
+// SPDX-License-Identifier: Apache-2.0
+
 /* Port of a hub that is a part of a process: its line is a pseudo-terminal or a TCP socket, its
  * pads are oscillators at rest. */
 #ifndef LINE_H

@@ -1,3 +1,6 @@
+// Copyright 2026 cube_tensor_driver authors
+// SPDX-License-Identifier: Apache-2.0
+
 /* cube_hub: hubs as a process, for hosts to be tried and loaded with.
  *
  * With CLOCK_MONOTONIC and a steady set of captures it costs what building and sending frames

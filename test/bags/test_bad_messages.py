@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """One bad message in a bag is left out and reported; the others give what they gave without it."""
 
 from __future__ import annotations

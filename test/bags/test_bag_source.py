@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Bags as sources of rows, and what a recording says about them."""
 
 from __future__ import annotations

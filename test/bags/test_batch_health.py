@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Health of recorded batches at once against the same one by one, as the node does it."""
 
 from __future__ import annotations

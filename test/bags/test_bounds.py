@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Compressed bags, and what is no bag at all: one line says why it was refused."""
 
 from __future__ import annotations

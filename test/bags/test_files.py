@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Bags as files: written, read, cut off and repaired, damaged, made into stress again. Needs no
 ROS."""
 

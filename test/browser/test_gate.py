@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Who may talk to the server of the browser view, what a browser may send, and what it may save."""
 
 from __future__ import annotations

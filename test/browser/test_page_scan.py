@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """One instant of the page: rows and the results of `contacts` for them, field, sampling rates."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """What one scan puts on the page, read from the messages of a websocket as a browser reads it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The page of ./cube view in a real browser: a load, a cube that is chosen, a tare, a replay that
 is held and jumps."""
 

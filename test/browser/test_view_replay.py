@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """A jump that a browser asks for is neither overwritten nor forgotten, however late things come."""
 
 from __future__ import annotations

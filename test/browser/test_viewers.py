@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The live table; and the set-ups for RViz and Foxglove. These programs are not installed here, so
 the tests check that every name in the set-ups is one that the programs' sources read.
 

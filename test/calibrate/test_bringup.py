@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Bring-up of a hub: pads at rest, presses that tell swapped pads and turned cubes, and the command
 with a scripted person on a pseudo-terminal."""
 

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Fit: known coefficients and gains come back, within what is stated, from loads with noise and
 outliers."""
 

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """./cube fit and ./cube layout as a user runs them: tables in, calibrations and pictures out, one
 line per mistake."""
 

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """./cube config and ./cube urdf as a user runs them."""
 
 from __future__ import annotations

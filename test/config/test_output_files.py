@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Files appear complete or not at all, whoever else writes them at the same time."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Skin files: what is read; and that every mistake gives one message with the file, the key, what
 was found and what is allowed."""
 

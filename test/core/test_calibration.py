@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Calibrations: plain types and back, and every way to be refused."""
 
 import dataclasses

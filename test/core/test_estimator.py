@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Inversion: what was put in comes out, with the stated scatter, residual and suspects."""
 
 import json

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Health of pads: what is broken is named at once, and nothing healthy is."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The kernel in C and the one in numpy agree on every bit, on every processor."""
 
 from __future__ import annotations

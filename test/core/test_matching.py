@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Rows of one table found in another by cube, sequence number and stamp."""
 
 from __future__ import annotations

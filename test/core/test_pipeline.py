@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Rows in, rows out: exact where it can be, marked where it cannot, fast."""
 
 import dataclasses

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """What the Reconstructor puts together, and the statistics below it, against truth."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Layouts, modes and the response that symmetry leaves: against the paper's matrix and
 characters."""
 

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Tare: taken only at rest, kept by uid, undone; drift followed only while nothing touches."""
 
 from __future__ import annotations

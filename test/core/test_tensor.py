@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Tensor algebra against its definitions."""
 
 from types import SimpleNamespace

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The main job in real processes: simulator, pseudo-terminal, driver, DDS, reconstruction, DDS,
 subscriber."""
 

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The worked examples: their files; and that each runs and finds the loads of its script."""
 
 from __future__ import annotations

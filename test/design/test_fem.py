@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Finite elements against exact solutions, balance, symmetry and their own convergence."""
 
 import json

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """./cube fem, ./cube study, ./cube paper as a user runs them: tables, files and pictures out, one
 line per mistake."""
 

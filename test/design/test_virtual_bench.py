@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The virtual bench against homogeneous solutions, and the study against the order of its error."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """A hub's clock that is set, sampling that is late, and rows whose stamps are in doubt meanwhile.
 
 On simulated arrivals with fixed seeds and known true times.

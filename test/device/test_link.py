@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Links over real pseudo-terminals and local TCP sockets; what cannot be provoked as root goes
 through errno."""
 

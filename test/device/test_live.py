@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """open_links over real pseudo-terminals: simulated hubs at one end, rows at the other."""
 
 from __future__ import annotations

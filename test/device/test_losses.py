@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Whatever is lost shows in the report of its link, and device time decides between a gap, a repeat
 and a restart."""
 

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The Python module of the wire in C gives what the Python code gives, bit by bit."""
 
 from __future__ import annotations

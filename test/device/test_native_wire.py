@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """native/cube_wire.c and the Python codec agree on every byte, counter and frame, whatever comes
 and wherever it is cut. The C side runs under the address and undefined-behaviour sanitizers."""
 

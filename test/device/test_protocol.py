@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Wire protocol: the dumps of docs/protocol.md are the golden data; every case whole, byte by byte
 and in junk."""
 

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The reader over real pseudo-terminals and TCP sockets; the test plays the hub on the other end,
 frame by frame."""
 

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Time by round trip, on simulated lines with fixed seeds and known true times."""
 
 from __future__ import annotations

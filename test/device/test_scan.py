@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """From samples to rows: which cube a value belongs to, what is left out and counted, when a scan is
 complete."""
 

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The documentation builds without a warning, and every command on its pages runs: here, or in a
 test named here."""
 

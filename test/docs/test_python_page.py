@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Every Python block of docs/python.md runs in order, and so does the example of the README."""
 
 from __future__ import annotations

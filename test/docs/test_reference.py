@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """docs/messages.md, docs/troubleshooting.md and computed numbers of pages against the package."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Hubs that are wrong in one way each, as firmware is; written from docs/protocol.md, not from the
 rules of the check."""
 

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The check of a hub: a sound hub passes, and a hub that breaks one rule fails exactly that one."""
 
 from __future__ import annotations

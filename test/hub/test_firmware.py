@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The hub in C: as a process of this machine, and on an emulated microcontroller."""
 
 from __future__ import annotations

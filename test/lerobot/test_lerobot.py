@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """A LeRobot data set of bags: every field against what was put in, without lerobot; and with it,
 where a Python that has it is named."""
 

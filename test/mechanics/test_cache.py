@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """What is computed once is kept: right, bounded, and made again where a file is damaged."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Contact fields against mechanics: balance, compatibility, boundary, total force, Hertz."""
 
 import numpy as np

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Influence functions of pads against direct solutions, a known field and their own convergence."""
 
 from dataclasses import replace

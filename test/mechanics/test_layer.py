@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The layer in wavenumber space against point forces, and against finite elements."""
 
 from __future__ import annotations

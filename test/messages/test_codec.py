@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The codec of the batch messages against rosbags' serialiser, and what it refuses."""
 
 from __future__ import annotations

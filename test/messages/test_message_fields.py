@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Each field of the messages about a skin and its contacts, against values from elsewhere."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Child processes, none of which outlives the process that started it, and signals to end."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """./cube tare and its neighbours, which need no ros2: with one simulated skin that runs for all
 tests, and with none."""
 

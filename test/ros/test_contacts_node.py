@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The node `contacts` with the method `inverse`: contacts with ids, and the surface's traction; the
 same out of a bag."""
 

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """What the reconstruction reports: lost messages, also those that DDS drops without a word, and its
 own state."""
 

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Two million bytes of each kind of noise through the decoder, and any text through the readers
 of files."""
 

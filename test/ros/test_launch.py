@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Launch files, the list of processes that they share with the demo, and a skin that starts."""
 
 from __future__ import annotations

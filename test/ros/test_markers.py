@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The picture of a skin: its geometry against cases computed by hand, its message as other nodes
 read it."""
 

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Two machines: simulator and driver on one, reconstruction and a recorder on the other; the cable
 between them is cut.
 

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Driver and reconstruction with a hub that a test plays. All tests share both nodes; each plugs in
 a hub of its own."""
 

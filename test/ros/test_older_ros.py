@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The nodes run where rclpy lacks what older releases of ROS 2 lack."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """What peers send over DDS ends no node: transitions, services, parameters, messages."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Tare, live parameters, lifecycle and shutdown of the real nodes."""
 
 from __future__ import annotations

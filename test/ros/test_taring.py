@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Tares and the uids of cubes that become known only later, when the driver says them."""
 
 from __future__ import annotations

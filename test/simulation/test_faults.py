@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The fault injector does what it says; so does `./cube inject`."""
 
 from __future__ import annotations

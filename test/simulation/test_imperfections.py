@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Imperfect pads: creep against its closed form, and spread and failure as often as asked for."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Load scripts: what they do in time, and the stress that they cause at the cubes, against
 closed forms."""
 

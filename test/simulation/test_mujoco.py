@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Skins on the bodies of MuJoCo models: forces in equal forces out, on bodies that stick, slip and
 roll; the discs and patches that this is made of, against exact sums."""
 

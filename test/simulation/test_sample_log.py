@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The sample log of a simulator, and the comparison of what was sent and received."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """A simulated skin in this process: exact frequencies, and the load comes out again."""
 
 from __future__ import annotations

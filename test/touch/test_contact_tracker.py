@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Contacts from all cubes: force, place and deviations, for loads that other methods computed."""
 
 from __future__ import annotations

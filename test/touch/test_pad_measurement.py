@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Cubes as pads in a thin layer: the tables against sums over the influence functions."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The field between the cubes against the contact model, and what the gradients buy."""
 
 from __future__ import annotations

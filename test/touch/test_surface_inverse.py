@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Traction on the surface from all cubes, against contacts that other methods computed."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Pictures leave matplotlib's global settings alone and need no display."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The benchmark of the whole chain: it must count right; how fast it is, is for whoever runs it."""
 
 from __future__ import annotations

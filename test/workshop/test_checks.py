@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The checks of torture find each thing that is wrong, and nothing where nothing is."""
 
 from __future__ import annotations

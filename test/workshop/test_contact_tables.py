@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The tables of contacts.json, with errors that no study has computed."""
 
 from __future__ import annotations

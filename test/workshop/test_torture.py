@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """A short torture: the whole chain in real processes under a mix of faults, checked to the last
 sample and bit; and mutations of it that the checks must find."""
 

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """`./cube bench contacts`: errors and CPU time of contacts by the shape of the load.
 
 The stress is that of point forces on a half space. It goes through the whole chain: pads whose

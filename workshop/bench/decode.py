@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """`./cube bench decode`: how fast bytes are decoded, clean frames and noise in the same run."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Floor of a benchmark: bare rclpy that publishes and echoes messages of a skin's sizes.
 
 `source` publishes SkinFrequencies at a rate, and `echo` answers each with a SkinStress. They have

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Hubs in C (`firmware/`) as the load of a benchmark: their start, and the samples they took."""
 
 from __future__ import annotations

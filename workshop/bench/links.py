@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """`./cube bench links`: from the bytes of hubs to arrays, without DDS and reconstruction."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Picture of `./cube bench scale`: cost and latency over the number of cubes."""
 
 from __future__ import annotations

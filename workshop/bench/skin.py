@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """`./cube bench skin`, `echo` and `scale`: the whole chain beside a bare floor.
 
 The floor is measured in the same run. Everything runs in a DDS domain of its own, so that a skin

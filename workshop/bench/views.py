@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """What views cost: the nodes markers and contacts and the browser view of a skin at 100 Hz.
 
 `python -m workshop.bench.views CUBES [chromium]` prints one line of figures. A client that draws

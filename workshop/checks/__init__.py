@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Checks of a torture: what a skin published, compared with what its simulated hubs did.
 
 One comparison per file; `all_checks.py` puts them together. What was sent comes from the sample log

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """All checks together: the figures of a torture."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Check of the counters of the nodes against what was sent and what arrived."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Check of one cube's own topics: their messages against the rows of `stress` of the same stamp."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Expected reading of each pad in each sample, from the load and the sample log alone.
 
 The hubs repeat a table of instants of the load. Faults that last change its readings. The noise of

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Check of the topic `frequencies`: every field of every row against what the hubs measured."""
 
 from __future__ import annotations

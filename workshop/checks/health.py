@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Check of the health of pads: flags of the reconstruction against the faults that pads had.
 
 Each fault must be flagged on its pad within its stated time, with its own bit, and no other pad may

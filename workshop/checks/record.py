@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Input of the checks: what arrived, in order, and what was done to the nodes."""
 
 from __future__ import annotations

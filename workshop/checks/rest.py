@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Rest frequencies in force: those of the calibrations, and those of each tare.
 
 A tare of the torture is made while the load of the tared cubes is held, so the frequencies of that

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """One torture, prepared for the checks."""
 
 from __future__ import annotations

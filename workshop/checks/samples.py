@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """All samples that the hubs took, and the faults that they had, from the sample log."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Check of the topic `stress`: each row against the row of frequencies that it was made from.
 
 The reference is the package's own pipeline in double precision, in this process. Which pads a row

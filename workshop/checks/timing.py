@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Checks of time: stamps, sampling periods, and how fast the driver connects again."""
 
 from __future__ import annotations

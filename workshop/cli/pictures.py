@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """./cube pictures: the pictures of the documentation, drawn again so that they stay true."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """./cube torture: real processes under all faults, checked against the simulator's log."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The tables of docs/pictures/contacts.json: accuracy of contacts, from the studies of traction."""
 
 from __future__ import annotations

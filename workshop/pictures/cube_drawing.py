@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Drawing for docs/build.md: a cube in its skin and the pads on the cube, to scale, in mm."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The pictures of the documentation, made from a running demo, the benchmark and the studies."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """A robot in simulation, and beside it pressure and shear on the skin of its fingers."""
 
 from __future__ import annotations

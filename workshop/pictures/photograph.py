@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """A picture of the running browser view in headless Chromium, while a load presses the chosen cube.
 
 Use: python -m workshop.pictures.photograph URL FILE.png

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Actions of a torture on the nodes: what their users do, and what a crash does."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Memory and threads of the nodes over time."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Log of the messages of topics as they arrive, with the gaps in the numbers that DDS gives them.
 
 A gap means that a message was sent and did not arrive here. So what this process missed can be told

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Mix of a torture: faults of the hubs and actions on the nodes, by time and seed."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Programming errors that the checks of torture must find.
 
 Each mutation is put into the process of a node when it starts; the nodes do not know of it. It

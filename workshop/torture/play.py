@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """One torture: its processes, what is done to them, and the record of what arrives.
 
 Nothing is checked here.

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Record of a torture: both batch topics, the topics of one cube, and the counters of the nodes."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Process that simulates hubs like `simulation/main.py`, some of them behind a TCP bridge.
 
 Links whose port in the skin file is a TCP address listen there, instead of on a pseudo-terminal.

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """`./cube torture`: a skin under a random mix of all faults, in processes of its own.
 
 Every row that arrives is compared with what was measured and with what was done.

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Reprocessing of many bags into one folder, in parallel processes or on a Dask cluster."""
 
 from __future__ import annotations

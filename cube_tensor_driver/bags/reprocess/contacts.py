@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Contacts and surface traction, computed and written while a bag is reprocessed."""
 
 from __future__ import annotations

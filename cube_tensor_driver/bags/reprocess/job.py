@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Reprocessing of one bag: stress is computed again from its recorded frequencies.
 
 The result is equal, bit by bit, to the stress that the reconstruction node published, unless other

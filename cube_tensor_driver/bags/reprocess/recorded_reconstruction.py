@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Settings and health from a bag for a reconstruction, so that replayed frequencies give exactly
 the recorded stress."""
 

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Diagnosis of pads from the statistics of a window, and how long a condition lasts.
 
 All arrays are (cubes, pads); nothing loops over cubes.

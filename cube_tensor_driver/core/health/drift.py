@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Tracking of slow drift in the rest frequencies of unloaded cubes.
 
 The frequency of a pad without load changes over minutes and hours (temperature, ageing). While

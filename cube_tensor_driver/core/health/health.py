@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Health of pads and cubes: which pads are broken, found from their frequencies alone.
 
 Every row (sample of one cube) is checked when it arrives. A pad whose frequency is impossible

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Statistics of every pad over windows of half a second.
 
 From the frequencies f[n] of a pad at the times t[n] of successive rows are computed:

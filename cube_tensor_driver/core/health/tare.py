@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Tare: take the present load of a cube as its unloaded state.
 
     f0 = mean(f) / factor(T)

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Arrays that the kernel reads and writes, in the order in which it takes them.
 
 The kernel computes stress from the frequencies of rows (samples of one cube), and adds the rows to

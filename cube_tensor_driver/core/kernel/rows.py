@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The kernel in numpy: the specification to read, and the kernel where no C compiler was.
 
 The rows of one scan (at most one row of each cube) are processed together; the kernel in C takes up

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The choice between the kernel in C and the one in numpy."""
 
 from __future__ import annotations

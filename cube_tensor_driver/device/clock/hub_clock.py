@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Conversion of one hub's device times to host times.
 
 Host time is a straight line over device time (`line.py`). Round trips (a question for the hub's

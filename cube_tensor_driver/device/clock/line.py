@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The straight line from the device time of one hub to host time, bounded by round trips.
 
     arrival = device time + offset + drift * device time + delay

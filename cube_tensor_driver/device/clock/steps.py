@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Detection of steps of the host's clock and of a hub's clock.
 
 The host's clock is compared with the monotonic clock, which is never set. A hub numbers its samples

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Waiting for data of all links, reading and decoding them, in one step.
 
 With the wire module in C, a single call does all of this without Python's global interpreter lock,

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Check whether the baud rate of a serial line suffices for the samples of its cubes."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """One link: a byte stream to and from a hub over a serial port, a pseudo-terminal or TCP.
 
 A link moves bytes without blocking and without a thread; `session.py` decides what is sent on it.

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Logging of lines about one link at a limited rate.
 
 A faulty hub can cause a thousand lines per second.

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The thread that reads all links of a skin.
 
 The thread opens and reopens the links, decodes their bytes, and calls back once each time it has

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Search for the serial ports of this machine, and for the hubs connected to them."""
 
 from __future__ import annotations

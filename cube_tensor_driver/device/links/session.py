@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Requests to one hub and handling of its answers, each time its port is opened.
 
 After each opening, the hub is asked for HELLO; when HELLO has come, the hub is sent its settings

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """TCP connections that are made without blocking the caller.
 
 pyserial could open ``socket://`` URLs, too, but blocks for up to 5 s while it looks up the name of

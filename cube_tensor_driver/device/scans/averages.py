@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Conversion of the rows of a live source to scans (one row of every cube) and to averages."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Table that tells which cube of the skin each row of a hub's sample belongs to.
 
 The HELLO frame of a hub lists the unique numbers (uids) of its cubes, and the skin file names each

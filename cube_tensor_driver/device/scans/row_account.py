@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Counting of rows: how many were received, delivered, and left out for each reason.
 
 A row (one sample of one cube) is counted as received as soon as its frame is decoded, before

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Joining of the samples of all links into scans, and conversion of scans to rows.
 
 A scan holds one sample of each link that delivers samples, taken at about the same time. The

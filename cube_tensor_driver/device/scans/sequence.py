@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Counting of one link's samples by their numbers: new, late, duplicate and missing ones."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Consistent overhead byte stuffing (COBS): removes zero bytes, so that a zero can end a frame.
 
 Each zero byte of the data ends a block. A block is encoded as one byte with its length plus one

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Decoding of the bytes of a link to frames. Any bytes are accepted, also damaged ones.
 
 Each non-empty run (bytes between two zero bytes) becomes one frame, or increases exactly one error

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Import of the wire module in C (folder native/), which reads and decodes frames.
 
 Where it was not compiled, `wire` is None, and the same functions run in Python, more slowly.

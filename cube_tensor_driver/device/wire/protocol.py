@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The frames of wire protocol version 1 and their bytes, without input or output.
 
 A frame is ``type:u8 version:u8 length:u16 payload crc:u32``, little-endian. `length` is the length

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Finds one topic, subscribes to it, and returns its messages as plain values (`./cube echo`)."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Records topics into a bag (file of messages). Messages are stored as the bytes that arrive.
 
 The main thread receives the messages, and a separate thread writes them to the disk.

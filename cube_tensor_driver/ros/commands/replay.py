@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Replays a bag: publishes the recorded messages on their topics at the recorded intervals.
 
 The player publishes in a thread of its own. The main thread spins a node, which publishes the state

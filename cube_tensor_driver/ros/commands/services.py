@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Calls services of running nodes for commands: reads and sets parameters, and requests tares."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Lists the topics that nodes publish, with the rate of their messages, for `./cube topics`."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Diagnostics of the driver: one status about all rows of frequencies, and one per link."""
 
 from __future__ import annotations

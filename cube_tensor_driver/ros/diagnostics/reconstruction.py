@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Diagnostics of the reconstruction: rows, lost messages, tares, and the health of the cubes."""
 
 from __future__ import annotations

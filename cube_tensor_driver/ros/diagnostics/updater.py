@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Publishes diagnostics of a node at 1 Hz.
 
 The package diagnostic_updater of ROS is used if it is installed, otherwise a replacement.

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The picture of a skin as a serialised MarkerArray: cubes, arrows, crosses and contacts.
 
 The pitch, in multiples of which many lengths are stated, is the distance of neighbouring cubes.

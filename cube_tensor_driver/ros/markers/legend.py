@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The legend of the picture of a skin: a colour bar with numbers, and the scales of the arrows."""
 
 from __future__ import annotations

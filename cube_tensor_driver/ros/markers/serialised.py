@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """A serialised MarkerArray in which points, colours and texts are replaced in the bytes.
 
 In rclpy each point and each colour of a marker is a Python object, so that serialising a picture of

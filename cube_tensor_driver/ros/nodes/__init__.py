@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The ROS nodes, one per file.
 
 Importing this package limits numpy's matrix products to one thread, through an environment variable

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Runs driver and reconstruction in one process, which saves sending frequencies over DDS.
 
 The topic `frequencies` is published only while it has subscribers.

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The node `contacts`: computes position, size and force of contacts on the skin from `stress`."""
 
 from __future__ import annotations

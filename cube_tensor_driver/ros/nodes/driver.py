@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The node `driver`: reads the hubs of a skin and publishes the frequencies of the pads."""
 
 from __future__ import annotations

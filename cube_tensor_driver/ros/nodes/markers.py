@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The node `markers`: draws the newest `stress` as a MarkerArray for RViz and Foxglove."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The node `reconstruction`: computes stress tensors and gradients from the pads' frequencies."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Publishes stress rows (the stress of one cube at one instant each) on several topics.
 
 All rows go to `stress`, forces of all cubes to `forces`, and the rows of single cubes to

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The services ~/tare and ~/clear_tare of the reconstruction node.
 
 A tare measures the rest frequencies (frequencies without load) of a cube anew. It is stored in a

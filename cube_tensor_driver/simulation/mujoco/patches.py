@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Contacts of a physics engine as tractions on a surface.
 
 An engine with rigid bodies gives forces at points. A single point is a round contact, whose radius

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """A MuJoCo scene as the load of a simulated skin, so that the driver can be run with a robot.
 
 The scene is one XML file, whose motion is given by its keyframes:

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """A skin on the bodies of a MuJoCo model: contact forces become tractions, and stress at the cubes.
 
 Example::

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Force, position, moment and area of a contact, with standard deviations.
 
 All are integrals of the traction over the nodes (small contacts) of a contact, or quotients of such

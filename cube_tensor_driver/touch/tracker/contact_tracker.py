@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Contact tracker: finds contacts in the traction on the surface, follows them from scan to scan.
 
 In every scan (set of values of all cubes), the linear inverse gives the field of the pressure,

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Traction on the whole skin: that of the fitted regions, and of the residual field around them."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Fit of Hertz contacts, which replaces the traction on the nodes of a region where it is likelier.
 
 A ball presses as a Hertz contact: force, centre and radius describe it with a few numbers, which

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Values of the cubes around a region of contact, divided by their noise."""
 
 from __future__ import annotations

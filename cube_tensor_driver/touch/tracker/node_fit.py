@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Posterior of the traction in one region of contact, from the values of the cubes around it.
 
 The traction is different from zero only in the region, which the field of the inverse problem shows

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Connected regions of significant pressure on a skin, and the parts of a region that are contacts.
 
 The pressure is that at the depth of the cubes' centres, below the points of the surface.

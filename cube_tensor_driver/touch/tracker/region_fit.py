@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Fit of one region of contact: traction on nodes, or Hertz contacts where they are likelier.
 
 Nodes are small contacts on a grid, whose forces are unknown (node_fit.py). A Hertz contact has a

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Pictures of the pads of a cube and of the fit of its calibration."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Curves over time in panels one below the other, as the page saves its plots."""
 
 from __future__ import annotations

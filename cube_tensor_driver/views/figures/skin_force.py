@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The picture of the demo: force on the whole skin and centre of pressure over time."""
 
 from __future__ import annotations

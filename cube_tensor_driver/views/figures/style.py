@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The style of all pictures: for print, readable in grey, made without a display.
 
 A drawing function has the decorator `@print_style()`, makes a `Figure` and returns it; `save`

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """End of a process by Ctrl-C while its main thread runs C code.
 
 Python raises KeyboardInterrupt only between two of its own instructions, and a matrix factorisation

@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """The live table of a skin in a terminal: latest tensor, rate and state of each cube."""
 
 from __future__ import annotations

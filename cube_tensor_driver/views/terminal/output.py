@@ -1,3 +1,5 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
 """Lines, tables and progress in a terminal, as all commands print them."""
 
 from __future__ import annotations
