@@ -45,7 +45,7 @@ from cube_tensor_hub.transcript import FrameListener
 
 SOURCE = ROOT / "firmware"
 SKIN = package_data() / "config" / "skin_firmware.yaml"
-OF_PERIODS = {"R3", "R6", "R7"}
+OF_PERIODS = {"H1", "R3", "R6", "R7"}
 NO_CC, NO_ARM = missing("make", "cc"), missing("make", "arm-none-eabi-gcc", "qemu-system-arm")
 
 pytestmark = [

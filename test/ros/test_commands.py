@@ -270,7 +270,10 @@ def test_parameters_that_are_not_there_or_refused_are_said(skin, capfd):
 
 
 def test_parameters_of_nobody(nobody, capfd):
-    assert main(["param"]) == 1
+    # A process of an earlier test in this domain may still be ending.
+    until = time.monotonic() + 20
+    while main(["param"]) != 1:
+        assert time.monotonic() < until
     assert "no node runs in DDS domain" in capfd.readouterr().err
 
 
