@@ -488,9 +488,11 @@ def test_replay_starts_late_pauses_steps_and_quits(ros, tmp_path):
     os.set_blocking(near, False)
     try:
         ros.wait(lambda: len(raw) > 10)
-        assert [int(one.sequence[0]) for one in raw[:10]] == list(range(100, 110)) and len(
-            infos
-        ) == 1
+        # The player may know of the subscription a little before the subscriber knows of the
+        # player, whose first messages are lost then.
+        first = int(raw[0].sequence[0])
+        assert 100 <= first < 200 and len(infos) == 1
+        assert [int(one.sequence[0]) for one in raw[:10]] == list(range(first, first + 10))
         os.write(near, b" ")
         held: list[int] = []
 
