@@ -76,7 +76,8 @@ _LETTERS = {
 """Letter, and its sign, by which Kiyota & Shinoda (eq. 1) name the response of the pad V1 to each
 mode. The mode zx has equal stresses sigma_zx and sigma_xz, so its response is c + d."""
 _PAPER_LETTERS = _LETTERS | {"zx": ("c", -1), "xz": ("d", -1)}
-"""The same letters for the modes of the paper, which treat sigma_zx and sigma_xz as independent."""
+"""Letter, and its sign, by which Kiyota & Shinoda (eq. 1) name the response of the pad V1 to each
+of their modes. They treat sigma_zx and sigma_xz as independent, so each of the two has a letter."""
 
 
 def generate_group(generators: Sequence[Matrix]) -> Index:

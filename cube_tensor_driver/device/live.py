@@ -166,10 +166,10 @@ class LinkSource:
         """Return the numbers of rows, and the state, notes and counters of each link.
 
         Every received row is counted once: given to the consumer, waiting for it, dropped because
-        the consumer was too slow, dropped because this host cannot read so many, a duplicate, lost
-        by an error of the driver, or left out because the skin does not have the cube or has it
-        with another number of pads. The notes of a link
-        include the problems since the last call.
+        the consumer was too slow, dropped because the host is too slow to read all rows, a
+        duplicate, lost by an error of the driver, or left out because the skin does not have the
+        cube or has it with another number of pads. The notes of a link include the problems since
+        the last call.
         """
         counts = self._links.row_counts()
         links = {

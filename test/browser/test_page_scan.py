@@ -27,7 +27,10 @@ from cube_tensor_driver.touch.surface import Surface, patches
 from cube_tensor_driver.views.scene import QUANTITIES
 from workshop.bench.views import stress_rows
 
-DEPTH, PITCH = 0.004, 0.01
+DEPTH = 0.004
+"""Depth of the cubes' centres below the surface, in m."""
+PITCH = 0.01
+"""Distance between neighbouring cubes, in m."""
 DEMO = read_skin(package_data() / "config" / "skin_demo.yaml")
 
 
@@ -39,7 +42,7 @@ def poses() -> CubePoses:
 
 
 def cloud_of(poses: CubePoses) -> np.ndarray:
-    """As the node publishes it: 2 x 2 points on the surface above each cube."""
+    """Return a point cloud of traction as the node publishes it, with 2 x 2 points per cube."""
     points = patches(poses, PITCH / 2, 2).reshape(-1, 3) + np.array([0, 0, DEPTH])
     pressure = 1e3 + 1e5 * points[:, 0] - 2e5 * points[:, 1]
     return np.column_stack([points, pressure, 0.3 * pressure, 70.0 + 0.01 * pressure])
@@ -59,7 +62,7 @@ def test_a_point_cloud_becomes_the_field_between_its_points(poses):
 
 
 def test_without_the_node_the_field_is_the_pressure_on_the_surface():
-    """As the inverse computes it; its integral is the force of the load."""
+    """The pressure is that of the inverse, and its integral is the force of the load."""
     load = Load(DEMO, default_script())
     seconds = max(np.arange(0, load.period, 0.05), key=lambda time: -load.total(time)[0][2])
     loaded = stress_rows(*load.at(seconds))

@@ -43,8 +43,12 @@ STRICT = [
 ]
 BITS = ["-ffp-contract=off", "-fno-trapping-math", "-fno-math-errno"]
 SANITIZED = ["-g", "-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
-N_TABLES, N_HEALTH, N_COLUMNS = 11, 3, 7
-"""Numbers of arrays that a call takes."""
+N_TABLES = 11
+"""Number of arrays with tables of the skin that a call of the kernel takes."""
+N_HEALTH = 3
+"""Number of arrays with the state of health that a call of the kernel takes."""
+N_COLUMNS = 7
+"""Number of arrays with columns of frequencies that a call of the kernel takes."""
 
 
 class ScanProcess:
@@ -226,7 +230,7 @@ def assert_same_bits(found: list[object], expected: list[object]) -> None:
 
 @pytest.mark.parametrize("skin", list(SKINS))
 def test_c_and_numpy_agree_on_every_bit(kernel, skin):
-    """Of results, states and windows, under all conditions."""
+    """The compared bits are those of results, states and windows, under all conditions of pads."""
     expected = played(None, SKINS[skin], 1)
     assert_same_bits(played(kernel, SKINS[skin], 1), expected)
 

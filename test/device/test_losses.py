@@ -312,8 +312,10 @@ class SlowHost:
 def test_a_host_that_is_too_slow_loses_what_exceeds_its_capacity(
     monkeypatch, as_usual, scan_ms, share
 ) -> None:
-    """Of 4 scans it delivers 4 * scan_ms + 0.5 ms later the next 4: at 1 kHz this share. They are
-    whole and late by a few periods, after the first half second, in which samples are lost."""
+    """A host needs 4 * scan_ms + 0.5 ms for 4 scans, so at 1 kHz it can deliver the given share.
+
+    Delivered scans are whole and late by a few periods. In the first half second samples are lost.
+    """
     if as_usual and native.wire is None:
         pytest.skip("was not compiled")
     host = SlowHost(monkeypatch, scan_ms, as_usual)
