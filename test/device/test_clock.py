@@ -333,6 +333,16 @@ SEQUENCES = {
         [N] * 200 + [D, N],
         (201, 0, 1, 0, 0),
     ),
+    "repeated a minute late": (
+        [(0, 10), (1, 20), (200, 60_020), (1, 20)],
+        [N, N, N, D],
+        (3, 198, 1, 0, 0),
+    ),
+    "more than a minute late is a restart": (
+        [(0, 10), (1, 20), (200, 60_021), (1, 20)],
+        [N, N, N, R],
+        (4, 198 + 1, 0, 0, 1),
+    ),
     "restart from before the first": (
         [*((number, 10 * number) for number in range(300, 400)), (100, 1000)],
         [N] * 100 + [R],
