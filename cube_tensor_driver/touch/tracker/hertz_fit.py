@@ -27,8 +27,8 @@ SIZE_DEVIATION = 1.0
 """Prior standard deviation of the natural logarithm of the radius of a Hertz contact."""
 
 USUAL_SIZE = 0.8
-"""Prior mean (of the logarithm) of the radius of a contact, divided by the depth of the cubes'
-centres below the surface."""
+"""Radius of a contact, divided by the depth of the cubes' centres below the surface, that the prior
+expects: its logarithm is the prior mean of the logarithm of this ratio."""
 
 MAX_START_SIZE = 2.0
 """Largest radius of a Hertz contact at the start of its fit, divided by the depth of the cubes'

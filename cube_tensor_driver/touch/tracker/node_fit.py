@@ -188,10 +188,13 @@ class NodeFit:
         self.posterior = Posterior(forces, root, float(scores[best]))
 
     def sharpen(self, white: Array) -> None:
-        """Fit again with a prior that is narrower where the posterior is small.
+        """Fit again with a prior that allows less force where the present fit finds little force.
+
+        This removes force that the first fit spreads over nodes without contact. If the evidence of
+        the new fit is not clearly higher, the present fit is kept.
 
         Args:
-            white: Values (n C,) divided by their noise.
+            white: Values (n C,), divided by their noise: C components of each of n cubes.
         """
         before = self.posterior, self.misfit, self._scale, self._decomposition
         square = self.posterior.forces[2] ** 2 + (self.posterior.root[2] ** 2).sum(axis=1)
