@@ -50,6 +50,22 @@ class ContactEstimate(NamedTuple):
     aspect: float
 
 
+class ContactSum(NamedTuple):
+    """Traction of a region as the sum of q Hertz contacts on the skin laid flat.
+
+    Attributes:
+        places: Centres (q, 2) in m.
+        sizes: Radii (q,) in m.
+        forces: Forces (3, q) in N, along x, y and z.
+        root: Square root (3, q, n) of the covariance of the forces, in N.
+    """
+
+    places: Array
+    sizes: Array
+    forces: Array
+    root: Array
+
+
 def estimate_contact(fit: NodeFit, chosen: Mask) -> ContactEstimate:
     """Integrate the traction on nodes (small contacts on a grid) over one contact.
 

@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -11,12 +13,13 @@ from ...core.arrays import Array, Index
 from ...mechanics.contact import hertz
 from ...mechanics.layer import FIELD
 from ..inverse import SurfaceInverse, TractionField
+from .contact_estimate import ContactSum
 from .local_values import unroll_points
 from .region_fit import RegionFit
 
-_NODE_RINGS = 4
-"""Number of rings of point forces that represent a node (small Hertz contact) when its force is
-shared out among the points of the surface."""
+_MIN_RINGS = 4
+"""Smallest number of rings of point forces that represent a Hertz contact when its force is shared
+out among the points of the surface."""
 
 
 def add_fits(
@@ -30,11 +33,11 @@ def add_fits(
     traction = residual.traction.copy()
     pressure = residual.depth_pressure.copy()
     for fit in fits:
-        forces = fit.nodes.posterior.forces
-        points, share, below, rotation = _distribute(inverse, fit)
-        local = np.einsum("mab,bm->ma", rotation, forces @ share.T)
+        contacts = fit.to_contacts()
+        points, share, below, rotation = _distribute(inverse, fit, contacts)
+        local = np.einsum("mab,bm->ma", rotation, contacts.forces @ share.T)
         traction[points] += local / inverse.area
-        pressure[points] += below @ forces.ravel()
+        pressure[points] += below @ contacts.forces.ravel()
     return TractionField(traction, pressure)
 
 
@@ -47,38 +50,49 @@ def fit_variances(inverse: SurfaceInverse, fits: list[RegionFit]) -> Array:
     """
     total = np.zeros((len(inverse.points), 2))
     for fit in fits:
-        root = fit.nodes.posterior.root
-        points, share, below, _ = _distribute(inverse, fit)
-        on_surface = share @ root[2] / inverse.area
-        at_depth = below @ root.reshape(-1, root.shape[2])
+        contacts = fit.to_contacts()
+        points, share, below, _ = _distribute(inverse, fit, contacts)
+        on_surface = share @ contacts.root[2] / inverse.area
+        at_depth = below @ contacts.root.reshape(-1, contacts.root.shape[2])
         total[points, 0] += (on_surface**2).sum(axis=1)
         total[points, 1] += (at_depth**2).sum(axis=1)
     return total
 
 
-def _distribute(inverse: SurfaceInverse, fit: RegionFit) -> tuple[Index, Array, Array, Array]:
-    """Return the effect of the nodes of a fit at the m points of the surface around it.
+def _distribute(
+    inverse: SurfaceInverse, fit: RegionFit, contacts: ContactSum
+) -> tuple[Index, Array, Array, Array]:
+    """Return the effect of the q contacts of a fit at the m points of the surface around it.
 
     Returns:
-        Indices (m,) of the points; shares (m, q) of the force of each node that act on the square
-        of each point; pressure (m, 3 q) in Pa/N at the cubes' depth, for forces along x of all
-        nodes, then y, then z; and rotations (m, 3, 3) from the home cube to the cube of each point.
+        Indices (m,) of the points; shares (m, q) of the force of each contact that act on the
+        square of each point; pressure (m, 3 q) in Pa/N at the cubes' depth, for forces along x of
+        all contacts, then y, then z; and rotations (m, 3, 3) from the home cube to the cube of each
+        point.
     """
     points = np.flatnonzero(np.isin(inverse.cube, fit.values.cubes))
     place = unroll_points(inverse, fit.home, points)
-    offsets, weights = hertz(fit.nodes.size, (0, 0, 1), order=_NODE_RINGS)
-    samples = (fit.nodes.places[:, None] + offsets[:, :2]).reshape(-1, 2)
+    count = len(contacts.places)
+    # The squares share the force of a contact by the rings within them, so rings must be narrow: at
+    # a sixteenth of a spacing the error of the pressure is below its deviation.
+    rings = max(_MIN_RINGS, math.ceil(16 * contacts.sizes.max() / inverse.spacing))
+    offsets, weights = hertz(1.0, (0, 0, 1), order=rings)
+    samples = contacts.places[:, None] + contacts.sizes[:, None, None] * offsets[:, :2]
     # Forces beyond the border of the skin act on no point.
-    distance, nearest = cKDTree(place).query(samples, distance_upper_bound=inverse.spacing)
-    share = np.zeros((len(points), len(fit.nodes.places)))
-    node = np.repeat(np.arange(len(fit.nodes.places)), len(offsets))
-    weight = np.tile(weights[:, 2], len(fit.nodes.places))
+    reach = inverse.spacing
+    distance, nearest = cKDTree(place).query(samples.reshape(-1, 2), distance_upper_bound=reach)
+    share = np.zeros((len(points), count))
+    contact = np.repeat(np.arange(count), len(offsets))
+    weight = np.tile(weights[:, 2], count)
     on_skin = np.isfinite(distance)
-    np.add.at(share, (nearest[on_skin], node[on_skin]), weight[on_skin])
+    np.add.at(share, (nearest[on_skin], contact[on_skin]), weight[on_skin])
 
-    from_nodes = (place[:, None] - fit.nodes.places).reshape(-1, 2)
-    below = -inverse.kernels.field(from_nodes, fit.nodes.size)[:, FIELD.index("zz")]
-    below = below.reshape(len(points), -1, 3).swapaxes(1, 2).reshape(len(points), -1)
+    below = np.zeros((len(points), 3, count))
+    for size in np.unique(contacts.sizes):
+        alike = np.flatnonzero(contacts.sizes == size)
+        from_contacts = (place[:, None] - contacts.places[alike]).reshape(-1, 2)
+        pressure = -inverse.kernels.field(from_contacts, size)[:, FIELD.index("zz")]
+        below[:, :, alike] = pressure.reshape(len(points), -1, 3).swapaxes(1, 2)
 
     _, angle = inverse.unroll(fit.home, inverse.cube[points])
     rotation = np.zeros((len(points), 3, 3))
@@ -86,4 +100,4 @@ def _distribute(inverse: SurfaceInverse, fit: RegionFit) -> tuple[Index, Array, 
     rotation[:, 0, 1] = np.sin(angle)
     rotation[:, 1, 0] = -rotation[:, 0, 1]
     rotation[:, 2, 2] = 1.0
-    return points, share, below, rotation
+    return points, share, below.reshape(len(points), -1), rotation

@@ -20,7 +20,7 @@ import numpy as np
 
 from ...core.arrays import Array
 from ...mechanics.kernels import DISC_SIZES
-from .contact_estimate import ContactEstimate
+from .contact_estimate import ContactEstimate, ContactSum
 from .node_fit import NodeFit
 
 SIZE_DEVIATION = 1.0
@@ -80,6 +80,7 @@ class HertzFit:
         score: -2 ln of the evidence (Laplace approximation), comparable with that of the region.
         last_step: Size of the last step: shift divided by the depth of the cubes' centres, or
             change of the logarithm of the radius.
+        explained: Whitened values (n C,) that these contacts cause.
     """
 
     def __init__(self, region: NodeFit, starts: list[ContactEstimate], depth: float) -> None:
@@ -169,7 +170,9 @@ class HertzFit:
         self.score = chi_squared / self.misfit + known * np.log(self.misfit)
         self.score += self._log_determinant
 
-        own = change[: _N_PARAMETERS * count].reshape(count, _N_PARAMETERS)
+        own = change[: _N_PARAMETERS * count]
+        self.explained = self._model + self._jacobian[:, : len(own)] @ own
+        own = own.reshape(count, _N_PARAMETERS)
         shift = np.clip(own[:, 3:5], -_MAX_STEP * self._depth, _MAX_STEP * self._depth)
         growth = np.clip(own[:, 5], -_MAX_STEP, _MAX_STEP)
         largest_shift = float(np.abs(shift).max()) / self._depth
@@ -177,6 +180,41 @@ class HertzFit:
         self.found_forces = self.forces + own[:, :3]
         self.found_centres = self.centres + shift
         self.found_sizes = np.clip(self.log_sizes + growth, *self._log_range)
+        self._found_flatness = own[:, 6]
+
+    def to_contacts(self, step: float) -> ContactSum:
+        """Describe these contacts and their deviations as a sum of Hertz contacts.
+
+        Each contact becomes seven: itself, one shifted each way along x and along y, one wider and
+        one narrower. Differences of them are its derivatives by centre, size and flatness.
+
+        Args:
+            step: Shift in m. It is at least the spacing of the points at which the traction is
+                evaluated, because differences over less than that vanish there.
+        """
+        count = len(self.found_forces)
+        shifts = np.concatenate([step * _STENCIL, np.zeros((2, 2))])
+        places = self.found_centres[:, None] + shifts
+        factors = np.exp(SIZE_STEP * np.array([0, 0, 0, 0, 0, 1, -1]))
+        sizes = np.exp(self.found_sizes)[:, None] * factors
+
+        # Derivatives (3, contacts of the sum, parameters) of the forces by the parameters.
+        slopes = np.zeros((3, count, 7, count, _N_PARAMETERS))
+        share = 1 / (1 + np.exp(2 * SIZE_STEP))
+        for j, force in enumerate(self.found_forces):
+            own = slopes[:, j, :, j]
+            own[:, 0, :3] = np.eye(3)
+            own[:, [1, 2], 3] = force[:, None] * [1, -1] / (2 * step)
+            own[:, [3, 4], 4] = force[:, None] * [1, -1] / (2 * step)
+            own[:, [5, 6], 5] = force[:, None] * [1, -1] / (2 * SIZE_STEP)
+            own[:, [0, 5, 6], 6] = force[:, None] * [1, -share, share - 1]
+        forces = np.einsum("ajkj,j->ajk", slopes[..., 6], self._found_flatness)
+        forces[:, :, 0] += self.found_forces.T
+
+        n = _N_PARAMETERS * count
+        covariance = self.misfit * self._inverse[:n, :n]
+        root = slopes.reshape(3, -1, n) @ np.linalg.cholesky(covariance)
+        return ContactSum(places.reshape(-1, 2), sizes.ravel(), forces.reshape(3, -1), root)
 
     def estimate(self, j: int, nodes: ContactEstimate) -> ContactEstimate:
         """Return the estimate of contact j, with the moment of the fit on nodes.

@@ -50,8 +50,8 @@ class LocalValues:
         # tiny increase those of components that are almost dependent.
         identity = np.eye(noise.shape[1])
         noise += identity * ~self.known[:, None] + 1e-9 * identity * noise
-        root = np.linalg.inv(np.linalg.cholesky(noise))
-        self._whitening = root * self.known[:, None]
+        self._noise_root = np.linalg.cholesky(noise)
+        self._whitening = np.linalg.inv(self._noise_root) * self.known[:, None]
 
     def is_valid(self, scaled: Array) -> bool:
         """Return whether the same values are known, and the same pads in use, as at the start.
@@ -72,6 +72,10 @@ class LocalValues:
         """
         values = np.where(self.known, scaled[self.cubes], 0.0)
         return np.asarray((self._whitening @ values[:, :, None]).ravel())
+
+    def unwhiten(self, white: Array) -> Array:
+        """Return the values (n, C) in Pa of which `whiten` makes `white` (n C,)."""
+        return np.asarray((self._noise_root @ white.reshape(*self.known.shape, 1))[:, :, 0])
 
     def respond(self, centres: Array, size: float) -> tuple[Array, Array]:
         """Compute the response of the cubes to Hertz contacts with a force of 1 N.

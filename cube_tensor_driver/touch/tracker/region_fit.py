@@ -16,7 +16,7 @@ import numpy as np
 from ...core.arrays import Array, Index
 from ...mechanics.kernels import DISC_SIZES, REACH_DEPTHS
 from ..inverse import SurfaceInverse
-from .contact_estimate import ContactEstimate, estimate_contact
+from .contact_estimate import ContactEstimate, ContactSum, estimate_contact
 from .hertz_fit import HertzFit
 from .local_values import LocalValues
 from .node_fit import NodeFit
@@ -171,16 +171,29 @@ class RegionFit:
         return [self.hertz.estimate(j, one) for j, one in enumerate(estimates)]
 
     def respond(self) -> Array:
-        """Return the values (cubes, C) in Pa that the traction on the nodes causes at all cubes.
+        """Return the values (cubes, C) in Pa that the traction of the fit causes at all cubes.
 
         C is the number of components that some cube of the skin observes.
         """
-        force = self.nodes.posterior.forces.sum(axis=1)
+        if self.hertz is None:
+            force = self.nodes.posterior.forces.sum(axis=1)
+            near = self.nodes.response @ self.nodes.posterior.forces.ravel()
+        else:
+            force = self.hertz.found_forces.sum(axis=0)
+            near = self.values.unwhiten(self.hertz.explained)
         total = np.zeros(self._inverse.observed.shape)
         far, response = self._far_response
         total[far] = response @ force
-        total[self.values.cubes] = self.nodes.response @ self.nodes.posterior.forces.ravel()
+        total[self.values.cubes] = near
         return total
+
+    def to_contacts(self) -> ContactSum:
+        """Describe the traction of the fit as a sum of Hertz contacts."""
+        if self.hertz is not None:
+            return self.hertz.to_contacts(self._inverse.spacing)
+        sizes = np.full(len(self.nodes.places), self.nodes.size)
+        posterior = self.nodes.posterior
+        return ContactSum(self.nodes.places, sizes, posterior.forces, posterior.root)
 
     @cached_property
     def _far_response(self) -> tuple[Index, Array]:
