@@ -20,9 +20,6 @@ from cube_tensor_driver.ros.messages import pack_array
 from cube_tensor_driver.ros.node import CubeNode, run
 from cube_tensor_driver.ros.qos import batch_profile
 
-PADS = 8
-"""Number of pads of each cube."""
-
 STRESSES = 6
 """Number of stresses in a row of stress."""
 
@@ -32,6 +29,7 @@ GRADIENTS = 9
 PARAMETERS = (
     AUTOSTART,
     Parameter("cubes", 64, "Rows of a message."),
+    Parameter("pads", 8, "Pads of each cube."),
     Parameter("rate", 1000.0, "Messages per second."),
 )
 """Parameters of both nodes."""
@@ -52,7 +50,7 @@ class BareSource(CubeNode):
         )
         self._cube = np.arange(n, dtype=np.uint16)
         self._zeros = np.zeros(n, np.uint32)
-        self._frequency = np.full((n, PADS), 1e5, np.float32)
+        self._frequency = np.full((n, int(self.value("pads"))), 1e5, np.float32)
         self._temperature = np.full(n, np.nan, np.float32)
         self._timer = self.create_timer(1.0 / rate, self._publish)
 
@@ -62,7 +60,7 @@ class BareSource(CubeNode):
             cube=pack_array("H", self._cube),
             sequence=pack_array("I", self._zeros),
             time_offset=pack_array("i", self._zeros),
-            n_pads=PADS,
+            n_pads=self._frequency.shape[1],
             frequency=pack_array("f", self._frequency),
             temperature=pack_array("f", self._temperature),
             pad_fault=pack_array("I", self._zeros),

@@ -22,6 +22,9 @@ FIRMWARE = Path(__file__).resolve().parents[2] / "firmware"
 PITCH = 0.012
 """Distance of neighbouring cubes, in m."""
 
+LAYOUTS = {8: "planar", 24: "cube"}
+"""Layout of the cubes by their number of pads."""
+
 MAX_CUBES_PER_HUB = 80
 """Largest number of cubes on one simulated hub."""
 
@@ -41,17 +44,24 @@ SAMPLE_RECORD = np.dtype(
 
 @dataclass(frozen=True)
 class HubLoad:
-    """Number of hubs, and number of cubes on each of them."""
+    """Hubs in C and their cubes.
+
+    Attributes:
+        hubs: Number of hubs.
+        cubes_per_hub: Number of cubes on each hub.
+        pads: Number of pads of each cube, a key of `LAYOUTS`.
+    """
 
     hubs: int
     cubes_per_hub: int
+    pads: int = 8
 
     @classmethod
-    def of(cls, cubes: int) -> HubLoad:
+    def of(cls, cubes: int, pads: int = 8) -> HubLoad:
         """Choose hubs for `cubes` cubes, or a few more: all hubs have the same number."""
         # As few hubs as possible, with the cubes shared out evenly.
         hubs = math.ceil(cubes / MAX_CUBES_PER_HUB)
-        return cls(hubs, math.ceil(cubes / hubs))
+        return cls(hubs, math.ceil(cubes / hubs), pads)
 
     @property
     def cubes(self) -> int:
@@ -61,7 +71,14 @@ class HubLoad:
     def write_skin(self, folder: Path, rate: float) -> Path:
         """Write the file of a skin of these hubs, sampled `rate` times a second."""
         path = folder / "skin.yaml"
-        data = grid(nx=self.cubes, ny=1, pitch=PITCH, links=self.hubs, rate=rate)
+        data = grid(
+            nx=self.cubes,
+            ny=1,
+            pitch=PITCH,
+            links=self.hubs,
+            rate=rate,
+            layout=LAYOUTS[self.pads],
+        )
         write_yaml(path, data)
         return path
 
@@ -80,6 +97,7 @@ class HubLoad:
             "--ports": ports,
             "--hubs": self.hubs,
             "--cubes": self.cubes_per_hub,
+            "--pads": self.pads,
             "--period": round(1e6 / rate),
         }
         return tuple(str(word) for option in options.items() for word in option)

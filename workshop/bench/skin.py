@@ -78,12 +78,14 @@ class Bench:
         duration: Duration of the measurement, in seconds.
         publish_period: Time that one message covers, in seconds; 0: one message for each scan.
         composed: Whether driver and reconstruction run in one process.
+        pads: Number of pads of each cube, 8 or 24.
     """
 
     rate: float
     duration: float
     publish_period: float = 0.0
     composed: bool = False
+    pads: int = 8
 
 
 @dataclass(frozen=True)
@@ -153,7 +155,7 @@ def _measure_both(
     progress: Progress,
 ) -> dict[str, Any]:
     """Measure the echo before and after the chain, and compare the chain with their mean."""
-    cubes = HubLoad.of(cubes).cubes
+    cubes = HubLoad.of(cubes, bench.pads).cubes
     before = _measure_echo(cubes, bench, progress)
     skin = _measure_skin(cubes, bench, progress)
     after = _measure_echo(cubes, bench, progress)
@@ -181,7 +183,7 @@ def _measure_skin(
     with tempfile.TemporaryDirectory(prefix="cube_bench_") as name:
         folder = Path(name)
         log = folder / "log"
-        load = HubLoad.of(cubes)
+        load = HubLoad.of(cubes, bench.pads)
         path = load.write_skin(folder, bench.rate)
         processes = _make_processes(path, log, load, bench, progress)
         arrivals = Arrivals(read_skin(path), one_per_hub=True)
@@ -259,7 +261,11 @@ def _measure_echo(
     bench: Bench,
     progress: Progress,
 ) -> dict[str, float]:
-    parameters: dict[str, Any] = {"cubes": cubes, "rate": float(bench.rate)}
+    parameters: dict[str, Any] = {
+        "cubes": cubes,
+        "pads": bench.pads,
+        "rate": float(bench.rate),
+    }
     processes = [
         Process(role, "workshop.bench.echo", parameters=parameters, arguments=(role,))
         for role in ("echo", "source")

@@ -53,6 +53,14 @@ def arguments(parser: Parser) -> None:
         help="time that one message covers, s; 0: one message per scan (default: %(default)g)",
     )
 
+    skin.add_argument(
+        "--pads",
+        type=int,
+        choices=(8, 24),
+        default=8,
+        help="number of pads of each cube (default: %(default)s)",
+    )
+
     scale = parser.add_subcommand("scale", "skin for growing numbers of cubes, with a picture")
     scale.add_argument(
         "--counts",
@@ -145,5 +153,11 @@ def _measure(options: argparse.Namespace) -> dict[str, Any]:
         return bench_echo(options.cubes, bench)
     if options.what == "scale":
         return bench_scale(options.counts, bench, options.figure)
-    chain = Bench(options.rate, options.duration, options.publish_period, options.composed)
+    chain = Bench(
+        options.rate,
+        options.duration,
+        options.publish_period,
+        options.composed,
+        options.pads,
+    )
     return bench_skin(options.cubes, chain)
