@@ -68,12 +68,13 @@ def contacts_message(
         frame_id: Coordinate frame of the positions, normals and forces.
         contacts: The contacts: all with a tracker (`TrackedContact`) or all without one.
     """
-    # Only tracked contacts have an id, a moment and further uncertainties. Without a tracker, these
-    # arrays of the message stay empty.
+    # Only tracked contacts have an id, a moment, further uncertainties and the mark `refined`.
+    # Without a tracker, these arrays of the message stay empty.
     tracked = [contact for contact in contacts if isinstance(contact, TrackedContact)]
     fields: dict[str, Any] = {name: _collect(contacts, name) for name in _NUMBERS}
     fields |= {name: _collect(tracked, name) for name in _TRACKED_NUMBERS}
     fields["id"] = np.array([contact.id for contact in tracked], np.uint32)
+    fields["refined"] = np.array([contact.refined for contact in tracked], bool)
     for name, kind in _VECTORS.items():
         vectors = [getattr(contact, name) for contact in contacts]
         fields[name] = [_make_xyz(make, kind, vector) for vector in vectors]

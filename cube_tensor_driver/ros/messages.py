@@ -145,11 +145,13 @@ def make_message(type_name: str, **fields: Any) -> Any:
 
     Args:
         type_name: Full name of the type, as in std_msgs/msg/Header.
-        fields: Values of the fields. Fields that are arrays of numbers may be numpy arrays.
+        fields: Values of the fields. Fields that are arrays of numbers or truth values may be
+            numpy arrays.
     """
-    # numpy and the module `array` use the same letters for types, such as "d" for float64.
+    # numpy and the module `array` use the same letters for types, such as "d" for float64; `array`
+    # has no truth values.
     arrays = {
-        name: pack_array(value.dtype.char, value)
+        name: value.tolist() if value.dtype == bool else pack_array(value.dtype.char, value)
         for name, value in fields.items()
         if isinstance(value, np.ndarray)
     }

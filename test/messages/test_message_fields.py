@@ -176,6 +176,8 @@ def distinct(kind: Callable, number: int) -> Contact | TrackedContact:
         if name in ("position", "normal", "force")
         else 10 + number
         if name == "id"
+        else number == 1
+        if name == "refined"
         else next(values)
         for name in kind._fields
     }
@@ -191,7 +193,7 @@ def test_each_number_of_a_contact_is_in_its_field(kind):
     for name in ("position", "normal", "force"):
         got = [[one.x, one.y, one.z] for one in getattr(message, name)]
         np.testing.assert_array_equal(got, [getattr(one, name) for one in contacts])
-    for name in (*NUMBERS, *TRACKED, "id"):
+    for name in (*NUMBERS, *TRACKED, "id", "refined"):
         has_it = name in kind._fields
         expected = [getattr(one, name) for one in contacts] if has_it else []
         np.testing.assert_array_equal(getattr(message, name), expected)

@@ -238,7 +238,8 @@ def test_contacts_and_traction_of_a_pressed_skin_live_and_out_of_a_bag(ros, tmp_
     for number, (touch, cloud) in enumerate(live):
         again = deserialize_message(expected[0][number], SkinContacts)
         assert touch.header == again.header
-        np.testing.assert_allclose(numbers(touch), numbers(again), rtol=1e-9)
+        # BLAS sums in an order that depends on memory addresses; eigenvalues amplify the rounding.
+        np.testing.assert_allclose(numbers(touch), numbers(again), rtol=1e-7)
         surface = deserialize_message(expected[1][number], PointCloud2)
         np.testing.assert_allclose(points_of(cloud), points_of(surface), rtol=1e-4, atol=1e-2)
         assert list(touch.id) == [0] and touch.header.frame_id == skin.parent_frame
@@ -247,7 +248,7 @@ def test_contacts_and_traction_of_a_pressed_skin_live_and_out_of_a_bag(ros, tmp_
     assert last.normal_force[0] == pytest.approx(2, rel=0.05)
     assert last.force[0].x == pytest.approx(0.5, abs=0.1)
     np.testing.assert_allclose([last.position[0].x, last.position[0].y], centre, atol=0.5e-3)
-    assert 0 < last.force_uncertainty[0] < 0.2 and len(last.moment) == 1
+    assert 0 < last.force_uncertainty[0] < 0.2 and len(last.moment) == 1 and last.refined[0]
     points = points_of(cloud)
     assert tuple(field.name for field in cloud.fields) == CLOUD
     assert cloud.header.frame_id == skin.parent_frame and cloud.width == len(points)

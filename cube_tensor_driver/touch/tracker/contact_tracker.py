@@ -149,6 +149,8 @@ class TrackedContact(NamedTuple):
         shear_uncertainty: Standard deviation of `shear_force`, in N.
         moment_uncertainty: Standard deviation of the moment, in N m.
         area_uncertainty: Standard deviation of the area, in m^2.
+        refined: Whether force, position and moment come from a fit of the traction in the region of
+            contact; if not, they are integrals of the linear field (`COARSE_DEVIATION`).
     """
 
     id: int
@@ -164,6 +166,7 @@ class TrackedContact(NamedTuple):
     shear_uncertainty: float
     moment_uncertainty: float
     area_uncertainty: float
+    refined: bool
 
 
 class ContactTracker:
@@ -456,6 +459,7 @@ class ContactTracker:
             shear_uncertainty=deviation,
             moment_uncertainty=deviation * float(np.sqrt(area)),
             area_uncertainty=area,
+            refined=False,
         )
 
     def _to_parent_frame(self, estimate: ContactEstimate, fit: RegionFit) -> TrackedContact:
@@ -494,6 +498,7 @@ class ContactTracker:
             shear_uncertainty=float(np.sqrt(shear_variance)),
             moment_uncertainty=float(np.sqrt(estimate.moment_variance)),
             area_uncertainty=float(np.sqrt(estimate.area_variance)),
+            refined=True,
         )
 
     def _number_contacts(self, contacts: list[TrackedContact]) -> list[TrackedContact]:
