@@ -9,17 +9,25 @@ So a pad under the stress v(t) reports the stress::
 
     v + sum_i c_i q_i,     tau_i dq_i/dt = v - q_i
 
-Loading and unloading then differ, which is the hysteresis of this model. The silicone around the
-cubes needs no such term: if its Poisson's ratio does not change, the stress in a viscoelastic body
-under given tractions is that of the elastic body (correspondence principle). The growth of contacts
-as silicone creeps is not modelled.
+Loading and unloading then differ, which is the hysteresis of this model. Measured elastomers follow
+a power law over many decades of time instead, J(t) = J(0) (1 + a t^alpha) (fractional element). It
+is an integral over Kelvin-Voigt elements of all times::
+
+    t^alpha = alpha / Gamma(1 - alpha) * integral of (1 - exp(-t / tau)) tau^(alpha - 1) dtau
+
+so it is simulated by as many terms as make the error of the integral invisible. The silicone around
+the cubes needs no such term: if its Poisson's ratio does not change, the stress in a viscoelastic
+body under given tractions is that of the elastic body (correspondence principle). The growth of
+contacts as silicone creeps is not modelled.
 
 Source: J. D. Ferry, Viscoelastic Properties of Polymers (1980), 1.E and 3.F; R. M. Christensen,
-Theory of Viscoelasticity (1982), 2.2.
+Theory of Viscoelasticity (1982), 2.2; F. Mainardi, Fractional Calculus and Waves in Linear
+Viscoelasticity (2010), 2.5 and 3.1.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -32,6 +40,20 @@ from ..core.errors import ConfigError
 
 MAX_SEED = (1 << 63) - 1
 """Largest seed of the random deviations of the pads: the largest signed 64-bit integer."""
+
+GROWTH_S = 600.0
+"""Duration of a steady load, in s, over which `Imperfections.creep_growth` states the creep."""
+
+MAX_DEVIATIONS = 6
+"""Largest deviation of the creep of a pad from the mean, in standard deviations; larger ones, which
+occur once in 10^9 pads, are cut to it."""
+
+POWER_LAW_TIMES = np.geomspace(1e-4, 1e10, 51)
+"""Time constants (51,), in s, of the terms that replace a power law of creep.
+
+Their ratio of 1.9 makes the sum differ from the integral by less than 1e-5 of the load. Loads of
+0.01 s to some hours lie far within their range.
+"""
 
 _CREEP_TERM: JsonSchema = {
     "type": "array",
@@ -55,6 +77,11 @@ _SCHEMA = Schema(
                 "items": _CREEP_TERM,
                 "description": "[[size, seconds], ...]",
             },
+            "creep_growth": real("a growth from 0 to below 1", minimum=0, exclusiveMaximum=1),
+            "creep_exponent": real(
+                "an exponent between 0 and 1", exclusiveMinimum=0, exclusiveMaximum=1
+            ),
+            "creep_spread": real("a number from 0 to below 1", minimum=0, exclusiveMaximum=1),
             "seed": integer(0, MAX_SEED, "a whole number from 0 up"),
         },
     )
@@ -70,6 +97,11 @@ class Imperfections:
         dead: Fraction of the pads whose oscillators do not run, 0 to 1.
         creep: Terms (c, tau) of the creep: in addition to the stress, a pad reports c times the
             stress after a low-pass filter with the time constant tau, in s.
+        creep_growth: Mean growth of the reported stress under a steady load by creep with a power
+            law, from 1 s to `GROWTH_S` after the load began, divided by the reported stress at
+            1 s, which is the true one (calibrations are made at about 1 s).
+        creep_exponent: Exponent alpha of the power law, 0 to 1.
+        creep_spread: Standard deviation of a pad's `creep_growth` divided by the mean.
         seed: Seed of the random numbers that determine the deviation of each pad.
 
     Raises:
@@ -79,6 +111,9 @@ class Imperfections:
     gain_spread: float = 0.0
     dead: float = 0.0
     creep: tuple[tuple[float, float], ...] = ()
+    creep_growth: float = 0.0
+    creep_exponent: float = 0.2
+    creep_spread: float = 0.0
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -87,6 +122,13 @@ class Imperfections:
         values["creep"] = [list(term) for term in self.creep]
         for _, mistake in _SCHEMA.mistakes(values):
             raise ConfigError(mistake)
+        # With more growth, the power law through 1 at 1 s would be negative at the begin.
+        limit = (GROWTH_S**self.creep_exponent - 1) / (1 + MAX_DEVIATIONS * self.creep_spread)
+        if self.creep_growth >= limit:
+            raise ConfigError(
+                f"creep_growth: found {self.creep_growth:g}, allowed: below {limit:.3g} with this "
+                "creep_exponent and creep_spread"
+            )
 
 
 def read_imperfections(path: Path) -> Imperfections:
@@ -132,10 +174,34 @@ class PadBehaviour:
         # The reshape gives the right shape (0, 2) if there are no terms.
         terms = np.array(imperfections.creep, float)
         terms = terms.reshape(-1, 2)
-        self._creep_size = terms[:, 0]
         self._creep_time = terms[:, 1]
-        self._crept = np.zeros((len(terms), *shape))  # low-passed stress of each term, in Pa
+        self._creep_size = np.ones(shape) * terms[:, 0, None, None]
+        self._at_once: Array = np.ones(shape)  # reported at once, per stress
+        if imperfections.creep_growth:
+            deviation = random.standard_normal(shape).clip(-MAX_DEVIATIONS, MAX_DEVIATIONS)
+            spread = np.maximum(1 + imperfections.creep_spread * deviation, 0)
+            growth = imperfections.creep_growth * spread
+            self._add_power_law(growth, imperfections.creep_exponent)
+        self._crept = np.zeros_like(self._creep_size)  # low-passed stress of each term, in Pa
         self._seconds = 0.0
+
+    def _add_power_law(self, growth: Array, exponent: float) -> None:
+        """Add the terms of creep with a power law.
+
+        Args:
+            growth: Growth of the reported stress from 1 s to `GROWTH_S` (cubes, pads).
+            exponent: Exponent alpha of the power law.
+        """
+        # J(t) = 1 + a (t^alpha - 1), so J is 1 at 1 s and 1 + growth at GROWTH_S.
+        factor = growth / (GROWTH_S**exponent - 1)
+        step = math.log(POWER_LAW_TIMES[1] / POWER_LAW_TIMES[0])
+        weight = exponent / math.gamma(1 - exponent) * POWER_LAW_TIMES**exponent
+        # Terms faster than the first one act at once: the integral from 0 to its lower limit.
+        fastest = weight[0] / exponent * math.exp(-exponent * step / 2)
+        self._at_once = 1 - factor * (1 - fastest)
+        self._creep_time = np.append(self._creep_time, POWER_LAW_TIMES)
+        sizes = factor * (weight * step)[:, None, None]
+        self._creep_size = np.concatenate([self._creep_size, sizes])
 
     def reported(self, stress: Array, seconds: float) -> Array:
         """Compute the stress that the pads report, and advance their creep.
@@ -148,14 +214,15 @@ class PadBehaviour:
             Reported stress (cubes, pads) in Pa; NaN for a pad that does not work.
         """
         # NaN stands for the missing frequency of an oscillator that does not run.
-        reported = np.where(self._dead, np.nan, stress * self._gain)
+        stress = np.where(self._dead, np.nan, stress * self._gain)
+        reported = stress * self._at_once
         if len(self._creep_time):
             elapsed = max(seconds - self._seconds, 0.0)
             # The low-passed stress q follows tau dq/dt = v - q. If the stress v is constant for the
             # time t, q approaches it by the fraction 1 - exp(-t / tau).
             approach = -np.expm1(-elapsed / self._creep_time)
-            target = np.nan_to_num(reported)
+            target = np.nan_to_num(stress)
             self._crept += approach[:, None, None] * (target - self._crept)
-            reported += np.tensordot(self._creep_size, self._crept, axes=1)
+            reported += (self._creep_size * self._crept).sum(axis=0)
             self._seconds = seconds
         return reported

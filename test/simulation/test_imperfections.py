@@ -34,6 +34,30 @@ def test_foam_creeps_under_a_step_and_recovers():
         assert found == pytest.approx(pressed * (crept + (after < 5e-3)), rel=1e-9)
 
 
+@pytest.mark.parametrize("exponent", [0.1, 0.2, 0.4])
+def test_a_power_law_of_creep_follows_its_closed_form(exponent):
+    """J = 1 + a (t^alpha - 1) up to 2 h of load, and after it (superposition).
+
+    The terms from 1e-4 to 1e10 s leave 7e-6 of the fastest and 2e-5 of the slowest creep out.
+    """
+    spread = 0.2
+    wanted = Imperfections(creep_growth=0.1, creep_exponent=exponent, creep_spread=spread, seed=1)
+    pads = PadBehaviour(wanted, (50, 24), 0)
+    held = 7200.0
+    pads.reported(np.zeros((50, 24)), 1.0)
+    crept = {t: pads.reported(np.ones((50, 24)), 1.0 + t) for t in (0.01, 1.0, 600.0, 3600.0, held)}
+    growth = crept[600.0] - 1
+    # Of 1200 pads; four standard deviations of the estimates.
+    assert growth.mean() == pytest.approx(0.1, abs=4 * 0.1 * spread / np.sqrt(1200))
+    assert growth.std() == pytest.approx(0.1 * spread, rel=4 / np.sqrt(2400))
+    factor = growth / (600**exponent - 1)
+    for time, found in crept.items():
+        np.testing.assert_allclose(found, 1 + factor * (time**exponent - 1), atol=5e-5)
+    after = pads.reported(np.zeros((50, 24)), 1.0 + held + 10.0)
+    left = factor * ((held + 10.0) ** exponent - 10.0**exponent)
+    np.testing.assert_allclose(after, left, atol=5e-5)
+
+
 def test_gains_spread_and_pads_fail_as_often_as_asked_for_and_always_alike():
     stress, wanted = np.full((500, 24), -1e4), Imperfections(gain_spread=0.05, dead=0.1, seed=3)
     found = PadBehaviour(wanted, stress.shape, 0).reported(stress, 1.0)
@@ -64,6 +88,7 @@ def test_a_simulated_skin_has_them():
         ({"gain_spread": -0.1}, "gain_spread: found -0.1"),
         ({"dead": 2.0}, "dead: found 2.0"),
         ({"dead": float("nan")}, "dead: found nan"),
+        ({"creep_growth": 0.5, "creep_exponent": 0.05}, "creep_growth: found 0.5, allowed: below"),
         ({"creep": ((0.1, 0.0),)}, r"creep\[0\]\[1\]: found 0.0, allowed: a time above 0 s"),
     ],
 )
@@ -81,7 +106,7 @@ def test_a_file_has_the_same_fields(tmp_path: Path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("[1]", r"top level: found \[1\], allowed: the keys gain_spread, dead, creep, seed"),
+        ("[1]", r"top level: found \[1\], allowed: the keys gain_spread, dead, creep, .*seed"),
         ("{gain: 0.1}", "top level: unknown key 'gain', allowed: gain_spread"),
         ("{dead: many}", "dead: found 'many', allowed: a fraction"),
         ("{dead: 2}", "dead: found 2, allowed"),
