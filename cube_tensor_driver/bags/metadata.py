@@ -8,6 +8,7 @@ types and the hashes that identify them.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -41,6 +42,8 @@ the largest number of nanoseconds in 64 bits, divided into seconds and nanosecon
 QosProfile = dict[str, Any]
 """Quality of service profile of a publisher, as metadata.yaml lists it: key, such as
 ``reliability``, and value."""
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -175,7 +178,8 @@ def read_metadata(folder: Path) -> BagFiles:
     """Read the names of the storage files from metadata.yaml in a bag's folder.
 
     Raises:
-        BagError: There is no metadata.yaml in the folder, or it is damaged.
+        BagError: There is no metadata.yaml in the folder, it is damaged, or it has a newer version
+            that states the files in another way.
     """
     path = folder / FILE_NAME
     if not path.is_file():
@@ -184,15 +188,19 @@ def read_metadata(folder: Path) -> BagFiles:
             f"./cube bag repair {folder} makes the latter readable"
         )
     # Only file names and compression are used: the storage files state topics and times, too.
+    reason = "damaged"
     try:
         about = read_yaml(path)["rosbag2_bagfile_information"]
+        if (version := about.get("version", 0)) > METADATA_VERSION:
+            reason = f"its version {version} is newer than {METADATA_VERSION}, the newest known one"
+            _log.warning("%s: %s", path, reason)
         names = about["relative_file_paths"]
         mode = str(about.get("compression_mode") or "").lower()
         # Some versions of rosbag2 write "folder/file" instead of the name of the file.
         paths = [folder / Path(name).name for name in names]
     except (ConfigError, KeyError, TypeError, AttributeError) as error:
         raise BagError(
-            f"{path}: damaged ({error}); ./cube bag repair {folder} writes it again"
+            f"{path}: {reason} ({error}); ./cube bag repair {folder} writes it again"
         ) from None
     return BagFiles(paths, "" if mode == "none" else mode)
 

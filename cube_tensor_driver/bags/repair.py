@@ -17,6 +17,7 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
+import re
 import shutil
 import sqlite3
 import struct
@@ -58,8 +59,12 @@ from .mcap_file import (
     summarise,
     unpack_chunk,
 )
-from .metadata import FILE_NAME, SUFFIXES, FileSummary, write_metadata
+from .metadata import FILE_NAME, SUFFIXES, FileSummary, read_metadata, write_metadata
 from .read import READ_ERRORS, check_storage_path, open_storage, report_damage
+
+_DATED_NAME = re.compile(r"(\d+)_.*_\d{4}(_\d\d){2}-\d\d(_\d\d){2}")
+"""Pattern of the name, without suffix, of a storage file that rosbag2 of ROS 2 Lyrical or newer
+has written: number of the file, prefix, date and local time."""
 
 REST_SUFFIX = ".rest"
 """Suffix of the file that keeps the bytes that a repair cut off; it is appended to the name of the
@@ -132,15 +137,36 @@ def _repair_folder(folder: Path, keep_rest: bool) -> Repaired:
 
 
 def _storage_files(folder: Path) -> list[Path]:
-    """Return the storage files of a folder in the order in which they were written."""
+    """Return the storage files of a folder in the order in which they were written.
 
-    def number(path: Path) -> tuple[int, str]:
-        """Return the number at the end of a file's name (0 if there is none), and the name."""
-        digits = path.stem.rpartition("_")[2]  # by number, as text would sort _10 before _2
-        return int(digits) if digits.isdigit() else 0, path.name
+    Files that metadata.yaml names come first, in its order. The other files, which are all of them
+    if there is no readable metadata.yaml, follow by the number in their names.
+    """
+    listed: list[str] = []
+    with suppress(BagError):
+        listed = [path.name for path in read_metadata(folder).paths]
+
+    def place(path: Path) -> tuple[int, int, str]:
+        """Return the position in metadata.yaml, the number in the name, and the name of a file."""
+        position = listed.index(path.name) if path.name in listed else len(listed)
+        return position, file_number(path.stem), path.name
 
     paths = (path for path in folder.iterdir() if path.suffix in SUFFIXES.values())
-    return sorted(paths, key=number)
+    return sorted(paths, key=place)
+
+
+def file_number(stem: str) -> int:
+    """Return the number that rosbag2 gave a storage file of a bag, counted from 0.
+
+    Args:
+        stem: Name of the file without suffix: number, prefix and time since ROS 2 Lyrical, as in
+            ``10_run_2026_05_01-10_30_00``; prefix and number before, as in ``run_10``. The result
+            for any other name is 0.
+    """
+    # Numbers are compared, because text would sort _10 before _2.
+    dated = _DATED_NAME.fullmatch(stem)
+    digits = dated[1] if dated else stem.rpartition("_")[2]
+    return int(digits) if digits.isdecimal() else 0
 
 
 def _summary(path: Path) -> FileSummary:

@@ -152,8 +152,11 @@ def decode_traction(message: Any) -> Array:
             f"a point cloud has the fields {', '.join(names)}; those of the topic traction are "
             f"{', '.join(CLOUD)}: listen to the topic of the node contacts"
         )
-    # The data are an `array.array` in a message of rclpy, and a numpy array in one of a bag.
-    points = np.frombuffer(bytes(message.data), "<f4")
+    # The data are an `array.array` in a message of rclpy, and a numpy array in one of a bag. ROS 2
+    # Lyrical may pass a `rosidl_buffer.Buffer`, which only its own method converts.
+    data = message.data
+    data = data.to_bytes() if hasattr(data, "to_bytes") else bytes(data)
+    points = np.frombuffer(data, "<f4")
     return points.reshape(-1, len(CLOUD)).astype(float)
 
 

@@ -444,7 +444,7 @@ def _run_nodes(nodes: Sequence[CubeNode], stopping: threading.Event) -> int:
     Returns:
         The exit code, see `run`.
     """
-    executor = make_executor()
+    executor = make_executor(nodes[0].get_logger().warning)
     code = 0
     for node in nodes:
         executor.add_node(node)

@@ -783,6 +783,48 @@ def test_disk_full_leaves_what_was_written(bag, tmp_path):
         assert [entry.data for entry in read.entries()] == whole[:kept]
 
 
+@pytest.mark.parametrize(
+    "name",
+    ["rosbag2_2026_05_01-10_30_00_{}", "{}_run_2026_05_01-10_30_00", "{}__2026_05_01-10_30_00"],
+)
+@pytest.mark.parametrize("listed", [(), (7, 3)])
+def test_files_are_read_in_the_order_of_recording(tmp_path, name, listed):
+    """After a repair too: as metadata.yaml says, then by the numbers in both forms of names."""
+    bag = tmp_path / "bag"
+    bag.mkdir()
+    for number in range(12):
+        with BagWriter(tmp_path / "one") as writer:
+            writer.add_topic("/number", "std_msgs/msg/String")
+            writer.write("/number", 100 + number, b"%d" % number)
+        next((tmp_path / "one").glob("*.mcap")).rename(bag / f"{name.format(number)}.mcap")
+        shutil.rmtree(tmp_path / "one")
+    if listed:
+        paths = [f"{name.format(number)}.mcap" for number in listed]
+        about = {"version": 9, "relative_file_paths": paths, "compression_mode": ""}
+        write_yaml(bag / "metadata.yaml", {"rosbag2_bagfile_information": about})
+    repair(bag)
+    with Bag(bag) as read:
+        order = [int(entry.data) for entry in read.entries()]
+    assert order == [*listed, *(number for number in range(12) if number not in listed)]
+
+
+def test_a_newer_metadata_version_is_one_line(copy, caplog):
+    path = copy / "metadata.yaml"
+    said = read_yaml(path)
+    about = said["rosbag2_bagfile_information"]
+    about["version"] = 10
+    write_yaml(path, said)
+    Bag(copy)
+    assert [record.getMessage() for record in caplog.records] == [
+        f"{path}: its version 10 is newer than 9, the newest known one"
+    ]
+    about["files_by_name"] = about.pop("relative_file_paths")
+    write_yaml(path, said)
+    with pytest.raises(BagError, match=r"version 10 is newer than 9.*bag repair") as caught:
+        Bag(copy)
+    assert "\n" not in str(caught.value)
+
+
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_a_running_recording_is_not_repaired(tmp_path, storage):
     with BagWriter(tmp_path / "bag", storage) as writer:

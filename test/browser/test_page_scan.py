@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -174,6 +176,29 @@ def test_the_deviation_is_a_colour_while_the_node_says_it(poses, known):
     assert colouring.text(3).endswith("± unknown kPa")
     by_pressure = Colouring.of(scan, surface, QUANTITIES["pressure"], 0.0, 0.0)
     assert by_pressure.text(2).endswith(f"on the surface {said}")
+
+
+class Buffer:
+    """What rclpy of ROS 2 Lyrical gives for uint8[] in the memory of a device: no sequence."""
+
+    def __init__(self, data):
+        self._data = bytes(data)
+
+    def __len__(self):
+        return len(self._data)
+
+    def to_bytes(self):
+        return self._data
+
+
+def test_a_point_cloud_in_a_rosidl_buffer_is_read(poses):
+    message = traction_message(make_message, 5, "skin_base", cloud_of(poses))
+    expected = decode_traction(message)
+    # The messages of older releases refuse such a value.
+    received = SimpleNamespace(
+        fields=message.fields, point_step=message.point_step, data=Buffer(message.data)
+    )
+    np.testing.assert_array_equal(decode_traction(received), expected)
 
 
 def test_another_point_cloud_is_refused_in_words(poses):

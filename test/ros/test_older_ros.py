@@ -25,7 +25,7 @@ from cube_tensor_driver.processes.skin_processes import SimulatedHubs, skin_proc
 
 def test_nodes_run_where_rclpy_lacks_what_humble_lacks(ros, tmp_path, monkeypatch):
     """In one process, where frequencies are published only if somebody subscribes. A parameter that
-    is set takes effect."""
+    is set takes effect, and the log says once that the executor is the slow one."""
     monkeypatch.setenv("PYTHONPATH", str(ROOT / "test"), prepend=":")
     skin = tmp_path / "skin.yaml"
     write_yaml(skin, grid(nx=2, ny=1, pitch=0.01, links=1, rate=100.0))
@@ -37,6 +37,7 @@ def test_nodes_run_where_rclpy_lacks_what_humble_lacks(ros, tmp_path, monkeypatc
             if process.node:
                 arguments = ",".join(FEATURES), process.module
                 process = replace(process, module="rclpy_without", arguments=arguments)
+                executable = process.executable
             children.start(process)
         ros.wait(lambda: len(stress) > 10 and len(frequencies) > 10)
         rate = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=20.0)
@@ -45,6 +46,7 @@ def test_nodes_run_where_rclpy_lacks_what_humble_lacks(ros, tmp_path, monkeypatc
         assert answer.results[0].successful, answer.results[0].reason
         ros.wait(lambda: period_s(stress[-5:]) > 0.04)  # 0.05 s, where it was 0.01 s
         children.check()
+        assert children.log(executable).count("this rclpy has no EventsExecutor") == 1
 
 
 def period_s(messages):
