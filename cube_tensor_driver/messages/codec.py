@@ -18,9 +18,8 @@ from functools import lru_cache
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..core.arrays import AnyArray, Index, Times
+from ..core.arrays import AnyArray, Times
 from ..core.errors import MessageError
 from ..core.modes import GRADIENT, STRESS
 from ..core.rows import FrequencyRows, StressRows
@@ -131,15 +130,14 @@ class _Layout(NamedTuple):
         record: Structured dtype of numpy that describes a whole message.
         sequences: Names of the fields that are sequences, `frame_id` first.
         counts: Numbers of values that these sequences must have.
-        count_words: Offsets, in units of 4 bytes from the start of the message, at which these
-            numbers are stored.
+        numbers: Reads seconds and nanoseconds of the header, then these numbers, from a message.
     """
 
     shape: _Shape
     record: np.dtype[Any]
     sequences: list[str]
-    counts: NDArray[np.uint32]
-    count_words: Index
+    counts: list[int]
+    numbers: struct.Struct
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,8 +263,8 @@ class MessageCodec(Generic[AnyRows]):
             MessageError: A message is too short, its fields contradict each other, or the messages
                 have different numbers of rows or pads.
         """
-        layout, record = self._read_records(messages)
-        stamp_ns, times_ns = _read_stamps(record)
+        layout, record, stamp_ns = self._read_records(messages)
+        times_ns = _row_times(record, stamp_ns)
         rows: AnyRows = self.make_rows(record, times_ns)
         frame_id = messages[0][_FRAME_AT : _FRAME_AT + layout.shape.frame]
         return Decoded(rows, stamp_ns, frame_id)
@@ -284,9 +282,11 @@ class MessageCodec(Generic[AnyRows]):
         Raises:
             MessageError: See `decode`.
         """
-        record: AnyArray = self._read_records(messages)[1]
-        _, times_ns = _read_stamps(record)
-        return [times_ns, *(_read_column(record, name) for name in names)]
+        _, record, stamp_ns = self._read_records(messages)
+        columns = [_row_times(record, stamp_ns)]
+        for name in names:
+            columns.append(_read_column(record, name))
+        return columns
 
     def shape_bytes(self, data: bytes) -> bytes:
         """Return the bytes of a serialised message that hold its frame id and number of rows.
@@ -393,12 +393,12 @@ class MessageCodec(Generic[AnyRows]):
         record["encapsulation"] = LITTLE_ENDIAN
         # Void data keep the closing zero, which numpy removes from strings of bytes.
         record["frame_id"] = np.void(frame_id)
-        for name, count in zip(layout.sequences, layout.counts.tolist(), strict=True):
+        for name, count in zip(layout.sequences, layout.counts, strict=True):
             record[f"length of {name}"] = count
         if self._n_fields_before_pads is not None:
             record["n_pads"] = layout.shape.pads
 
-    def _read_records(self, messages: Sequence[bytes]) -> tuple[_Layout, AnyArray]:
+    def _read_records(self, messages: Sequence[bytes]) -> tuple[_Layout, AnyArray, Times]:
         """View serialised messages as an array (M,) of the structured dtype of their layout.
 
         The layout states the byte offset and type of each field.
@@ -407,7 +407,8 @@ class MessageCodec(Generic[AnyRows]):
             messages: M serialised messages whose lengths and `shape_bytes` are equal.
 
         Returns:
-            The layout of the messages, and the array.
+            The layout of the messages, the array, and the time stamps of the headers (M,), in ns
+            since the Unix epoch.
 
         Raises:
             MessageError: See `decode`.
@@ -422,9 +423,9 @@ class MessageCodec(Generic[AnyRows]):
                 raise MessageError(
                     f"{self._name}: {count} messages of different lengths; decode them one by one"
                 )
-        self._check_counts(layout, data, count)
+        stamp_ns = np.array([self._read_stamp(layout, message) for message in messages])
         record: AnyArray = np.frombuffer(data, layout.record, count)
-        return layout, record
+        return layout, record, stamp_ns
 
     def _read_shape(self, data: bytes) -> _Shape:
         """Return the length of the frame id and the numbers of rows and pads that a message states.
@@ -464,35 +465,20 @@ class MessageCodec(Generic[AnyRows]):
             )
         return shape
 
-    def _check_counts(
-        self,
-        layout: _Layout,
-        data: bytes,
-        count: int,
-    ) -> None:
-        """Check that each sequence has as many values as the number of rows requires.
-
-        Args:
-            layout: Layout of the messages.
-            data: The messages, one after the other.
-            count: Number of messages.
+    def _read_stamp(self, layout: _Layout, message: bytes) -> int:
+        """Return the time stamp of a message's header, in ns since the Unix epoch.
 
         Raises:
-            MessageError: A sequence has another number of values.
+            MessageError: A sequence has another number of values than the number of rows requires.
         """
-        size, expected = layout.record.itemsize, layout.counts
-        # This array has one row of 32-bit integers for each message. The rows are `size` bytes
-        # apart, which need not be a multiple of 4.
-        words = np.ndarray((count, size // 4), "<u4", data, 0, (size, 4))
-        counts = words.take(layout.count_words, axis=1)
-        # The numbers are compared as bytes, which takes a third of the time of comparing arrays.
-        if counts.tobytes() == expected.tobytes() * count:
-            return
-        message, which = np.argwhere(counts != expected)[0].tolist()
-        raise MessageError(
-            f"{self._name} of {layout.shape.rows} rows has {counts[message, which]} values of "
-            f"{layout.sequences[which]}, they need {expected[which]}"
-        )
+        seconds, nanoseconds, *counts = layout.numbers.unpack_from(message)
+        for name, found, needed in zip(layout.sequences, counts, layout.counts, strict=True):
+            if found != needed:
+                raise MessageError(
+                    f"{self._name} of {layout.shape.rows} rows has {found} values of {name}, "
+                    f"they need {needed}"
+                )
+        return int(seconds * SECOND + nanoseconds)
 
     def _compute_end(self, shape: _Shape, n_fields: int) -> int:
         """Return the byte offset, from the start of a message, where its first fields end.
@@ -540,7 +526,7 @@ class MessageCodec(Generic[AnyRows]):
         ]
         sequences = ["frame_id"]
         counts = [shape.frame]
-        counts_at = [_FRAME_LENGTH_AT]
+        counts_at: list[int] = [_FRAME_LENGTH_AT]
         for field, count_at, at, values in located:
             if count_at is not None:
                 entries.append((f"length of {field.name}", "<u4", count_at))
@@ -562,8 +548,8 @@ class MessageCodec(Generic[AnyRows]):
             shape=shape,
             record=record,
             sequences=sequences,
-            counts=np.array(counts, "<u4"),
-            count_words=np.array(counts_at) // 4,
+            counts=counts,
+            numbers=_make_struct([_SECONDS_AT, _NANOSECONDS_AT, *counts_at]),
         )
 
 
@@ -581,20 +567,24 @@ def _dimensions(width: int, shape: _Shape) -> tuple[int, ...]:
     return (shape.rows, shape.pads if width == PER_PAD else width)
 
 
-def _read_stamps(record: AnyArray) -> tuple[Times, Times]:
-    """Return the time stamps of messages and of their rows (samples of cubes).
+def _make_struct(offsets: Sequence[int]) -> struct.Struct:
+    """Return the struct that reads 32-bit integers at these byte offsets, the first one signed."""
+    form, end = "<", 0
+    for offset in offsets:
+        form += f"{offset - end}x{'I' if end else 'i'}"
+        end = offset + 4
+    return struct.Struct(form)
+
+
+def _row_times(record: AnyArray, stamp_ns: Times) -> Times:
+    """Return the times of the rows of all messages, one after the other, in ns since 1970.
 
     Args:
         record: Messages (M,) as an array of the structured dtype of their layout.
-
-    Returns:
-        Time stamps of the headers (M,), and those of the rows of all messages, one after the other;
-        both in ns since the Unix epoch.
+        stamp_ns: Time stamps of the headers (M,), in ns since the Unix epoch.
     """
-    seconds = record["sec"].astype(np.int64)
-    stamp_ns: Times = seconds * SECOND + record["nanosec"]
     times_ns: Times = stamp_ns[:, None] + record["time_offset"]
-    return stamp_ns, times_ns.reshape(-1)
+    return times_ns.reshape(-1)
 
 
 def _read_column(record: AnyArray, name: str) -> AnyArray:
