@@ -98,7 +98,8 @@ static void warm_row(const cube_scan_call *call, block *b, int64_t i) {
 }
 
 /* Pad law (Kiyota & Shinoda, eq. 6): v = (f - f0) / (f_highest - f), the stress on a pad divided by
- * its stiffness; 0 without 0 < f < f_highest. NaN fails all comparisons.
+ * its stiffness; 0 without 0 < f < f_highest. NaN fails all comparisons. An offset (weight, creep,
+ * thermal stress) is subtracted from it; v of the call keeps it as it was measured.
  *
  * Returns the number of pads with such a frequency and, with health, one in their possible range. */
 INLINE int64_t apply_law(const cube_scan_call *call, block *b, const float *rest, const float *highest) {
@@ -110,6 +111,13 @@ INLINE int64_t apply_law(const cube_scan_call *call, block *b, const float *rest
         const bool is_good = (f[l] > 0) & (below > 0);
         b->v[l] = is_good ? quotient : 0;
         n_good += is_good;
+    }
+    if (call->v != NULL)
+        memcpy(call->v + b->row * call->length[P], b->v, (size_t)n_lanes * sizeof *b->v);
+    if (call->offset != NULL) {
+        const float *offset = call->offset + b->row * call->length[P];
+        LANES for (int64_t l = 0; l < n_lanes; l++)
+            b->v[l] -= offset[l];
     }
     if (call->words == NULL)
         return n_good;

@@ -71,13 +71,16 @@ typedef struct {
     X(const int64_t, stamp_ns, 'i', "N", INPUT)       \
     X(const uint16_t, doubt, 'u', "N", INPUT)         \
     X(const bool, known, 'b', "N", OPTION)            \
+    X(const float, offset, 'f', "NP", OPTION)         \
     X(float, stress, 'f', "N6", RESULT)               \
     X(float, gradient, 'f', "N9", RESULT)             \
     X(float, residual, 'f', "N", RESULT)              \
     X(uint16_t, status, 'u', "N", RESULT)             \
     X(uint16_t, row_observed, 'u', "N", RESULT)       \
-    X(uint32_t, left_out, 'u', "N", RESULT)
+    X(uint32_t, left_out, 'u', "N", RESULT)          \
+    X(float, v, 'f', "NP", STATE)
 
+/* OPTION and STATE may be absent; STATE and RESULT are written. */
 enum cube_scan_use { CUBE_SCAN_INPUT, CUBE_SCAN_OPTION, CUBE_SCAN_STATE, CUBE_SCAN_RESULT };
 #define CUBE_SCAN_LETTERS "NCPGDTEKQ"
 
@@ -95,7 +98,7 @@ typedef struct {
     enum cube_scan_use use;
 } cube_scan_array;
 
-#define CUBE_SCAN_N_ARRAYS 27
+#define CUBE_SCAN_N_ARRAYS 29
 extern const cube_scan_array cube_scan_arrays[CUBE_SCAN_N_ARRAYS];
 
 /* Makes a call without arrays; the caller sets them and n_residuals. */

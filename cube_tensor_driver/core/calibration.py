@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from .arrays import Array
+from .compensation.models import CreepModel, EffectModel, ThermalModel, WeightModel
 from .defaults import BETA, FOAM_MODULUS, FREQUENCY_NOISE, HALF_SIDE, REST_FREQUENCY
 from .errors import CalibrationError, LayoutError, SymmetryError
 from .layout import LAYOUTS, Layout, find_layout
@@ -31,6 +32,12 @@ MAX_UID = 2**64 - 1
 PAD_QUANTITIES = ("rest_frequency", "noise", "modulus", "gain", "beta")
 """Names of the attributes of a calibration that have one value per pad: frequency without load,
 noise, modulus of the foam, gain, and beta (ratio of parasitic to active capacitance)."""
+
+
+EFFECTS: dict[str, type[EffectModel]] = {
+    model.key: model for model in (WeightModel, CreepModel, ThermalModel)
+}
+"""Names of the attributes of a calibration with effects on the pads that are no load -> class."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +62,9 @@ class Calibration:
         beta: Ratio of the parasitic to the active capacitance of a pad without load (P,).
         covariance: Covariance (K, K) of the coefficients, if it is known.
         temperature: Model of the rest frequency over temperature, if it is known.
+        weight: Response of the pads to weight and inertia, if it is known.
+        creep: Creep of the elastomer at each pad, if it is known.
+        thermal: Reading of each pad over temperature without load, if it is known.
         neglect: Names of modes whose amplitude is assumed to be zero. The pads then determine more
             of the other modes.
         uid: Unique id of the cube. None means that the calibration holds for any cube.
@@ -77,6 +87,9 @@ class Calibration:
     beta: Array = field(default_factory=lambda: np.array(0.0))
     covariance: Array | None = None
     temperature: TemperatureModel | None = None
+    weight: WeightModel | None = None
+    creep: CreepModel | None = None
+    thermal: ThermalModel | None = None
     neglect: tuple[str, ...] = ()
     uid: int | None = None
     created: str = ""
@@ -96,6 +109,7 @@ class Calibration:
         self._set("neglect", tuple(self.neglect))
         self._read_response(structure)
         self._check_temperature()
+        self._check_effects()
         self._check_uid()
 
     def __repr__(self) -> str:
@@ -169,6 +183,16 @@ class Calibration:
                 f"temperature has {n_lists} lists of coefficients; "
                 f"layout {self.layout.name!r} has {self.layout.n_pads} pads"
             )
+
+    def _check_effects(self) -> None:
+        """Raise CalibrationError unless each effect has values for every pad."""
+        for key in EFFECTS:
+            model: EffectModel | None = getattr(self, key)
+            if model is not None and model.n_pads != self.layout.n_pads:
+                raise CalibrationError(
+                    f"{key} has values of {model.n_pads} pads; "
+                    f"layout {self.layout.name!r} has {self.layout.n_pads} pads"
+                )
 
     def _check_uid(self) -> None:
         """Raise CalibrationError if the unique id is neither None nor a whole number of 8 bytes."""
@@ -293,6 +317,8 @@ class Calibration:
         values["neglect"] = tuple(neglect)
         if values.get("temperature") is not None:
             values["temperature"] = TemperatureModel.from_dict(values["temperature"])
+        for key in EFFECTS.keys() & values.keys():
+            values[key] = EFFECTS[key].from_dict(values[key])
         for key in ("symmetry", "created", "source"):
             if not isinstance(values.get(key, ""), str):
                 raise CalibrationError(f"calibration: {key} is {values[key]!r}; it must be text")
@@ -377,7 +403,7 @@ def _to_plain(value: Any, is_per_pad: bool) -> Any:
         return float(value[0])
     if isinstance(value, np.ndarray):
         return value.tolist()
-    if isinstance(value, TemperatureModel):
+    if isinstance(value, (TemperatureModel, EffectModel)):
         return value.to_dict()
     if isinstance(value, tuple):
         return list(value)

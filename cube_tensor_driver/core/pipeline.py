@@ -106,6 +106,8 @@ class Pipeline:
         calibrations: Calibration of each cube.
         n_pads: Largest number of pads of a cube, P.
         dtype: Precision of the computation.
+        newest_offset: Offsets of the newest rows (cubes, P), stress / stiffness, that compensation
+            (of weight, creep or temperature) subtracts; None: nothing is compensated.
     """
 
     def __init__(self, calibrations: Sequence[Calibration], dtype: type = np.float64) -> None:
@@ -147,6 +149,7 @@ class Pipeline:
         for number, estimator in enumerate(whole):
             self._store_table(number, number, estimator)
         self._n_extra = 0
+        self.newest_offset: Array | None = None
         rest = [c.rest_frequency for c in self.calibrations]
         self.rest_frequency = pad_table(rest, self.n_pads, fill=np.nan)
 
@@ -186,6 +189,17 @@ class Pipeline:
         self._tables.rest[:] = self._rest
         self._tables.highest[:] = highest_frequency(self._rest, self._beta[group])
 
+    @property
+    def stiffness(self) -> Array:
+        """Stiffness E (1 + beta) / beta of each pad (cubes, P), in Pa.
+
+        It is 0 where a cube has no such pad. E is the modulus of the pad's foam, and beta the ratio
+        of the pad's parasitic to its active capacitance. The kernel computes with pad stresses
+        divided by the stiffness.
+        """
+        stiffness: Array = self._stiffness[self._tables.calibration]
+        return stiffness
+
     def temperature_factor(self, cube: Index, temperature: Real) -> Array:
         """Return the ratio of rest frequencies at a temperature to those at the reference (N, P).
 
@@ -198,6 +212,23 @@ class Pipeline:
         calibration = self._tables.calibration[cube]
         return temperature_factor(self._tables, calibration, np.asarray(temperature))
 
+    def unloaded_factor(self, cube: Index, temperature: Real) -> Array:
+        """Return the ratio of the frequencies without load now to the rest frequencies (N, P).
+
+        It is the factor of temperature, and that of the offset o that compensation subtracts: the
+        pad law o = (f - f0) / (f0 (1 + beta) / beta - f), solved for f / f0.
+
+        Args:
+            cube: Numbers of the cubes (N,).
+            temperature: Temperatures (N,), in °C; NaN where they are unknown.
+        """
+        factor = self.temperature_factor(cube, temperature)
+        if self.newest_offset is None:
+            return factor
+        offset, beta = self.newest_offset[cube], self._beta[self._tables.calibration[cube]]
+        shifted: Array = factor * (1 + offset * (1 + beta) / beta) / (1 + offset)
+        return shifted
+
     def process(
         self,
         rows: FrequencyRows,
@@ -206,6 +237,8 @@ class Pipeline:
         watch: Watch | None = None,
         known: Mask | None = None,
         out: StressRows | None = None,
+        offset: Real | None = None,
+        v: Real | None = None,
     ) -> StressRows:
         """Compute the stress of N rows.
 
@@ -220,19 +253,21 @@ class Pipeline:
             known: Whether the health of a row is not found but given, by `left_out` and the
                 `status` of `out` (N,).
             out: Rows to write into; None makes new ones.
+            offset, v: Values to subtract from the pads' stresses, and array for these stresses
+                before that (N, P), both divided by `stiffness`; see `Columns` and `Results`.
 
         Raises:
             LayoutError: Arrays have the wrong shape, or `watch` is given and a row is of a cube
                 that the skin does not have. Every other problem of a row becomes a bit of its
                 status.
         """
-        columns = self._read_columns(rows, known)
+        columns = self._read_columns(rows, known)._replace(offset=offset)
         if out is None:
             out = self.make_rows(rows)
         if watch is None or known is not None:
             out.left_out[:] = rows.pad_fault if left_out is None else left_out
         results = Results(
-            out.stress, out.gradient, out.residual, out.status, out.observed, out.left_out
+            out.stress, out.gradient, out.residual, out.status, out.observed, out.left_out, v
         )
         sums = watch.sums if watch else None
         row, request = 0, DONE

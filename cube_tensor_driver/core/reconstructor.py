@@ -19,6 +19,7 @@ import numpy as np
 from .arguments import check_skin
 from .arrays import Array, Mask, PadMasks, StatusBits
 from .calibration import Calibration
+from .compensation.compensation import Compensation
 from .errors import TareError
 from .health.drift import DriftTracker
 from .health.health import Health
@@ -65,6 +66,7 @@ class Reconstructor:
     Attributes:
         pipeline: Pipeline from frequencies to stress.
         health: Health of the pads.
+        compensation: Effects on the pads that are no load, which are subtracted.
         names: Names of the cubes, for messages.
         drift_time: Time constant of the tracking of slow drift of the rest frequencies (frequencies
             without load), in s. 0 turns the tracking off.
@@ -93,6 +95,7 @@ class Reconstructor:
             self.names = list(skin.names)
         self.pipeline = Pipeline(calibrations, dtype)
         self.health = Health(self.pipeline)
+        self.compensation = Compensation(self.pipeline)
         self.drift_time = 0.0
         self.rest_changes = 0
         self._calibrated_rest = self.pipeline.rest_frequency
@@ -184,14 +187,17 @@ class Reconstructor:
         if recorded is not None:
             left_out, known = recorded.left_out, recorded.known
             out.status[:] = recorded.status
-        return self.pipeline.process(rows, left_out, watch=health, known=known, out=out)
+        return self.compensation.process(rows, left_out, watch=health, known=known, out=out)
 
     def covariance(self, cube: int, left_out: int = 0) -> Array:
-        """Return the covariance (15, 15) of a cube's components due to the noise of its pads.
+        """Return the covariance (15, 15) of the components of a cube's newest row.
 
+        It contains the noise of the pads and the deviations of what is compensated.
         `Pipeline.covariance` states arguments and units.
         """
-        return self.pipeline.covariance(cube, left_out)
+        growth = self.compensation.growth(cube, left_out)
+        noise = self.pipeline.covariance(cube, left_out)
+        return noise if growth is None else noise + growth
 
     def tare(self, cubes: Sequence[int] | None = None, duration: float = 1.0) -> Array:
         """Take the present load of cubes as their unloaded state.

@@ -55,8 +55,13 @@ class _Rows:
         Args:
             chosen: Row numbers, a slice or a mask (N,), with which numpy indexes an array.
         """
-        columns = (getattr(self, field.name) for field in fields(self))  # type: ignore[arg-type]
-        return type(self)(*(column[chosen] for column in columns))
+        return type(self)(**{name: column[chosen] for name, column in self.columns().items()})
+
+    def columns(self) -> dict[str, AnyArray]:
+        """Return the columns that the table has, by name."""
+        names = (field.name for field in fields(self))  # type: ignore[arg-type]
+        columns = {name: getattr(self, name) for name in names}
+        return {name: column for name, column in columns.items() if column is not None}
 
 
 _Kind = TypeVar("_Kind", bound=_Rows)
@@ -75,6 +80,9 @@ class FrequencyRows(_Rows):
         temperature: Temperature of the cube (N,), in °C; NaN where it is unknown.
         pad_fault: Bit masks (N,); bit p is set if the device reports that pad p is broken.
         status: Bits of `status.py` (N,), of which only STAMP (doubtful time stamp) is used.
+        specific_force: Specific force at each cube in the cube's frame (N, 3), in m/s²: what an
+            accelerometer there measures, acceleration minus gravity. NaN where it is unknown. None:
+            weight and inertia are not compensated.
     """
 
     cube: NDArray[np.uint16]
@@ -84,6 +92,7 @@ class FrequencyRows(_Rows):
     temperature: Single
     pad_fault: PadMasks
     status: StatusBits
+    specific_force: Single | None = None
 
     @classmethod
     def of(
@@ -96,6 +105,7 @@ class FrequencyRows(_Rows):
         temperature: Any = np.nan,
         pad_fault: Any = 0,
         status: Any = 0,
+        specific_force: Any = None,
     ) -> FrequencyRows:
         """Construct N rows from numbers, lists or arrays.
 
@@ -104,6 +114,7 @@ class FrequencyRows(_Rows):
             frequency: Frequencies (N, P), in Hz.
             stamp_ns, sequence, temperature, pad_fault, status: The other attributes, each with N
                 values or with one value for all rows.
+            specific_force: Specific forces (N, 3) or (3,), in m/s²; None: there is no such column.
         """
         columns = _fill_columns(
             cube,
@@ -113,6 +124,9 @@ class FrequencyRows(_Rows):
             pad_fault=pad_fault,
             status=status,
         )
+        if specific_force is not None:
+            shape = len(columns["cube"]), 3
+            columns["specific_force"] = np.array(np.broadcast_to(specific_force, shape), np.float32)
         return cls(frequency=np.asarray(frequency), **columns)
 
 
@@ -181,13 +195,15 @@ class StressRows(_Rows):
 
 
 def concatenate(parts: Sequence[_Kind]) -> _Kind:
-    """Return one table with the rows of one or more tables of the same class, in their order."""
-    kind = type(parts[0])
-    columns = (
-        np.concatenate([getattr(part, field.name) for part in parts])
-        for field in fields(kind)  # type: ignore[arg-type]
+    """Return one table with the rows of one or more tables of the same class, in their order.
+
+    A column that a table lacks (None) is left out.
+    """
+    columns = [part.columns() for part in parts]
+    common = [name for name in columns[0] if all(name in column for column in columns)]
+    return type(parts[0])(
+        **{name: np.concatenate([column[name] for column in columns]) for name in common}
     )
-    return kind(*columns)
 
 
 def _fill_columns(cube: Any, **columns: Any) -> dict[str, AnyArray]:

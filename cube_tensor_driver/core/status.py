@@ -35,12 +35,32 @@ The clock of the device seems to have been set, or the time that the device send
 like a clock.
 """
 
+COMPENSATION = 4096
+"""Status bit: a compensation that is asked for is missing, stale or uncertain.
+
+Weight, creep or temperature was not subtracted from the stresses on the pads, because an input or
+the calibration lacks what it takes, or the deviation of the compensation is larger than usual.
+"""
+
+WEIGHT = 8192
+"""Status bit: weight and inertia of the cube and of the elastomer around it are subtracted."""
+
+CREEP = 16384
+"""Status bit: the creep of the elastomer (strain that follows a load slowly) is subtracted."""
+
+THERMAL = 32768
+"""Status bit: thermal stress and thermal drift of the pads are subtracted."""
+
 STATUS = {
     "PAD_FAULT": PAD_FAULT,
     "RESIDUAL": RESIDUAL,
     "INVALID": INVALID,
     "TEMPERATURE": TEMPERATURE,
     "STAMP": STAMP,
+    "COMPENSATION": COMPENSATION,
+    "WEIGHT": WEIGHT,
+    "CREEP": CREEP,
+    "THERMAL": THERMAL,
 }
 """Status bits by name, as messages and tables show them."""
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -201,14 +201,14 @@ class MessageBuffer(Generic[AnyRows]):
         layout: _Layout,
         frame_id: bytes,
     ) -> None:
-        self._record = np.zeros(1, layout.record)
+        self._record: AnyArray = np.zeros(1, layout.record)
         codec.write_constants(self._record, layout, frame_id)
         stamp_ns = np.zeros(layout.shape.rows, np.int64)
         self.rows: AnyRows = codec.make_rows(self._record, stamp_ns)
         self._time_offset = self._record["time_offset"][0]
         # The columns are looked up only once, because this takes as long as copying the rows of a
         # skin with few cubes.
-        self._names = [field.name for field in fields(self.rows)]
+        self._names = codec.columns
         self._columns = [getattr(self.rows, name) for name in self._names]
 
     def fill(self, rows: AnyRows) -> None:
@@ -232,7 +232,11 @@ class MessageBuffer(Generic[AnyRows]):
 
 
 class MessageCodec(Generic[AnyRows]):
-    """Converts one type of message between serialised bytes and rows."""
+    """Converts one type of message between serialised bytes and rows.
+
+    Attributes:
+        columns: Names of the columns of the rows that the message contains.
+    """
 
     def __init__(
         self,
@@ -249,9 +253,10 @@ class MessageCodec(Generic[AnyRows]):
         """
         self._name = name
         self._rows: type[AnyRows] = rows
-        self._columns = [field.name for field in fields(rows)]
         self._fields = message_fields
         names = [field.name for field in message_fields]
+        self.columns = [name for name in names if name not in ("time_offset", "n_pads")]
+        self.columns.append("stamp_ns")
         self._n_fields_before_pads = names.index("n_pads") if "n_pads" in names else None
         self._find_end = lru_cache(MAX_CACHED_LAYOUTS)(self._compute_end)
         self._find_layout = lru_cache(MAX_CACHED_LAYOUTS)(self._make_layout)
@@ -356,7 +361,7 @@ class MessageCodec(Generic[AnyRows]):
         # of its header.
         times_ns = rows.stamp_ns.reshape(count, -1)
         record["time_offset"] = times_ns - stamp_ns[:, None]
-        for name in self._columns:
+        for name in self.columns:
             if name != "stamp_ns":
                 record[name] = getattr(rows, name).reshape(record[name].shape)
         return [message.tobytes() for message in record]
@@ -373,7 +378,7 @@ class MessageCodec(Generic[AnyRows]):
         """
         columns: dict[str, AnyArray] = {
             name: stamp_ns if name == "stamp_ns" else _read_column(record, name)
-            for name in self._columns
+            for name in self.columns
         }
         return self._rows(**columns)
 

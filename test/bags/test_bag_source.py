@@ -24,7 +24,7 @@ from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.errors import BagError
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.reconstructor import Reconstructor
-from cube_tensor_driver.core.rows import StressRows
+from cube_tensor_driver.core.rows import StressRows, concatenate
 from cube_tensor_driver.core.status import STUCK
 from cube_tensor_driver.messages.codec import frequency_codec
 from cube_tensor_driver.messages.types import FREQUENCIES, INFO
@@ -45,8 +45,7 @@ def bag(tmp_path_factory):
 
 
 def columns(parts: list) -> list[np.ndarray]:
-    names = [field.name for field in dataclasses.fields(parts[0])]
-    return [np.concatenate([getattr(rows, name) for rows in parts]) for name in names]
+    return list(concatenate(parts).columns().values())
 
 
 def assert_same(one: list, other: list) -> None:

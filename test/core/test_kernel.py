@@ -24,11 +24,12 @@ from hypothesis import strategies as st
 from conftest import ROOT
 from cube_tensor_driver.core import pipeline
 from cube_tensor_driver.core.calibration import Calibration, illustrative
+from cube_tensor_driver.core.compensation.models import WeightModel
 from cube_tensor_driver.core.kernel import run
 from cube_tensor_driver.core.oscillator import TemperatureModel
 from cube_tensor_driver.core.reconstructor import Reconstructor, RecordedHealth
 from cube_tensor_driver.core.rows import FrequencyRows, StressRows
-from cube_tensor_driver.core.status import STAMP
+from cube_tensor_driver.core.status import CREEP, STAMP
 
 NATIVE = ROOT / "native"
 SOURCES = [NATIVE / "cube_scan.c", ROOT / "test" / "scan_process.c"]
@@ -47,7 +48,7 @@ N_TABLES = 11
 """Number of arrays with tables of the skin that a call of the kernel takes."""
 N_HEALTH = 3
 """Number of arrays with the state of health that a call of the kernel takes."""
-N_COLUMNS = 7
+N_COLUMNS = 8
 """Number of arrays with columns of frequencies that a call of the kernel takes."""
 
 
@@ -136,18 +137,47 @@ def thermal(layout: str, seed: int, degree: int) -> Calibration:
     return individual(layout, seed, temperature=TemperatureModel(24.0, slopes))
 
 
+def heavy(calibration: Calibration, seed: int) -> Calibration:
+    """The calibration with a response to weight that differs between pads."""
+    response = 5 * np.random.default_rng(seed).normal(size=(calibration.layout.n_pads, 3))
+    return replace(calibration, weight=WeightModel(response))
+
+
+class Sluggish:
+    """A recursive effect: half of what the pads measured before."""
+
+    bit, is_recursive = CREEP, True
+
+    def __init__(self, pipeline) -> None:
+        self._half = np.zeros((len(pipeline.calibrations), pipeline.n_pads), pipeline.dtype)
+        self.seen: list[np.ndarray] = []
+
+    def applies(self, rows) -> bool:
+        return True
+
+    def add_offset(self, rows, cube, offset):
+        offset += self._half[cube]
+        return rows.temperature > 25
+
+    def update(self, rows, cube, v, bad):
+        self._half[cube] = v / 2
+        self.seen.append(v)
+
+
 SKINS = {
     "planar": [illustrative("planar")] * 9,
     "mixed": [
+        heavy(individual("cube", 8), 9),
         thermal("cube", 1, 2),
         *(individual("planar", seed) for seed in range(4)),
         individual("quad", 6),
         replace(illustrative("planar"), beta=np.array(0.0)),
         thermal("planar", 7, 1),
     ],
-    "quad": [illustrative("quad")] * 3,
+    "quad": [heavy(illustrative("quad"), 2)] * 3,
 }
-"""Skins of all layouts: of one calibration, of many, with temperature, and without a residual."""
+"""Skins of all layouts: of one calibration, of many, with temperature, with weight, and without a
+residual."""
 
 WILD = [np.nan, np.inf, -np.inf, 0.0, -1e5, 1e-300, 1e300, 2e4, 1.8e5, 3.5e5, 1e5 * 1.3 / 0.3]
 
@@ -180,6 +210,8 @@ def played_rows(calibrations, seed: int, dtype) -> Iterator[tuple[FrequencyRows,
         fault = rng.integers(0, 2**32, n) * (rng.random(n) < chance)
         doubt = STAMP * (rng.random(n) < chance)
         celsius = rng.choice([np.nan, 20.0, 31.4], n)
+        force = 9.81 * rng.normal(size=(n, 3))
+        force[rng.random(n) < chance] = np.nan
         with np.errstate(all="ignore"):
             rows = FrequencyRows.of(
                 cube.astype(np.uint16),
@@ -188,6 +220,7 @@ def played_rows(calibrations, seed: int, dtype) -> Iterator[tuple[FrequencyRows,
                 temperature=celsius,
                 pad_fault=fault,
                 status=doubt,
+                specific_force=force if rng.random() < 0.8 else None,
             )
         known = rng.random(n) < 0.5
         left_out = rng.choice([0, 1, 6], n).astype(np.uint32)
@@ -203,6 +236,9 @@ def played(kernel, calibrations, seed: int, dtype=np.float32) -> list[object]:
         patch.setattr(pipeline, "MAX_CACHED_ESTIMATORS", 24)
         reconstructor = Reconstructor(calibrations, dtype)
         health = reconstructor.health
+        sluggish = Sluggish(reconstructor.pipeline)
+        if seed % 2:
+            reconstructor.compensation.effects.insert(0, sluggish)
         for number, (rows, recorded) in enumerate(played_rows(calibrations, seed, dtype)):
             if number % 10 == 7:
                 reconstructor.rest_frequency = reconstructor.rest_frequency * (1 + 1e-4)
@@ -212,7 +248,7 @@ def played(kernel, calibrations, seed: int, dtype=np.float32) -> list[object]:
             found += [health.state, health.mask.copy(), *health.collect(), *health.window()]
         found += [column for window in health.history for column in window]
         found += [health.sums.cubes[name] for name in health.sums.cubes.dtype.names]
-        found += [health.sums.quantities, health.sums.window_ns, health.closed]
+        found += [health.sums.quantities, health.sums.window_ns, health.closed, *sluggish.seen]
     return found
 
 
@@ -305,7 +341,7 @@ def test_arrays_that_do_not_fit_are_refused():
         patch.setattr(run, "native", SimpleNamespace(run=record))
         Reconstructor(SKINS["planar"]).process(rows)
     call = calls[-1]
-    with pytest.raises(TypeError, match="takes 29 arguments"):
+    with pytest.raises(TypeError, match="takes 31 arguments"):
         module.run(*call[:-1])
     for number in range(2, len(call)):
         for wrong in (

@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from itertools import count
 from pkgutil import resolve_name
@@ -127,8 +127,8 @@ def _change_frequencies(change: RowsChange | None = None, **columns: ColumnChang
             rows = publisher._next.rows
             changed = change(rows)
             # The rows are views of the message, so they are changed in place.
-            for field in fields(rows):
-                getattr(rows, field.name)[:] = getattr(changed, field.name)
+            for name, column in rows.columns().items():
+                column[:] = getattr(changed, name)
         original(publisher)
 
     return _wrap("ros.nodes.driver:FrequenciesPublisher", "publish", publish)

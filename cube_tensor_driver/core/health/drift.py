@@ -47,7 +47,7 @@ class DriftTracker:
     At the end of each window of 0.5 s, the tracked rest frequency f0 (frequency without load) of
     every pad of an unloaded cube moves towards the mean frequency of the window::
 
-        f0 += (mean(f) / temperature_factor - f0) * WINDOW_S / time_constant
+        f0 += (mean(f) / unloaded_factor - f0) * WINDOW_S / time_constant
 
     A cube is unloaded when all of its usable pads have been still and within `CONTACT_THRESHOLD`
     of their rest frequency for `RELEASE_S`. A load that stays below the threshold cannot be
@@ -75,7 +75,7 @@ class DriftTracker:
         window = self._health.history[-1]
         has_rows = window.rows > 0
         cubes = np.arange(len(has_rows))
-        factor = self._pipeline.temperature_factor(cubes, self._health.temperature)
+        factor = self._pipeline.unloaded_factor(cubes, self._health.temperature)
         measured = window.mean / factor
         # The rest frequency of a pad that a cube does not have is NaN, so this pad is never usable.
         is_left_out = self._health.state & LEFT_OUT > 0

@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tare: take the present load of a cube as its unloaded state.
 
-    f0 = mean(f) / factor(T)
+    f0 = mean(f) / factor(T, o)
 
 The mean frequency of each pad over the last windows (of 0.5 s) that `Health` keeps becomes the
-frequency without load, f0. factor(T) is f0(T) / f0 by the temperature model of the calibration. The
+frequency without load, f0. factor(T, o) is f0(T) / f0 by the temperature model of the calibration
+and by the offset o that compensation (of weight, for example) subtracts. The
 mean is of data that have already arrived, so nothing has to wait. A tare is refused if a frequency
 moved during these windows, or if the data have a gap.
 """
@@ -140,7 +141,7 @@ def measure_rest(
 
     with np.errstate(invalid="ignore"):  # NaN where a cube has no such pad
         means = _average(windows, chosen)
-        factor = pipeline.temperature_factor(chosen, health.temperature[chosen])
+        factor = pipeline.unloaded_factor(chosen, health.temperature[chosen])
         rest = means.frequency / factor
         checks = _list_checks(pipeline, health, chosen, rest, means)
     for check in checks:

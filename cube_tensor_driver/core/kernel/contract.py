@@ -184,6 +184,9 @@ class Columns(NamedTuple):
         doubt: Status bits (N,) of which STAMP (doubtful time stamp) is used.
         known: Whether `left_out` and `status` of `Results` hold the health of a row before the call
             (N,); None stands for False in all rows.
+        offset: Values (N, P) to subtract from v (pad stress / stiffness) before the product with
+            the matrix: effects that are no load, such as weight, creep and thermal stress. They
+            are finite, and 0 for pads that a cube does not have. None: nothing is subtracted.
     """
 
     cube: NDArray[np.uint16]
@@ -193,6 +196,7 @@ class Columns(NamedTuple):
     stamp_ns: Times
     doubt: StatusBits
     known: Mask | None
+    offset: Real | None = None
 
     def select(self, rows: slice) -> Columns:
         """Return the columns of some successive rows, as views."""
@@ -205,6 +209,10 @@ class Results(NamedTuple):
 
     Before a call, `left_out` and `status` must hold the mask of the pads that are not used and the
     conditions of the pads, for all rows whose health is not judged in this call.
+
+    Attributes:
+        v: Pad stress / stiffness (N, P) by the pad law, before an offset is subtracted; 0 where a
+            frequency lies outside the range of the law. None: not wanted.
     """
 
     stress: Real
@@ -213,7 +221,9 @@ class Results(NamedTuple):
     status: StatusBits
     observed: NDArray[np.uint16]
     left_out: PadMasks
+    v: Real | None = None
 
     def select(self, rows: slice) -> Results:
         """Return the columns of some successive rows, as views."""
-        return Results(*(column[rows] for column in self))  # type: ignore[arg-type]
+        columns = (None if column is None else column[rows] for column in self)
+        return Results(*columns)  # type: ignore[arg-type]

@@ -198,6 +198,10 @@ def _process(
     is_lacking = find_existing(tables, calibration) & ~is_good
     is_bad = is_lacking | mask_bits(tables, calibration, out.left_out)
     bad = pack_bits(is_bad)
+    if out.v is not None:
+        out.v[:] = v
+    if rows.offset is not None:
+        v = v - rows.offset
     v[is_bad] = 0
     table, key = _find_tables(tables, calibration, bad)
     stops = np.flatnonzero(has_new_condition | (key != DONE))

@@ -1,0 +1,121 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
+"""The sum of all effects that are subtracted from the stresses on the pads.
+
+    v = (f - f0) / (f_highest - f)        pad law: stress on a pad / its stiffness
+    v - offset,  offset = sum of effects  what the load contributes
+
+A row is one sample of one cube, P the largest number of pads of a cube. Without effects, nothing is
+computed here.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from ..arrays import Array, Mask, PadMasks
+from ..pipeline import Pipeline, Watch
+from ..rows import FrequencyRows, StressRows
+from ..status import COMPENSATION
+from .effect import Effect
+from .weight import Weight
+
+
+class Compensation:
+    """Subtracts the effects on the pads of one skin that are no load.
+
+    Attributes:
+        effects: The effects, in the order in which they are subtracted. Creep comes after effects
+            of the electronics, which do not strain the elastomer, and before those that do.
+    """
+
+    def __init__(self, pipeline: Pipeline) -> None:
+        self._pipeline = pipeline
+        self.effects: list[Effect] = [Weight(pipeline)]
+        self._active: list[Effect] = []
+
+    def process(
+        self,
+        rows: FrequencyRows,
+        left_out: PadMasks | None,
+        *,
+        watch: Watch | None,
+        known: Mask | None,
+        out: StressRows,
+    ) -> StressRows:
+        """Compute the stress of rows without the effects; arguments as `Pipeline.process`."""
+        self._active = [effect for effect in self.effects if effect.applies(rows)]
+        if not self._active:
+            self._pipeline.newest_offset = None
+            return self._pipeline.process(rows, left_out, watch=watch, known=known, out=out)
+        for part in self._split(rows):
+            self._process_part(
+                rows.select(part),
+                None if left_out is None else left_out[part],
+                watch,
+                None if known is None else known[part],
+                out.select(part),
+            )
+        return out
+
+    def growth(self, cube: int, left_out: int = 0) -> Array | None:
+        """Return what the effects add to the covariance (15, 15) of a cube's newest row.
+
+        Args:
+            cube: Number of the cube.
+            left_out: Bit mask of the pads that are not used.
+
+        Returns:
+            Covariance in the units of `Pipeline.covariance`; None: nothing.
+        """
+        patterns = [effect.deviation(cube) for effect in self._active]
+        if not patterns or not any(pattern.any() for pattern in patterns):
+            return None
+        matrix = self._pipeline.matrix(cube, left_out)
+        components = matrix @ np.hstack(patterns)[: matrix.shape[1]]
+        growth: Array = components @ components.T
+        return growth
+
+    def _split(self, rows: FrequencyRows) -> list[slice]:
+        """Return the parts of rows that are processed at once: all, or single scans."""
+        if not any(effect.is_recursive for effect in self._active):
+            return [slice(None)]
+        # A scan begins where the cube number does not rise.
+        begins = [0, *(np.flatnonzero(rows.cube[1:] <= rows.cube[:-1]) + 1).tolist(), len(rows)]
+        return [slice(*ends) for ends in pairwise(begins)]
+
+    def _process_part(
+        self,
+        rows: FrequencyRows,
+        left_out: PadMasks | None,
+        watch: Watch | None,
+        known: Mask | None,
+        out: StressRows,
+    ) -> None:
+        """Compute the stress of rows without the effects.
+
+        Args:
+            rows: Rows of frequencies, of one scan if an effect is recursive.
+            left_out, watch, known, out: As for `Pipeline.process`.
+        """
+        pipeline = self._pipeline
+        # Cube numbers that the skin does not have are refused or marked by the pipeline.
+        cube = np.clip(rows.cube, 0, len(pipeline.calibrations) - 1).astype(np.intp)
+        offset = np.zeros((len(rows), pipeline.n_pads), pipeline.dtype)
+        before = {}
+        bits = np.zeros(len(rows), np.uint16)
+        for effect in self._active:
+            if effect.is_recursive:
+                before[effect] = offset.copy()
+            is_known = effect.add_offset(rows, cube, offset)
+            bits |= np.where(is_known, effect.bit, COMPENSATION).astype(np.uint16)
+        v = np.empty_like(offset) if before else None
+        pipeline.process(rows, left_out, watch=watch, known=known, out=out, offset=offset, v=v)
+        out.status[:] |= bits
+        for effect, earlier in before.items():
+            effect.update(rows, cube, v - earlier, out.left_out)
+        if pipeline.newest_offset is None:
+            pipeline.newest_offset = np.zeros((len(pipeline.calibrations), pipeline.n_pads))
+        pipeline.newest_offset[cube] = offset

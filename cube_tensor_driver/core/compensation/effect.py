@@ -1,0 +1,64 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
+"""What every effect on the pads that is compensated has to provide.
+
+A row is one sample of one cube, P the largest number of pads of a cube.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from ..arrays import Array, Index, Mask, PadMasks, Real
+from ..rows import FrequencyRows
+
+
+class Effect(Protocol):
+    """One effect on the pads that is no load, such as weight or creep.
+
+    Attributes:
+        bit: Status bit of rows from which the effect is subtracted.
+        is_recursive: Whether the effect depends on the stresses of earlier rows. Scans are then
+            processed one by one, and `update` is called after each.
+    """
+
+    bit: int
+    is_recursive: bool
+
+    def applies(self, rows: FrequencyRows) -> bool:
+        """Return whether the effect is to be subtracted from rows of this source."""
+
+    def add_offset(self, rows: FrequencyRows, cube: Index, offset: Real) -> Mask:
+        """Add the effect to offsets (N, P), as far as it is known.
+
+        Args:
+            rows: N rows of frequencies; of one scan if an effect is recursive.
+            cube: Numbers of their cubes, to index with.
+            offset: Offsets, stress / stiffness, which are changed. They must stay finite, and 0 for
+                pads that a cube does not have.
+
+        Returns:
+            Whether the effect is known, so that it is subtracted, and not too uncertain (N,).
+        """
+
+    def update(self, rows: FrequencyRows, cube: Index, v: Real, bad: PadMasks) -> None:
+        """Take the stresses on the pads of one scan; an effect that is not recursive does nothing.
+
+        Args:
+            rows: N rows of frequencies of one scan.
+            cube: Numbers of their cubes, to index with.
+            v: Stress / stiffness without the effects that are listed before this one (N, P).
+            bad: Bit masks of the pads that are not used (N,).
+        """
+        return
+
+    def deviation(self, cube: int) -> Array:
+        """Return what is not known about the effect on a cube's newest row.
+
+        Args:
+            cube: Number of the cube.
+
+        Returns:
+            Patterns (P, k) of one standard deviation each of the stresses on the pads, in Pa; the
+            k patterns are independent of each other.
+        """

@@ -1,0 +1,89 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
+"""Compensation of weight and inertia: the pads' response to the specific force of each row.
+
+A row is one sample of one cube; the specific force is what an accelerometer at the cube measures.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..arrays import Array, Index, Mask, Real
+from ..pipeline import Pipeline
+from ..rows import FrequencyRows
+from ..status import WEIGHT
+from .effect import Effect
+
+STANDARD_GRAVITY = 9.80665
+"""Standard acceleration of gravity, in m/s² (ISO 80000-3)."""
+
+MAX_SPECIFIC_FORCE = 1000.0
+"""Largest credible specific force along one axis, in m/s² (100 g). A larger one counts as missing,
+because it is an error of the source and would look like a load."""
+
+
+class Weight(Effect):
+    """Computes what weight and inertia do to the pads of one skin.
+
+    Attributes:
+        bit: Status bit of rows from which the effect is subtracted.
+        is_recursive: Whether the effect depends on the stresses of earlier rows.
+    """
+
+    bit = WEIGHT
+    is_recursive = False
+
+    def __init__(self, pipeline: Pipeline) -> None:
+        """Take the models of the skin's calibrations.
+
+        Args:
+            pipeline: Pipeline with the calibrations and the pads' stiffness.
+        """
+        models = [calibration.weight for calibration in pipeline.calibrations]
+        shape = len(models), pipeline.n_pads, 3
+        # Stress on each pad per specific force, in Pa per m/s², and its standard deviation.
+        self._response, self._deviation = np.zeros(shape), np.zeros(shape)
+        self._has_model = np.zeros(len(models), bool)
+        for number, model in enumerate(models):
+            if model is None:
+                continue
+            self._has_model[number] = True
+            gain = pipeline.calibrations[number].gain[:, None]
+            self._response[number, : len(gain)] = gain * model.response
+            if model.deviation is not None:
+                self._deviation[number, : len(gain)] = gain * model.deviation
+        # With the axis first, each of the three terms of a product is one contiguous table.
+        stiffness = np.where(pipeline.stiffness > 0, pipeline.stiffness, np.inf)
+        table = np.moveaxis(self._response / stiffness[..., None], 2, 0)
+        self._table = np.ascontiguousarray(table, pipeline.dtype)
+        self._newest_force = np.full((len(models), 3), np.nan)
+
+    def applies(self, rows: FrequencyRows) -> bool:
+        """Return whether the rows have a column of specific forces, known or not."""
+        return rows.specific_force is not None
+
+    def add_offset(self, rows: FrequencyRows, cube: Index, offset: Real) -> Mask:
+        """Add the effect to the offsets of the pads; see `Effect.add_offset`."""
+        if rows.specific_force is None:
+            return np.zeros(len(rows), bool)
+        with np.errstate(invalid="ignore"):  # NaN stands for a force that is not known
+            is_credible = np.abs(rows.specific_force) < MAX_SPECIFIC_FORCE
+        is_known: Mask = is_credible.all(axis=1) & self._has_model[cube]
+        force = np.where(is_known[:, None], rows.specific_force, 0).astype(offset.dtype)
+        for axis, table in enumerate(self._table):
+            offset += table[cube] * force[:, axis, None]
+        self._newest_force[cube] = np.where(is_known[:, None], force, np.nan)
+        return is_known
+
+    def deviation(self, cube: int) -> Array:
+        """Return patterns of one standard deviation of the pads' stresses; see `Effect.deviation`.
+
+        An unknown specific force is taken as 0 with a standard deviation of 1 g along each axis.
+        """
+        force = self._newest_force[cube]
+        is_known = not np.isnan(force).any()
+        pattern: Array = (
+            self._deviation[cube] * force if is_known else self._response[cube] * STANDARD_GRAVITY
+        )
+        return pattern
