@@ -27,7 +27,7 @@ UBUNTU = (
     "python3-transforms3d",
     "python3-yaml",
 )
-# Packages that Humble, Jazzy and Kilted have released.
+# Packages that Humble, Jazzy, Kilted and Lyrical have released.
 ROS = (
     "ament_cmake",
     "ament_cmake_pytest",
@@ -52,7 +52,7 @@ ROS = (
     "std_srvs",
     "visualization_msgs",
 )
-UBUNTU_OF = {"humble": "jammy", "jazzy": "noble", "kilted": "noble"}
+UBUNTU_OF = {"humble": "jammy", "jazzy": "noble", "kilted": "noble", "lyrical": "resolute"}
 
 needs_bloom = pytest.mark.skipif(
     not (shutil.which("bloom-generate") and shutil.which("rosdep")),
