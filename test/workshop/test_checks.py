@@ -19,7 +19,7 @@ from cube_tensor_driver.simulation.faults import Fault
 from cube_tensor_driver.simulation.sample_log import FaultRecord, LinkLog, SampleLog, SampleRun
 from workshop.checks.all_checks import check_all
 from workshop.checks.expected import ExpectedReadings, load_tables
-from workshop.checks.record import CubeMessages, NodeAction, Received, Record
+from workshop.checks.record import NodeAction, Received, Record
 from workshop.checks.rest import TRANSPORT_S
 from workshop.checks.samples import Samples
 
@@ -41,7 +41,6 @@ WRONG = (
     "wrong_tensors",
     "unflagged",
     "false_alarms",
-    "wrong_cube_messages",
     "wrong_periods",
 )
 
@@ -98,7 +97,6 @@ def recorded(skin, log, actions=(), rest_after=None):
         instants=INSTANTS,
         frequencies=received(frequencies),
         stress=received(stress),
-        cube_messages=CubeMessages(0, frozenset({skin.frame(skin.cubes[0])}), (), ()),
         actions=actions,
         counters={
             "lost_on_the_way": 1,

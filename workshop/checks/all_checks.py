@@ -14,7 +14,6 @@ from cube_tensor_driver.demo.verification import percentile
 from cube_tensor_driver.simulation.sample_log import SampleLog
 
 from .counters import check_counters
-from .cube_topics import check_cube_topics
 from .frequencies import check_frequencies
 from .health import check_health
 from .record import Record
@@ -42,7 +41,7 @@ def check_all(record: Record, log: SampleLog) -> dict[str, Any]:
 
     figures = Counter[str]()
     examples: list[str] = []
-    for findings in (frequencies, counters, tensors, health, check_cube_topics(run)):
+    for findings in (frequencies, counters, tensors, health):
         figures.update(findings.figures)
         examples += findings.examples
     topics = (record.frequencies, record.stress)

@@ -11,7 +11,7 @@ from typing import Generic
 import numpy as np
 
 from cube_tensor_driver.config.skin import Skin
-from cube_tensor_driver.core.arrays import AnyArray, Array, Mask, Times
+from cube_tensor_driver.core.arrays import AnyArray, Mask, Times
 from cube_tensor_driver.core.rows import FrequencyRows, StressRows
 from cube_tensor_driver.messages.codec import AnyRows
 
@@ -119,31 +119,6 @@ class Received(Generic[AnyRows]):
         return inside
 
 
-Tensor = tuple[int, Array, float, int, int, Array]
-"""Message of one cube: stamp in ns, stresses and gradients (15,), residual, status, observed,
-covariance (225,)."""
-
-Wrench = tuple[int, Array]
-"""Message of one cube: stamp in ns, force and torque (6,)."""
-
-
-@dataclass(frozen=True)
-class CubeMessages:
-    """Some messages of the topics of one cube.
-
-    Attributes:
-        cube: Index of the cube in the skin.
-        frame_ids: Frames that the messages named.
-        tensors: Messages of its topic `stress`.
-        wrenches: Messages of its topic `wrench`.
-    """
-
-    cube: int
-    frame_ids: frozenset[str]
-    tensors: tuple[Tensor, ...]
-    wrenches: tuple[Wrench, ...]
-
-
 @dataclass(frozen=True, kw_only=True)
 class NodeAction(Span):
     """Something that was done to the nodes, with the span of time from the request to its end.
@@ -170,7 +145,6 @@ class Record(Span):
         instants: Number of instants of the load that the hubs repeat.
         frequencies: Rows of the topic `frequencies`.
         stress: Rows of the topic `stress`.
-        cube_messages: Some messages of one cube's own topics.
         actions: What was done to the nodes, in order.
         counters: Newest counters of the driver, summed over all links and all of its lives.
         messages_lost: Number of messages that the reconstruction states to have lost.
@@ -180,7 +154,6 @@ class Record(Span):
     instants: int
     frequencies: Received[FrequencyRows]
     stress: Received[StressRows]
-    cube_messages: CubeMessages
     actions: tuple[NodeAction, ...]
     counters: Mapping[str, int]
     messages_lost: int

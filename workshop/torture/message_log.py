@@ -13,30 +13,19 @@ from itertools import groupby
 from typing import Any, Generic, NamedTuple
 
 import numpy as np
-from geometry_msgs.msg import WrenchStamped
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
-from rclpy.serialization import deserialize_message
 
 from cube_tensor_driver.config.skin import Skin
 from cube_tensor_driver.core.arrays import AnyArray
 from cube_tensor_driver.core.errors import MessageError
 from cube_tensor_driver.core.rows import concatenate
 from cube_tensor_driver.messages.codec import AnyRows, MessageCodec
-from cube_tensor_driver.msg import StressTensorStamped
-from cube_tensor_driver.ros.messages import to_ns
 
-from ..checks.record import CubeMessages, Received, Tensor, Wrench
+from ..checks.record import Received
 
 MESSAGES_PER_DECODING = 500
 """Number of messages that are decoded together, which takes less time than decoding one by one."""
-
-MESSAGES_PER_SAMPLE = 8
-"""Number of messages on the topics of a single cube of which one is kept for the checks."""
-
-MAX_CUBE_MESSAGES = 4000
-"""Number of messages on the topics of a single cube after which these are unsubscribed. To receive
-all messages would take a third of the processor time of the machine."""
 
 MAX_MESSAGES_TAKEN = 300
 """Maximum number of messages that are taken at a time, so that this process also does other
@@ -61,7 +50,7 @@ class RawSubscription:
         topic: str,
         quality: QoSProfile,
     ) -> None:
-        self._node, self._kind = node, kind
+        self._kind = kind
         self._subscription: Any = node.create_subscription(
             kind, topic, lambda _: None, quality, raw=True
         )
@@ -80,10 +69,6 @@ class RawSubscription:
                 number, sent_ns = info["publication_sequence_number"], info["source_timestamp"]
                 taken.append(Message(data, number, sent_ns))
         return taken
-
-    def close(self) -> None:
-        """Unsubscribe."""
-        self._node.destroy_subscription(self._subscription)
 
 
 class TopicLog(Generic[AnyRows]):
@@ -182,76 +167,3 @@ class TopicLog(Generic[AnyRows]):
 
     def _shape_of(self, message: Message) -> tuple[int, bytes]:
         return len(message.data), self._codec.shape_bytes(message.data)
-
-
-class CubeTopicLog:
-    """Collects some messages of the topics of one cube."""
-
-    def __init__(
-        self,
-        node: Node,
-        skin: Skin,
-        cube: int,
-        quality: QoSProfile,
-    ) -> None:
-        self._cube = cube
-        self._kinds = {"stress": StressTensorStamped, "wrench": WrenchStamped}
-        self._subscriptions = {
-            name: RawSubscription(node, kind, f"cubes/{skin.cubes[cube].name}/{name}", quality)
-            for name, kind in self._kinds.items()
-        }
-        self._kept: dict[str, list[Any]] = {name: [] for name in self._kinds}
-        self._count = 0
-
-    def take(self) -> None:
-        """Take what has arrived; to be called again and again."""
-        for name, subscription in self._subscriptions.items():
-            for message in subscription.take():
-                self._count += 1
-                if self._count % MESSAGES_PER_SAMPLE == 0:
-                    self._kept[name].append(message.data)
-        # Without a subscriber, the reconstruction does not make these messages any more.
-        if self._count > MAX_CUBE_MESSAGES:
-            for subscription in self._subscriptions.values():
-                subscription.close()
-            self._subscriptions.clear()
-
-    def received(self) -> CubeMessages:
-        """Return the messages that were kept."""
-        tensors, wrenches = (
-            [deserialize_message(data, kind) for data in self._kept[name]]
-            for name, kind in self._kinds.items()
-        )
-        return CubeMessages(
-            self._cube,
-            frozenset(message.header.frame_id for message in (*tensors, *wrenches)),
-            tuple(map(_read_tensor, tensors)),
-            tuple(map(_read_wrench, wrenches)),
-        )
-
-
-def _read_tensor(message: StressTensorStamped) -> Tensor:
-    tensor = message.tensor
-    values = [
-        *_read_vector(tensor.normal),
-        *_read_vector(tensor.shear),
-        *tensor.normal_gradient,
-    ]
-    return (
-        to_ns(message.header.stamp),
-        np.array(values),
-        tensor.residual,
-        tensor.status,
-        tensor.observed,
-        np.array(tensor.covariance),
-    )
-
-
-def _read_wrench(message: WrenchStamped) -> Wrench:
-    wrench = message.wrench
-    values = [*_read_vector(wrench.force), *_read_vector(wrench.torque)]
-    return to_ns(message.header.stamp), np.array(values)
-
-
-def _read_vector(vector: Any) -> tuple[float, float, float]:
-    return vector.x, vector.y, vector.z

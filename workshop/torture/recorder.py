@@ -1,6 +1,6 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Record of a torture: both batch topics, the topics of one cube, and the counters of the nodes."""
+"""Record of a torture: both batch topics, and the counters of the nodes."""
 
 from __future__ import annotations
 
@@ -24,15 +24,11 @@ from cube_tensor_driver.ros.qos import batch_profile
 
 from ..checks.record import NodeAction, Record, Span
 from .memory import MemoryMonitor
-from .message_log import CubeTopicLog, RawSubscription, TopicLog
-from .mix import CUBES_PER_HUB, OPENING_CUBES, OPENING_HUB, RATE
+from .message_log import RawSubscription, TopicLog
+from .mix import RATE
 
 INSTANTS = 1000
 """Number of instants of the load that the simulated hubs repeat."""
-
-RECORDED_CUBE = OPENING_HUB * CUBES_PER_HUB + OPENING_CUBES[0]
-"""Number of the cube whose own topics are recorded, too. One of its pads breaks at the
-beginning."""
 
 QUIET_S = 1.0
 """Time, in seconds, without a new message after which everything has arrived."""
@@ -73,7 +69,6 @@ class TortureRecorder:
         stress = RawSubscription(node, SkinStress, "stress", quality)
         self._frequencies = TopicLog(frequencies, frequency_codec, skin)
         self.stress = TopicLog(stress, stress_codec, skin)
-        self._cube_topics = CubeTopicLog(node, skin, RECORDED_CUBE, quality)
 
         self._links: dict[str, dict[str, str]] = {}
         self._totals: dict[str, str] = {}
@@ -87,8 +82,8 @@ class TortureRecorder:
 
     def take(self) -> None:
         """Take what has arrived; to be called again and again."""
-        for log in (self._frequencies, self.stress, self._cube_topics):
-            log.take()
+        self._frequencies.take()
+        self.stress.take()
         n_messages = self._frequencies.count + self.stress.count
         if n_messages != self._n_messages:
             self._n_messages, self._last_message_s = n_messages, time.monotonic()
@@ -137,7 +132,6 @@ class TortureRecorder:
             instants=INSTANTS,
             frequencies=self._frequencies.received(),
             stress=self.stress.received(),
-            cube_messages=self._cube_topics.received(),
             actions=tuple(actions),
             counters=counters,
             messages_lost=sum(self._messages_lost),

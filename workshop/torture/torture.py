@@ -43,7 +43,6 @@ FORBIDDEN = (
     "wrong_tensors",
     "unflagged",
     "false_alarms",
-    "wrong_cube_messages",
     "wrong_periods",
     "deeds_failed",
     "crashes",
