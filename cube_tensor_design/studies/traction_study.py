@@ -10,7 +10,7 @@ whose gains are known to `GAIN_ERROR`, the pad law, a counter's noise, the pipel
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -60,10 +60,8 @@ about z."""
 METHODS = ("interpolation", "inverse", "inverse with contacts")
 """Methods that compute the pressure between the cubes: interpolation, the surface traction that
 explains all cubes, and this inverse with contacts fitted first."""
-SHAPES = ("ball", "flat punch", "rounded punch", "two balls")
-"""Shapes of the load. Two balls touch each other, and are together as wide as a single ball."""
-ROUNDED_RADII = np.linspace(0.6, 1.0, 8)
-"""Relative radii of the flat punches whose mean is a rounded punch."""
+SHAPES = ("ball", "flat punch")
+"""Shapes of the load. `./cube bench contacts` has more."""
 GAIN_ERROR = 0.01
 """Standard deviation of the error of a pad's calibrated gain, relative to the gain. The inverse
 assumes the value in pad_noise.py."""
@@ -230,21 +228,8 @@ class TractionBench:
         order: int = ORDER,
     ) -> tuple[Array, Array]:
         """Return the load as point forces: positions (S, 3) in m and forces (S, 3) in N."""
-        shape = self.setting.shape
-        radius = width / 2
-        if shape == "ball":
-            return contact.hertz(radius, force, centre, order)
-        if shape == "flat punch":
-            return flat_punch(radius, force, centre, order)
-        if shape == "rounded punch":
-            share = force / len(ROUNDED_RADII)
-            parts = [flat_punch(r * radius, share, centre, order) for r in ROUNDED_RADII]
-        else:
-            offset = radius / 2 * np.array([0.8, 0.6])
-            centres = (centre - offset, centre + offset)
-            parts = [contact.hertz(radius / 2, force / 2, one, order) for one in centres]
-        sources, forces = zip(*parts, strict=True)
-        return np.concatenate(sources), np.concatenate(forces)
+        distribute = flat_punch if self.setting.shape == "flat punch" else contact.hertz
+        return distribute(width / 2, force, centre, order)
 
     def values(
         self,
@@ -359,7 +344,7 @@ class TractionBench:
         both: list[list[Any]] = [list(interpolated), list(tracked)]
         for k, contacts in enumerate(both):
             if contacts:
-                total = _sum_contacts(contacts)
+                total = sum_contacts(contacts)
                 difference = total.force - FORCE
                 force_error[k] = difference / FORCE
                 position_error[k] = np.linalg.norm(total.position - centre)
@@ -427,7 +412,7 @@ class _CaseErrors(NamedTuple):
     is_single: bool
 
 
-class _TotalContact(NamedTuple):
+class TotalContact(NamedTuple):
     """Normal force of all contacts in N and where it acts (2,) in m, with standard deviations."""
 
     force: float
@@ -436,7 +421,7 @@ class _TotalContact(NamedTuple):
     position_deviation: float
 
 
-def _sum_contacts(contacts: list[Any]) -> _TotalContact:
+def sum_contacts(contacts: Sequence[Any]) -> TotalContact:
     """Add up contacts as if they were independent of each other."""
     forces = np.array([one.normal_force for one in contacts])
     force_deviations = np.array([one.force_uncertainty for one in contacts])
@@ -449,7 +434,7 @@ def _sum_contacts(contacts: list[Any]) -> _TotalContact:
     lever = np.linalg.norm(positions - centre, axis=1) / np.sqrt(2)
     moment_variance = (forces * position_deviations) ** 2 + (lever * force_deviations) ** 2
     deviation = float(np.sqrt(moment_variance.sum())) / total
-    return _TotalContact(total, float(np.linalg.norm(force_deviations)), centre, deviation)
+    return TotalContact(total, float(np.linalg.norm(force_deviations)), centre, deviation)
 
 
 def _place_cubes(setting: Setting) -> CubePoses:
@@ -522,10 +507,6 @@ PITCHES = tuple(
     for cubes in CUBES[:2]
 )
 """Skins with pitches (distances between neighbouring cubes) of 12 and 24 mm and a depth of 4 mm."""
-SHAPED = tuple(
-    replace(setting, shape=shape) for shape in SHAPES[1:] for setting in (*MAIN[:2], *PITCHES)
-)
-"""Skins with pitches of 8, 12 and 24 mm under loads that are not balls."""
 WRONG = {
     "everything as known": Setting(),
     "5 % gain spread": Setting(gain_error=0.05),

@@ -14,7 +14,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cube_tensor_design.studies.traction_study import CUBES, Setting, TractionBench, flat_punch
+from cube_tensor_design.studies.traction_study import (
+    CUBES,
+    Setting,
+    TractionBench,
+    flat_punch,
+    sum_contacts,
+)
 from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.defaults import CONTACT_PRESSURE
 from cube_tensor_driver.mechanics import contact
@@ -169,21 +175,14 @@ def _bench_load(
         start_s = time.process_time()
         found = tracker.update(values)
         times_ms.append(1e3 * (time.process_time() - start_s))
-    forces = np.array([one.normal_force for one in found])
-    deviations = np.array([one.force_uncertainty for one in found])
-    places = np.array([one.position[:2] for one in found])
-    force = float(forces.sum())
-    place = forces @ places / force
-    # The uncertain forces of several contacts move their common centre.
-    levers = np.linalg.norm(places - place, axis=1) / np.sqrt(2)
-    own = forces * np.array([one.position_uncertainty for one in found])
-    place_deviation = np.linalg.norm(np.hypot(own, levers * deviations)) / force
-    error = float(np.linalg.norm(place - centre))
+    total = sum_contacts(found)
+    error = float(np.linalg.norm(total.position - centre))
+    # The deviation is that of each of two coordinates, while the error is a distance.
     return [
-        force - FORCE_N,
-        (force - FORCE_N) / float(np.linalg.norm(deviations)),
+        total.force - FORCE_N,
+        (total.force - FORCE_N) / total.force_deviation,
         error,
-        error / float(place_deviation * np.sqrt(2)),
+        error / (total.position_deviation * np.sqrt(2)),
         len(found),
         times_ms[0],
         times_ms[-1],

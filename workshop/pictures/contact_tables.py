@@ -14,7 +14,6 @@ from cube_tensor_design.studies.pads_study import FORMS, study_pads
 from cube_tensor_design.studies.traction_study import (
     MAIN,
     PITCHES,
-    SHAPED,
     WRONG,
     Errors,
     Setting,
@@ -82,7 +81,6 @@ def contact_tables(true_pads: Influence) -> dict[str, Table]:
     """Run the studies and return their tables by name."""
     balls = traction_study((*MAIN, *PITCHES), WIDTHS, BALL_LOADS, SEED)
     wrong = traction_study(list(WRONG.values()), WRONG_WIDTHS, FEW_LOADS, SEED)
-    shaped = traction_study(SHAPED, WIDTHS, FEW_LOADS, SEED)
     forms = study_pads(true_pads, WIDTHS, PAD_LOADS, SEED)
     return {
         "balls, pitch 8 mm, depth 5 mm": {
@@ -94,26 +92,14 @@ def contact_tables(true_pads: Influence) -> dict[str, Table]:
         "balls, pitches 12 and 24 mm, depth 4 mm": {
             "about": f"As above, {BALL_LOADS} loads for each line.",
             "columns": ["cubes and pitch", *METHOD_COLUMNS],
-            "rows": _method_rows({_name(setting): balls[setting] for setting in PITCHES}),
+            "rows": _method_rows(
+                {f"{one.cubes}, {1e3 * one.pitch:g} mm": balls[one] for one in PITCHES}
+            ),
         },
         "wrong assumptions": {
             "about": f"24-pad cubes, pitch 8 mm, depth 5 mm, {FEW_LOADS} loads for each line.",
             "columns": ["assumption", *METHOD_COLUMNS],
             "rows": _method_rows({name: wrong[setting] for name, setting in WRONG.items()}),
-        },
-        "other shapes": {
-            "about": f"{FEW_LOADS} loads for each cell; depth 5 mm at the pitch of 8 mm, otherwise "
-            "4 mm. A rounded punch is the mean of flat ones of 0.6 to 1 of its radius.",
-            "columns": [
-                "cubes and pitch",
-                "contact width, mm",
-                "rounded punch: force error in %, error / predicted deviation, position error in "
-                "mm, error / predicted deviation",
-                "two balls: the same four",
-                "loads of two balls that did not become one contact",
-                "flat punch: the same four",
-            ],
-            "rows": _shape_rows(shaped),
         },
         "cubes as points and as pads": {
             "about": f"Layer of 11 mm, cubes in its middle, pitch 8 mm, {PAD_LOADS} loads for each "
@@ -122,10 +108,6 @@ def contact_tables(true_pads: Influence) -> dict[str, Table]:
             "rows": _form_rows(forms),
         },
     }
-
-
-def _name(setting: Setting) -> str:
-    return f"{setting.cubes}, {1e3 * setting.pitch:g} mm"
 
 
 def _method_rows(results: Mapping[str, Sequence[Errors]]) -> list[list[Any]]:
@@ -145,38 +127,6 @@ def _method_rows(results: Mapping[str, Sequence[Errors]]) -> list[list[Any]]:
                 ]
             )
     return rows
-
-
-def _shape_rows(results: Mapping[Setting, Sequence[Errors]]) -> list[list[Any]]:
-    """Return one row for each skin and width, with the errors of the contacts for each shape."""
-    by_skin: dict[str, dict[str, Sequence[Errors]]] = {}
-    for setting in sorted(results, key=lambda one: (one.cubes, one.pitch)):
-        by_skin.setdefault(_name(setting), {})[setting.shape] = results[setting]
-    rows = []
-    for name, by_shape in by_skin.items():
-        for k, width in enumerate(WIDTHS):
-            flat, rounded, balls = (
-                by_shape[shape][k] for shape in ("flat punch", "rounded punch", "two balls")
-            )
-            others = round((1 - balls.found) * FEW_LOADS)
-            counted = f"{others} of {FEW_LOADS}"
-            cells = [
-                _contact_cell(rounded),
-                _contact_cell(balls),
-                counted,
-                _contact_cell(flat),
-            ]
-            rows.append([name, round(1e3 * width), *cells])
-    return rows
-
-
-def _contact_cell(one: Errors) -> list[float]:
-    """Return force error in % and position error in mm, each with its calibration ratio."""
-    force = 100 * one.force[1]
-    position = 1e3 * one.position[1]
-    force_ratio, position_ratio = one.ratio[1]
-    digits = ((force, 1), (force_ratio, 1), (position, 2), (position_ratio, 1))
-    return [round(float(value), count) for value, count in digits]
 
 
 def _form_rows(
