@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from ..fem.body import Body
     from ..fem.fem import Response
     from ..fem.model import Model
+    from ..fem.thermal import ThermalStress
     from ..studies.surface_study import SurfaceRow, SurfaceStudy
 
 MAX_STRUCTURE_RESIDUAL = 1e-3
@@ -38,6 +39,11 @@ COLUMN_GAP = 2
 MAX_COEFFICIENTS_SHOWN = 40
 """Maximum number of coefficients in the printed table of convergence; the file of --json has
 all."""
+THERMAL_HEADER = """Stress on each pad in Pa per K of the temperature P_k(s), k = 0, 1, ...:
+P_k is the Legendre polynomial, s grows from -1 at the ground to 1 at the surface."""
+"""Comment at the top of a file of thermal stress."""
+SMALLEST_SHOWN_STRESS = 0.05
+"""Thermal stress in Pa/K (gradient in Pa/m/K) below which a component is not printed."""
 MIN_SHOWN_SHARE = 0.05
 """Share of the largest stress under a load below which no ratio of measured to true stress is
 printed, because it would be noise."""
@@ -57,10 +63,17 @@ def arguments(parser: Parser) -> None:
         help="bond the lower face to rigid ground, and compute the influence functions of the "
         "pads: their stress under forces on the upper face",
     )
+    parser.add_argument(
+        "--temperature",
+        action="store_true",
+        help="bond the lower face to rigid ground, take the width as the pitch of the cubes, and "
+        "compute the stress of the pads per K, because the elastomer expands",
+    )
     parser.add_output(
         "-o",
         "--output",
-        help="write the calibration (.yaml), or with --surface the influence functions (.npz)",
+        help="write the calibration (.yaml), with --surface the influence functions (.npz), or "
+        "with --temperature the thermal stress for the simulator (.yaml)",
     )
     parser.add_json()
     parser.add_argument(
@@ -80,25 +93,31 @@ def run(options: argparse.Namespace) -> int:
 
     from ..fem.fem import Response, compute_response
     from ..fem.model import read_model
+    from ..fem.thermal import ThermalStress, compute_thermal_stress
     from ..studies.surface_study import study_surface
 
     model = read_model(options.model)
     _check_output(options, model)
     body, layout = model.body, model.layout
-    place = " on rigid ground" if options.surface else ""
-    symmetry = "" if options.surface else f", symmetry {model.symmetry}"
+    is_on_ground = options.surface or options.temperature
+    place = " on rigid ground" if is_on_ground else ""
+    symmetry = "" if is_on_ground else f", symmetry {model.symmetry}"
     print(f"{describe(body, layout)}{place}; {layout.n_pads} pads{symmetry}", flush=True)
-    result: Response | SurfaceStudy
+    result: Response | SurfaceStudy | ThermalStress
     # The factorisation runs in C, where Ctrl-C would not be noticed.
     with ends_at_once(), progress_bar() as report:
         if options.surface:
             result = study_surface(body, layout, options.meshes, model.neglect, report)
+        elif options.temperature:
+            result = compute_thermal_stress(body, layout, options.meshes, report)
         else:
             result = compute_response(body, layout, model.symmetry, options.meshes, report)
     if options.json is not None:
         write_json(options.json, result.to_dict())
     if isinstance(result, Response):
         show_response(result)
+    elif isinstance(result, ThermalStress):
+        show_thermal_stress(result)
     else:
         show_surface(result)
     if options.output is not None:
@@ -111,6 +130,10 @@ def _check_output(options: argparse.Namespace, model: Model) -> None:
     from cube_tensor_driver.config.output_files import check_yaml
     from cube_tensor_driver.core.errors import ConfigError
 
+    if options.surface and options.temperature:
+        raise ConfigError("--surface and --temperature are two computations; give one of them")
+    if options.temperature and options.figures is not None:
+        raise ConfigError("--figures: there are no pictures of --temperature; leave it out")
     path = options.output
     if path is None:
         return
@@ -154,8 +177,7 @@ def _command(options: argparse.Namespace) -> str:
     # Only what changes the result; the default number of meshes is left out.
     if options.model is not None:
         words.append(options.model)
-    if options.surface:
-        words.append("--surface")
+    words += [f"--{name}" for name in ("surface", "temperature") if getattr(options, name)]
     if options.meshes != 3:
         words += ["--meshes", str(options.meshes)]
     return shlex.join(words)
@@ -164,15 +186,22 @@ def _command(options: argparse.Namespace) -> str:
 def _write(
     options: argparse.Namespace,
     model: Model,
-    result: Response | SurfaceStudy,
+    result: Response | SurfaceStudy | ThermalStress,
 ) -> None:
-    """Write the calibration of a response, or the influence functions of a cube on ground."""
+    """Write the calibration of a response, or the influence functions or the thermal stress of a
+    cube on ground."""
+    from cube_tensor_driver.config.yaml import write_yaml
     from cube_tensor_driver.mechanics.influence_file import write_influence
 
     from ..fem.fem import Response
+    from ..fem.thermal import ThermalStress
 
     if isinstance(result, Response):
         _write_calibration(options, model, result)
+    elif isinstance(result, ThermalStress):
+        header = f"Made by: {_command(options)} -o {options.output}\n{THERMAL_HEADER}"
+        write_yaml(options.output, result.to_dict(), header)
+        print(f"wrote {options.output}")
     else:
         write_influence(options.output, result.influence, _command(options))
         print(f"wrote {options.output}")
@@ -288,6 +317,33 @@ def _convergence_table(result: Response) -> Table:
     table.add_row("change to the next", *shown)
     table.add_row("seconds", *(f"{mesh['seconds']:.1f}" for mesh in meshes))
     return table
+
+
+def show_thermal_stress(result: ThermalStress) -> None:
+    """Print the stress of the pads per K, and what a cube with the shipped calibration measures."""
+    from rich.console import Console
+
+    from cube_tensor_driver.config.calibration import shipped_calibration
+    from cube_tensor_driver.core.modes import COMPONENTS, STRESS
+    from cube_tensor_driver.core.pipeline import Pipeline
+
+    console = Console(highlight=False)
+    title = "stress of the pads, Pa per K of a temperature P0 (uniform), P1, ... of the height"
+    table = new_table(title, "pad", [f"P{degree}" for degree in range(result.pads.shape[1])])
+    for pad, row in zip(result.layout.pads, result.pads, strict=True):
+        table.add_row(pad, *(format_number(value, 2) for value in row))
+    console.print(table)
+    if result.change is not None:
+        console.print(f"change from the mesh before: {100 * result.change:.2g} %")
+    calibration = shipped_calibration(result.layout)
+    if calibration is None:
+        return
+    uniform = Pipeline([calibration]).matrix(0) @ result.pads[:, 0]
+    for name, value in zip(COMPONENTS, uniform.tolist(), strict=True):
+        # Symmetry makes most components vanish but for rounding.
+        if abs(value) > SMALLEST_SHOWN_STRESS:
+            text = f"{value:+.1f} Pa/K" if name in STRESS else f"{1e-3 * value:+.1f} Pa/mm/K"
+            console.print(f"measured with the shipped calibration: {name} {text}")
 
 
 def show_surface(study: SurfaceStudy) -> None:

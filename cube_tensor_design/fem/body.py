@@ -71,6 +71,10 @@ class Body:
         x: Position of the cube's centre along x relative to the body's centre, in m.
         z: Position of the cube's centre along z relative to the body's centre, in m.
         ground: Whether the lower face is bonded to rigid ground.
+        confined: Whether the sides slide on walls. The layer then has no edges, and cubes in it
+            whose pitch is the width.
+        expansion: Linear thermal expansion of the elastomer, in 1/K.
+        cube_expansion: Linear thermal expansion of the cube, in 1/K. It is small: 12e-6 for steel.
 
     Raises:
         ElasticError: A value is out of its range, or the cube does not fit into the body.
@@ -88,6 +92,9 @@ class Body:
     x: float = 0.0
     z: float = 0.0
     ground: bool = False
+    confined: bool = False
+    expansion: float = 3e-4
+    cube_expansion: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("width", "depth", "height", "side", "young", "cube_young"):

@@ -280,7 +280,7 @@ def make_solid(
         # A rigid cube moves with a body on ground, so it is a very stiff elastic one here.
         cube = lame(STIFF_CUBE_RATIO, 0.0, plane)
     mesh = grid or make_mesh(body, layout, MAX_MESHES - 1)
-    return Solid(mesh, lame(1.0, body.poisson, plane), cube, body.ground)
+    return Solid(mesh, lame(1.0, body.poisson, plane), cube, body.ground, body.confined)
 
 
 def linear_response(

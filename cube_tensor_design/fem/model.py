@@ -50,6 +50,7 @@ _POISSON = real(
     minimum=0,
     exclusiveMaximum=0.5,
 )
+_EXPANSION = real("a thermal expansion in 1/K")
 _MODES = list_of(TEXT, "names of modes") | {
     "minItems": 0,
     "description": "a list of modes",
@@ -66,12 +67,14 @@ _BODY = {
     "height": _LENGTH,
     "young": _YOUNG,
     "poisson": _POISSON,
+    "expansion": _EXPANSION,
 }
 _CUBE = {
     "side": _LENGTH,
     "rigid": _RIGID,
     "young": _YOUNG,
     "poisson": _POISSON,
+    "expansion": _EXPANSION,
     "x": _OFFSET,
     "z": _OFFSET,
 }
@@ -174,7 +177,7 @@ def _build_body(data: Mapping[str, Any]) -> Body:
     if cube.pop("rigid", False):
         cube["young"] = math.inf
     for key, value in cube.items():
-        values[f"cube_{key}" if key in ("young", "poisson") else key] = value
+        values[f"cube_{key}" if key in ("young", "poisson", "expansion") else key] = value
     if "plane" in data:
         values["plane"] = data["plane"]
     return Body(**values)

@@ -124,6 +124,7 @@ class Solid:
         basis: The elements; its dofs are the unknown displacements.
         positions: (dim, dofs) position of each unknown, in d0 (half the side of the cube).
         component: (dofs,) number of the axis along which each unknown displacement is.
+        moduli: Lame's constants of the body, and of the cube or None.
         body: (dofs, dofs) stiffness of the body without the cube.
         total: (dofs, dofs) stiffness of body and cube.
         parities: Parities (+1 even or -1 odd under the mirror of each axis, 0 without mirror) of
@@ -136,6 +137,7 @@ class Solid:
         body: tuple[float, float],
         cube: tuple[float, float] | None,
         ground: bool = False,
+        confined: bool = False,
     ) -> None:
         """Assemble the stiffness.
 
@@ -145,11 +147,14 @@ class Solid:
             body: Lame's constants lambda and mu of the body.
             cube: Lame's constants of the cube in the same unit; None: the cube is rigid.
             ground: Whether the lower face is held at rest; then the cube must be elastic.
+            confined: Whether the sides slide on walls: they do not move along their normals.
         """
         self.dim = int(mesh.dim())
         self.order = 4 if self.dim == 2 else 2
         self.is_rigid = cube is None
+        self.moduli = (body, cube)
         self._ground = ground
+        self._confined = confined
         # Without a mirror, an axis has the parity 0 alone.
         has_mirror = mesh.p.min(axis=1) > -SAME_COORDINATE
         signs = [(1, -1) if mirrored else (0,) for mirrored in has_mirror]
@@ -258,6 +263,21 @@ class Solid:
         swap = self.dim * before[:, None] + axes
         return tuple(parity[k] for k in axes), swap.ravel()
 
+    def expansion_forces(self, load: Callable[[Array], Array], in_cube: bool) -> Array:
+        """Return the nodal forces (dofs, n) that pressures have in the body, or in the cube.
+
+        Args:
+            load: From positions (dim, ...) to n pressures (n, ...).
+            in_cube: Whether the pressures are in the cube.
+        """
+        mesh = self.basis.mesh
+        centres = mesh.p[:, mesh.t].mean(axis=1)
+        is_cube = np.all(np.abs(centres) < 1.0, axis=0)
+        part = self._restrict(is_cube == in_cube)
+        form = skfem.LinearForm(lambda v, w: w.p * np.trace(v.grad))
+        pressures = load(np.asarray(part.default_parameters()["x"]))
+        return np.stack([form.assemble(part, p=p) for p in pressures], axis=1)
+
     def pad_weights(self, layout: Layout, parity: Parity) -> Array:
         """Return weights (P, dofs) from nodal forces on the body to the mean stresses of the pads.
 
@@ -287,6 +307,10 @@ class Solid:
                 # Even: the normal component is zero on the mirror; odd: the other ones.
                 is_normal = component == k
                 held |= _is_at(x[k], 0.0) & (is_normal == (sign > 0))
+        if self._confined:
+            for k in range(self.dim - 1):
+                at_side = _is_at(x[k], x[k].max()) | _is_at(x[k], x[k].min())
+                held |= at_side & (np.abs(x[k]) > 1.0) & (component == k)
         if self._ground:
             return held | _is_at(x[-1], x[-1].min())
         if self.is_rigid:

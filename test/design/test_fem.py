@@ -3,6 +3,7 @@
 """Finite elements against exact solutions, balance, symmetry and their own convergence."""
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from cube_tensor_design.fem.body import Body, strip_layout
 from cube_tensor_design.fem.fem import calibration_from_fem, compute_response
 from cube_tensor_design.fem.pads import interval_weights
 from cube_tensor_design.fem.solid import Solid, lame, stiffness
+from cube_tensor_design.fem.thermal import N_PROFILES, compute_thermal_stress
 from cube_tensor_design.paper.virtual_bench import VirtualBench
 from cube_tensor_driver.config.calibration import read_calibration
 from cube_tensor_driver.core.errors import ElasticError, LayoutError, SymmetryError
@@ -441,3 +443,41 @@ def test_progress_counts_to_the_end():
         Body(cube_young=RIGID), HALVES, meshes=2, progress=lambda *step: seen.append(step)
     )
     assert [done for done, _, _ in seen] == list(range(9)) and seen[-1] == (8, 8, "done")
+
+
+# thermal stress
+
+
+@pytest.mark.parametrize("plane, law", [("strain", 1 / (1 - 0.48)), ("stress", 1.0)])
+@pytest.mark.parametrize("place", [{}, {"x": 1e-3, "z": -1.5e-3}], ids=["centre", "off centre"])
+def test_a_heated_layer_without_a_cube_has_the_stress_of_the_closed_form(plane, law, place):
+    # sigma_xx = -E alpha T(z) / (1 - nu) and sigma_zz = 0 below a free surface; -E alpha T(z) with
+    # sigma_yy = 0, too. The "cube" is elastomer that expands like the rest.
+    layout = LAYOUTS["planar"]
+    body = Body(width=12e-3, plane=plane, expansion=3e-4, cube_expansion=3e-4, **place)
+    body = replace(body, cube_young=body.young, cube_poisson=body.poisson)
+    pads = compute_thermal_stress(body, layout).pads
+
+    half = layout.pad_size / 2
+    ends = layout.positions[:, 2:] * 2e-3 + body.z + 2e-3 * np.array([-half, half])
+    for degree in range(N_PROFILES):
+        profile = np.polynomial.Legendre.basis(degree, [-body.height / 2, body.height / 2])
+        mean = np.diff(profile.integ()(ends))[:, 0] / np.diff(ends)[:, 0]
+        is_side = layout.normals[:, 0] != 0
+        expected = np.where(is_side, -body.young * 3e-4 * law * mean, 0)
+        # Displacements of a profile of degree 5 are of degree 6, those of the elements of degree 4.
+        np.testing.assert_allclose(pads[:, degree], expected, atol=1e-6 if degree < 4 else 1e-2)
+
+
+def test_only_the_difference_of_the_expansions_stresses_a_cube_and_its_layer():
+    # A cube that expands like the elastomer, however stiff, feels the layer's stress alone; what a
+    # cube that does not expand feels is linear in the difference.
+    layout = LAYOUTS["planar"]
+    first, second, third = (
+        compute_thermal_stress(Body(width=12e-3, cube_expansion=expansion), layout).pads[:, 0]
+        for expansion in (0.0, 1e-4, 3e-4)
+    )
+    np.testing.assert_allclose(second, first + (third - first) / 3, rtol=1e-9)
+    rigid = Body(width=12e-3, cube_young=RIGID)
+    steel = compute_thermal_stress(rigid, layout).pads[:, 0]
+    np.testing.assert_allclose(first, steel, rtol=1e-4)

@@ -23,14 +23,17 @@ pytest.importorskip("skfem", reason="needs skfem: pip install scikit-fem")
 from conftest import ROOT
 from cube_tensor_design.fem import body as bodies
 from cube_tensor_design.fem import memory
+from cube_tensor_design.fem.thermal import compute_thermal_stress
 from cube_tensor_design.paper import experiments as paper
 from cube_tensor_design.paper import rod_parts, rod_shear
 from cube_tensor_design.studies.layout_study import LayoutStudy
 from cube_tensor_driver.cli import main as cli
 from cube_tensor_driver.cli.table import PACKAGES
-from cube_tensor_driver.config.calibration import read_calibration
+from cube_tensor_driver.config.calibration import read_calibration, shipped_calibration
+from cube_tensor_driver.config.yaml import read_yaml
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.layout import LAYOUTS
+from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.mechanics.influence_file import read_influence
 from cube_tensor_driver.views.terminal.output import progress_bar
 
@@ -102,6 +105,24 @@ def test_space_on_a_coarse_mesh(coarse, fem, tmp_path, capsys):
     assert len(result["coefficients"]) == 12
     np.testing.assert_allclose(read_calibration(saved).response, result["matrix"], atol=1e-9)
     assert "unobservable: yz_x, zx_y, xy_z" in capsys.readouterr().out
+
+
+def test_thermal_stress_is_shown_and_written(fem, tmp_path, capsys):
+    saved = tmp_path / "thermal.yaml"
+    options = ("--temperature", "--meshes", 2, "-o", saved, "--json", tmp_path / "thermal.json")
+    assert fem("body: {width: 0.012, expansion: 6.0e-4}", *options) == 0
+    shown = capsys.readouterr().out
+    stress = read_yaml(saved)
+    assert stress["layout"] == "planar" and stress["depth"] == 0.0055
+    assert json.loads((tmp_path / "thermal.json").read_text()) == stress
+    first = re.search(r"\+z-x +([\d.]+)", shown)
+    assert first and float(first[1]) == pytest.approx(stress["pads"][0][0], abs=0.006)
+    # Twice the expansion of the default has twice the stress.
+    usual = compute_thermal_stress(bodies.Body(width=12e-3), LAYOUTS["planar"], 2).pads
+    np.testing.assert_allclose(stress["pads"], 2 * usual, atol=1e-3)
+    components = Pipeline([shipped_calibration(LAYOUTS["planar"])]).matrix(0) @ (2 * usual[:, 0])
+    assert f"shipped calibration: xx {components[0]:+.1f} Pa/K" in shown
+    assert f"zz_z {1e-3 * components[14]:+.1f} Pa/mm/K" in shown
 
 
 @pytest.mark.parametrize("layout", ["planar", "cube"])
@@ -274,6 +295,9 @@ def test_a_mistake_in_a_model_is_one_line_before_any_work(
         ("narrow.yaml --surface", ["width is 8 mm", "make it wider"]),
         ("--surface -o x.yaml", ["-o x.yaml", "ends in .npz"]),
         ("--surface -o x.npz", ["-o x.npz", "layout: cube"]),
+        ("--temperature --surface", ["two computations", "give one"]),
+        ("--temperature --figures x", ["no pictures", "leave it out"]),
+        ("--temperature -o x.npz", ["-o x.npz", "a YAML file ends in .yaml"]),
         ("-o x.npz", ["-o x.npz", "a YAML file ends in .yaml"]),
         ("-o none/cube.yaml", ["-o none/cube.yaml", "a folder that can be written"]),
         ("-o /proc/cube.yaml", ["-o /proc/cube.yaml", "a folder that can be written"]),
