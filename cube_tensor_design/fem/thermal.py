@@ -119,7 +119,7 @@ def _solve(solid: Solid, body: Body, layout: Layout) -> Array:
         parts.append(pressure * solid.expansion_forces(profiles, in_cube=number == 1))
     # A field that depends on the height alone is even under each mirror.
     parity = next(parity for parity in solid.parities if min(parity) >= 0)
-    displacement = solid.solve(parity, sum(parts))
+    displacement = solid.solve(parity, parts[0] + parts[1])
     reactions = solid.body @ displacement - parts[0]
     stress: Array = body.young * (solid.pad_weights(layout, parity) @ reactions)
     return stress
