@@ -132,8 +132,6 @@ def _check_output(options: argparse.Namespace, model: Model) -> None:
 
     if options.surface and options.temperature:
         raise ConfigError("--surface and --temperature are two computations; give one of them")
-    if options.temperature and options.figures is not None:
-        raise ConfigError("--figures: there are no pictures of --temperature; leave it out")
     path = options.output
     if path is None:
         return

@@ -296,7 +296,6 @@ def test_a_mistake_in_a_model_is_one_line_before_any_work(
         ("--surface -o x.yaml", ["-o x.yaml", "ends in .npz"]),
         ("--surface -o x.npz", ["-o x.npz", "layout: cube"]),
         ("--temperature --surface", ["two computations", "give one"]),
-        ("--temperature --figures x", ["no pictures", "leave it out"]),
         ("--temperature -o x.npz", ["-o x.npz", "a YAML file ends in .yaml"]),
         ("-o x.npz", ["-o x.npz", "a YAML file ends in .yaml"]),
         ("-o none/cube.yaml", ["-o none/cube.yaml", "a folder that can be written"]),
