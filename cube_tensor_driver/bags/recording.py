@@ -21,9 +21,10 @@ from ..core.reconstructor import RecordedHealth
 from ..core.rows import FrequencyRows
 from ..core.tensor import rpy_from_quaternion
 from ..messages.codec import SECOND
-from ..messages.skin_info import cube_calibrations
+from ..messages.skin_info import cube_calibrations, cube_poses
 from ..messages.types import INFO
 from .read import Bag
+from .recorded_compensation import CompensationReader
 from .recorded_health import RecordedHealthReader
 
 
@@ -48,6 +49,7 @@ class Recording:
         infos: SkinInfo messages (cubes, calibrations and rest frequencies) in the order of their
             stamps; there is at least one.
         settings: Calibrations and rest frequencies in each of the SkinInfo messages.
+        compensation: Reader of the motion of the skin and of states of what is compensated.
     """
 
     def __init__(self, bag: Bag, topic: str) -> None:
@@ -78,6 +80,7 @@ class Recording:
         self._since_ns = np.array(stamps)
         # The recorded stress, which states the health, is read only when `health_at` is called.
         self._health = RecordedHealthReader(bag, topic)
+        self.compensation = CompensationReader(bag, topic, cube_poses(self.infos[-1]))
 
     def __repr__(self) -> str:
         return f"Recording({self.infos[-1].name!r} of {self._bag.path}: {len(self.infos)} infos)"

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..config.skin import Skin
-from ..core.arrays import Times
+from ..core.arrays import Array, Times
 from ..core.errors import BagError
 from ..core.rows import FrequencyRows
 from ..messages.codec import Decoded
@@ -29,11 +29,14 @@ class Segment(NamedTuple):
         recorded_ns: (M,) time at which each was recorded, in ns since the Unix epoch.
         number: Index in `Recording.infos` of the SkinInfo message (calibrations and rest
             frequencies) with which these frequencies were reconstructed.
+        states: States of creep and temperature, by name, that the reconstruction had before the
+            first of these messages; empty: it went on from the message before.
     """
 
     messages: Decoded[FrequencyRows]
     recorded_ns: Times
     number: int
+    states: Mapping[str, Array]
 
 
 class BagSource:
@@ -122,10 +125,16 @@ class BagSource:
             number = self.recording.number_at(newest_ns)
 
             # A segment (messages reconstructed together) ends where the next message has other
-            # cubes or a newer SkinInfo message (calibrations, rest frequencies) applies.
+            # cubes, a newer SkinInfo message (calibrations, rest frequencies) applies, or the next
+            # message states what is compensated, or from which state on.
             has_other_cubes = (cube[1:] != cube[:-1]).any(axis=1)
             has_other_info = number[1:] != number[:-1]
-            ends = np.flatnonzero(has_other_cubes | has_other_info) + 1
+            compensation = self.recording.compensation
+            recorded = [compensation.at(stamp_ns) for stamp_ns in messages.stamp_ns.tolist()]
+            has_motion = np.array([one.motion is not None for one in recorded])
+            begins_anew = np.array([bool(one.states) for one in recorded[1:]], bool)
+            begins_anew |= has_motion[1:] != has_motion[:-1]
+            ends = np.flatnonzero(has_other_cubes | has_other_info | begins_anew) + 1
             bounds = [0, *ends.tolist(), len(messages)]
             for begin, end in pairwise(bounds):
                 # A scan ends where the cube number does not rise. Messages are reconstructed
@@ -134,10 +143,12 @@ class BagSource:
                 step = end - begin if are_apart else 1
                 for first in range(begin, end, step):
                     chosen = slice(first, first + step)
-                    part = messages.select(chosen)
+                    part = compensation.add_forces(messages.select(chosen), recorded[chosen])
                     self.messages += len(part)
                     self.rows += len(part.rows)
-                    yield Segment(part, recorded_ns[chosen], int(number[first]))
+                    yield Segment(
+                        part, recorded_ns[chosen], int(number[first]), recorded[first].states
+                    )
 
 
 def open_bag(path: Path | str, topic: str | None = None) -> BagSource:

@@ -194,6 +194,20 @@ RECONSTRUCTION = (
         span=(0.0, 1e6),
         live=True,
     ),
+    Parameter(
+        "gravity",
+        "",
+        "Frame whose z axis points up. Its transform to the parent frame of the skin on /tf then "
+        "gives the direction of gravity, with which the weight of cubes and elastomer is "
+        "compensated. It is for arms that move slowly; an empty text stands for none.",
+    ),
+    Parameter(
+        "imu",
+        "",
+        "Topic (sensor_msgs/Imu) of an IMU that is fixed to the same rigid body as the skin, with "
+        "which weight and inertia of cubes and elastomer are compensated; an empty text stands for "
+        "none.",
+    ),
 )
 """Declarations of the ROS parameters of the node `reconstruction`, which computes stress tensors
 from the frequencies of pads."""

@@ -31,6 +31,7 @@ from std_msgs.msg import Header
 from ..config.calibration import calibration_text
 from ..config.skin import Skin, SkinCube
 from ..core.arrays import AnyArray, Array
+from ..core.compensation.motion import UNKNOWN_MOTION, Motion
 from ..core.errors import BagError
 from ..core.pipeline import Pipeline
 from ..core.rows import StressRows
@@ -38,6 +39,7 @@ from ..core.tensor import quaternion_from_rpy
 from ..messages.codec import SECOND
 from ..msg import (
     CubeInfo,
+    SkinCompensation,
     SkinInfo,
     StressTensor,
     StressTensorStamped,
@@ -156,6 +158,29 @@ def make_message(type_name: str, **fields: Any) -> Any:
         if isinstance(value, np.ndarray)
     }
     return message_class("make_message", type_name)(**fields | arrays)
+
+
+def compensation_message(
+    frame_id: str, stamp_ns: int, motion: Motion | None, states: Mapping[str, Array]
+) -> SkinCompensation:
+    """Return a SkinCompensation message.
+
+    Args:
+        frame_id: Parent frame of the skin.
+        stamp_ns: Stamp of the messages of frequencies and stress to which it belongs, in ns since
+            the Unix epoch.
+        motion: Motion of the skin; None: weight is not compensated.
+        states: States of effects by name, see `Compensation.states`.
+    """
+    known = motion or UNKNOWN_MOTION
+    return SkinCompensation(
+        header=Header(stamp=to_time(stamp_ns), frame_id=frame_id),
+        weight=motion is not None,
+        time_offset=pack_array("q", known.time_ns - stamp_ns),
+        specific_force=pack_array("d", known.specific_force),
+        gradient=pack_array("d", known.gradient),
+        **{name: pack_array("d", state) for name, state in states.items()},
+    )
 
 
 def pack_array(code: str, values: AnyArray) -> array[Any]:

@@ -146,7 +146,7 @@ def heavy(calibration: Calibration, seed: int) -> Calibration:
 class Sluggish:
     """A recursive effect: half of what the pads measured before."""
 
-    bit, is_recursive = CREEP, True
+    key, bit, is_recursive = "creep", CREEP, True
 
     def __init__(self, pipeline) -> None:
         self._half = np.zeros((len(pipeline.calibrations), pipeline.n_pads), pipeline.dtype)

@@ -318,6 +318,8 @@ def _reconstruct(
             if ids != (ids := [one.id for one in current.calibrations]):
                 reconstructor = Reconstructor(current.calibrations)
             reconstructor.rest_frequency = current.rest_frequency
+        if use_health:
+            reconstructor.compensation.restore(segment.states)
         try:
             # If the recording states the health of every row, it is not determined again, which
             # saves two fifths of the time.

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ...core.compensation.motion import Motion
 from ...core.reconstructor import Reconstructor, RecordedHealth
 from ...core.rows import FrequencyRows
 from ..recording import Settings
@@ -62,3 +63,16 @@ class RecordedReconstruction:
             self._settings = settings
             reconstructor.rest_frequency = settings.rest_frequency
         return self._source.recording.health_at(rows)
+
+    def compensation_at(self, stamp_ns: int, reconstructor: Reconstructor) -> Motion | None:
+        """Return the recorded motion of the skin for a message; None: weight is not compensated.
+
+        States of creep and temperature that are recorded for it are set in the reconstructor.
+
+        Args:
+            stamp_ns: Stamp of the message of frequencies, in ns since the Unix epoch.
+            reconstructor: The reconstructor that will process its rows.
+        """
+        recorded = self._source.recording.compensation.at(stamp_ns)
+        reconstructor.compensation.restore(recorded.states)
+        return recorded.motion

@@ -11,6 +11,7 @@ computed here.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import pairwise
 
 import numpy as np
@@ -77,6 +78,24 @@ class Compensation:
         components = matrix @ np.hstack(patterns)[: matrix.shape[1]]
         growth: Array = components @ components.T
         return growth
+
+    def states(self) -> dict[str, Array]:
+        """Return the states that earlier rows left, by the names of the effects that have one."""
+        states = {effect.key: effect.state() for effect in self.effects}
+        return {key: state for key, state in states.items() if len(state)}
+
+    def restore(self, states: Mapping[str, Array]) -> None:
+        """Continue from recorded states, so that the next rows give the bits of the recording.
+
+        Args:
+            states: States of effects by name; the others go on as they are.
+
+        Raises:
+            LayoutError: A state is that of another skin.
+        """
+        for effect in self.effects:
+            if effect.key in states:
+                effect.restore(states[effect.key])
 
     def _split(self, rows: FrequencyRows) -> list[slice]:
         """Return the parts of rows that are processed at once: all, or single scans."""

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from typing import Protocol
 
+import numpy as np
+
 from ..arrays import Array, Index, Mask, PadMasks, Real
 from ..rows import FrequencyRows
 
@@ -17,11 +19,13 @@ class Effect(Protocol):
     """One effect on the pads that is no load, such as weight or creep.
 
     Attributes:
+        key: Name of the effect, that of its block in a calibration.
         bit: Status bit of rows from which the effect is subtracted.
         is_recursive: Whether the effect depends on the stresses of earlier rows. Scans are then
             processed one by one, and `update` is called after each.
     """
 
+    key: str
     bit: int
     is_recursive: bool
 
@@ -62,3 +66,15 @@ class Effect(Protocol):
             Patterns (P, k) of one standard deviation each of the stresses on the pads, in Pa; the
             k patterns are independent of each other.
         """
+
+    def state(self) -> Array:
+        """Return the state that earlier rows left, as flat numbers; an effect without has none."""
+        return np.zeros(0)
+
+    def restore(self, state: Array) -> None:
+        """Continue from a state that `state` returned, so that the next rows give the same bits.
+
+        Raises:
+            LayoutError: The state is that of another skin.
+        """
+        return

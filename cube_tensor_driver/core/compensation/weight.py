@@ -27,10 +27,12 @@ class Weight(Effect):
     """Computes what weight and inertia do to the pads of one skin.
 
     Attributes:
+        key: Name of the effect.
         bit: Status bit of rows from which the effect is subtracted.
         is_recursive: Whether the effect depends on the stresses of earlier rows.
     """
 
+    key = "weight"
     bit = WEIGHT
     is_recursive = False
 

@@ -65,12 +65,14 @@ class ReconstructionDiagnostics:
     Attributes:
         refused_messages: Number of messages of `frequencies` that were refused, because they were
             damaged or inconsistent.
+        compensation_problem: Why a compensation does not work now; empty: there is no problem.
     """
 
     def __init__(
         self, skin: Skin, reconstructor: Reconstructor, tare: TareState, lost: LostMessages
     ) -> None:
         self.refused_messages = 0
+        self.compensation_problem = ""
         self._skin, self._tare, self._lost = skin, tare, lost
         self._cubes = CubeHealth(skin, reconstructor)
         self._rows = self._invalid_rows = 0
@@ -119,7 +121,9 @@ class ReconstructionDiagnostics:
                 f"{lost} messages lost on the way: by the network, or this node was too late for "
                 "its queue"
             )
-        has_problem = bool(self.refused_messages) or lost > 0
+        if self.compensation_problem:
+            texts.append(self.compensation_problem)
+        has_problem = bool(self.refused_messages or self.compensation_problem) or lost > 0
         level = DiagnosticStatus.WARN if has_problem else DiagnosticStatus.OK
         rows = make_status(
             "rows",

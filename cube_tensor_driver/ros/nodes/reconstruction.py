@@ -5,17 +5,22 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from ...config.parameters import RECONSTRUCTION
+from ...core.arrays import Array
+from ...core.compensation.motion import UNKNOWN_MOTION, ForcesAtCubes, Motion
 from ...core.errors import BagError, CubeError, MessageError
 from ...core.reconstructor import Reconstructor
 from ...core.rows import FrequencyRows
-from ...messages.codec import frequency_codec
-from ...msg import SkinFrequencies, SkinInfo
+from ...messages.codec import SECOND, frequency_codec
+from ...messages.skin_info import cube_poses
+from ...msg import SkinCompensation, SkinFrequencies, SkinInfo
+from ..callbacks import LOG_PERIOD_S
 from ..compat import with_number
 from ..diagnostics.reconstruction import (
     LostMessages,
@@ -23,7 +28,13 @@ from ..diagnostics.reconstruction import (
     log_changes,
 )
 from ..diagnostics.updater import Diagnostics
-from ..messages import CheckedSubscription, info_message, log_refused_message
+from ..messages import (
+    CheckedSubscription,
+    compensation_message,
+    info_message,
+    log_refused_message,
+)
+from ..motion import MissingMotion, make_motion_source
 from ..node import CubeNode, run
 from ..qos import LATCHED, scans_per_message
 from .stress_publisher import StressPublisher
@@ -38,6 +49,12 @@ publish_period requires more.
 
 The limit keeps a single message from blocking the node for long: one row for each of 1280 cubes
 takes up to 0.3 ms.
+"""
+
+STATES_PERIOD_NS = 10 * SECOND
+"""Time, in ns, between two messages with the states of the compensation of creep and temperature.
+
+From each of them, a recording can be processed again with the same bits.
 """
 
 BAG_SUFFIXES = (".mcap", ".db3")
@@ -109,7 +126,21 @@ class Reconstruction(CubeNode):
                 event_callbacks=self._lost.new_subscription(),
             )
             self.own(frequencies)
-        self._publish_info()
+        info_now = self._publish_info()
+        self._forces = ForcesAtCubes(cube_poses(info_now))
+        self._motion = make_motion_source(self, skin.parent_frame)
+        self._compensation = self.own(
+            self.create_publisher(SkinCompensation, "compensation", profile)
+        )
+        self._states_ns = 0
+        for cube in skin.cubes if self._motion else ():
+            if cube.calibration.weight is None:
+                self.get_logger().warning(
+                    f"cube {cube.name}: weight is not compensated, as its calibration "
+                    f"{cube.calibration.id} has no response to it: ./cube fem or ./cube fit "
+                    "--weight computes it"
+                )
+                break
 
     def on_parameter_change(self, name: str) -> None:
         self._reconstructor.drift_time = float(self.value("drift_time"))
@@ -154,6 +185,7 @@ class Reconstruction(CubeNode):
                 recorded = self._recorded
                 health = recorded.health_at(rows, self._reconstructor) if recorded else None
                 out = self._publisher.make_rows(rows, frame_id)
+                rows = self._note_compensation(rows, stamp_ns)
                 # The lock keeps a tare from changing the rest frequencies during the computation.
                 stress = self._reconstructor.process(rows, health, out)
                 if self._reconstructor.rest_changes != self._published_rest_changes:
@@ -163,6 +195,37 @@ class Reconstruction(CubeNode):
             return
         self._publisher.publish(stress, stamp_ns, frame_id)
         self._diagnostics.count(stress)
+
+    def _note_compensation(self, rows: FrequencyRows, stamp_ns: int) -> FrequencyRows:
+        """Return rows with specific forces, and publish what their compensation starts from.
+
+        Without compensation the rows are returned as they are, and nothing is published.
+
+        Args:
+            rows: Rows of frequencies.
+            stamp_ns: Stamp of their message, in ns since the Unix epoch.
+        """
+        compensation, problem = self._reconstructor.compensation, ""
+        motion: Motion | None = None
+        if self._recorded:
+            motion = self._recorded.compensation_at(stamp_ns, self._reconstructor)
+        elif self._motion:
+            try:
+                first_ns = rows.stamp_ns.min(initial=stamp_ns)
+                last_ns = rows.stamp_ns.max(initial=stamp_ns)
+                motion = self._motion.motion(int(first_ns), int(last_ns))
+            except MissingMotion as error:
+                motion, problem = UNKNOWN_MOTION, f"weight is not compensated: {error}"
+                self.get_logger().warning(problem, throttle_duration_sec=LOG_PERIOD_S)
+        self._diagnostics.compensation_problem = problem
+        states: Mapping[str, Array] = {}
+        if abs(stamp_ns - self._states_ns) >= STATES_PERIOD_NS:
+            self._states_ns, states = stamp_ns, compensation.states()
+        if motion is None and not states:
+            return rows
+        message = compensation_message(self._skin.parent_frame, stamp_ns, motion, states)
+        self._compensation.publish(message)
+        return rows if motion is None else self._forces.add_to(rows, motion)
 
     def _refuse(self, error: CubeError) -> None:
         self._diagnostics.refused_messages += 1
@@ -187,7 +250,7 @@ class Reconstruction(CubeNode):
                 f"{self._max_scans}: set parameter publish_period to the driver's"
             )
 
-    def _publish_info(self) -> None:
+    def _publish_info(self) -> SkinInfo:
         # The stamp states from which row on the rest frequencies are valid, which reprocessing of a
         # bag needs: 1 ns after the last row that was computed without them.
         newest_ns = self._reconstructor.health.newest_ns
@@ -200,6 +263,7 @@ class Reconstruction(CubeNode):
             self._taring.uids,
         )
         self._info.publish(info)
+        return info
 
     def _statuses(self) -> list[DiagnosticStatus]:
         if not self.is_configured:

@@ -1,0 +1,48 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
+"""Decoding of SkinCompensation: motion of the skin, and states of effects."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..core.arrays import Array
+from ..core.compensation.motion import Motion
+from ..core.errors import MessageError
+
+STATES = ("creep", "thermal")
+"""Names of the effects whose states the message holds, each in the field of this name."""
+
+
+def read_motion(message: Any, stamp_ns: int) -> Motion | None:
+    """Return the motion of the skin in a SkinCompensation message; None: weight is not compensated.
+
+    Args:
+        message: The message.
+        stamp_ns: Stamp of its header, in ns since the Unix epoch.
+
+    Raises:
+        MessageError: The lengths of its arrays contradict each other.
+    """
+    if not message.weight:
+        return None
+    offsets = np.asarray(message.time_offset, np.int64)
+    try:
+        return Motion(
+            stamp_ns + offsets,
+            np.asarray(message.specific_force, float).reshape(len(offsets), 3),
+            np.asarray(message.gradient, float).reshape(len(offsets), 3, 3),
+        )
+    except ValueError:
+        raise MessageError(
+            f"compensation: {len(offsets)} instants with {len(message.specific_force)} numbers of "
+            f"specific force and {len(message.gradient)} of its gradient; 3 and 9 each are needed"
+        ) from None
+
+
+def read_states(message: Any) -> dict[str, Array]:
+    """Return the states of effects in a SkinCompensation message, by the names of the effects."""
+    states = {name: np.asarray(getattr(message, name), float) for name in STATES}
+    return {name: state for name, state in states.items() if len(state)}

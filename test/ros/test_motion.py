@@ -1,0 +1,359 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
+"""Weight and inertia in the reconstruction node: from an IMU or TF to rows, a bag, and its bits."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
+pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
+
+from bag_maker import header, message
+from moving_skin import G, MovingSkin
+from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.parameter import Parameter
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import Imu
+
+from cube_tensor_driver.bags.metadata import quality, typestore
+from cube_tensor_driver.bags.reprocess.job import reconstruct
+from cube_tensor_driver.bags.source import open_bag
+from cube_tensor_driver.bags.write import BagWriter
+from cube_tensor_driver.config.calibration import write_calibration
+from cube_tensor_driver.config.yaml import write_yaml
+from cube_tensor_driver.core.calibration import illustrative
+from cube_tensor_driver.core.compensation import compensation
+from cube_tensor_driver.core.compensation.effect import Effect
+from cube_tensor_driver.core.compensation.models import WeightModel
+from cube_tensor_driver.core.rows import FrequencyRows, concatenate
+from cube_tensor_driver.core.status import COMPENSATION, CREEP, WEIGHT
+from cube_tensor_driver.core.tensor import rotation_from_rpy
+from cube_tensor_driver.messages.codec import frequency_codec, stress_codec
+from cube_tensor_driver.messages.types import COMPENSATION as COMPENSATION_TYPE
+from cube_tensor_driver.messages.types import FREQUENCIES, INFO, STRESS
+from cube_tensor_driver.ros.messages import to_ns, to_time
+from cube_tensor_driver.ros.nodes.reconstruction import Reconstruction
+
+START_NS = 1_700_000_000_000_000_000
+CUBES = [((0.02, 0.0, 0.01), (0.3, 0.0, 0.0)), ((-0.2, 0.1, 0.0), (0.0, 1.2, 0.4))]
+"""Positions in m and roll, pitch, yaw of the cubes in the parent frame."""
+IMU_POINT, IMU_AXES = np.array([0.05, -0.08, 0.03]), rotation_from_rpy(0.1, 0.2, -1.0)
+IMU_S, ROW_S, DELAY_S = 0.005, 0.004, 0.003
+"""Periods of IMU and rows, and the delay with which samples of the IMU arrive."""
+RESPONSE = np.tile([[2.0, 1.0, 8.0]], (8, 1))  # Pa per m/s², about that of a steel cube
+
+
+@pytest.fixture
+def skin_file(tmp_path):
+    calibration = replace(illustrative("planar"), weight=WeightModel(RESPONSE))
+    write_calibration(tmp_path / "heavy.yaml", calibration)
+    cubes = [
+        {
+            "name": f"c{k}",
+            "link": "hub0",
+            "index": k,
+            "pose": {"xyz": list(xyz), "rpy": list(rpy)},
+            "layout": "planar",
+            "calibration": "heavy.yaml",
+        }
+        for k, (xyz, rpy) in enumerate(CUBES)
+    ]
+    data = {
+        "name": "skin",
+        "parent_frame": "tool",
+        "rate": 250.0,
+        "links": [{"name": "hub0", "port": "/dev/ttyACM0"}],
+        "cubes": cubes,
+    }
+    write_yaml(tmp_path / "skin.yaml", data)
+    return tmp_path / "skin.yaml"
+
+
+class Published:
+    """Keeps what a publisher of the node would send."""
+
+    def __init__(self) -> None:
+        self.sent: list = []
+
+    def publish(self, message) -> None:
+        self.sent.append(message)
+
+
+@pytest.fixture
+def start(ros, skin_file, tmp_path):
+    """A function that starts a node with parameters; its messages are in its attribute `sent`."""
+    nodes = []
+
+    def start(**parameters):
+        node = Reconstruction(subscribes=False)
+        nodes.append(node)
+        values = {"config": str(skin_file), "tare_folder": str(tmp_path), **parameters}
+        node.set_parameters([Parameter(name, value=value) for name, value in values.items()])
+        info = Published()
+        original = node.create_publisher
+        node.create_publisher = lambda *a, **k: info if a[1] == "info" else original(*a, **k)
+        assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
+        node.trigger_activate()
+        assert node.is_active
+        node._compensation = Published()
+        node._publisher._publisher = Published()
+        node.sent = {
+            "info": info.sent,
+            "compensation": node._compensation.sent,
+            "stress": node._publisher._publisher.sent,
+        }
+        return node
+
+    yield start
+    for node in nodes:
+        node.end()
+        node.destroy_node()
+
+
+def imu_message(moving: MovingSkin, t: float) -> Imu:
+    message = Imu()
+    message.header.stamp = to_time(START_NS + round(1e9 * t))
+    message.header.frame_id = "imu"
+    force = moving.specific_force(t, IMU_POINT, IMU_AXES)
+    velocity = moving.angular_velocity(t, IMU_AXES)
+    a, w = message.linear_acceleration, message.angular_velocity
+    (a.x, a.y, a.z), (w.x, w.y, w.z) = force.tolist(), velocity.tolist()
+    return message
+
+
+def scan_at(t: float, frequency: float = 99.9e3) -> FrequencyRows:
+    """One row of each cube, the second 1 ms after the first."""
+    stamps = START_NS + np.array([round(1e9 * t), round(1e9 * t) + 1_000_000])
+    frequencies = np.full((2, 8), frequency, np.float32)
+    return FrequencyRows.of(
+        np.arange(2, dtype=np.uint16), frequencies, stamp_ns=stamps, sequence=round(t / ROW_S)
+    )
+
+
+def fake_tf(monkeypatch, **frames) -> None:
+    """tf2_ros is in no wheel: frames are rotation, position and time in the target frame."""
+    module = ModuleType("tf2_ros")
+
+    class TransformException(Exception):
+        pass
+
+    class Buffer:
+        def lookup_transform(self, target, source, when):
+            if source not in frames or target != "tool":
+                raise TransformException(f"{source} does not exist")
+            (x, y, z, w), p, stamp_ns = frames[source]
+            return SimpleNamespace(
+                transform=SimpleNamespace(
+                    translation=SimpleNamespace(x=p[0], y=p[1], z=p[2]),
+                    rotation=SimpleNamespace(x=x, y=y, z=z, w=w),
+                ),
+                header=SimpleNamespace(stamp=to_time(stamp_ns)),
+            )
+
+    module.TransformException, module.Buffer = TransformException, Buffer
+    module.TransformListener = lambda buffer, node: SimpleNamespace(unregister=lambda: None)
+    monkeypatch.setitem(sys.modules, "tf2_ros", module)
+
+
+def quaternion(rotation: np.ndarray) -> tuple:
+    """x, y, z, w of a rotation by less than 180°, by the trace."""
+    w = np.sqrt(1 + np.trace(rotation)) / 2
+    x, y, z = (rotation[[2, 0, 1], [1, 2, 0]] - rotation[[1, 2, 0], [2, 0, 1]]) / (4 * w)
+    return x, y, z, w
+
+
+IMU_FRAME = (quaternion(IMU_AXES), IMU_POINT, 0)
+
+
+def played(node, moving: MovingSkin, seconds: float) -> FrequencyRows:
+    """Play an IMU and rows, each when it arrives; returns the rows."""
+    sent, scans = 0, []
+    for k in range(round(seconds / ROW_S)):
+        t = 0.1 + k * ROW_S
+        while sent * IMU_S + DELAY_S <= t:
+            node._motion.on_imu(imu_message(moving, sent * IMU_S))
+            sent += 1
+        scans.append(scan_at(t))
+        node.on_rows(scans[-1])
+    return concatenate(scans)
+
+
+def test_an_imu_gives_the_specific_force_of_every_cube(start, monkeypatch):
+    """With the lever arm, in the axes of each cube, while samples come late and rows between."""
+    fake_tf(monkeypatch, imu=IMU_FRAME)
+    node, moving = start(imu="/imu"), MovingSkin()
+    seen = []
+    forces = node._forces.add_to
+    node._forces.add_to = lambda *a: seen.append(forces(*a)) or seen[-1]
+    rows = played(node, moving, 1.0)
+    times = (rows.stamp_ns - START_NS) * 1e-9
+    expected = [
+        moving.specific_force(t, CUBES[c][0], rotation_from_rpy(*CUBES[c][1]))
+        for t, c in zip(times, rows.cube, strict=True)
+    ]
+    off = concatenate(seen).specific_force - expected
+    # 8 Pa per m/s² leave less than 5 Pa rms of the 2 g.
+    assert np.sqrt((off**2).mean()) < 5 / 8
+    assert np.abs(expected).max() > 2 * G
+    stress = stress_codec.decode(node.sent["stress"][-1]).rows
+    assert (stress.status & (WEIGHT | COMPENSATION) == WEIGHT).all()
+
+
+class Remembering(Effect):
+    """A recursive effect with a state: a third of what the pads measured before."""
+
+    key, bit, is_recursive = "creep", CREEP, True
+
+    def __init__(self, pipeline) -> None:
+        self._third = np.zeros((len(pipeline.calibrations), pipeline.n_pads))
+
+    def applies(self, rows) -> bool:
+        return True
+
+    def add_offset(self, rows, cube, offset):
+        offset += self._third[cube].astype(offset.dtype)
+        return np.ones(len(rows), bool)
+
+    def update(self, rows, cube, v, bad):
+        self._third[cube] = (self._third[cube] + v) / 3
+
+    def deviation(self, cube):
+        return np.zeros((8, 0))
+
+    def state(self):
+        return self._third.ravel()
+
+    def restore(self, state):
+        self._third = state.reshape(self._third.shape).copy()
+
+
+def as_sent(one) -> bytes:
+    """The bytes of a SkinCompensation; serialize_message adds some after empty lists."""
+    names = ("time_offset", "specific_force", "gradient", "creep", "thermal")
+    lists = {name: np.array(getattr(one, name)) for name in names}
+    stamped = header(to_ns(one.header.stamp), one.header.frame_id)
+    made = message(COMPENSATION_TYPE, header=stamped, weight=one.weight, **lists)
+    return bytes(typestore().serialize_cdr(made, COMPENSATION_TYPE))
+
+
+def write_bag(folder, node, rows: FrequencyRows, dropped: range) -> None:
+    """What a recorder keeps of a node, without some messages of compensation."""
+    topics = {"info": INFO, "frequencies": FREQUENCIES, "stress": STRESS}
+    topics["compensation"] = COMPENSATION_TYPE
+    scans = [rows.select(slice(k, k + 2)) for k in range(0, len(rows), 2)]
+    frequencies = [frequency_codec.encode(scan, b"tool\0") for scan in scans]
+    compensation = [as_sent(one) for one in node.sent["compensation"]]
+    with BagWriter(folder) as writer:
+        for topic, kind in topics.items():
+            writer.add_topic(f"/{topic}", kind, [quality(latched=topic == "info")])
+        writer.write("/info", START_NS, serialize_message(node.sent["info"][-1]))
+        for k, scan in enumerate(scans):
+            time_ns = int(scan.stamp_ns[0])
+            writer.write("/frequencies", time_ns, frequencies[k])
+            if k not in dropped:
+                writer.write("/compensation", time_ns + 1, compensation[k])
+            writer.write("/stress", time_ns + 2, node.sent["stress"][k])
+
+
+def test_a_bag_gives_the_bits_of_the_node_from_every_state_on(start, monkeypatch, tmp_path):
+    """Also where the IMU failed; a bag that begins later follows from the next recorded state."""
+    fake_tf(monkeypatch, imu=IMU_FRAME)
+    init = compensation.Compensation.__init__
+
+    def with_memory(self, pipeline):
+        init(self, pipeline)
+        self.effects.insert(0, Remembering(pipeline))
+
+    monkeypatch.setattr(compensation.Compensation, "__init__", with_memory)
+    monkeypatch.setattr("cube_tensor_driver.ros.nodes.reconstruction.STATES_PERIOD_NS", 100_000_000)
+    node = start(imu="/imu")
+    rows = played(node, MovingSkin(), 0.5)
+    node._motion._samples.clear()
+    for k in range(150, 200):
+        scan = scan_at(0.1 + k * ROW_S, 99.8e3)
+        node.on_rows(scan)
+        rows = concatenate([rows, scan])
+    expected = concatenate([stress_codec.decode(one).rows for one in node.sent["stress"]])
+    assert {WEIGHT, COMPENSATION} == set((expected.status & (WEIGHT | COMPENSATION)).tolist())
+
+    write_bag(tmp_path / "whole", node, rows, range(0))
+    with open_bag(tmp_path / "whole") as source:
+        found = concatenate([stress for _, stress in reconstruct(source)])
+    for name, column in expected.columns().items():
+        assert column.tobytes() == getattr(found, name).tobytes(), name
+
+    later = rows.select(slice(20, None))
+    for sent in (node.sent["compensation"], node.sent["stress"]):
+        del sent[:10]
+    write_bag(tmp_path / "later", node, later, range(40, 42))
+    with open_bag(tmp_path / "later") as source:
+        found = concatenate([stress for _, stress in reconstruct(source)])
+    expected = expected.select(slice(20, None))
+    differs = (found.stress != expected.stress)[:, [0, 2, 4]].any(axis=1)
+    # The state comes every 0.1 s; two messages of motion are lost until the next one.
+    assert not differs[50:80].any() and not differs[130:].any()
+    assert (found.status[80:84] & COMPENSATION).all()
+
+
+@pytest.mark.parametrize(
+    ("case", "text"),
+    [
+        ("none", "no message on /imu: start the IMU"),
+        ("frame", "no transform from imu to tool: imu does not exist; publish it"),
+        ("stopped", "samples on /imu are 0.5"),
+        ("clock", "s newer than the rows"),
+        ("no_acceleration", "states no acceleration"),
+        ("no_tf2", "TF needs tf2_ros: apt install"),
+    ],
+)
+def test_a_missing_imu_is_one_line_and_the_node_goes_on(start, monkeypatch, case, text):
+    if case == "no_tf2":
+        monkeypatch.setitem(sys.modules, "tf2_ros", None)
+    else:
+        fake_tf(monkeypatch, **({} if case == "frame" else {"imu": IMU_FRAME}))
+    node, moving = start(imu="/imu"), MovingSkin()
+    row_s = {"stopped": 0.6, "clock": -40.0}.get(case, 0.1)
+    for k in range(0 if case == "none" else 20):
+        message = imu_message(moving, k * IMU_S)
+        if case == "no_acceleration":
+            message.linear_acceleration_covariance[0] = -1.0
+        node._motion.on_imu(message)
+    node.on_rows(scan_at(row_s))
+    (stress,) = node.sent["stress"]
+    assert (stress_codec.decode(stress).rows.status & COMPENSATION).all()
+    (motion,) = node.sent["compensation"]
+    assert motion.weight and not len(motion.time_offset)
+    status = node._statuses()[0]
+    assert text in status.message and "weight is not compensated" in status.message
+    assert "\n" not in status.message and status.level != b"\0"
+
+
+def test_gravity_comes_from_tf_alone(start, monkeypatch):
+    """A turned frame gives a turned weight; a transform that is no longer sent is an old one."""
+    turned = rotation_from_rpy(0.4, -0.3, 2.0)
+    stamp_ns = START_NS + 100_000_000
+    fake_tf(monkeypatch, world=(quaternion(turned), np.zeros(3), stamp_ns))
+    node = start(gravity="world")
+    node.on_rows(scan_at(0.1))
+    node.on_rows(scan_at(1.5))
+    known, old = node.sent["compensation"]
+    np.testing.assert_allclose(known.specific_force, turned[:, 2] * G)
+    assert not len(old.time_offset)
+    assert "transform from world to tool is 1.4 s older" in node._statuses()[0].message
+    stress = [stress_codec.decode(one).rows for one in node.sent["stress"]]
+    assert [rows.status[0] & (WEIGHT | COMPENSATION) for rows in stress] == [WEIGHT, COMPENSATION]
+
+
+def test_without_a_parameter_nothing_is_compensated_and_two_are_refused(start):
+    node = start()
+    node.on_rows(scan_at(0.1))
+    assert not node.sent["compensation"]
+    assert not (stress_codec.decode(node.sent["stress"][0]).rows.status & COMPENSATION).any()
+    with pytest.raises(AssertionError):
+        start(gravity="world", imu="/imu")
