@@ -185,6 +185,7 @@ def test_every_dependency_is_declared_and_pinned():
         for element in ElementTree.parse(ROOT / "package.xml").iter()
         if "depend" in element.tag
     }
+    of_ros |= {name.removesuffix("_py") for name in of_ros}  # tf2_ros_py has the module tf2_ros
     locks = [path.read_text() for path in (ROOT / "tools").glob("requirements-*.lock")]
     pinned = [set(re.findall(r"^([a-z0-9-]+)==", lock, re.MULTILINE)) for lock in locks]
     locked = set.intersection(*pinned)

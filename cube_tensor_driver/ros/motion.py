@@ -97,7 +97,7 @@ class Transforms:
         if target == source:
             return np.eye(3), np.zeros(3), 0
         if self._buffer is None:
-            raise MissingMotion("TF needs tf2_ros: apt install ros-$ROS_DISTRO-tf2-ros")
+            raise MissingMotion("TF needs tf2_ros: apt install ros-$ROS_DISTRO-tf2-ros-py")
         from rclpy.time import Time
 
         try:
