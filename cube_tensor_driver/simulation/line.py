@@ -110,6 +110,10 @@ class SimulatedLine:
                 written = os.write(self.fd, self._queue)
                 del self._queue[:written]
 
+    def is_waiting(self, now_us: int) -> bool:
+        """Return whether bytes wait for room in the line, and for no stall or burst to end."""
+        return self.plugged and bool(self._queue) and self.due_us(now_us) is None
+
     def due_us(self, now_us: int) -> int | None:
         """Return the simulated time in µs at which a stall or burst lets waiting bytes be sent.
 

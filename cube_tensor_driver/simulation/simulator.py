@@ -196,9 +196,12 @@ class Simulator:
             for link in self._links:
                 if link.line.plugged:
                     readers[link.line.fd] = partial(self._answer, link)
-            wait_us = self._due_us(report_us) - self.now_us()
+            now = self.now_us()
+            # A pseudo-terminal takes some 10 kB at a time, so a larger frame waits for the host to read.
+            writers = [link.line.fd for link in self._links if link.line.is_waiting(now)]
+            wait_us = self._due_us(report_us) - now
             # `select` is used, because epoll rounds waiting times to milliseconds.
-            readable, _, _ = select.select(readers, [], [], max(0.0, wait_us * 1e-6))
+            readable, _, _ = select.select(readers, writers, [], max(0.0, wait_us * 1e-6))
             for fd in readable:
                 readers[fd]()
 
@@ -320,8 +323,9 @@ class Simulator:
 
     def _answer(self, link: PlayedLink) -> None:
         """Read the requests of the host on a link and send the hub's answers."""
-        now = self.now_us()
         request = link.line.read()
+        # The clock is read after the last byte of a request for the time (TIME) has come.
+        now = self.now_us()
         link.line.send(link.hub.receive(request, now), now)
 
     def _read_faults(self) -> None:
