@@ -7,6 +7,7 @@ The response matrix and the law from stress to frequency are those of the driver
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,7 +21,7 @@ from ..core.errors import ConfigError
 from ..core.modes import COMPONENTS, STRESS, to_matrix
 from ..core.oscillator import pad_frequency, stress_slope
 from ..device.wire.protocol import NOT_MEASURED
-from .imperfections import Imperfections, PadBehaviour
+from .imperfections import Imperfections, PadBehaviour, make_thermal_pads
 from .sample_log import ABSENT
 
 Millihertz = NDArray[np.uint32]
@@ -69,6 +70,14 @@ class SimulatedCubes:
         self._behaviour = None
         if imperfections is not None:
             self._behaviour = PadBehaviour(imperfections, shape, seed)
+        self._thermal = make_thermal_pads(imperfections, shape, seed)
+
+    def temperature(self, seconds: float) -> float:
+        """Return the temperature, in °C, that the hub measures at a simulated time in s.
+
+        It is NaN if it is unknown.
+        """
+        return math.nan if self._thermal is None else self._thermal.measured(seconds)
 
     def frequency(
         self,
@@ -91,13 +100,17 @@ class SimulatedCubes:
         for calibration, rows in self._groups:
             state = true_state(calibration, stress[rows], gradient[rows])
             pad_stress[rows] = state @ calibration.response.T
+        warm = np.ones_like(pad_stress)
+        if self._thermal is not None:
+            thermal_stress, warm = self._thermal.at(seconds)
+            pad_stress += thermal_stress
         # Imperfections change the stress that determines a pad's frequency.
         if self._behaviour is not None:
             pad_stress = self._behaviour.reported(pad_stress, seconds)
 
         hertz = np.empty_like(pad_stress)
         for calibration, rows in self._groups:
-            rest = calibration.rest_frequency * (1 + self._drift * seconds)
+            rest = calibration.rest_frequency * (1 + self._drift * seconds) * warm[rows]
             hertz[rows] = pad_frequency(
                 pad_stress[rows], rest, calibration.beta, calibration.modulus
             )

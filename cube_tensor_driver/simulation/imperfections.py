@@ -1,6 +1,7 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Deviations of real pads from their calibrations: spread of gains, creep with hysteresis, failure.
+"""Deviations of real pads from their calibrations: spread of gains, creep with hysteresis, failure,
+and the effects of temperature (`temperature.py`).
 
 The foam of the pads creeps: under a constant stress, its strain keeps growing, and so does the
 stress that a pad reports. In linear viscoelasticity, the compliance J (strain per stress) is a
@@ -33,10 +34,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ..config.schema import JsonSchema, Schema, integer, mapping, real
+from ..config.schema import TEXT, JsonSchema, Schema, integer, list_of, mapping, real
 from ..config.yaml import read_yaml
 from ..core.arrays import Array
 from ..core.errors import ConfigError
+from .temperature import ThermalPads, read_thermal_stress
 
 MAX_SEED = (1 << 63) - 1
 """Largest seed of the random deviations of the pads: the largest signed 64-bit integer."""
@@ -66,6 +68,12 @@ _CREEP_TERM: JsonSchema = {
     "description": "[size, seconds]",
 }
 
+_KNOTS: JsonSchema = {
+    "type": "array",
+    "items": list_of(real("a number"), "a time in s and a temperature in °C", 2) | {"maxItems": 2},
+    "description": "[[seconds, °C], ...]",
+}
+
 _SCHEMA = Schema(
     mapping(
         (),
@@ -82,10 +90,20 @@ _SCHEMA = Schema(
                 "an exponent between 0 and 1", exclusiveMinimum=0, exclusiveMaximum=1
             ),
             "creep_spread": real("a number from 0 to below 1", minimum=0, exclusiveMaximum=1),
+            "temperature": _KNOTS,
+            "air": _KNOTS,
+            "heat_exchange": real("a number above 0 in W/(m² K)", exclusiveMinimum=0),
+            "thermal_stress": TEXT,
+            "pad_drift": real("a relative change per K"),
+            "pad_drift_spread": real("a number from 0 up", minimum=0),
+            "layer_spread": real("a number from 0 to 0.3", minimum=0, maximum=0.3),
             "seed": integer(0, MAX_SEED, "a whole number from 0 up"),
         },
     )
 )
+
+_PAIRS = {"creep", "temperature", "air"}
+"""Names of the fields of `Imperfections` that hold pairs of numbers."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +120,17 @@ class Imperfections:
             1 s, which is the true one (calibrations are made at about 1 s).
         creep_exponent: Exponent alpha of the power law, 0 to 1.
         creep_spread: Standard deviation of a pad's `creep_growth` divided by the mean.
+        temperature: Times in s and temperatures in °C of the ground below the skin, which the
+            thermometers of the hubs measure; in between they are linear. Empty: the temperature is
+            unknown and has no effect.
+        air: The same for the air above the skin; empty: as the ground in the beginning.
+        heat_exchange: Heat exchange of the surface with the air, in W/(m² K).
+        thermal_stress: File of `./cube fem --temperature -o` with the layer and the stress of its
+            pads, or the name of a shipped one.
+        pad_drift: Mean relative change of the rest frequency (frequency without load) of a pad per
+            K, because of its electronics.
+        pad_drift_spread: Standard deviation of a pad's `pad_drift` divided by the mean.
+        layer_spread: Standard deviation of the layer's height at a cube divided by the mean.
         seed: Seed of the random numbers that determine the deviation of each pad.
 
     Raises:
@@ -114,14 +143,26 @@ class Imperfections:
     creep_growth: float = 0.0
     creep_exponent: float = 0.2
     creep_spread: float = 0.0
+    temperature: tuple[tuple[float, float], ...] = ()
+    air: tuple[tuple[float, float], ...] = ()
+    heat_exchange: float = 10.0
+    thermal_stress: str = "cube_11mm"
+    pad_drift: float = 1e-4
+    pad_drift_spread: float = 0.0
+    layer_spread: float = 0.0
     seed: int = 0
 
     def __post_init__(self) -> None:
         # The schema describes the values of a file, in which a term is a list.
         values = asdict(self)
-        values["creep"] = [list(term) for term in self.creep]
+        for name in _PAIRS:
+            values[name] = [list(pair) for pair in getattr(self, name)]
         for _, mistake in _SCHEMA.mistakes(values):
             raise ConfigError(mistake)
+        for name in ("temperature", "air"):
+            times = [time for time, _ in getattr(self, name)]
+            if times != sorted(set(times)):
+                raise ConfigError(f"{name}: found the times {times} s, allowed: rising times")
         # With more growth, the power law through 1 at 1 s would be negative at the begin.
         limit = (GROWTH_S**self.creep_exponent - 1) / (1 + MAX_DEVIATIONS * self.creep_spread)
         if self.creep_growth >= limit:
@@ -141,9 +182,9 @@ def read_imperfections(path: Path) -> Imperfections:
     for _, mistake in _SCHEMA.mistakes(data):
         raise ConfigError(f"{path}: {mistake}")
     # Lists become tuples, because an instance of `Imperfections` is immutable.
-    terms = data.pop("creep", ())
-    creep = tuple((size, time) for size, time in terms)
-    return Imperfections(creep=creep, **data)
+    for name in _PAIRS & data.keys():
+        data[name] = tuple((first, second) for first, second in data[name])
+    return Imperfections(**data)
 
 
 class PadBehaviour:
@@ -226,3 +267,35 @@ class PadBehaviour:
             reported += (self._creep_size * self._crept).sum(axis=0)
             self._seconds = seconds
         return reported
+
+
+def make_thermal_pads(
+    imperfections: Imperfections | None,
+    shape: tuple[int, int],
+    seed: int,
+) -> ThermalPads | None:
+    """Return what temperature does to the pads of some cubes; None: nothing.
+
+    Args:
+        imperfections: Temperatures and the spread of their effects.
+        shape: Number of cubes and of pads per cube.
+        seed: Seed that differs between the hubs of a skin.
+
+    Raises:
+        ConfigError: The file of thermal stress cannot be used for these cubes.
+    """
+    if imperfections is None or not imperfections.temperature:
+        return None
+    wanted = imperfections
+    random = np.random.default_rng([wanted.seed, seed, 1])
+    height = 1 + wanted.layer_spread * random.standard_normal(shape[0]).clip(-3, 3)
+    spread = 1 + wanted.pad_drift_spread * random.standard_normal(shape)
+    first = ((0.0, wanted.temperature[0][1]),)
+    return ThermalPads(
+        read_thermal_stress(wanted.thermal_stress, shape[1]),
+        height,
+        wanted.heat_exchange,
+        wanted.pad_drift * spread,
+        wanted.temperature,
+        wanted.air or first,
+    )

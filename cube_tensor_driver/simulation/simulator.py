@@ -313,6 +313,9 @@ class Simulator:
         else:
             stress, gradient = self._load.at(load_us)
             frequency = link.carried.frequency(stress, gradient, time_us * 1e-6)
+        celsius = link.carried.cubes.temperature(time_us * 1e-6)
+        if not math.isnan(celsius):
+            link.hub.celsius = round(100 * celsius)
         measured = self._injector.measured(link, frequency, time_us)
         frame = link.hub.sample(measured)
         sent = self._injector.transmitted(link, frame)

@@ -94,7 +94,7 @@ class SimulatedSource:
     All rows of scan k have the sequence number k and stamp_ns = k × period; simulated time 0 is the
     start of the load script. Frequencies are rounded as those of a real hub: whole mHz, in Hz as
     float32. They are NaN for pads that a cube does not have or whose oscillator stopped. The
-    temperature is unknown.
+    temperature is unknown (NaN) unless the imperfections state it.
 
     Attributes:
         skin: Skin to simulate.
@@ -204,6 +204,7 @@ class SkinPads:
         count = len(self._cube)
         shape = (count, self._n_pads)
         millihertz = np.full(shape, NOT_MEASURED, np.uint32)
+        temperature = np.empty(count, np.float32)
         # The rows are sorted link by link, as the driver delivers them.
         start = 0
         for hub in self._hubs:
@@ -215,6 +216,7 @@ class SkinPads:
                 1e-6 * time_us,
             )
             millihertz[start:end, : hub.cubes.n_pads] = own
+            temperature[start:end] = hub.cubes.temperature(1e-6 * time_us)
             start = end
 
         # Frequencies from a real hub are also whole mHz, which the driver converts to float32 Hz.
@@ -225,7 +227,7 @@ class SkinPads:
             sequence=np.full(count, number % SEQUENCE_RANGE, np.uint32),
             stamp_ns=np.full(count, 1000 * time_us),
             frequency=frequency,
-            temperature=np.full(count, np.nan, np.float32),
+            temperature=temperature,
             pad_fault=np.zeros(count, np.uint32),
             status=np.zeros(count, np.uint16),
         )

@@ -1,0 +1,189 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
+"""Temperature of a simulated skin: heat conduction through its layer, thermal stress and drift.
+
+The ground below the elastomer has a given temperature, and the surface exchanges heat with the air.
+With the height z above the ground, the height h of the layer and its temperature T(z, t)::
+
+    dT/dt = D d²T/dz²,   T(0) = T_ground,   -k dT/dz(h) = exchange (T(h) - T_air)
+
+Finite volumes turn this into a linear system, whose eigenvectors are advanced exactly under
+temperatures of ground and air that are linear in time. The thermal stress of a pad is linear in
+T(z); finite elements (`./cube fem --temperature`) have computed it for Legendre polynomials. The
+oscillators of a cube have the mean temperature of its height. Heat along the layer, and into the
+cubes, which conduct better than the elastomer, is left out.
+
+Source: H. S. Carslaw, J. C. Jaeger, Conduction of Heat in Solids (1959), 3.11.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.polynomial.legendre import legvander
+
+from ..config.package_data import package_data
+from ..config.yaml import read_yaml
+from ..core.arrays import Array
+from ..core.errors import ConfigError
+
+REFERENCE_CELSIUS = 25.0
+"""Temperature, in °C, at which the rest frequencies of the calibrations hold and no pad has thermal
+stress."""
+
+DIFFUSIVITY = 1.25e-7
+"""Thermal diffusivity D of silicone rubber, in m²/s: conductivity / (density × heat capacity)."""
+
+CONDUCTIVITY = 0.2
+"""Thermal conductivity k of silicone rubber, in W/(m K)."""
+
+CELLS = 44
+"""Number of finite volumes across a layer. Their error is below 2e-3 of a step 10 s after it."""
+
+
+class Stressed(NamedTuple):
+    """Layer with cubes, as a file of `./cube fem --temperature` describes it.
+
+    Attributes:
+        height: Height of the layer, in m.
+        depth: Distance from the centre of a cube to the surface, in m.
+        side: Side of a cube, in m.
+        pads: Stress on each pad (P, K) in Pa per K of the Legendre polynomial of degree k, whose
+            variable grows from -1 at the ground to 1 at the surface.
+    """
+
+    height: float
+    depth: float
+    side: float
+    pads: Array
+
+
+def read_thermal_stress(name: str, n_pads: int) -> Stressed:
+    """Read a file of thermal stress, a shipped one by its name or another by its path.
+
+    Raises:
+        ConfigError: There is no such file, or it has another number of pads.
+    """
+    shipped = package_data() / "config" / "thermal" / f"{name}.yaml"
+    data = read_yaml(shipped if shipped.is_file() else Path(name))
+    try:
+        pads = np.array(data["pads"], float)
+        layer = Stressed(float(data["height"]), float(data["depth"]), float(data["side"]), pads)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ConfigError(
+            f"{name}: {error} does not suit; ./cube fem --temperature -o writes a file"
+        ) from None
+    if pads.ndim != 2 or len(pads) != n_pads:
+        raise ConfigError(
+            f"{name}: thermal stress of shape {pads.shape}, the cubes have {n_pads} pads; compute "
+            "it with ./cube fem --temperature for their layout"
+        )
+    return layer
+
+
+class WarmLayer:
+    """Temperature of the layer at some cubes over time.
+
+    Attributes:
+        temperature: Temperature of each finite volume (cubes, `CELLS`), in °C, from the ground up.
+    """
+
+    def __init__(self, height: Array, exchange: float, ground: float, air: float) -> None:
+        """Begin with the temperatures that ground and air keep up for ever.
+
+        Args:
+            height: Height of the layer at each cube (cubes,), in m.
+            exchange: Heat exchange of the surface with the air, in W/(m² K).
+            ground: Temperature of the ground, in °C.
+            air: Temperature of the air, in °C.
+        """
+        size = height[:, None] / CELLS
+        matrix = np.zeros((len(height), CELLS, CELLS))
+        inner = np.arange(CELLS - 1)
+        # A finite volume exchanges heat with the next one, and the first one with the ground half
+        # a volume below its centre.
+        for a, b in ((inner, inner + 1), (inner + 1, inner)):
+            matrix[:, a, b] += 1
+            matrix[:, a, a] -= 1
+        matrix[:, 0, 0] -= 2
+        to_air = 1 / (CONDUCTIVITY / (exchange * size[:, 0]) + 0.5)
+        matrix[:, -1, -1] -= to_air
+        rate, self._vectors = np.linalg.eigh(matrix)
+        self._rate = -rate * DIFFUSIVITY / size**2
+        # Amplitudes of the eigenvectors in the steady state, per temperature of ground and air.
+        self._from_ground = 2 * self._vectors[:, 0] / -rate
+        self._from_air = to_air[:, None] * self._vectors[:, -1] / -rate
+        self._steady = self._amplitude = ground * self._from_ground + air * self._from_air
+
+    @property
+    def temperature(self) -> Array:
+        temperature: Array = (self._vectors @ self._amplitude[:, :, None])[:, :, 0]
+        return temperature
+
+    def advance(self, seconds: float, ground: float, air: float) -> None:
+        """Advance by a time in s, to the end of which ground and air change linearly, in °C."""
+        steady = ground * self._from_ground + air * self._from_air
+        if seconds > 0:
+            steps = self._rate * seconds
+            decay = np.exp(-steps)
+            slope = (steady - self._steady) * -np.expm1(-steps) / steps
+            self._amplitude = steady + (self._amplitude - self._steady) * decay - slope
+            self._steady = steady
+
+
+class ThermalPads:
+    """Thermal stress and drift of the pads of some cubes over time."""
+
+    def __init__(
+        self,
+        layer: Stressed,
+        height: Array,
+        exchange: float,
+        drift: Array,
+        ground: tuple[tuple[float, float], ...],
+        air: tuple[tuple[float, float], ...],
+    ) -> None:
+        """Prepare the layer.
+
+        Args:
+            layer: Layer with the cubes, and the thermal stress of their pads.
+            height: Height of the layer at each cube (cubes,), in units of that of `layer`.
+            exchange: Heat exchange of the surface with the air, in W/(m² K).
+            drift: Relative change of the rest frequency of each pad (cubes, P), per K.
+            ground, air: Times in s and temperatures in °C, which are linear in between.
+        """
+        self._knots = [np.array(knots).T for knots in (ground, air)]
+        self._drift, self._seconds = drift, 0.0
+        self._layer = WarmLayer(height * layer.height, exchange, *self._outside(0.0))
+
+        s = (2 * np.arange(CELLS) + 1) / CELLS - 1
+        # Least squares: the polynomials are not quite orthogonal on a grid.
+        to_profiles = np.linalg.pinv(legvander(s, layer.pads.shape[1] - 1))
+        self._to_stress = layer.pads @ to_profiles
+        to_centre = (s + 1) * layer.height / 2 - (layer.height - layer.depth)
+        self._in_cube = np.abs(to_centre) < layer.side / 2
+
+    def _outside(self, seconds: float) -> tuple[float, float]:
+        """Return the temperatures of ground and air at a time in s, in °C."""
+        ground, air = (float(np.interp(seconds, *knots)) for knots in self._knots)
+        return ground, air
+
+    def measured(self, seconds: float) -> float:
+        """Return what the hub's thermometer measures, the temperature of the ground, in °C."""
+        return round(self._outside(seconds)[0], 2)
+
+    def at(self, seconds: float) -> tuple[Array, Array]:
+        """Return the stress (cubes, P) in Pa and the factors (cubes, P) of the rest frequencies.
+
+        Args:
+            seconds: Simulated time in s; it should not decrease from call to call.
+        """
+        times = np.unique(np.concatenate([knots[0] for knots in self._knots] + [[seconds]]))
+        for time in times[(times > self._seconds) & (times <= seconds)].tolist():
+            self._layer.advance(time - self._seconds, *self._outside(time))
+            self._seconds = time
+        rise = self._layer.temperature - REFERENCE_CELSIUS
+        in_cube = rise[:, self._in_cube].mean(axis=1)
+        return rise @ self._to_stress.T, 1 + self._drift * in_cube[:, None]
