@@ -197,7 +197,7 @@ class Simulator:
                 if link.line.plugged:
                     readers[link.line.fd] = partial(self._answer, link)
             now = self.now_us()
-            # A pseudo-terminal takes some 10 kB at a time, so a larger frame waits for the host to read.
+            # A pseudo-terminal takes some 10 kB at a time; large frames wait until the host reads.
             writers = [link.line.fd for link in self._links if link.line.is_waiting(now)]
             wait_us = self._due_us(report_us) - now
             # `select` is used, because epoll rounds waiting times to milliseconds.
