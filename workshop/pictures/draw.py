@@ -50,7 +50,6 @@ from cube_tensor_driver.views.figures.style import save
 
 from ..bench.skin import Bench, bench_scale
 from .contact_tables import write_contact_tables
-from .cube_drawing import draw_cube
 from .fingers import draw_fingers
 
 START_S = 30.0
@@ -114,7 +113,6 @@ def make_pictures(folder: Path) -> None:
         print(f"no gripper.png: {error}", file=sys.stderr)
     scale = bench_scale(COUNTS, Bench(RATE, MEASURE_S), folder / "scale.png")
     write_json(folder / "scale.json", scale)
-    save(draw_cube(planar_calibration()), folder / "cube.png")
     save(draw_pads(planar_calibration()), folder / "pads.png")
     save(draw_sweep(sweep()), folder / "mistaken_shear.png")
     a, _, b, _, c, _ = experiments()
