@@ -149,7 +149,7 @@ def typestore() -> Typestore:
     folder = package_data() / "msg"
     for path in sorted(folder.glob("*.msg")):
         name = f"{PACKAGE}/msg/{path.stem}"
-        types |= get_types_from_msg(path.read_text(), name)
+        types |= get_types_from_msg(path.read_text("utf-8"), name)
     # They are registered in one call, because messages of this package contain each other.
     store.register(types)
     return store

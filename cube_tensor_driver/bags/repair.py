@@ -15,7 +15,6 @@ record follows only from the length that stands in front of each record.
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 import re
 import shutil
@@ -258,17 +257,23 @@ def _check_not_recorded(path: Path) -> None:
 
     A repair would cut off what that process writes next.
     """
+    try:
+        import fcntl
+
+        lease = fcntl.F_SETLEASE
+    except (ImportError, AttributeError):
+        return  # only Linux tells who has a file open
     with path.open("rb") as stream:
         # The kernel grants a read lease (fcntl(2)) only if nobody has the file open for writing.
         try:
-            fcntl.fcntl(stream, fcntl.F_SETLEASE, fcntl.F_RDLCK)
+            fcntl.fcntl(stream, lease, fcntl.F_RDLCK)
         except BlockingIOError:
             raise BagError(
                 f"{path}: is being recorded by another process; end that first"
             ) from None
         except OSError:
             return  # this file system, or the owner of the file, does not allow leases
-        fcntl.fcntl(stream, fcntl.F_SETLEASE, fcntl.F_UNLCK)
+        fcntl.fcntl(stream, lease, fcntl.F_UNLCK)
 
 
 def _has_summary(path: Path) -> bool:

@@ -111,11 +111,14 @@ def single_keys() -> Iterator[bool]:
     The terminal is restored at the end of the `with` block.
 
     Yields:
-        Whether keys can be read; they cannot if stdin is not a terminal.
+        Whether keys can be read; they cannot if stdin is not a terminal, or on Windows.
     """
-    import termios
-    import tty
-
+    try:
+        import termios
+        import tty
+    except ImportError:
+        yield False
+        return
     if not sys.stdin.isatty():
         yield False
         return

@@ -150,4 +150,4 @@ def write_yaml(path: Path, value: Any, header: str = "") -> None:
     comment = "".join(f"# {line}".rstrip() + "\n" for line in header.splitlines())
     text = comment + to_yaml(value)
     with atomic_write(path) as temporary:
-        temporary.write_text(text)
+        temporary.write_text(text, "utf-8")

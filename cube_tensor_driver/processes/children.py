@@ -54,7 +54,10 @@ class Children:
 
         Raises:
             ConfigError: The environment variable ROS_DOMAIN_ID is no valid DDS domain.
+            ChildError: The system is Windows, which has no signals to groups of processes.
         """
+        if not hasattr(os, "killpg"):
+            raise ChildError("commands that start other processes need Linux or macOS")
         check_domain()
         self._logs = logs
         self._processes: dict[str, subprocess.Popen[bytes]] = {}

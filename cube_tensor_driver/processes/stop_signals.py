@@ -11,9 +11,9 @@ from collections.abc import Callable
 INTERRUPTED = 130
 """Exit code after Ctrl-C: by the convention of shells, 128 plus the number of the signal SIGINT."""
 
-STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+STOP_SIGNALS = [one for one in signal.Signals if one.name in ("SIGINT", "SIGTERM", "SIGHUP")]
 """Signals that ask this process to end: SIGINT comes from Ctrl-C, SIGTERM from another process, and
-SIGHUP when the terminal is closed."""
+SIGHUP, which Windows does not have, when the terminal is closed."""
 
 
 def on_stop_signal(stop: Callable[[], None]) -> None:
@@ -24,7 +24,7 @@ def on_stop_signal(stop: Callable[[], None]) -> None:
     """
     for number in STOP_SIGNALS:
         # A command started with nohup ignores SIGHUP; a handler here would undo that.
-        if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
+        if number.name != "SIGHUP" or signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, lambda *_: stop())
 
 

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import contextlib
 import os
-import tty
 from pathlib import Path
+
+from ..core.errors import ConfigError
 
 MAX_QUEUED_BYTES = 1 << 16
 """Maximum number of bytes that wait to be sent on a line. A hub drops and counts samples for which
@@ -57,8 +58,18 @@ class SimulatedLine:
 
         Args:
             port: New path of the port; None: the path does not change.
+
+        Raises:
+            ConfigError: The system has no pseudo-terminals.
         """
         self.port = port or self.port
+        try:
+            import tty
+        except ImportError:  # Windows
+            raise ConfigError(
+                "simulated ports are pseudo-terminals, which this system does not have: use Linux "
+                "or macOS, or simulate() in Python"
+            ) from None
         # The host's end stays open in this process. Otherwise, the hub's end would report an error
         # whenever the driver closes the port.
         self.fd, self._far_end = os.openpty()

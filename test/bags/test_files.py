@@ -808,6 +808,22 @@ def test_files_are_read_in_the_order_of_recording(tmp_path, name, listed):
     assert order == [*listed, *(number for number in range(12) if number not in listed)]
 
 
+def test_bags_and_simulation_need_nothing_posix(tmp_path):
+    """In a child process that takes away what Windows lacks; reprocessing gives the same bits, and
+    what cannot run says so in one line."""
+    script = ROOT / "test" / "without_posix.py"
+    done = subprocess.run(
+        [sys.executable, script, KEPT, tmp_path / "out"],
+        env={**os.environ, "PYTHONPATH": f"{ROOT}:{os.environ.get('PYTHONPATH', '')}"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "need Linux or macOS" in done.stdout and "pseudo-terminals" in done.stdout
+    reprocess(ReprocessJob(KEPT, tmp_path / "here", "bag"))
+    assert all_differing_bits(stress(tmp_path / "out" / "bag"), stress(tmp_path / "here")) == 0
+
+
 def test_a_newer_metadata_version_is_one_line(copy, caplog):
     path = copy / "metadata.yaml"
     said = read_yaml(path)

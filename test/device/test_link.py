@@ -127,6 +127,35 @@ def test_tcp_both_ways_and_lost(server: socket.socket) -> None:
     link.close()
 
 
+def test_links_without_file_descriptors(
+    pty: tuple[int, str], server: socket.socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on Windows: pyserial and the socket move the bytes, and say when the other end is gone."""
+    monkeypatch.setattr(Link, "HAS_DESCRIPTORS", False)
+    master, path = pty
+    port, tcp_link = opened(Link(LinkConfig("a", path))), opened(Link(LinkConfig("b", url(server))))
+    peer, _ = server.accept()
+    ends = [
+        (port, lambda data: os.write(master, data), lambda: os.read(master, 100)),
+        (tcp_link, peer.sendall, lambda: peer.recv(100)),
+    ]
+    for link, send, receive in ends:
+        assert link.fileno() == -1 and link.read() == b""
+        send(bytes(range(256)))
+        got = bytearray()
+        until(lambda got=got, link=link: got.extend(link.read()) or len(got) == 256, "256 bytes")
+        assert bytes(got) == bytes(range(256))
+        link.write(b"\0\r\n\x03\x11")
+        assert receive() == b"\0\r\n\x03\x11" and link.counters["bytes_out"] == 5
+    os.close(master)
+    peer.close()
+    for link in (port, tcp_link):
+        with pytest.raises(LinkError, match="connection lost") as lost:
+            until(link.read, "lost")
+        assert lost.value.kind == "lost"
+        link.close()
+
+
 def test_read_takes_much_but_lets_others_in(server: socket.socket) -> None:
     link = opened(Link(LinkConfig("a", url(server))))
     peer, _ = server.accept()

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import ctypes
 import select
+import time
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -20,6 +21,10 @@ from ..wire.decoder import NativeDecoder, unpack_all
 from ..wire.native import wire
 from ..wire.protocol import Frame
 from .link import Link
+
+ASK_PERIOD_S = 1e-3
+"""Time, in s, between two looks at the links for bytes on systems that cannot wait for serial ports
+(all but Linux). Bytes arrive up to this time late."""
 
 
 class UsualSamples(NamedTuple):
@@ -55,7 +60,8 @@ class Intake:
 
     Args:
         links: All links; those that are closed are not read.
-        wake_fd: File descriptor of a pipe; a byte in it ends the wait.
+        wake_fd: File descriptor of a pipe; a byte in it ends the wait. It is not used where
+            `Link.HAS_DESCRIPTORS` is false.
         clock_ns: Clock of the arrival times, in ns. It is read after the bytes, so that no arrival
             time is earlier than the true one.
     """
@@ -96,6 +102,8 @@ class Intake:
             Whether bytes had been waiting before the call, so that this host is behind; the samples
             that were counted and stamped in C; and all other results of reading.
         """
+        if not Link.HAS_DESCRIPTORS:
+            return self._ask_links(timeout_s)
         if wire is None or len(self._targets) < len(self._links):
             return self._read_in_python(timeout_s)
         is_late, links, raws, stamps_ns, reads = wire.read_links(
@@ -106,6 +114,16 @@ class Intake:
             result = unpack_all(frames) if size > 0 else self._links[i].read_error(-size)
             events.append(LinkRead(i, arrival_ns, result))
         return is_late, UsualSamples(links, raws, stamps_ns), events
+
+    def _ask_links(self, timeout_s: float) -> tuple[bool, UsualSamples, list[LinkRead]]:
+        """Read the open links again and again until frames have come; see `read`."""
+        until = time.monotonic() + timeout_s
+        while True:
+            is_open = [i for i, link in enumerate(self._links) if link.is_open]
+            reads = [read for read in self._read_ready(is_open) if read.result]
+            if reads or time.monotonic() >= until:
+                return False, UsualSamples([], [], []), reads
+            time.sleep(ASK_PERIOD_S)
 
     def _read_in_python(self, timeout_s: float) -> tuple[bool, UsualSamples, list[LinkRead]]:
         """Wait, read and decode in Python; see `read`. It does not wait for the other links."""

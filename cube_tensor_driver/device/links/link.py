@@ -3,8 +3,9 @@
 """One link: a byte stream to and from a hub over a serial port, a pseudo-terminal or TCP.
 
 A link moves bytes without blocking and without a thread; `session.py` decides what is sent on it.
-pyserial opens serial ports by their path, and ``os.read`` reads them, up to 4 kB per call. Every
-failure is a `LinkError`, whose `kind` is one word and whose text names the fix:
+pyserial opens serial ports by their path. On Linux ``os.read`` reads them, up to 4 kB per call; on
+other systems pyserial does, because Windows has no file descriptors of ports. Every failure is a
+`LinkError`, whose `kind` is one word and whose text names the fix:
 
     no_port  no_permission  busy  not_serial  bad_port  bad_baud      opening a serial port
     refused  no_answer  unreachable  unresolved                       opening a TCP link
@@ -16,17 +17,14 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import glob
 import os
 import socket
-import struct
-import termios
+import sys
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-
-import serial
+from typing import TYPE_CHECKING, ClassVar
 
 from ...config.port import TCP, port_problem
 from ...core.errors import LinkError
@@ -34,6 +32,9 @@ from ..track import LinkTrack
 from ..wire.decoder import Decoder
 from ..wire.protocol import Hello
 from .tcp import TcpConnection
+
+if TYPE_CHECKING:
+    import serial
 
 READ_CHUNK = 1 << 16
 """Largest number of bytes that one call reads from one link. The limit keeps a link with much data
@@ -124,6 +125,8 @@ class Link:
         track: Sample numbers and clock values of the link; None for new ones.
 
     Attributes:
+        HAS_DESCRIPTORS: Whether serial ports and sockets have file descriptors that one call (poll)
+            waits for, which is so on Linux. If not, links are asked one after the other.
         track: Sample numbers and clock values of the link, which are kept when it is reopened.
         state: State of the link; `Session` sets it.
         error: Reason of the state; None if there is none. `Session` sets it.
@@ -138,6 +141,8 @@ class Link:
     Raises:
         LinkError: With the kind `bad_port`: the port is neither a device path nor a TCP address.
     """
+
+    HAS_DESCRIPTORS: ClassVar[bool] = sys.platform == "linux"
 
     def __init__(self, config: LinkConfig, track: LinkTrack | None = None) -> None:
         self.config = config
@@ -193,7 +198,7 @@ class Link:
         return bool(self._out)
 
     def fileno(self) -> int:
-        """Return the file descriptor of the open port; -1 if it is closed."""
+        """Return the file descriptor of the open port; -1 if it is closed or has none."""
         return self._fd
 
     def open(self) -> bool:
@@ -213,7 +218,8 @@ class Link:
             self._open_serial()
         if self._stream is None:
             return False
-        self._fd = self._stream.fileno()
+        if self.HAS_DESCRIPTORS:
+            self._fd = self._stream.fileno()
         self.opened += 1
         return True
 
@@ -227,7 +233,16 @@ class Link:
             LinkError: With the kind `lost`: the other end was unplugged or closed the connection.
         """
         try:
-            data = os.read(self._fd, READ_CHUNK)
+            if self.HAS_DESCRIPTORS:
+                data = os.read(self._fd, READ_CHUNK)
+            elif isinstance(self._stream, socket.socket):
+                data = self._stream.recv(READ_CHUNK)
+            elif self._stream is not None:
+                # Here no byte means that none has arrived; an unplugged port raises an OSError.
+                received: bytes = self._stream.read(self._stream.in_waiting)
+                return received
+            else:
+                return b""
         except BlockingIOError:
             return b""
         except OSError as error:
@@ -270,7 +285,14 @@ class Link:
         """
         try:
             while self._out:
-                sent = os.write(self._fd, self._out)
+                if self.HAS_DESCRIPTORS:
+                    sent = os.write(self._fd, self._out)
+                elif isinstance(self._stream, socket.socket):
+                    sent = self._stream.send(self._out)
+                elif self._stream is not None:
+                    sent = self._stream.write(self._out) or 0
+                else:
+                    return
                 self.bytes_out += sent
                 del self._out[:sent]
         except BlockingIOError:
@@ -283,14 +305,12 @@ class Link:
 
         For TCP the result is False, because the kernel sends the rest after closing.
         """
-        if self._tcp or self._stream is None:
+        if self._stream is None or isinstance(self._stream, socket.socket):
             return False
         try:
-            answer = fcntl.ioctl(self._fd, termios.TIOCOUTQ, bytes(4))
-            (waiting,) = struct.unpack("i", answer)
+            return bool(self._out) or self._stream.out_waiting > 0
         except OSError:
             return False
-        return bool(self._out) or waiting > 0
 
     def close(self) -> None:
         """Close the port at once, in any state of the link; a second call does nothing.
@@ -302,11 +322,11 @@ class Link:
             self._connecting.close()
             self._connecting = None
         if self._stream is not None:
-            if self.is_draining():
+            if self.is_draining() and not isinstance(self._stream, socket.socket):
                 # The bytes that the hub has not read are discarded. Otherwise the kernel would
                 # block in close for up to 30 s to send them.
-                with contextlib.suppress(termios.error):
-                    termios.tcflush(self._fd, termios.TCOFLUSH)
+                with contextlib.suppress(OSError, _terminal_error()):
+                    self._stream.reset_output_buffer()
             with contextlib.suppress(OSError):
                 self._stream.close()
             self._stream = None
@@ -403,9 +423,9 @@ def explain_open_error(path: str, error: BaseException) -> LinkError:
     """
     code = getattr(error, "errno", None)
     for source in (error, error.__context__):
-        # Some errors of termios, which have no attribute `errno`, come from pyserial unchanged;
-        # others are the context of an error of pyserial.
-        if code is None and isinstance(source, termios.error):
+        # Some errors of the terminal, which have no attribute `errno`, come from pyserial
+        # unchanged; others are the context of an error of pyserial.
+        if code is None and isinstance(source, _terminal_error()):
             code = source.args[0]
     if code in _OPEN_ERRORS:
         kind, fix = _OPEN_ERRORS[code]
@@ -413,13 +433,26 @@ def explain_open_error(path: str, error: BaseException) -> LinkError:
     return LinkError(f"{path}: cannot open it ({error}): correct the port", "bad_port")
 
 
+def _terminal_error() -> type[Exception]:
+    """Return the class of errors of the terminal, termios.error; OSError where Python has none."""
+    try:
+        import termios
+    except ImportError:  # Windows
+        return OSError
+    return termios.error
+
+
 def _open_port(path: str, baud: int) -> serial.Serial:
     """Open one serial port for this process only; raise LinkError if that fails."""
+    import serial
+
     try:
         # inter_byte_timeout=0 makes pyserial set the terminal's VMIN to 1. Then reading a port
         # without data fails with EAGAIN, and an empty result always means an unplugged hub.
-        port = serial.Serial(path, baud, timeout=0, inter_byte_timeout=0, exclusive=True)
-    except (OSError, termios.error) as error:
+        port = serial.Serial(
+            path, baud, timeout=0, write_timeout=0, inter_byte_timeout=0, exclusive=True
+        )
+    except (OSError, _terminal_error()) as error:
         raise explain_open_error(path, error) from error
     except ValueError as error:
         kind = "bad_baud" if "baud" in str(error).lower() else "bad_port"

@@ -141,9 +141,11 @@ class Reader:
         """
         if self._thread is not None:
             raise LinkError("a reader starts once: make a new Reader", "closed")
-        wake_read, self._wake_write = os.pipe()
-        os.set_blocking(wake_read, False)
-        os.set_blocking(self._wake_write, False)
+        wake_read = -1
+        if Link.HAS_DESCRIPTORS:
+            wake_read, self._wake_write = os.pipe()
+            os.set_blocking(wake_read, False)
+            os.set_blocking(self._wake_write, False)
         self._thread = threading.Thread(
             target=self._run, args=(wake_read,), name="cube reader", daemon=True
         )
@@ -375,6 +377,7 @@ class Reader:
             session.link.close()
             session.set_state(LinkState.CLOSED)
         with self._wake_lock:
-            os.close(wake_read)
-            os.close(self._wake_write)
-            self._wake_write = -1
+            if self._wake_write >= 0:
+                os.close(wake_read)
+                os.close(self._wake_write)
+                self._wake_write = -1

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import select
 import tempfile
 import time
 from dataclasses import dataclass
@@ -18,6 +17,8 @@ from .link import Link, LinkConfig
 
 ANSWER_S = 1.0
 """Longest time, in s, to wait for the answer of a hub to the request HELLO (identify yourself)."""
+ASK_PERIOD_S = 0.005
+"""Time, in s, between two looks at the ports for an answer."""
 DEMO_PORTS = "cube_demo_*/ports/*"
 """Pattern of the paths of the simulated serial ports of running demos, relative to the system's
 folder for temporary files."""
@@ -63,41 +64,43 @@ def ask_ports(ports: list[Port]) -> None:
     Args:
         ports: The ports. The attribute `hello` or `problem` of each is set to the result.
     """
-    links: dict[int, tuple[Link, Port]] = {}
+    links: list[tuple[Link, Port]] = []
     question = encode(Request(Command.HELLO))
     try:
         for port in ports:
             try:
                 link = Link(LinkConfig(port.path, port.path))
                 link.open()
-                links[link.fileno()] = link, port
+                links.append((link, port))
                 link.write(question)
             except LinkError as error:
                 port.problem = str(error)
         _listen(links)
     finally:
-        for link, _ in links.values():
+        for link, _ in links:
             link.close()
 
 
-def _listen(links: dict[int, tuple[Link, Port]]) -> None:
+def _listen(links: list[tuple[Link, Port]]) -> None:
     """Read the links until a HELLO has come from each, for at most `ANSWER_S`.
 
     Args:
-        links: Each open link and its port, by file descriptor.
+        links: Each open link and its port.
     """
     until = time.monotonic() + ANSWER_S
-    waiting = set(links)
-    while waiting and (left := until - time.monotonic()) > 0:
-        for number in select.select(waiting, [], [], left)[0]:
-            link, port = links[number]
-            try:
-                frames = link.decoder.feed(link.read())
-            except LinkError as error:
-                port.problem = str(error)
-                waiting.discard(number)
-                continue
-            for frame in frames:
-                if isinstance(frame, Hello):
-                    port.hello = frame
-                    waiting.discard(number)
+    while links and time.monotonic() < until:
+        links = [(link, port) for link, port in links if not _has_answered(link, port)]
+        time.sleep(ASK_PERIOD_S)
+
+
+def _has_answered(link: Link, port: Port) -> bool:
+    """Read a link, and return whether its hub has answered, or it cannot be read any more."""
+    try:
+        frames = link.decoder.feed(link.read())
+    except LinkError as error:
+        port.problem = str(error)
+        return True
+    for frame in frames:
+        if isinstance(frame, Hello):
+            port.hello = frame
+    return port.hello is not None
