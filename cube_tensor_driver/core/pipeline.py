@@ -108,7 +108,10 @@ class Pipeline:
         dtype: Precision of the computation.
         newest_offset: Offsets of the newest rows (cubes, P), stress / stiffness, that compensation
             (of weight, creep or temperature) subtracts; None: nothing is compensated.
+        rest_version: Number of times that the rest frequencies were set.
     """
+
+    rest_version = 0
 
     def __init__(self, calibrations: Sequence[Calibration], dtype: type = np.float64) -> None:
         """Prepare the matrices of all calibrations.
@@ -186,6 +189,7 @@ class Pipeline:
                 "every pad's must be finite and above 0"
             )
         self._rest = np.where(exists, rest, np.nan)
+        self.rest_version += 1
         self._tables.rest[:] = self._rest
         self._tables.highest[:] = highest_frequency(self._rest, self._beta[group])
 
@@ -228,6 +232,18 @@ class Pipeline:
         offset, beta = self.newest_offset[cube], self._beta[self._tables.calibration[cube]]
         shifted: Array = factor * (1 + offset * (1 + beta) / beta) / (1 + offset)
         return shifted
+
+    def shift_of_zero(self, before: Array) -> Array:
+        """Return by how much the zero of older rest frequencies is wrong (cubes, P).
+
+        It is the stress / stiffness that they give for the present frequencies without load.
+
+        Args:
+            before: The older rest frequencies (cubes, P), in Hz.
+        """
+        ratio, beta = self._rest / before, self._beta[self._tables.calibration]
+        shift: Array = (ratio - 1) / ((1 + beta) / beta - ratio)
+        return shift
 
     def process(
         self,

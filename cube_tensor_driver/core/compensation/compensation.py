@@ -20,6 +20,7 @@ from ..arrays import Array, Mask, PadMasks
 from ..pipeline import Pipeline, Watch
 from ..rows import FrequencyRows, StressRows
 from ..status import COMPENSATION
+from .creep import Creep
 from .effect import Effect
 from .weight import Weight
 
@@ -28,13 +29,15 @@ class Compensation:
     """Subtracts the effects on the pads of one skin that are no load.
 
     Attributes:
+        creep: The compensation of creep, which a tare needs.
         effects: The effects, in the order in which they are subtracted. Creep comes after effects
             of the electronics, which do not strain the elastomer, and before those that do.
     """
 
     def __init__(self, pipeline: Pipeline) -> None:
         self._pipeline = pipeline
-        self.effects: list[Effect] = [Weight(pipeline)]
+        self.creep = Creep(pipeline)
+        self.effects: list[Effect] = [self.creep, Weight(pipeline)]
         self._active: list[Effect] = []
 
     def process(

@@ -112,23 +112,39 @@ class WeightModel(EffectModel):
 
 @dataclass(frozen=True, eq=False)
 class CreepModel(EffectModel):
-    """Linear viscoelastic law of each pad, as a Prony series.
+    """Linear viscoelastic law of the foam of each pad: a generalised Maxwell body.
 
-    A step of stress by 1 that lasts for the time t changes the reading of pad p by
-    1 + sum_k amplitude_pk (1 - exp(-t / time_k)).
+    The reading u of a pad is its strain times the modulus that it has at once. If a strain lasts
+    for the time t, the stress relaxes to u (1 - sum_k amplitude_pk (1 - exp(-t / time_k))).
 
     Attributes:
-        time: Time constants (K,), in s, in rising order.
-        amplitude: Amplitudes of each pad (P, K), relative to the reading at once.
-        deviation: Standard deviation of `amplitude` (P, K); None: it is not known.
+        time: Relaxation times (K,), in s, in rising order.
+        amplitude: Amplitudes of each pad (P, K), relative to the stress at once.
+        deviation: Patterns (S, P, K) of one standard deviation of `amplitude` each, which are
+            independent of each other; None: they are not known.
     """
 
     key = "creep"
-    axes: ClassVar[Mapping[str, int]] = {"time": 1, "amplitude": 2, "deviation": 2}
+    axes: ClassVar[Mapping[str, int]] = {"time": 1, "amplitude": 2, "deviation": 3}
 
     time: Array
     amplitude: Array
     deviation: Array | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        shape = len(self.amplitude), len(self.time)
+        deviation = np.zeros((0, *shape)) if self.deviation is None else self.deviation
+        if self.amplitude.shape != shape or deviation.shape[1:] != shape:
+            raise CalibrationError(
+                f"creep: amplitude and deviation have the shapes {self.amplitude.shape} and "
+                f"{deviation.shape}; give {len(self.time)} numbers per pad, one for each time"
+            )
+        if (np.diff(self.time, prepend=0) <= 0).any() or (self.amplitude.sum(axis=1) >= 1).any():
+            raise CalibrationError(
+                "creep: times must be above 0 and rise, and amplitudes of a pad add up to less "
+                "than 1, or the foam would flow away under a load"
+            )
 
 
 @dataclass(frozen=True, eq=False)
