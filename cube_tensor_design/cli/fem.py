@@ -7,6 +7,7 @@ from __future__ import annotations
 import argparse
 import math
 import shlex
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cube_tensor_driver.cli.parser import Parser
@@ -14,14 +15,17 @@ from cube_tensor_driver.cli.parser import Parser
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from rich.console import Console
     from rich.table import Table
 
+    from cube_tensor_driver.core.arrays import Array
     from cube_tensor_driver.core.layout import Layout
 
     from ..fem.body import Body
     from ..fem.fem import Response
     from ..fem.model import Model
     from ..fem.thermal import ThermalStress
+    from ..fem.weight import WeightResponse
     from ..studies.surface_study import SurfaceRow, SurfaceStudy
 
 MAX_STRUCTURE_RESIDUAL = 1e-3
@@ -43,7 +47,10 @@ THERMAL_HEADER = """Stress on each pad in Pa per K of the temperature P_k(s), k 
 P_k is the Legendre polynomial, s grows from -1 at the ground to 1 at the surface."""
 """Comment at the top of a file of thermal stress."""
 SMALLEST_SHOWN_STRESS = 0.05
-"""Thermal stress in Pa/K (gradient in Pa/m/K) below which a component is not printed."""
+"""Stress by weight in Pa or by temperature in Pa/K (gradient in Pa/m or Pa/m/K) below which a
+component is not printed."""
+COMPUTATIONS = ("surface", "temperature", "weight")
+"""Options that ask for another computation than the response to linear stress fields."""
 MIN_SHOWN_SHARE = 0.05
 """Share of the largest stress under a load below which no ratio of measured to true stress is
 printed, because it would be noise."""
@@ -68,6 +75,19 @@ def arguments(parser: Parser) -> None:
         action="store_true",
         help="bond the lower face to rigid ground, take the width as the pitch of the cubes, and "
         "compute the stress of the pads per K, because the elastomer expands",
+    )
+    parser.add_argument(
+        "--weight",
+        action="store_true",
+        help="bond the lower face to rigid ground, take the width as the pitch of the cubes, and "
+        "compute the stress of the pads by weight and inertia, from the densities in the model",
+    )
+    parser.add_argument(
+        "--base",
+        type=Path,
+        metavar="FILE",
+        help="calibration to which --weight adds its result (default: the shipped one of the "
+        "layout)",
     )
     parser.add_output(
         "-o",
@@ -94,22 +114,25 @@ def run(options: argparse.Namespace) -> int:
     from ..fem.fem import Response, compute_response
     from ..fem.model import read_model
     from ..fem.thermal import ThermalStress, compute_thermal_stress
+    from ..fem.weight import WeightResponse, compute_weight
     from ..studies.surface_study import study_surface
 
     model = read_model(options.model)
     _check_output(options, model)
     body, layout = model.body, model.layout
-    is_on_ground = options.surface or options.temperature
+    is_on_ground = options.surface or options.temperature or options.weight
     place = " on rigid ground" if is_on_ground else ""
     symmetry = "" if is_on_ground else f", symmetry {model.symmetry}"
     print(f"{describe(body, layout)}{place}; {layout.n_pads} pads{symmetry}", flush=True)
-    result: Response | SurfaceStudy | ThermalStress
+    result: Response | SurfaceStudy | ThermalStress | WeightResponse
     # The factorisation runs in C, where Ctrl-C would not be noticed.
     with ends_at_once(), progress_bar() as report:
         if options.surface:
             result = study_surface(body, layout, options.meshes, model.neglect, report)
         elif options.temperature:
             result = compute_thermal_stress(body, layout, options.meshes, report)
+        elif options.weight:
+            result = compute_weight(body, layout, options.meshes, report)
         else:
             result = compute_response(body, layout, model.symmetry, options.meshes, report)
     if options.json is not None:
@@ -118,6 +141,8 @@ def run(options: argparse.Namespace) -> int:
         show_response(result)
     elif isinstance(result, ThermalStress):
         show_thermal_stress(result)
+    elif isinstance(result, WeightResponse):
+        show_weight(result)
     else:
         show_surface(result)
     if options.output is not None:
@@ -130,8 +155,11 @@ def _check_output(options: argparse.Namespace, model: Model) -> None:
     from cube_tensor_driver.config.output_files import check_yaml
     from cube_tensor_driver.core.errors import ConfigError
 
-    if options.surface and options.temperature:
-        raise ConfigError("--surface and --temperature are two computations; give one of them")
+    chosen = [f"--{name}" for name in COMPUTATIONS if getattr(options, name)]
+    if len(chosen) > 1:
+        raise ConfigError(f"{' and '.join(chosen)} are different computations; give one of them")
+    if options.base is not None and not options.weight:
+        raise ConfigError("--base is for --weight, which adds its result to a calibration")
     path = options.output
     if path is None:
         return
@@ -175,7 +203,7 @@ def _command(options: argparse.Namespace) -> str:
     # Only what changes the result; the default number of meshes is left out.
     if options.model is not None:
         words.append(options.model)
-    words += [f"--{name}" for name in ("surface", "temperature") if getattr(options, name)]
+    words += [f"--{name}" for name in COMPUTATIONS if getattr(options, name)]
     if options.meshes != 3:
         words += ["--meshes", str(options.meshes)]
     return shlex.join(words)
@@ -184,15 +212,16 @@ def _command(options: argparse.Namespace) -> str:
 def _write(
     options: argparse.Namespace,
     model: Model,
-    result: Response | SurfaceStudy | ThermalStress,
+    result: Response | SurfaceStudy | ThermalStress | WeightResponse,
 ) -> None:
-    """Write the calibration of a response, or the influence functions or the thermal stress of a
-    cube on ground."""
+    """Write the calibration of a response, that of another with the response to weight, or the
+    influence functions or the thermal stress of a cube on ground."""
     from cube_tensor_driver.config.yaml import write_yaml
     from cube_tensor_driver.mechanics.influence_file import write_influence
 
     from ..fem.fem import Response
     from ..fem.thermal import ThermalStress
+    from ..fem.weight import WeightResponse
 
     if isinstance(result, Response):
         _write_calibration(options, model, result)
@@ -200,9 +229,42 @@ def _write(
         header = f"Made by: {_command(options)} -o {options.output}\n{THERMAL_HEADER}"
         write_yaml(options.output, result.to_dict(), header)
         print(f"wrote {options.output}")
+    elif isinstance(result, WeightResponse):
+        _write_weight(options, result)
     else:
         write_influence(options.output, result.influence, _command(options))
         print(f"wrote {options.output}")
+
+
+def _write_weight(options: argparse.Namespace, result: WeightResponse) -> None:
+    """Write the calibration of --base, or the shipped one of the layout, with the response to
+    specific force."""
+    from dataclasses import replace
+
+    from cube_tensor_driver.config.calibration import (
+        read_calibration,
+        shipped_calibration,
+        write_calibration,
+    )
+    from cube_tensor_driver.core.compensation.models import WeightModel
+    from cube_tensor_driver.core.errors import ConfigError
+
+    base = read_calibration(options.base) if options.base else shipped_calibration(result.layout)
+    if base is None or not base.layout.same_as(result.layout):
+        raise ConfigError(
+            f"--base: the weight is that of a cube with the layout {result.layout.name!r}, and "
+            f"{'no calibration is shipped' if base is None else 'the calibration is not'} for it; "
+            "name a calibration of the same layout"
+        )
+    calibration = replace(base, weight=WeightModel(result.pads))
+    body = result.body
+    header = (
+        f"Made by: {_command(options)} -o {options.output}\n"
+        f"The block weight is computed: {describe(body, result.layout)} on rigid ground, densities "
+        f"{body.density:g} and {body.cube_density:g} kg/m³."
+    )
+    write_calibration(options.output, calibration, header)
+    print(f"wrote {options.output}: calibration {calibration.id}")
 
 
 def _write_calibration(
@@ -321,27 +383,68 @@ def show_thermal_stress(result: ThermalStress) -> None:
     """Print the stress of the pads per K, and what a cube with the shipped calibration measures."""
     from rich.console import Console
 
-    from cube_tensor_driver.config.calibration import shipped_calibration
-    from cube_tensor_driver.core.modes import COMPONENTS, STRESS
-    from cube_tensor_driver.core.pipeline import Pipeline
-
     console = Console(highlight=False)
     title = "stress of the pads, Pa per K of a temperature P0 (uniform), P1, ... of the height"
     table = new_table(title, "pad", [f"P{degree}" for degree in range(result.pads.shape[1])])
     for pad, row in zip(result.layout.pads, result.pads, strict=True):
         table.add_row(pad, *(format_number(value, 2) for value in row))
     console.print(table)
-    if result.change is not None:
-        console.print(f"change from the mesh before: {100 * result.change:.2g} %")
-    calibration = shipped_calibration(result.layout)
+    _show_change(console, result.change)
+    _show_measured(console, result.layout, result.pads[:, 0], "", "/K")
+
+
+def _show_change(console: Console, change: float | None) -> None:
+    """Print the change of a result from the mesh before, relative to its largest value."""
+    if change is not None:
+        console.print(f"change from the mesh before: {100 * change:.2g} %")
+
+
+def _show_measured(
+    console: Console,
+    layout: Layout,
+    pads: Array,
+    label: str,
+    unit: str,
+) -> None:
+    """Print what a cube with the shipped calibration of its layout measures, if there is one.
+
+    Args:
+        console: Where to print.
+        layout: Layout of the cube.
+        pads: Stress on each pad (P,), in Pa per `unit`.
+        label: Text in front of each line, or "".
+        unit: Text after Pa and Pa/mm, such as "/K".
+    """
+    from cube_tensor_driver.config.calibration import shipped_calibration
+    from cube_tensor_driver.core.modes import COMPONENTS, STRESS
+    from cube_tensor_driver.core.pipeline import Pipeline
+
+    calibration = shipped_calibration(layout)
     if calibration is None:
         return
-    uniform = Pipeline([calibration]).matrix(0) @ result.pads[:, 0]
-    for name, value in zip(COMPONENTS, uniform.tolist(), strict=True):
+    measured = Pipeline([calibration]).matrix(0) @ pads
+    for name, value in zip(COMPONENTS, measured.tolist(), strict=True):
         # Symmetry makes most components vanish but for rounding.
         if abs(value) > SMALLEST_SHOWN_STRESS:
-            text = f"{value:+.1f} Pa/K" if name in STRESS else f"{1e-3 * value:+.1f} Pa/mm/K"
-            console.print(f"measured with the shipped calibration: {name} {text}")
+            text = f"{value:+.1f} Pa" if name in STRESS else f"{1e-3 * value:+.1f} Pa/mm"
+            console.print(f"{label}measured with the shipped calibration: {name} {text}{unit}")
+
+
+def show_weight(result: WeightResponse) -> None:
+    """Print the stress of the pads per m/s², and what a cube with the shipped calibration measures
+    under the weight of each pose."""
+    from rich.console import Console
+
+    from cube_tensor_driver.core.compensation.weight import STANDARD_GRAVITY
+
+    console = Console(highlight=False)
+    table = new_table("stress of the pads, Pa per m/s² of specific force", "pad", "xyz")
+    for pad, row in zip(result.layout.pads, result.pads, strict=True):
+        table.add_row(pad, *(format_number(value, 3) for value in row))
+    console.print(table)
+    _show_change(console, result.change)
+    for axis, pads in zip("xyz", result.pads.T, strict=True):
+        _show_measured(console, result.layout, STANDARD_GRAVITY * pads, f"{axis} up, ", "")
 
 
 def show_surface(study: SurfaceStudy) -> None:

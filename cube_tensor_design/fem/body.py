@@ -74,6 +74,9 @@ class Body:
         confined: Whether the sides slide on walls. The layer then has no edges, and cubes in it
             whose pitch is the width.
         expansion: Linear thermal expansion of the elastomer, in 1/K.
+        density: Density of the elastomer, in kg/m³. Silicones have 970 to 1150.
+        cube_density: Density of the cube, in kg/m³: 7850 for steel, 2500 for glass, 1190 for
+            acrylic.
         cube_expansion: Linear thermal expansion of the cube, in 1/K. It is small: 12e-6 for steel.
 
     Raises:
@@ -95,9 +98,12 @@ class Body:
     confined: bool = False
     expansion: float = 3e-4
     cube_expansion: float = 0.0
+    density: float = 1070.0
+    cube_density: float = 7850.0
 
     def __post_init__(self) -> None:
-        for name in ("width", "depth", "height", "side", "young", "cube_young"):
+        positive = ("width", "depth", "height", "side", "young", "cube_young")
+        for name in (*positive, "density", "cube_density"):
             value = getattr(self, name)
             if not value > 0 or (np.isinf(value) and name != "cube_young"):
                 raise ElasticError(f"{name} is {value}; it must be a positive number in SI units")

@@ -51,6 +51,7 @@ _POISSON = real(
     exclusiveMaximum=0.5,
 )
 _EXPANSION = real("a thermal expansion in 1/K")
+_DENSITY = real("a density in kg/m³ greater than 0", exclusiveMinimum=0)
 _MODES = list_of(TEXT, "names of modes") | {
     "minItems": 0,
     "description": "a list of modes",
@@ -68,6 +69,7 @@ _BODY = {
     "young": _YOUNG,
     "poisson": _POISSON,
     "expansion": _EXPANSION,
+    "density": _DENSITY,
 }
 _CUBE = {
     "side": _LENGTH,
@@ -75,6 +77,7 @@ _CUBE = {
     "young": _YOUNG,
     "poisson": _POISSON,
     "expansion": _EXPANSION,
+    "density": _DENSITY,
     "x": _OFFSET,
     "z": _OFFSET,
 }
@@ -177,7 +180,8 @@ def _build_body(data: Mapping[str, Any]) -> Body:
     if cube.pop("rigid", False):
         cube["young"] = math.inf
     for key, value in cube.items():
-        values[f"cube_{key}" if key in ("young", "poisson", "expansion") else key] = value
+        is_material = f"cube_{key}" in Body.__annotations__
+        values[f"cube_{key}" if is_material else key] = value
     if "plane" in data:
         values["plane"] = data["plane"]
     return Body(**values)

@@ -147,7 +147,9 @@ class Solid:
             body: Lame's constants lambda and mu of the body.
             cube: Lame's constants of the cube in the same unit; None: the cube is rigid.
             ground: Whether the lower face is held at rest; then the cube must be elastic.
-            confined: Whether the sides slide on walls: they do not move along their normals.
+            confined: Whether the sides are mirrors, as between the equal cells of a skin without
+                edges: they do not move along their normals in an even field, and only along these
+                in an odd one.
         """
         self.dim = int(mesh.dim())
         self.order = 4 if self.dim == 2 else 2
@@ -278,6 +280,20 @@ class Solid:
         pressures = load(np.asarray(part.default_parameters()["x"]))
         return np.stack([form.assemble(part, p=p) for p in pressures], axis=1)
 
+    def body_forces(self, axis: int, in_cube: bool) -> Array:
+        """Return the nodal forces (dofs,) of a force of 1 per volume along an axis.
+
+        Args:
+            axis: Number of the axis.
+            in_cube: Whether the force acts in the cube; else it acts in the body.
+        """
+        mesh = self.basis.mesh
+        centres = mesh.p[:, mesh.t].mean(axis=1)
+        is_cube = np.all(np.abs(centres) < 1.0, axis=0)
+        part = self._restrict(is_cube == in_cube)
+        forces: Array = skfem.LinearForm(lambda v, _: v[axis]).assemble(part)
+        return forces
+
     def pad_weights(self, layout: Layout, parity: Parity) -> Array:
         """Return weights (P, dofs) from nodal forces on the body to the mean stresses of the pads.
 
@@ -310,7 +326,8 @@ class Solid:
         if self._confined:
             for k in range(self.dim - 1):
                 at_side = _is_at(x[k], x[k].max()) | _is_at(x[k], x[k].min())
-                held |= at_side & (np.abs(x[k]) > 1.0) & (component == k)
+                is_normal = component == k
+                held |= at_side & (np.abs(x[k]) > 1.0) & (is_normal == (parity[k] >= 0))
         if self._ground:
             return held | _is_at(x[-1], x[-1].min())
         if self.is_rigid:

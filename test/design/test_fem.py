@@ -25,6 +25,7 @@ from cube_tensor_design.fem.fem import calibration_from_fem, compute_response
 from cube_tensor_design.fem.pads import interval_weights
 from cube_tensor_design.fem.solid import Solid, lame, stiffness
 from cube_tensor_design.fem.thermal import N_PROFILES, compute_thermal_stress
+from cube_tensor_design.fem.weight import compute_weight
 from cube_tensor_design.paper.virtual_bench import VirtualBench
 from cube_tensor_driver.config.calibration import read_calibration
 from cube_tensor_driver.core.errors import ElasticError, LayoutError, SymmetryError
@@ -481,3 +482,34 @@ def test_only_the_difference_of_the_expansions_stresses_a_cube_and_its_layer():
     rigid = Body(width=12e-3, cube_young=RIGID)
     steel = compute_thermal_stress(rigid, layout).pads[:, 0]
     np.testing.assert_allclose(first, steel, rtol=1e-4)
+
+
+# weight and inertia
+
+
+@pytest.mark.parametrize("place", [{}, {"z": -1.5e-3}], ids=["centre", "off centre"])
+def test_a_layer_without_a_cube_weighs_rho_g_h(place):
+    """sigma_zz = -rho s_z h below a free surface, and sigma_xx = nu / (1 - nu) sigma_zz.
+
+    Along x there is only shear, which no pad measures. The "cube" is elastomer."""
+    layout, density = LAYOUTS["planar"], 1070.0
+    body = Body(width=12e-3, density=density, cube_density=density, **place)
+    body = replace(body, cube_young=body.young, cube_poisson=body.poisson)
+    pads = compute_weight(body, layout).pads
+    depth = body.height / 2 - body.z - 2e-3 * layout.positions[:, 2]
+    ratio = np.where(layout.normals[:, 2] != 0, 1, 0.48 / (1 - 0.48))
+    np.testing.assert_allclose(pads[:, 2], -density * depth * ratio, rtol=1e-6)
+    np.testing.assert_allclose(pads[:, :2], 0, atol=1e-6)
+
+
+def test_a_rigid_bar_stands_on_the_elastomer_below_it():
+    """Balance of a cell that the bar nearly fills: what is above a plane weighs on it. The gap beside
+    the bar, a tenth of the cell, carries about as much per width, which costs some percent."""
+    body = Body(width=4.41e-3, cube_young=RIGID, density=1000.0, cube_density=8000.0)
+    pads = compute_weight(body, HALVES).pads[:, 2]
+    is_top, is_bottom = (HALVES.normals[:, 2] == sign for sign in (1, -1))
+    bar, gap = 8000 * 4e-3 * 4e-3, 1000 * 0.41e-3 * 4e-3
+    above = 1000 * 3.5e-3
+    assert pads[is_top].mean() == pytest.approx(-above, rel=0.1)
+    below = above + (bar + gap) / 4.41e-3
+    assert pads[is_bottom].mean() == pytest.approx(-below, rel=0.1)

@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from conftest import ROOT
 from cube_tensor_design.fem import body as bodies
 from cube_tensor_design.fem import memory
 from cube_tensor_design.fem.thermal import compute_thermal_stress
+from cube_tensor_design.fem.weight import compute_weight
 from cube_tensor_design.paper import experiments as paper
 from cube_tensor_design.paper import rod_parts, rod_shear
 from cube_tensor_design.studies.layout_study import LayoutStudy
@@ -123,6 +125,27 @@ def test_thermal_stress_is_shown_and_written(fem, tmp_path, capsys):
     components = Pipeline([shipped_calibration(LAYOUTS["planar"])]).matrix(0) @ (2 * usual[:, 0])
     assert f"shipped calibration: xx {components[0]:+.1f} Pa/K" in shown
     assert f"zz_z {1e-3 * components[14]:+.1f} Pa/mm/K" in shown
+
+
+def test_weight_is_shown_and_added_to_a_calibration(fem, tmp_path, capsys):
+    saved, model = tmp_path / "heavy.yaml", "body: {width: 0.012, density: 2140.0}\n"
+    assert fem(model, "--weight", "--meshes", 1, "-o", saved) == 0
+    shown = capsys.readouterr().out
+    shipped, heavy = shipped_calibration(LAYOUTS["planar"]), read_calibration(saved)
+    assert replace(heavy, weight=None).id == shipped.id != heavy.id
+    expected = compute_weight(bodies.Body(width=12e-3, density=2140.0), LAYOUTS["planar"]).pads
+    np.testing.assert_allclose(heavy.weight.response, expected)
+    components = Pipeline([shipped]).matrix(0) @ (9.80665 * expected)
+    assert f"z up, measured with the shipped calibration: zz {components[2, 2]:+.1f} Pa" in shown
+    assert f"x up, measured with the shipped calibration: zx {components[4, 0]:+.1f} Pa" in shown
+    again = tmp_path / "again.yaml"
+    assert fem("body: {width: 0.012}", "--weight", "--meshes", 1, "--base", saved, "-o", again) == 0
+    assert fem(model, "--weight", "--surface") == 1
+    assert "--surface and --weight are different computations" in capsys.readouterr().err
+    assert fem(model, "--base", saved) == 1
+    other = "body: {width: 0.012}\npads: {width: 0.0009}"
+    assert fem(other, "--weight", "--meshes", 1, "-o", again) == 1
+    assert "name a calibration of the same layout" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("layout", ["planar", "cube"])
