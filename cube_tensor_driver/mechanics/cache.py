@@ -36,6 +36,7 @@ _CODE = (
     "mechanics/circular.py",
     "mechanics/spectra.py",
     "mechanics/kernels.py",
+    "mechanics/load_response.py",
     "mechanics/contact_tables.py",
     "mechanics/cache.py",
     "touch/prior.py",

@@ -87,6 +87,53 @@ Row vectors are multiplied from the left: ``parts @ FIELD_FROM_CIRCULAR``.
 """
 
 
+def rotation_phases(angle: Array, order: Orders) -> Complex:
+    """Return the phases exp(i m angle) by which rotations multiply circular components of order m.
+
+    Args:
+        angle: Angles (N,) in rad.
+        order: Orders m (n,) of the circular components.
+
+    Returns:
+        Phases (N, n).
+    """
+    phases: Complex = np.exp(1j * angle[:, None] * order)
+    return phases
+
+
+def rotate_loads(
+    parts: Array,
+    direction: Array,
+    angle: Array,
+    order: Orders,
+) -> Array:
+    """Return circular components in rotated frames under unit loads along x, y and z.
+
+    Args:
+        parts: Functions R, Z and T (N, 3, n) of the file head at the distances of N cubes from
+            their load.
+        direction: Directions (N,) from the load to the cube, from the x axis on, in rad.
+        angle: The same directions (N,) in the frame of the cube, in rad.
+        order: Orders m (n,) of the circular components.
+
+    Returns:
+        Real parts and then imaginary parts (N, 3, 2 n), for loads along x, y and z.
+    """
+    radial = parts[:, 0]
+    normal = parts[:, 1]
+    across = 1j * parts[:, 2]
+
+    # A force along x has the components F_r = cos(phi) and F_t = -sin(phi).
+    cosine = np.cos(direction)[:, None]
+    sine = np.sin(direction)[:, None]
+    along_x = cosine * radial - sine * across
+    along_y = sine * radial + cosine * across
+    loads = np.stack([along_x, along_y, normal], axis=1)
+
+    rotated = rotation_phases(angle, order)[:, None] * loads
+    return np.concatenate([rotated.real, rotated.imag], axis=2)
+
+
 def sum_rotated(
     circular: NDArray[np.complex64], rotation: NDArray[np.complexfloating]
 ) -> tuple[Array, Array]:

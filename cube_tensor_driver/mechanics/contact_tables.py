@@ -37,8 +37,9 @@ from scipy.interpolate import CubicSpline
 from ..core.arrays import Array, Complex, Index, Single
 from .cache import Arrays, load_or_compute
 from .circular import ORDERS, sum_rotated
-from .kernels import POINTS_PER_DEPTH, REACH_DEPTHS, disc_spectrum
+from .kernels import POINTS_PER_DEPTH, REACH_DEPTHS
 from .layer import Layer
+from .load_response import disc_spectrum
 from .spectra import layer_spectra, tabulate_bessel
 
 CONTACT_SIZES = np.geomspace(0.1, 5.0, 23)

@@ -27,11 +27,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.arrays import Array, Complex, Index
+from ..core.arrays import Array, Index
 from ..core.modes import COMPONENTS, STRESS
 from .cache import Arrays, load_or_compute
-from .circular import CIRCULAR_FROM_FIELD, FIELD_FROM_CIRCULAR, ORDERS, Orders
+from .circular import (
+    CIRCULAR_FROM_FIELD,
+    FIELD_FROM_CIRCULAR,
+    ORDERS,
+    Orders,
+    rotate_loads,
+    rotation_phases,
+)
 from .layer import FIELD, Layer
+from .load_response import disc_spectrum
 from .spectra import BesselTable, Spectra, layer_spectra, tabulate_bessel
 
 PRIOR_LENGTHS = (0.2, 0.8)
@@ -444,19 +452,7 @@ class Kernels:
         """
         distance, direction = _polar(place)
         parts = self._interpolate(table, distance)
-        radial = parts[:, 0]
-        normal = parts[:, 1]
-        across = 1j * parts[:, 2]
-
-        # A force along x has the components F_r = cos(phi) and F_t = -sin(phi).
-        cosine = np.cos(direction)[:, None]
-        sine = np.sin(direction)[:, None]
-        along_x = cosine * radial - sine * across
-        along_y = sine * radial + cosine * across
-        loads = np.stack([along_x, along_y, normal], axis=1)
-
-        rotated = _phases(direction - angle, order)[:, None] * loads
-        return np.concatenate([rotated.real, rotated.imag], axis=2)
+        return rotate_loads(parts, direction, direction - angle, order)
 
     def _measure(self, circular: Array, variant: Index) -> Array:
         """Convert the n circular components at N cubes to the components that the cubes measure.
@@ -487,7 +483,7 @@ class Kernels:
             Two matrices (N, 15, n): for the real parts of the circular components, and for their
             imaginary parts.
         """
-        phases = _phases(angle, self._order)[:, None]
+        phases = rotation_phases(angle, self._order)[:, None]
         real, imaginary = np.split(
             self.component_matrices.swapaxes(1, 2),
             2,
@@ -560,18 +556,6 @@ def hertz_pressure(distance: Array, size: float) -> Array:
     return np.asarray(peak * np.sqrt(inside))
 
 
-def disc_spectrum(x: Array) -> Array:
-    """Compute the spectrum (Fourier transform) B of the pressure of a Hertz contact with 1 N.
-
-    Args:
-        x: Wavenumbers (...) in 1/m multiplied by the radius of the contact in m.
-    """
-    # Near x = 0, sin x - x cos x would lose all digits, so a Taylor series replaces it.
-    safe = np.maximum(x, 1e-2)
-    exact = 3 * (np.sin(safe) - safe * np.cos(safe)) / safe**3
-    return np.where(x < 1e-2, 1 - x**2 / 10, exact)
-
-
 def _prior_spectrum(wavenumber: Array) -> Array:
     """Return the spectrum S of the random pressure that serves as prior, divided by depth^2.
 
@@ -595,20 +579,6 @@ def _polar(place: Array) -> tuple[Array, Array]:
     """
     x, y = place.T
     return np.hypot(x, y), np.arctan2(y, x)
-
-
-def _phases(angle: Array, order: Orders) -> Complex:
-    """Return the phases exp(i m angle) by which rotations multiply circular components of order m.
-
-    Args:
-        angle: Angles (N,) in rad.
-        order: Orders m (n,) of the circular components.
-
-    Returns:
-        Phases (N, n).
-    """
-    phases: Complex = np.exp(1j * angle[:, None] * order)
-    return phases
 
 
 def _cubic_weights(index: Array | float) -> tuple[Index, Array]:

@@ -1,0 +1,325 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
+"""Detection of touch in every scan (one sample of every cube): whether, where and how hard.
+
+The pressure of a cube is -zz minus its slow part (high-pass). The sequential test is Page's CUSUM
+of the pressure p over its standard deviation sigma::
+
+    S <- max(0, S + p / sigma - REFERENCE),     touch begins when S > h and ends when S = 0
+
+Of all components that a cube measures, zz falls off fastest with the distance r from a load (r^-5
+below a point force; the others r^-3 or r^-4), so that a strong load does not look like touches of
+cubes far away. The test has one sign, because after a load the elastomer recovers in the other.
+
+Source: D. C. Montgomery, Introduction to Statistical Quality Control (2013), 9.1 (CUSUM); D.
+Siegmund, Sequential Analysis (1985), 2.6 (mean time between false alarms). numpy alone is used,
+because the reconstruction node does not load scipy.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..config.skin import Skin, as_skin
+from ..core.arguments import check_number
+from ..core.arrays import Array, Index, PadMasks
+from ..core.modes import COMPONENTS
+from ..core.pipeline import Pipeline
+from ..core.rows import StressRows
+from .pad_noise import GAIN_ERROR
+from .touch_forces import estimate_forces
+
+FALSE_ALARMS = 1.0
+"""Default rate of touches found in noise alone, per hour, of the whole skin."""
+
+DEFAULT_RATE_HZ = 1000.0
+"""Sampling rate of each cube, in Hz, that is assumed if the skin file states none."""
+
+TIME_CONSTANT_S = 1.0
+"""Time constant of the high-pass, in s. The pressure of a load that grows more slowly than about
+2 sigma in this time (2 Pa/s with 24 pads) counts as drift."""
+
+REFERENCE = 2.0
+"""Reference value of the CUSUM, in standard deviations of the noise. It is half of the smallest
+change of the pressure that is to be found in two scans (samples of every cube)."""
+
+OVERSHOOT = 1.04
+"""Reduction of the limit of the CUSUM, in standard deviations, because the sum does not end at the
+limit but beyond it. With `REFERENCE` = 2 the true mean time between false alarms, from its integral
+equation, is 1.05 to 1.15 times the stated one."""
+
+SETTLING_ROWS = 50
+"""Number of samples of a cube from which its slow part is averaged before touch is looked for. They
+add 1 % to the standard deviation of the pressure."""
+
+NEIGHBOURS = 9
+"""Number of cubes that decide together where a touch is, and from which its force is estimated: the
+cube of the touch and those nearest to it."""
+
+SPREAD = 0.25
+"""Largest ratio of the pressures, other than by noise, of a cube and of a neighbour nearer to the
+load by one pitch, if both are far from the load. It limits how far a load is felt."""
+
+FAR = 1e-4
+"""Largest ratio of the pressure of a cube at least seven pitches away from a load to the largest
+pressure, at a pitch of 8 mm, a depth of 5 mm, and with a shear force of half the normal one."""
+
+DRIFT = 0.5
+"""Largest drift of the pressure, in Pa/s, that must not count as touch while the slow part is not
+followed because of a load. Pads drift by about 1e-6 of their frequency per second, or 0.4 Pa/s."""
+
+REMAINDER = 0.02
+"""Largest share of a pressure that remains after the load has gone, because the foam of the pads
+creeps."""
+
+MIN_RELEASE = 8.0
+"""Smallest fall of the pressure below its slow part, in standard deviations, at which a load has
+ended that was taken for the slow part. The slow part then starts again."""
+
+STALE_NS = 1_000_000_000
+"""Time, in ns, without a sample of a cube after which nothing is known of it."""
+
+PRESSURE = COMPONENTS.index("zz")
+"""Index in `COMPONENTS` of the stress zz, whose negative is the pressure."""
+
+
+class Touches(NamedTuple):
+    """The m touches in one scan (sample of every cube), the one with the largest pressure first.
+
+    Attributes:
+        stamp_ns: Time of the earliest sample of the scan, in ns of the source's clock.
+        cube: Indices (m,) of the cubes with a larger pressure than their neighbours.
+        pressure: Pressure (m,) at the centre of this cube, without its slow part, in Pa.
+        pressure_uncertainty: Standard deviation (m,) of `pressure`, in Pa.
+        force: Force (m, 3) on the skin within about a pitch around this cube, along x, y and z of
+            this cube's frame, in N. NaN if the skin file states no elastomer, or if a component of
+            this cube or of a neighbour is missing.
+        force_uncertainty: Standard deviation (m, 3) of `force`, in N.
+    """
+
+    stamp_ns: int
+    cube: Index
+    pressure: Array
+    pressure_uncertainty: Array
+    force: Array
+    force_uncertainty: Array
+
+
+class Touch:
+    """Finds touches in the stress of a skin, scan by scan (samples of every cube).
+
+    The work of a scan does not depend on the load. Cubes that do not observe the stress zz find no
+    touch.
+
+    Attributes:
+        limit: Limit h of the CUSUM, in standard deviations of the noise.
+    """
+
+    def __init__(self, skin: Skin | str | Path, false_alarms: float = FALSE_ALARMS) -> None:
+        """Prepare the detection, which takes up to some seconds on a large bent skin.
+
+        Args:
+            skin: Skin as from `read_skin`, or the path of a skin file.
+            false_alarms: Rate of touches found in noise alone, per hour, of the whole skin. It
+                holds for noise as in the calibrations, and at the sampling rate in the skin file.
+
+        Raises:
+            ConfigError: The rate is not above 0.
+            ElasticError: The elastomer of the skin file is impossible.
+        """
+        allowed = "a number above 0, per hour"
+        check_number("false_alarms", false_alarms, lambda x: 0 < x < math.inf, allowed)
+        skin = as_skin(skin)
+        n = len(skin.cubes)
+        tests = 3600 * (skin.rate or DEFAULT_RATE_HZ) * n / false_alarms
+        limit = math.log(2 * REFERENCE**2 * tests) / (2 * REFERENCE) - OVERSHOOT
+        self.limit = max(0.0, limit)
+
+        self._pipeline = Pipeline(skin.calibrations)
+        covariance = np.array([self._pipeline.covariance(cube) for cube in range(n)])
+        variance = np.diagonal(covariance, axis1=1, axis2=2)
+        self._unobserved = np.isnan(variance)
+        self._deviation = np.sqrt(variance[:, PRESSURE])
+        self._near = _find_neighbours(skin.poses.position)
+        self._estimate = None
+        if skin.elastomer is not None:
+            self._estimate = estimate_forces(skin.poses, skin.elastomer, self._near, covariance)
+
+        # Slow part of the values, NaN where unknown, and difference of the values from it, 0 there
+        self._slow = np.full(variance.shape, np.nan)
+        self._change = np.zeros(variance.shape)
+        self._left_out = np.zeros(n, np.uint32)
+        self._stamp_ns = np.zeros(n, np.int64)
+        self._count = np.zeros(n, np.int64)
+        self._margin = np.zeros(n)
+        self._sum = np.zeros(n)
+        self._touched = np.zeros(n, bool)
+        # Upper limit of the pressure that touches cause at each cube, and whether it is above noise
+        self._reach = np.zeros(n)
+        self._held = np.zeros(n, bool)
+
+    def restart(self) -> None:
+        """Start the slow parts again after a tare, which changes all values.
+
+        The present pressures stay. A new touch is found after `SETTLING_ROWS` samples.
+        """
+        self._slow[:] = np.nan
+        self._count[:] = 0
+
+    def update(self, rows: StressRows) -> list[Touches]:
+        """Find the touches in rows (samples of one cube each).
+
+        Args:
+            rows: Rows of one scan, or of several scans one after the other. Within a scan the
+                number of the cube increases.
+
+        Returns:
+            The touches of each scan, the same in one call and in one call for each scan.
+        """
+        is_first = np.diff(rows.cube.astype(int), prepend=len(self._sum)) <= 0
+        bounds = [*np.flatnonzero(is_first).tolist(), len(rows)]
+        return [self._update_scan(rows.select(slice(*pair))) for pair in pairwise(bounds)]
+
+    __call__ = update
+
+    def _update_scan(self, rows: StressRows) -> Touches:
+        cube = rows.cube
+        changed = rows.left_out != self._left_out[cube]
+        if changed.any():
+            self._use_pads(cube[changed], rows.left_out[changed])
+
+        elapsed_s = 1e-9 * (rows.stamp_ns - self._stamp_ns[cube])
+        elapsed_s = np.clip(elapsed_s, 0, TIME_CONSTANT_S)
+        self._stamp_ns[cube] = rows.stamp_ns
+
+        values = np.hstack([rows.stress, rows.gradient]).astype(np.float64)
+        slow = self._slow[cube]
+        # Where a slow part starts again, a load that is there stays.
+        slow = np.where(np.isnan(slow), values - self._change[cube], slow)
+        change = values - slow
+        self._change[cube] = np.where(np.isnan(change), 0, change)
+        self._test(cube, -change[:, PRESSURE], elapsed_s)
+        gain = self._gain(cube, -change[:, PRESSURE], elapsed_s)
+        self._slow[cube] = slow + gain[:, None] * change
+        self._count[cube] += 1
+
+        stale = self._stamp_ns < rows.stamp_ns.max() - STALE_NS
+        self._slow[stale] = np.nan
+        for state in (self._change, self._count, self._sum, self._touched):
+            state[stale] = 0
+        return self._locate(int(rows.stamp_ns.min()))
+
+    def _use_pads(self, cubes: Index, left_out: PadMasks) -> None:
+        """Start the slow parts of cubes again, because the pads in use have changed."""
+        self._left_out[cubes] = left_out
+        self._slow[cubes] = np.nan
+        self._count[cubes] = 0
+        for cube, mask in zip(cubes.tolist(), left_out.tolist(), strict=True):
+            covariance = self._pipeline.covariance(cube, mask)
+            self._deviation[cube] = np.sqrt(covariance[PRESSURE, PRESSURE])
+
+    def _gain(self, cube: NDArray[np.uint16], pressure: Array, elapsed_s: Array) -> Array:
+        """Return the share (k,) of the difference by which the slow part of k cubes follows.
+
+        The arguments are those of `_test`, which is called before.
+        """
+        if not self._touched.any():
+            self._count[cube[pressure < -MIN_RELEASE * self._deviation[cube]]] = 0
+        # The first samples are averaged.
+        gain = np.maximum(elapsed_s / TIME_CONSTANT_S, 1 / (self._count[cube] + 1))
+        return np.where(self._held[cube], 0, gain)
+
+    def _test(self, cube: NDArray[np.uint16], pressure: Array, elapsed_s: Array) -> None:
+        """Add the pressures of k cubes to their sums.
+
+        Args:
+            cube: Indices (k,) of the cubes.
+            pressure: Pressures (k,) without their slow part, in Pa, NaN where unknown.
+            elapsed_s: Time (k,) since the row before, in s, up to `TIME_CONSTANT_S`.
+        """
+        # While the slow part is held, drift and what remains of the load must not count as touch.
+        margin = self._margin[cube]
+        growing = np.fmax(margin, REMAINDER * np.abs(pressure)) + DRIFT * elapsed_s
+        fading = (1 - elapsed_s / TIME_CONSTANT_S) * margin
+        margin = np.where(self._held[cube], growing, fading)
+        self._margin[cube] = margin
+
+        before = self._sum[cube]
+        score = (pressure - margin) / self._deviation[cube]
+        # The upper limit makes a touch end within a few scans after any load.
+        after = np.clip(before + score - REFERENCE, 0, self.limit + REFERENCE)
+        after = np.where(self._count[cube] < SETTLING_ROWS, before, after)
+        self._sum[cube] = np.where(np.isnan(pressure), 0, after)
+        self._touched = (self._sum > self.limit) | (self._touched & (self._sum > 0))
+
+    def _locate(self, stamp_ns: int) -> Touches:
+        """Return the touches and their forces.
+
+        A touch is a touched cube with a larger pressure than its neighbours and than what another
+        load may cause there.
+
+        Args:
+            stamp_ns: Time of the earliest sample of the scan, in ns.
+        """
+        pressure = -self._change[:, PRESSURE]
+        strength = np.where(self._touched, pressure, 0)
+        near = self._near.T
+        is_largest = self._touched & (strength >= strength[near].max(axis=0))
+        # Each scan spreads the reach by one pitch, which is fast compared with the high-pass.
+        spread = SPREAD * self._reach[near].max(axis=0)
+        is_own = strength > np.maximum(spread, FAR * strength.max())
+        self._reach = np.maximum(strength, spread)
+        self._held = self._reach > self._deviation / 2
+
+        cube = np.flatnonzero(is_largest & is_own)
+        cube = cube[np.argsort(-pressure[cube], kind="stable")]
+        own = pressure[cube]
+        margin = self._margin[cube]
+        deviation = np.sqrt(self._deviation[cube] ** 2 + margin**2 + (GAIN_ERROR * own) ** 2)
+        share = np.clip(margin / np.maximum(own, 1e-9), 0, 1)[:, None]
+        return Touches(stamp_ns, cube, own, deviation, *self._estimate_forces(cube, share))
+
+    def _estimate_forces(self, cube: Index, share: Array) -> tuple[Array, Array]:
+        """Return the forces (m, 3) at m cubes and their standard deviations (m, 3), in N.
+
+        Args:
+            cube: Indices (m,) of the cubes.
+            share: Possible share (m, 1) of drift and of earlier loads in the force.
+        """
+        estimate = self._estimate
+        if estimate is None or not len(cube):
+            unknown = np.full((len(cube), 3), np.nan)
+            return unknown, unknown
+        near, kind = self._near[cube], estimate.kind[cube]
+        values = self._change[near].reshape(len(cube), -1, 1)
+        terms = values * estimate.weights[kind]
+        force = terms.sum(axis=1)
+        variance = (
+            estimate.noise[kind] ** 2
+            + GAIN_ERROR**2 * (terms**2).sum(axis=1)
+            + np.einsum("mij,mj->mi", estimate.error[kind] ** 2, force**2)
+            + (share * force) ** 2
+        )
+        is_complete = np.isnan(self._slow[near]) == self._unobserved[near]
+        force[~is_complete.all(axis=(1, 2))] = np.nan
+        return force, np.where(np.isnan(force), np.nan, np.sqrt(variance))
+
+
+def _find_neighbours(position: Array) -> Index:
+    """Return the indices (cubes, W) of the cubes nearest to each cube, itself first.
+
+    Args:
+        position: Positions (cubes, 3) of the cubes, in m.
+    """
+    near = []
+    for one in position:
+        # Rounding keeps neighbours at the same distance in the order of their numbers.
+        distance = np.linalg.norm(position - one, axis=1).round(6)
+        near.append(np.argsort(distance, kind="stable")[:NEIGHBOURS])
+    return np.array(near)
