@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from .device.live import open_links
     from .simulation.source import simulate
     from .touch.inverse import SurfaceInverse
+    from .touch.touch_detection import Touch
 
 __all__ = [
     "CubeError",
@@ -38,6 +39,7 @@ __all__ = [
     "Reconstructor",
     "StressRows",
     "SurfaceInverse",
+    "Touch",
     "open_bag",
     "open_links",
     "read_skin",
@@ -55,6 +57,7 @@ _HOMES = {
     "Reconstructor": ".core.reconstructor",
     "StressRows": ".core.rows",
     "SurfaceInverse": ".touch.inverse",
+    "Touch": ".touch.touch_detection",
     "open_bag": ".bags.source",
     "open_links": ".device.live",
     "read_skin": ".config.skin",

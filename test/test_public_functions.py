@@ -45,6 +45,7 @@ def test_an_argument_that_cannot_be_used_is_named_with_the_fix(call, words):
 def test_a_path_is_accepted_where_a_skin_is():
     assert next(iter(ctd.simulate(str(FILE)))).cube.tolist() == list(range(16))
     assert ctd.SurfaceInverse(FILE).points.shape == ctd.SurfaceInverse(SKIN).points.shape
+    assert ctd.Touch(FILE).limit == ctd.Touch(SKIN).limit
     with ctd.open_links(FILE, port_directory="/nowhere") as source:
         assert source.skin.names == SKIN.names
 

@@ -165,6 +165,15 @@ RECONSTRUCTION = (
         "With true the node publishes one force per cube as a point cloud on `forces`.",
     ),
     Parameter(
+        "touch_false_alarms",
+        0.0,
+        "Rate, per hour, at which noise alone is taken for a touch somewhere on the skin. With a "
+        "value such as 1.0 the node publishes the touches of every scan on `touch`. With 0 it "
+        "looks for none.",
+        span=(0.0, 3600.0),
+        minimum=1e-3,
+    ),
+    Parameter(
         "publish_period",
         0.0,
         "Value of the driver's parameter publish_period, in s. The node computes the depths of its "

@@ -56,18 +56,18 @@ class LoadResponse:
         """
         spacing = 2 * np.pi / (PERIOD_DEPTHS * depth)
         count = int(MAX_WAVENUMBER / depth / spacing)
-        k = spacing * np.arange(-count, count + 1)
+        k: Array = spacing * np.arange(-count, count + 1.0)
         self._step = depth / POINTS_PER_DEPTH
         distance = self._step * np.arange(PERIOD_DEPTHS // 2 * POINTS_PER_DEPTH)
 
         # The waves of -k_x are the complex conjugates of those of k_x, so half of them suffice. One
         # k_x at a time saves memory.
         field = np.zeros((len(distance), len(FIELD), 3))
-        for kx in k[count:]:
-            weight = disc_spectrum(np.hypot(kx, k) * width / 2) * (spacing / (2 * np.pi)) ** 2
-            summed = np.einsum("y,yfl->fl", weight, layer.transfer(kx, k, depth))
+        for kx in k[count:, None]:
+            load = disc_spectrum(np.hypot(kx, k) * width / 2) * (spacing / (2 * np.pi)) ** 2
+            amplitude = (load[:, None, None] * layer.transfer(kx, k, depth)).sum(axis=0)
             waves = np.exp(1j * kx * distance) * (2 if kx else 1)
-            field += np.multiply.outer(waves, summed).real
+            field += np.multiply.outer(waves, amplitude).real
 
         circular = CIRCULAR_FROM_FIELD @ field
         # Towards +x, a force along x is radial, and one along y is across (circular.py).

@@ -245,8 +245,9 @@ def test_programs_of_a_page_run(name):
     poses = CubePoses(np.zeros((1, 3)), np.eye(3)[None], np.full(1, 0.002))
     there = {
         "skin": types.SimpleNamespace(
-            poses=poses, calibrations=[illustrative("planar")], elastomer=None
+            poses=poses, calibrations=[illustrative("planar")], elastomer=None, rate=None
         ),
+        "source": (),
         "poses": poses,
         "values": np.zeros((1, 15)),
     }

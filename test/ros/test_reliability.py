@@ -396,9 +396,10 @@ def test_the_security_policy_allows_what_the_nodes_do(stage, tmp_path):
                 return {each for each in allowed if not any(fnmatch(one, each) for one in there())}
 
             # Discovery tells of a node before it tells of its last topic. The clock is there with
-            # use_sim_time, topics of cubes when somebody listens, traction with method:=inverse.
+            # use_sim_time, topics of cubes when somebody listens, and touch and traction with their
+            # parameters.
             not_in_the_bag = {"/diagnostics", "/driver/info"} if name == "player" else set()
-            may_be_idle = {"/clock", "/cubes/*", "/traction"} | not_in_the_bag
+            may_be_idle = {"/clock", "/cubes/*", "/touch", "/traction"} | not_in_the_bag
             stage.wait(lambda idle=idle, allowed=may_be_idle: idle() <= allowed)
             more = [one for one in there() if not any(fnmatch(one, each) for each in allowed)]
             assert more == [], (name, what)

@@ -63,7 +63,7 @@ is also taken for a bag."""
 
 
 class Reconstruction(CubeNode):
-    """Publishes `stress`, `info`, diagnostics, and the stress and wrench of single cubes.
+    """Publishes `stress`, `touch`, `info`, diagnostics, and stress and wrench of single cubes.
 
     It gets frequencies from the topic `frequencies`, or from a driver in the same process.
     """
@@ -102,6 +102,13 @@ class Reconstruction(CubeNode):
             side=self.value("wrench_side") or None,
             with_forces=bool(self.value("forces")),
         )
+        false_alarms = float(self.value("touch_false_alarms"))
+        self._touch = None
+        if false_alarms:
+            # The import is here, because only this case needs the mechanics of the skin.
+            from .touch_publisher import TouchPublisher
+
+            self._touch = TouchPublisher(self, skin, profile, false_alarms)
         self._info = self.own(self.create_publisher(SkinInfo, "info", LATCHED))
         self._taring = Taring(
             self,
@@ -186,6 +193,7 @@ class Reconstruction(CubeNode):
                 health = recorded.health_at(rows, self._reconstructor) if recorded else None
                 out = self._publisher.make_rows(rows, frame_id)
                 rows = self._note_compensation(rows, stamp_ns)
+                rest_changes = self._reconstructor.rest_changes
                 # The lock keeps a tare from changing the rest frequencies during the computation.
                 stress = self._reconstructor.process(rows, health, out)
                 if self._reconstructor.rest_changes != self._published_rest_changes:
@@ -194,6 +202,8 @@ class Reconstruction(CubeNode):
             self._refuse(error)
             return
         self._publisher.publish(stress, stamp_ns, frame_id)
+        if self._touch is not None:
+            self._touch.publish(stress, rest_changes)
         self._diagnostics.count(stress)
 
     def _note_compensation(self, rows: FrequencyRows, stamp_ns: int) -> FrequencyRows:
