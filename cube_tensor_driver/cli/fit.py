@@ -23,6 +23,7 @@ def arguments(parser: Parser) -> None:
     parser.add_argument(
         "loads",
         type=Path,
+        nargs="?",
         metavar="LOADS",
         help="CSV with columns of pads (Hz) and of modes (Pa) or fx fy fz (N); or a bag",
     )
@@ -34,8 +35,13 @@ def arguments(parser: Parser) -> None:
     parser.add_argument(
         "--cube", metavar="NAME", help="cube of the bag, if there are several in it"
     )
+    parser.add_argument("--layout", metavar="NAME", help="quad, planar, cube, or a YAML file")
     parser.add_argument(
-        "--layout", required=True, metavar="NAME", help="quad, planar, cube, or a YAML file"
+        "--weight",
+        type=Path,
+        metavar="BAG",
+        help="instead of a table, fit the response to weight and inertia to a bag in which an "
+        "unloaded arm is turned through a few poses",
     )
     parser.add_argument(
         "--symmetry",
@@ -70,13 +76,19 @@ def run(options: argparse.Namespace) -> int:
     import datetime
     from dataclasses import replace
 
+    if options.weight is not None:
+        return run_weight(options)
+
     from ..calibrate.fit import fit, measured_stress
     from ..config.calibration import named_layout, write_calibration
     from ..config.output_files import write_json
+    from ..core.errors import ConfigError
     from ..core.symmetry import find_structure
     from ..views.figures.calibration import draw_fit
     from ..views.figures.style import save
 
+    if options.loads is None or options.layout is None:
+        raise ConfigError("./cube fit needs a table of loads and --layout, or --weight BAG")
     layout = named_layout(options.layout)
     loads, base, rest, rest_source = read_inputs(options, layout)
     # A calibration with a uid (unique id of a cube) can only be used for that cube.
@@ -100,6 +112,28 @@ def run(options: argparse.Namespace) -> int:
     calibration = result.calibration(base, created, f"fit of {table}, {len(measured)} loads")
     header = f"./cube fit {table} --layout {options.layout} --symmetry {options.symmetry}"
     write_calibration(options.output, calibration, header)
+    print(f"wrote {options.output}: calibration {calibration.id}")
+    return 0
+
+
+def run_weight(options: argparse.Namespace) -> int:
+    """Fit the response to weight and inertia to a bag, print it and write the calibration."""
+    from rich.console import Console
+
+    from ..calibrate.weight import fit_weight
+    from ..config.calibration import write_calibration
+    from ..views.terminal.output import make_table
+
+    calibration = fit_weight(options.weight, options.cube)
+    model = calibration.weight
+    if model is not None and model.deviation is not None:
+        table = make_table(("pad",), [f"{axis}, Pa per m/s²" for axis in "xyz"])
+        rows = zip(calibration.layout.pads, model.response, model.deviation, strict=True)
+        for pad, values, deviations in rows:
+            pairs = zip(values, deviations, strict=True)
+            table.add_row(pad, *(f"{value:+.3f} ± {sd:.2g}" for value, sd in pairs))
+        Console(highlight=False).print(table)
+    write_calibration(options.output, calibration, f"./cube fit --weight {options.weight.name}")
     print(f"wrote {options.output}: calibration {calibration.id}")
     return 0
 

@@ -503,8 +503,10 @@ def test_a_layer_without_a_cube_weighs_rho_g_h(place):
 
 
 def test_a_rigid_bar_stands_on_the_elastomer_below_it():
-    """Balance of a cell that the bar nearly fills: what is above a plane weighs on it. The gap beside
-    the bar, a tenth of the cell, carries about as much per width, which costs some percent."""
+    """Balance of a cell that the bar nearly fills: what is above a plane weighs on it.
+
+    The gap beside the bar, a tenth of the cell, carries about as much, which costs some percent.
+    """
     body = Body(width=4.41e-3, cube_young=RIGID, density=1000.0, cube_density=8000.0)
     pads = compute_weight(body, HALVES).pads[:, 2]
     is_top, is_bottom = (HALVES.normals[:, 2] == sign for sign in (1, -1))

@@ -1,0 +1,134 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
+"""The response to weight that `./cube fit --weight` finds, against the one that made the bag."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
+
+from bag_maker import START_NS, header, info_of, message
+
+from cube_tensor_driver.bags.metadata import quality, typestore
+from cube_tensor_driver.bags.write import BagWriter
+from cube_tensor_driver.calibrate.weight import fit_weight
+from cube_tensor_driver.cli import main as cli
+from cube_tensor_driver.config.calibration import read_calibration
+from cube_tensor_driver.core.calibration import illustrative
+from cube_tensor_driver.core.errors import BagError
+from cube_tensor_driver.core.oscillator import pad_frequency
+from cube_tensor_driver.core.pipeline import Pipeline
+from cube_tensor_driver.core.rows import FrequencyRows
+from cube_tensor_driver.messages.codec import frequency_codec
+from cube_tensor_driver.messages.types import COMPENSATION, FREQUENCIES, INFO
+
+G = 9.80665
+RNG = np.random.default_rng(5)
+BASE = replace(illustrative("planar"), gain=1 + 0.05 * RNG.normal(size=8))
+RESPONSE = 8 * RNG.normal(size=(8, 3))
+POSES = [[0, 0, G], [0, 0, -G], [G, 0, 0], [0, -G, 0], [0, G, 0], [-G, 0, 0]]
+SECONDS = 5.0
+"""Time in each pose; the arm turns within the last second of it."""
+
+
+def force_at(t: float, poses) -> np.ndarray:
+    k = int(t / SECONDS)
+    turned = np.clip(t / SECONDS - k - 0.8, 0, 1) / 0.2
+    before, after = np.array(poses[k]), np.array(poses[min(k + 1, len(poses) - 1)])
+    return before + turned * (after - before)
+
+
+def make_bag(folder, poses=POSES, spread: float = 0.0, cubes: int = 3, motion: bool = True):
+    """A bag of unloaded cubes with noise and drift, whose responses differ by a factor."""
+    rng = np.random.default_rng(7)
+    skin = SimpleNamespace(
+        name="skin",
+        frame=lambda cube: cube.name,
+        cubes=[
+            SimpleNamespace(name=f"c{k}", link="hub0", index=k, uid=0, calibration=BASE)
+            for k in range(cubes)
+        ],
+    )
+    responses = RESPONSE * (1 + spread * rng.normal(size=(cubes, 1, 1)))
+    store, offset = typestore(), 50 * rng.normal(size=(cubes, 8))
+    with BagWriter(folder) as writer:
+        topics = {"info": INFO, "frequencies": FREQUENCIES}
+        for topic, kind in topics.items() | ({("compensation", COMPENSATION)} if motion else set()):
+            writer.add_topic(f"/{topic}", kind, [quality(latched=topic == "info")])
+        info = info_of(skin, Pipeline([BASE] * cubes), START_NS)
+        writer.write("/info", START_NS, bytes(store.serialize_cdr(info, INFO)))
+        for n in range(round(len(poses) * SECONDS * 25)):
+            stamp_ns, force = START_NS + n * 40_000_000, force_at(n / 25, poses)
+            pads = (BASE.gain[:, None] * responses) @ force + offset * (1 + n / 2000)
+            pads = pads + BASE.noise * rng.normal(size=pads.shape)
+            rows = FrequencyRows.of(
+                np.arange(cubes, dtype=np.uint16),
+                pad_frequency(pads, BASE.rest_frequency, BASE.beta, BASE.modulus),
+                stamp_ns=stamp_ns,
+                sequence=n,
+            )
+            rows = replace(rows, frequency=rows.frequency.astype(np.float32))
+            writer.write("/frequencies", stamp_ns, frequency_codec.encode(rows, b"base\0"))
+            if motion:
+                one = message(
+                    COMPENSATION,
+                    header=header(stamp_ns),
+                    weight=True,
+                    time_offset=np.zeros(1, np.int64),
+                    specific_force=force,
+                    gradient=np.zeros(9),
+                    creep=np.zeros(0),
+                    thermal=np.zeros(0),
+                )
+                data = bytes(store.serialize_cdr(one, COMPENSATION))
+                writer.write("/compensation", stamp_ns + 1, data)
+    return folder
+
+
+def test_the_response_is_found_and_its_deviation_is_stated(tmp_path):
+    """24 numbers of white noise: their error over the stated one is 1 within 5 x 1/sqrt(48)."""
+    model = fit_weight(make_bag(tmp_path / "bag")).weight
+    ratio = (model.response - RESPONSE) / model.deviation
+    assert 0.3 < np.sqrt((ratio**2).mean()) < 1.7
+    assert np.abs(model.response - RESPONSE).max() < 0.1  # Pa per m/s², of 8
+
+
+def test_cubes_that_differ_widen_the_deviation_of_their_mean(tmp_path):
+    folder = make_bag(tmp_path / "bag", spread=0.1, cubes=30)
+    model = fit_weight(folder).weight
+    large = np.abs(RESPONSE) > 3
+    found = (model.deviation / np.abs(RESPONSE))[large]
+    np.testing.assert_allclose(found, 0.1, rtol=0.4)  # the spread of 30 draws, to 3 sigma
+    alone = fit_weight(folder, "c3").weight
+    assert np.median((alone.deviation / np.abs(RESPONSE))[large]) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("changes", "name", "text"),
+    [
+        ({"poses": POSES[:2] * 3}, None, "turn the arm until each axis has pointed upwards"),
+        ({"poses": POSES[:1]}, None, "10 blocks of 0.5 s"),
+        ({"motion": False}, None, "record it while the parameter imu or gravity"),
+        ({"poses": POSES[:1]}, "c9", "no cube 'c9'; its cubes are c0, c1, c2"),
+    ],
+)
+def test_what_does_not_determine_it_is_one_line(tmp_path, changes, name, text):
+    with pytest.raises(BagError, match=text) as error:
+        fit_weight(make_bag(tmp_path / "bag", **changes), name)
+    assert "\n" not in str(error.value)
+
+
+def test_the_command_writes_the_calibration(tmp_path, capsys):
+    bag, saved = make_bag(tmp_path / "bag"), tmp_path / "heavy.yaml"
+    assert cli.main(["fit", "--weight", str(bag), "-o", str(saved)]) == 0
+    found = read_calibration(saved)
+    np.testing.assert_allclose(found.weight.response, RESPONSE, atol=0.1)
+    assert f"{found.weight.response[0, 0]:+.3f} ±" in capsys.readouterr().out
+    assert replace(found, weight=None, source=BASE.source).id == BASE.id
+    assert cli.main(["fit", "-o", str(saved)]) == 1
+    assert "needs a table of loads and --layout, or --weight BAG" in capsys.readouterr().err
