@@ -127,7 +127,7 @@ def test_a_tare_in_one_pose_holds_in_another(turned):
 MODELS = {
     "weight": WeightModel(RESPONSE, np.abs(RESPONSE)),
     "creep": CreepModel(np.array([1.0, 10.0]), 0.1 * np.ones((8, 2))),
-    "thermal": ThermalModel(np.array(25.0), np.array(40.0), np.ones((8, 2))),
+    "thermal": ThermalModel(np.array(25.0), np.array([40.0]), np.ones((8, 2))),
 }
 
 

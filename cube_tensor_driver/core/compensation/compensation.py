@@ -22,6 +22,7 @@ from ..rows import FrequencyRows, StressRows
 from ..status import COMPENSATION
 from .creep import Creep
 from .effect import Effect
+from .thermal import Thermal
 from .weight import Weight
 
 
@@ -30,14 +31,15 @@ class Compensation:
 
     Attributes:
         creep: The compensation of creep, which a tare needs.
-        effects: The effects, in the order in which they are subtracted. Creep comes after effects
-            of the electronics, which do not strain the elastomer, and before those that do.
+        effects: The effects, in the order in which they are subtracted. Creep comes after the
+            effect of temperature, whose model was measured in place and contains the creep of the
+            foam under thermal stress, and before weight, which strains the foam.
     """
 
     def __init__(self, pipeline: Pipeline) -> None:
         self._pipeline = pipeline
         self.creep = Creep(pipeline)
-        self.effects: list[Effect] = [self.creep, Weight(pipeline)]
+        self.effects: list[Effect] = [Thermal(pipeline), self.creep, Weight(pipeline)]
         self._active: list[Effect] = []
 
     def process(

@@ -49,10 +49,11 @@ class EffectModel:
                     f"{self.key}: {name} is {value!r}; it must be finite numbers "
                     f"with {n_axes} axes, one list per pad if there are two"
                 )
-            if shapes.setdefault(n_axes, array.shape) != array.shape:
-                raise CalibrationError(
-                    f"{self.key}: {name} has shape {array.shape}; it must be {shapes[n_axes]}"
-                )
+            # Patterns of deviations may be more or fewer than the values that they are for.
+            shape = array.shape[:1] if name == "ramp" else array.shape
+            wanted = shapes.setdefault(n_axes, array.shape)[: len(shape)]
+            if shape != wanted:
+                raise CalibrationError(f"{self.key}: {name} has shape {shape}; it must be {wanted}")
             array.flags.writeable = False
             object.__setattr__(self, name, array)
 
@@ -152,20 +153,37 @@ class ThermalModel(EffectModel):
     """Reading of each pad over temperature without load, in place, with the lag of the elastomer.
 
     It contains the drift of the electronics and the thermal stress that the expansion of the
-    elastomer causes. With u the measured temperature minus `reference` after a first-order low-pass
-    filter, pad p reads sum_d coefficient_pd u^d, d = 1, 2, ...
+    elastomer causes, so the readings are with the pads' gains. With u the measured temperature
+    minus `reference` after a low-pass filter, pad p reads sum_d coefficient_pd u^d, d = 1, 2, ...
 
     Attributes:
         reference: Temperature, in °C, at which the rest frequencies of the calibration hold.
-        lag: Time constant of the low-pass filter, in s; 0: no lag.
+        lag: Time constants (L,), in s, of low-pass filters in a row, all different; 0: no lag.
         coefficient: Coefficients of each pad (P, D), in Pa/K^d, the linear term first.
-        deviation: Standard deviation of `coefficient` (P, D); None: it is not known.
+        deviation: Standard deviation of `coefficient` (P, D), which is common to all pads up to its
+            sign; None: it is not known.
+        ramp: Patterns (P, K) of one standard deviation each, in Pa per K by which the temperature
+            after the filter lags behind the measured one; None: they are not known.
     """
 
     key = "thermal"
-    axes: ClassVar[Mapping[str, int]] = {"reference": 0, "lag": 0, "coefficient": 2, "deviation": 2}
+    axes: ClassVar[Mapping[str, int]] = {
+        "reference": 0,
+        "lag": 1,
+        "coefficient": 2,
+        "deviation": 2,
+        "ramp": 2,
+    }
 
     reference: Array
     lag: Array
     coefficient: Array
     deviation: Array | None = None
+    ramp: Array | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if len(np.unique(self.lag)) < len(self.lag) or self.lag.min() < 0:
+            raise CalibrationError(
+                f"thermal: lag is {self.lag.tolist()} s; time constants are different, at least 0"
+            )
