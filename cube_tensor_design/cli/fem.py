@@ -95,6 +95,11 @@ def arguments(parser: Parser) -> None:
         help="write the calibration (.yaml), with --surface the influence functions (.npz), or "
         "with --temperature the thermal stress for the simulator (.yaml)",
     )
+    parser.add_output(
+        "--figures",
+        kind="folder",
+        help="write pictures of convergence, response and each load",
+    )
     parser.add_json()
     parser.add_argument(
         "--meshes",
@@ -145,6 +150,8 @@ def run(options: argparse.Namespace) -> int:
         show_weight(result)
     else:
         show_surface(result)
+    if options.figures is not None:
+        _draw(result, options.figures)
     if options.output is not None:
         _write(options, model, result)
     return 0
@@ -160,6 +167,8 @@ def _check_output(options: argparse.Namespace, model: Model) -> None:
         raise ConfigError(f"{' and '.join(chosen)} are different computations; give one of them")
     if options.base is not None and not options.weight:
         raise ConfigError("--base is for --weight, which adds its result to a calibration")
+    if options.figures is not None and (options.temperature or options.weight):
+        raise ConfigError(f"--figures: there are no pictures of {chosen[0]}; leave it out")
     path = options.output
     if path is None:
         return
@@ -175,6 +184,28 @@ def _check_output(options: argparse.Namespace, model: Model) -> None:
             f"-o {path}: layout {model.layout.name!r} lies in a plane, and influence functions for "
             "a skin are of a layout in space; take a model with layout: cube, or leave out -o"
         )
+
+
+def _draw(result: Response | SurfaceStudy, folder: Path) -> None:
+    """Draw influence functions, or convergence, response and the loads of a layout in a plane."""
+    from cube_tensor_driver.views.figures.style import save
+
+    from ..fem.fem import Response
+    from ..figures.deformation import draw_loads
+    from ..figures.response import draw_convergence, draw_influence, draw_response
+    from ..paper.experiments import mode_deformations
+
+    folder.mkdir(parents=True, exist_ok=True)
+    body, layout = result.body, result.layout
+    if isinstance(result, Response):
+        save(draw_convergence(result), folder / "convergence.png")
+        save(draw_response(result), folder / "response.png")
+        if layout.planar:
+            save(draw_loads(layout, mode_deformations(body, layout)), folder / "loads.png")
+    else:
+        influence = draw_influence(result.influence, layout, body.side / 2)
+        save(influence, folder / "influence.png")
+    print(f"pictures in {folder}")
 
 
 def describe(body: Body, layout: Layout) -> str:

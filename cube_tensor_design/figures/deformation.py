@@ -8,12 +8,17 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
+from matplotlib.patches import Patch, Rectangle
 from matplotlib.patheffects import withStroke
 from matplotlib.tri import Triangulation
 
 from cube_tensor_driver.core.arrays import Array
-from cube_tensor_driver.views.figures.style import SIGNED_COLOURS, print_style
+from cube_tensor_driver.core.layout import Layout
+from cube_tensor_driver.views.figures.style import (
+    SIGNED_COLOURS,
+    print_style,
+    symbol,
+)
 
 from ..paper.virtual_bench import Deformation
 
@@ -28,6 +33,36 @@ MAX_DISPLACEMENT = 0.4
 COLOUR_PERCENTILE = 95
 """Percentile of the stress around the cube at which the colour scale ends. The maximum would not
 do, because the stress is infinite at the corners of the cube."""
+
+
+@print_style()
+def draw_loads(layout: Layout, deformations: dict[str, Deformation]) -> Figure:
+    """Draw the section under every plane mode, with pads, deformed outline and displacements.
+
+    Args:
+        layout: Pads of the cube.
+        deformations: Deformation under 10 kPa of each plane mode, by the mode's name.
+    """
+    figure = Figure(figsize=(10, 12))
+    axes = figure.subplots(4, 2)
+    for axis, (name, deformation) in zip(axes.flat, deformations.items(), strict=False):
+        scale = _draw_deformation(axis, deformation, 4)
+        axis.set_title(f"{symbol(name)}, 10 kPa (displacements times {scale:.2g})")
+        _draw_pads(axis, layout, 1e3 * deformation.half_side)
+    pad = Patch(
+        facecolor="white",
+        edgecolor="black",
+        hatch="||||",
+        label="pad",
+    )
+    axes.flat[-1].axis("off")
+    axes.flat[-1].legend(
+        handles=[pad],
+        loc="center",
+        handlelength=4,
+    )
+    figure.supxlabel(r"$x$ / mm")
+    return figure
 
 
 @print_style()
@@ -49,6 +84,34 @@ def draw_figure_4(deformations: dict[str, Deformation]) -> Figure:
         fontsize=8,
     )
     return figure
+
+
+def _draw_pads(
+    axis: Any,
+    layout: Layout,
+    half_side: float,
+) -> None:
+    """Draw pads on the faces of an undeformed cube whose half side is `half_side` mm."""
+    centres = layout.positions[:, [0, 2]]
+    normals = layout.normals[:, [0, 2]]
+    for centre, normal in zip(centres, normals, strict=True):
+        along = layout.pad_size * (1 - np.abs(normal))
+        ends = half_side * (centre + np.outer((-0.5, 0.5), along)).T
+        axis.plot(
+            *ends,
+            color="black",
+            linewidth=7,
+            solid_capstyle="butt",
+        )
+        # White dashes on the black line are the hatches of the pad.
+        dashes = (0, (0.5, 0.5))
+        axis.plot(
+            *ends,
+            color="white",
+            linewidth=3.5,
+            linestyle=dashes,
+            dash_capstyle="butt",
+        )
 
 
 def _draw_deformation(

@@ -132,6 +132,7 @@ class VirtualBench:
     Attributes:
         body: The body.
         finite: Whether the material is neo-Hookean.
+        layout: Pads of the cube.
         section: The finite elements.
         in_cube: (elements,) whether an element is in the cube's place.
     """
@@ -141,6 +142,7 @@ class VirtualBench:
         body: Body,
         cube: bool = True,
         finite: bool = False,
+        layout: Layout | None = None,
         size: float = 0.5,
     ) -> None:
         """Mesh the body.
@@ -149,15 +151,17 @@ class VirtualBench:
             body: The body.
             cube: Whether the cube is there; elastomer replaces it otherwise.
             finite: Whether the material is neo-Hookean.
+            layout: Pads of the cube, by default the planar layout.
             size: Longest side of an element away from the cube; below the top it is half of that.
         """
         if finite and body.plane != "strain":
             raise ElasticError(f"plane is {body.plane!r}; the finite bench knows 'strain' only")
         self.body = body
         self.finite = finite
+        self.layout = layout or LAYOUTS["planar"]
         self._half_side = body.side / 2
 
-        mesh = _bench_mesh(body, cube, size)
+        mesh = _bench_mesh(body, self.layout, cube, size)
         check_memory(mesh, BYTES_PER_CORNER)
         centres = mesh.p[:, mesh.t].mean(axis=1)
         self.in_cube = np.all(np.abs(centres) < 1.0, axis=0)
@@ -393,7 +397,7 @@ class VirtualBench:
         stress = section.material.stress(section.deformation(u))
         force = -section.forces(stress, ~self.in_cube)
         angle = self._rotation(u) if self.finite else 0.0  # Linear theory has no rotation.
-        return self.pad_weights(LAYOUTS["planar"], angle) @ force
+        return self.pad_weights(self.layout, angle) @ force
 
     def _state(self, u: Array) -> Array:
         """Return amplitudes (7,) of the plane modes (linear stress fields), in Pa, fitted to the
@@ -415,12 +419,12 @@ class VirtualBench:
 
 def _bench_mesh(
     body: Body,
+    layout: Layout,
     cube: bool,
     size: float,
 ) -> skfem.MeshTri:
     """Return triangles of the section, refined at the cube and where rods press; lengths in d0
     (half the side of the cube)."""
-    layout = LAYOUTS["planar"]
     half_side = body.side / 2
     half_pad = layout.pad_size / 2
     on_face = np.abs(layout.positions - layout.normals)

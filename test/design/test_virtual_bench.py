@@ -19,7 +19,6 @@ from cube_tensor_design.paper.rod_parts import P_SHEAR, PARTS, draw_back, split_
 from cube_tensor_design.paper.virtual_bench import LoadStep, VirtualBench
 from cube_tensor_design.studies.layout_study import layout_study
 from cube_tensor_driver.core.errors import ElasticError
-from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.core.modes import COMPONENTS
 
 BODY, NARROW = Body(), Body(width=20e-3)
@@ -265,7 +264,7 @@ def test_a_rod_above_c2_raises_p_shear_only_with_c2_on_the_lower_face(coarse):
 def test_the_parts_under_a_rod_sum_to_the_signal_of_the_bench(coarse):
     """The parts know the field without the cube alone; a rod above the middle gives none."""
     bench = VirtualBench(NARROW, size=1.0)
-    signal = P_SHEAR @ bench.pad_weights(LAYOUTS["planar"])
+    signal = P_SHEAR @ bench.pad_weights(bench.layout)
     middle, beside = (dent(NARROW, Rod(1e-3, place)) for place in (0.0, 2e-3))
     none, parts = (split_signals(bench, step, [signal])[0] for step in (middle, beside))
     assert parts.sum() == pytest.approx(P_SHEAR @ bench.run([beside]).pads[0], rel=1e-6)
@@ -277,7 +276,7 @@ def test_the_parts_sum_to_the_signal_of_a_rod_with_the_force_it_has_without_the_
     bench = VirtualBench(Body(width=12e-3), size=2.0)
     step = dent(bench.body, Rod(1e-3, 1e-3, edge_radius=1e-5))  # sharp: soon solved
     drawn_back, bottom = draw_back(bench, step), bottom_weights(bench.section.basis, along=1) > 0
-    signal = P_SHEAR @ bench.pad_weights(LAYOUTS["planar"])
+    signal = P_SHEAR @ bench.pad_weights(bench.layout)
     parts = split_signals(bench, step, [signal], "force")[0]
     assert parts.sum() == pytest.approx(P_SHEAR @ bench.run([drawn_back]).pads[0], rel=1e-6)
     force, without = (
@@ -310,7 +309,7 @@ def test_a_field_of_one_order_has_one_part(monkeypatch, part, field):
         return np.where(outside, 1e-4 * np.array(field(*(x / NARROW.side))), np.nan)
 
     bench = VirtualBench(NARROW, size=1.0)
-    parts = split_signals(bench, LoadStep(moved), [bench.pad_weights(LAYOUTS["planar"])[1]])[0]
+    parts = split_signals(bench, LoadStep(moved), [bench.pad_weights(bench.layout)[1]])[0]
     assert np.argmax(np.abs(parts)) == PARTS.index(part)
     others = np.delete(parts, PARTS.index(part))
     assert np.abs(others).max() < 5e-3 * np.abs(parts).max()
