@@ -150,7 +150,7 @@ def run(options: argparse.Namespace) -> int:
         show_weight(result)
     else:
         show_surface(result)
-    if options.figures is not None:
+    if options.figures is not None and not isinstance(result, ThermalStress | WeightResponse):
         _draw(result, options.figures)
     if options.output is not None:
         _write(options, model, result)
