@@ -216,8 +216,8 @@ class Pipeline:
         calibration = self._tables.calibration[cube]
         return temperature_factor(self._tables, calibration, np.asarray(temperature))
 
-    def unloaded_factor(self, cube: Index, temperature: Real) -> Array:
-        """Return the ratio of the frequencies without load now to the rest frequencies (N, P).
+    def unloaded_factor(self, cube: Index, temperature: Real, offset: Real | None = None) -> Array:
+        """Return the ratio of the frequencies without load to the rest frequencies (N, P).
 
         It is the factor of temperature, and that of the offset o that compensation subtracts: the
         pad law o = (f - f0) / (f0 (1 + beta) / beta - f), solved for f / f0.
@@ -225,11 +225,14 @@ class Pipeline:
         Args:
             cube: Numbers of the cubes (N,).
             temperature: Temperatures (N,), in °C; NaN where they are unknown.
+            offset: Offsets (N, P); None: those of the newest rows.
         """
         factor = self.temperature_factor(cube, temperature)
-        if self.newest_offset is None:
+        if offset is None and self.newest_offset is not None:
+            offset = self.newest_offset[cube]
+        if offset is None:
             return factor
-        offset, beta = self.newest_offset[cube], self._beta[self._tables.calibration[cube]]
+        beta = self._beta[self._tables.calibration[cube]]
         shifted: Array = factor * (1 + offset * (1 + beta) / beta) / (1 + offset)
         return shifted
 

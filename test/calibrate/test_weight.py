@@ -15,11 +15,14 @@ pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 from bag_maker import START_NS, header, info_of, message
 
 from cube_tensor_driver.bags.metadata import quality, typestore
+from cube_tensor_driver.bags.reprocess.job import Overrides, settings_with
+from cube_tensor_driver.bags.source import open_bag
 from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.calibrate.weight import fit_weight
 from cube_tensor_driver.cli import main as cli
 from cube_tensor_driver.config.calibration import read_calibration
 from cube_tensor_driver.core.calibration import illustrative
+from cube_tensor_driver.core.compensation.models import WeightModel
 from cube_tensor_driver.core.errors import BagError
 from cube_tensor_driver.core.oscillator import pad_frequency
 from cube_tensor_driver.core.pipeline import Pipeline
@@ -43,14 +46,14 @@ def force_at(t: float, poses) -> np.ndarray:
     return before + turned * (after - before)
 
 
-def make_bag(folder, poses=POSES, spread: float = 0.0, cubes: int = 3, motion: bool = True):
+def make_bag(folder, poses=POSES, spread=0.0, cubes=3, motion=True, **changes):
     """A bag of unloaded cubes with noise and drift, whose responses differ by a factor."""
-    rng = np.random.default_rng(7)
+    rng, calibration = np.random.default_rng(7), replace(BASE, **changes)
     skin = SimpleNamespace(
         name="skin",
         frame=lambda cube: cube.name,
         cubes=[
-            SimpleNamespace(name=f"c{k}", link="hub0", index=k, uid=0, calibration=BASE)
+            SimpleNamespace(name=f"c{k}", link="hub0", index=k, uid=0, calibration=calibration)
             for k in range(cubes)
         ],
     )
@@ -60,7 +63,7 @@ def make_bag(folder, poses=POSES, spread: float = 0.0, cubes: int = 3, motion: b
         topics = {"info": INFO, "frequencies": FREQUENCIES}
         for topic, kind in topics.items() | ({("compensation", COMPENSATION)} if motion else set()):
             writer.add_topic(f"/{topic}", kind, [quality(latched=topic == "info")])
-        info = info_of(skin, Pipeline([BASE] * cubes), START_NS)
+        info = info_of(skin, Pipeline([calibration] * cubes), START_NS)
         writer.write("/info", START_NS, bytes(store.serialize_cdr(info, INFO)))
         for n in range(round(len(poses) * SECONDS * 25)):
             stamp_ns, force = START_NS + n * 40_000_000, force_at(n / 25, poses)
@@ -121,6 +124,20 @@ def test_what_does_not_determine_it_is_one_line(tmp_path, changes, name, text):
     with pytest.raises(BagError, match=text) as error:
         fit_weight(make_bag(tmp_path / "bag", **changes), name)
     assert "\n" not in str(error.value)
+
+
+def test_a_tare_from_a_bag_is_that_of_a_cube_without_weight(tmp_path):
+    """Of 100 rows with 8 ppm of noise; 5 Pa of drift are 10 ppm, the weight above 100 ppm."""
+    heavy = {"weight": WeightModel(RESPONSE)}
+    folder = make_bag(tmp_path / "bag", [[0, 0, G], [G, 0, 0]], cubes=1, **heavy)
+    with open_bag(folder) as source:
+        first, second = (
+            settings_with(source, Overrides(tare=span))[0].rest_frequency
+            for span in ((0.0, 4.0), (5.0, 9.0))
+        )
+    np.testing.assert_allclose(first, second, rtol=4e-5)
+    weight = BASE.gain[:, None] * RESPONSE * G / (BASE.modulus * (1 + BASE.beta))[:, None]
+    assert np.abs(weight[:, 2] - weight[:, 0]).max() > 2e-4
 
 
 def test_the_command_writes_the_calibration(tmp_path, capsys):

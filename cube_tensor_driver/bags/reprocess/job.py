@@ -21,6 +21,7 @@ from ...config.calibration import calibration_text
 from ...config.skin import Skin
 from ...core.arrays import Array
 from ...core.calibration import Calibration
+from ...core.compensation.compensation import Compensation
 from ...core.errors import BagError, CalibrationError, CubeError
 from ...core.pipeline import Pipeline
 from ...core.reconstructor import Reconstructor
@@ -417,15 +418,20 @@ def _measure_rest(
     count = np.zeros(exists.shape)
     begin_ns = bag.start_ns + round(begin_s * 1e9)
     end_ns = bag.start_ns + round(end_s * 1e9)
-    for messages, _ in bag.frequencies(source.topic):
-        rows = messages.rows
+    # Weight is no load: a tare holds in every pose. Creep follows loads, of which there are none.
+    effects = [effect for effect in Compensation(pipeline).effects if not effect.is_recursive]
+    for rows in BagSource(bag, source.topic):
+        rows = rows.select(rows.cube < len(exists))
+        cube = rows.cube.astype(np.intp)
+        offset = np.zeros(rows.frequency.shape)
+        for effect in effects:
+            if effect.applies(rows):
+                effect.add_offset(rows, cube, offset)
         inside = (rows.stamp_ns >= begin_ns) & (rows.stamp_ns < end_ns)
-        is_known = rows.cube < len(exists)
-        rows = rows.select(inside & is_known)
+        rows, cube, offset = rows.select(inside), cube[inside], offset[inside]
         if not len(rows):
             continue
-        cube = rows.cube.astype(np.intp)
-        frequency = rows.frequency / pipeline.temperature_factor(cube, rows.temperature)
+        frequency = rows.frequency / pipeline.unloaded_factor(cube, rows.temperature, offset)
         pads = np.arange(frequency.shape[1])
         is_faulty = rows.pad_fault[:, np.newaxis] >> pads & 1 > 0
         is_usable = np.isfinite(frequency) & (frequency > 0) & ~is_faulty
