@@ -42,8 +42,8 @@ DEFAULT_RATE_HZ = 1000.0
 """Sampling rate of each cube, in Hz, that is assumed if the skin file states none."""
 
 TIME_CONSTANT_S = 1.0
-"""Time constant of the high-pass, in s. The pressure of a load that grows more slowly than about
-2 sigma in this time (2 Pa/s with 24 pads) counts as drift."""
+"""Time constant of the high-pass, in s. The pressure of a load that grows by less than `DRIFT` plus
+2 standard deviations of its noise in this time (2.3 Pa/s with 24 pads) counts as drift."""
 
 REFERENCE = 2.0
 """Reference value of the CUSUM, in standard deviations of the noise. It is half of the smallest
@@ -71,8 +71,8 @@ FAR = 1e-4
 pressure, at a pitch of 8 mm, a depth of 5 mm, and with a shear force of half the normal one."""
 
 DRIFT = 0.5
-"""Largest drift of the pressure, in Pa/s, that must not count as touch while the slow part is not
-followed because of a load. Pads drift by about 1e-6 of their frequency per second, or 0.4 Pa/s."""
+"""Largest drift of the pressure, in Pa/s, at which the rate of false alarms holds. All pads of a
+cube that drift together by 1.3e-6 of their frequency per second cause it."""
 
 REMAINDER = 0.02
 """Largest share of a pressure that remains after the load has gone, because the foam of the pads
@@ -136,7 +136,8 @@ class Touch:
         Args:
             skin: Skin as from `read_skin`, or the path of a skin file.
             false_alarms: Rate of touches found in noise alone, per hour, of the whole skin. It
-                holds for noise as in the calibrations, and at the sampling rate in the skin file.
+                holds for noise as in the calibrations, for drift up to `DRIFT`, and at the sampling
+                rate in the skin file.
 
         Raises:
             ConfigError: The rate is not above 0.
@@ -156,11 +157,13 @@ class Touch:
         self._unobserved = np.isnan(variance)
         self._deviation = np.sqrt(variance[:, PRESSURE])
         self._place = skin.poses.position / skin.poses.pitch
-        self._near = _find_neighbours(skin.poses.position)
+        near = _find_neighbours(skin.poses.position)
         self._estimate = None
         if skin.elastomer is not None:
-            self._estimate = estimate_forces(skin.poses, skin.elastomer, self._near, covariance)
+            self._estimate = estimate_forces(skin.poses, skin.elastomer, near, covariance)
 
+        # The largest value of the neighbours is found faster if they are the first axis.
+        self._near = near.T.copy()
         # Slow part of the values, NaN where unknown, and difference of the values from it, 0 there
         self._slow = np.full(variance.shape, np.nan)
         self._change = np.zeros(variance.shape)
@@ -266,7 +269,9 @@ class Touch:
         self._margin[cube] = margin
 
         before = self._sum[cube]
-        score = (pressure - margin) / self._deviation[cube]
+        # A pressure that drifts steadily is ahead of its slow part by one time constant.
+        excess = pressure - margin - DRIFT * TIME_CONSTANT_S
+        score = excess / self._deviation[cube]
         # The upper limit makes a touch end within a few scans after any load.
         after = np.clip(before + score - REFERENCE, 0, self.limit + REFERENCE)
         after = np.where(self._count[cube] < SETTLING_ROWS, before, after)
@@ -284,10 +289,9 @@ class Touch:
         """
         pressure = -self._change[:, PRESSURE]
         strength = np.where(self._touched, pressure, 0)
-        near = self._near.T
-        is_largest = self._touched & (strength >= strength[near].max(axis=0))
+        is_largest = self._touched & (strength >= strength[self._near].max(axis=0))
         # Each scan spreads the reach by one pitch, which is fast compared with the high-pass.
-        spread = SPREAD * self._reach[near].max(axis=0)
+        spread = SPREAD * self._reach[self._near].max(axis=0)
         is_own = strength > np.maximum(spread, FAR * strength.max())
         self._reach = np.maximum(strength, spread)
         self._held = self._reach > self._deviation / 2
@@ -311,7 +315,7 @@ class Touch:
         if estimate is None or not len(cube):
             unknown = np.full((len(cube), 3), np.nan)
             return unknown, unknown
-        near, kind = self._near[cube], estimate.kind[cube]
+        near, kind = self._near[:, cube].T, estimate.kind[cube]
         values = self._change[near].reshape(len(cube), -1, 1)
         terms = values * estimate.weights[kind]
         force = terms.sum(axis=1)

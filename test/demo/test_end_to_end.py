@@ -40,9 +40,16 @@ from cube_tensor_driver.core.forces import Forces
 from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.demo.demo import DemoSettings
 from cube_tensor_driver.demo.watching import DemoResult, SkinWatcher
-from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress, StressTensorStamped
+from cube_tensor_driver.msg import (
+    SkinFrequencies,
+    SkinInfo,
+    SkinStress,
+    SkinTouch,
+    StressTensorStamped,
+)
 from cube_tensor_driver.processes.children import Children, ros_arguments
 from cube_tensor_driver.processes.skin_processes import SimulatedHubs, skin_processes
+from cube_tensor_driver.ros.messages import to_ns
 from cube_tensor_driver.views.terminal.live_table import LiveTable
 
 SKIN = package_data() / "config" / "skin_demo.yaml"
@@ -181,18 +188,20 @@ def test_every_topic_of_a_skin(ros, tmp_path, scans):
     tensors = ros.listen(StressTensorStamped, "cubes/c05/stress")
     wrenches = ros.listen(WrenchStamped, "cubes/c05/wrench")
     clouds = ros.listen(PointCloud2, "forces")
+    touches = ros.listen(SkinTouch, "touch")
     diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
     with Children(tmp_path) as children:
         for process in skin_processes(SKIN, simulated=SimulatedHubs(tmp_path / "ports")):
             if process.node and scans > 1:
                 process.parameters["publish_period"] = scans / skin.rate
             if process.executable == "reconstruction":
-                process.parameters["forces"] = True
+                process.parameters.update(forces=True, touch_false_alarms=1.0)
             children.start(process)
         ros.wait(
             lambda: len(batches) > 50 and len(raw) > 80 and len(tensors) > 20 and len(wrenches) > 20
         )
-        ros.wait(lambda: len(clouds) > 20)
+        # The load of the simulation passes over cubes, and a touch is known in the very scan.
+        ros.wait(lambda: len(clouds) > 20 and any(touch.cube for touch in touches))
         ros.wait(
             lambda: (
                 {status.name for array in diagnostics for status in array.status}
@@ -221,6 +230,8 @@ def test_every_topic_of_a_skin(ros, tmp_path, scans):
     counts = np.bincount(np.concatenate([message.cube for message in batches]), minlength=16)
     assert counts.min() > 0.5 * counts.max()
     assert np.median([len(message.cube) for message in batches]) == 16 * scans
+    stamps_ns = {stamp for message in batches for stamp in decoded(message).rows.stamp_ns.tolist()}
+    assert {to_ns(touch.header.stamp) for touch in touches[-10:-5]} <= stamps_ns
     rows = decoded(batches[-1]).rows
     assert batches[-1].header.frame_id == "skin_base"
     assert (rows.status == 0).all()

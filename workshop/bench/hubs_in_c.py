@@ -25,6 +25,9 @@ PITCH = 0.012
 LAYOUTS = {8: "planar", 24: "cube"}
 """Layout of the cubes by their number of pads."""
 
+DEPTH = 0.005
+"""Distance from the centres of the cubes to the surface of the skin, in m."""
+
 MAX_CUBES_PER_HUB = 80
 """Largest number of cubes on one simulated hub."""
 
@@ -79,6 +82,7 @@ class HubLoad:
             rate=rate,
             layout=LAYOUTS[self.pads],
         )
+        data["elastomer"] = {"depth": DEPTH, "thickness": 0.0}
         write_yaml(path, data)
         return path
 

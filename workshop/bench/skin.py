@@ -1,6 +1,6 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""`./cube bench skin`, `echo` and `scale`: the whole chain beside a bare floor.
+"""`./cube bench skin`, `echo`, `touch` and `scale`: the whole chain beside a bare floor.
 
 The floor is measured in the same run. Everything runs in a DDS domain of its own, so that a skin
 that runs elsewhere is not disturbed.
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import gc
 import re
+import struct
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -23,12 +24,13 @@ from rich.console import Console
 from rich.progress import Progress
 
 from cube_tensor_driver.config.skin import read_skin
+from cube_tensor_driver.core.arrays import Index
 from cube_tensor_driver.core.errors import CubeError
 from cube_tensor_driver.demo.running import end_simulator, observing
 from cube_tensor_driver.demo.usage import Usage
 from cube_tensor_driver.demo.verification import Arrivals, compare, percentile
 from cube_tensor_driver.messages.codec import stress_codec
-from cube_tensor_driver.msg import SkinStress
+from cube_tensor_driver.msg import SkinStress, SkinTouch
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.domain import own_domain
 from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, skin_processes
@@ -79,6 +81,7 @@ class Bench:
         publish_period: Time that one message covers, in seconds; 0: one message for each scan.
         composed: Whether driver and reconstruction run in one process.
         pads: Number of pads of each cube, 8 or 24.
+        finds_touch: Whether the reconstruction also publishes `touch`.
     """
 
     rate: float
@@ -86,6 +89,7 @@ class Bench:
     publish_period: float = 0.0
     composed: bool = False
     pads: int = 8
+    finds_touch: bool = False
 
 
 @dataclass(frozen=True)
@@ -124,6 +128,24 @@ def bench_skin(cubes: int, bench: Bench) -> dict[str, Any]:
     """
     with _prepared() as progress:
         return _measure_both(cubes, bench, progress)
+
+
+def bench_touch(cubes: int, bench: Bench) -> dict[str, Any]:
+    """Measure the latency of `touch`, and the processor time that it adds to the chain.
+
+    The chain runs once without and once with touch. A subscriber gets `stress` both times.
+    """
+    with _prepared() as progress:
+        without = _measure_skin(cubes, bench, progress)
+        touch = _measure_skin(cubes, replace(bench, finds_touch=True), progress)
+    cpu = {name: value for name, value in without.items() if name.startswith("cpu_")}
+    return {
+        "cubes": cubes,
+        "rate_hz": bench.rate,
+        "duration_s": bench.duration,
+        **{name: value for name, value in touch.items() if "touch" in name or name in cpu},
+        **{f"{name}_without_touch": value for name, value in cpu.items()},
+    }
 
 
 def bench_scale(
@@ -187,13 +209,19 @@ def _measure_skin(
         path = load.write_skin(folder, bench.rate)
         processes = _make_processes(path, log, load, bench, progress)
         arrivals = Arrivals(read_skin(path), one_per_hub=True)
+        touches: list[tuple[int, int]] = []
 
         def receive(data: bytes) -> None:
             arrivals.add(stress_codec.decode(data).rows, time.time_ns())
 
+        def receive_touch(data: bytes) -> None:
+            # The stamp stands behind the four bytes that state the encoding.
+            seconds, nanoseconds = struct.unpack_from("<iI", data, 4)
+            touches.append((10**9 * seconds + nanoseconds, time.time_ns()))
+
         with Children(folder) as children:
             name = f"skin of {load.cubes} cubes"
-            measured = _measure(processes, children, bench, receive, progress, name)
+            measured = _measure(processes, children, bench, receive, progress, name, receive_touch)
             taken, skipped = _end_load(processes[0].executable, children, log, load)
     # Rows of the first cube of each hub stand for all: keeping all would delay the receiver.
     comparison = compare(taken, arrivals, measured.start_ns, measured.end_ns)
@@ -210,6 +238,31 @@ def _measure_skin(
         **{f"cpu_{name}_percent": round(value, 1) for name, value in cpu.items()},
         **summarise_memory(measured.memory_mb),
         "first_tensor_s": round(measured.first_tensor_s, 2),
+        **(_summarise_touches(np.array(touches), taken, measured) if bench.finds_touch else {}),
+    }
+
+
+def _summarise_touches(
+    touches: Index, taken: SampleTable, measured: Measurement
+) -> dict[str, float]:
+    """Return number and latencies of the messages of `touch`, which have no sequence number.
+
+    Args:
+        touches: Stamps and times of arrival (N, 2), in ns since the Unix epoch.
+        taken: The samples that the hubs took.
+        measured: Span of the measurement.
+    """
+    sampled_ns = np.sort(taken.time_ns)
+    stamp_ns, arrival_ns = touches.T
+    # A stamp is closer to its own sample than to any other scan.
+    after = np.searchsorted(sampled_ns, stamp_ns).clip(1, len(sampled_ns) - 1)
+    is_earlier = stamp_ns - sampled_ns[after - 1] < sampled_ns[after] - stamp_ns
+    latency_ms = 1e-6 * (arrival_ns - sampled_ns[after - is_earlier])
+    latency_ms = latency_ms[(stamp_ns > measured.start_ns) & (stamp_ns < measured.end_ns)]
+    return {
+        "touch_messages": len(latency_ms),
+        "touch_latency_p50_ms": percentile(latency_ms, 50),
+        "touch_latency_p99_ms": percentile(latency_ms, 99),
     }
 
 
@@ -228,6 +281,9 @@ def _make_processes(
         composed=bench.composed,
         simulated=SimulatedHubs(ports, sample_log=log, instants=INSTANTS),
     )
+    if bench.finds_touch:
+        for process in processes[1:]:
+            process.parameters["touch_false_alarms"] = 1.0
     try:
         program = load.build(path.parent / "firmware")
     except FirmwareError as error:
@@ -287,6 +343,7 @@ def _measure(
     receive: Callable[[bytes], None],
     progress: Progress,
     description: str,
+    receive_touch: Callable[[bytes], None] | None = None,
 ) -> Measurement:
     """Start the processes, wait for the first tensors and measure.
 
@@ -298,6 +355,7 @@ def _measure(
             than what is measured.
         progress: Shows how far the measurement is.
         description: Name of the measurement.
+        receive_touch: Called with each message of `touch`, if there are any.
 
     Raises:
         CubeError: No tensor arrived.
@@ -319,6 +377,8 @@ def _measure(
 
     with observing("bench", children) as observer:
         observer.listen(SkinStress, "stress", on_stress, batch_profile(bench.rate))
+        if bench.finds_touch and receive_touch is not None:
+            observer.listen(SkinTouch, "touch", receive_touch, batch_profile(bench.rate))
         observer.spin(MAX_START_S, lambda: n_messages > 0)
         if not n_messages:
             logs = "\n".join(children.log(name)[-800:] for name in names)

@@ -42,24 +42,15 @@ def arguments(parser: Parser) -> None:
     )
     _add_cubes(skin, 64)
     _add_time(skin)
-    skin.add_argument(
-        "--composed", action="store_true", help="run driver and reconstruction in one process"
-    )
-    skin.add_argument(
-        "--publish-period",
-        type=not_negative,
-        default=0.0,
-        metavar="S",
-        help="time that one message covers, s; 0: one message per scan (default: %(default)g)",
-    )
 
-    skin.add_argument(
-        "--pads",
-        type=int,
-        choices=(8, 24),
-        default=8,
-        help="number of pads of each cube (default: %(default)s)",
+    touch = parser.add_subcommand(
+        "touch", "latency from hubs to received touch, and the processor time that it adds"
     )
+    _add_cubes(touch, 256)
+    _add_time(touch)
+
+    for chain in (skin, touch):
+        _add_chain(chain)
 
     scale = parser.add_subcommand("scale", "skin for growing numbers of cubes, with a picture")
     scale.add_argument(
@@ -83,7 +74,7 @@ def arguments(parser: Parser) -> None:
         help="number of loads of each shape (default: %(default)s)",
     )
 
-    for benchmark in (pipeline, decode, links, echo, skin, scale, contacts):
+    for benchmark in (pipeline, decode, links, echo, skin, touch, scale, contacts):
         benchmark.add_json()
     scale.add_output(
         "--figure",
@@ -120,6 +111,26 @@ def _add_time(parser: Parser) -> None:
     )
 
 
+def _add_chain(parser: Parser) -> None:
+    parser.add_argument(
+        "--composed", action="store_true", help="run driver and reconstruction in one process"
+    )
+    parser.add_argument(
+        "--publish-period",
+        type=not_negative,
+        default=0.0,
+        metavar="S",
+        help="time that one message covers, s; 0: one message per scan (default: %(default)g)",
+    )
+    parser.add_argument(
+        "--pads",
+        type=int,
+        choices=(8, 24),
+        default=8,
+        help="number of pads of each cube (default: %(default)s)",
+    )
+
+
 def run(options: argparse.Namespace) -> int:
     """Run the benchmark and report its figures. Only its own modules are imported."""
     from cube_tensor_driver.demo.running import report
@@ -146,7 +157,7 @@ def _measure(options: argparse.Namespace) -> dict[str, Any]:
 
         return bench_links(options.cubes, options.rate, options.duration)
 
-    from ..bench.skin import Bench, bench_echo, bench_scale, bench_skin
+    from ..bench.skin import Bench, bench_echo, bench_scale, bench_skin, bench_touch
 
     bench = Bench(options.rate, options.duration)
     if options.what == "echo":
@@ -160,4 +171,6 @@ def _measure(options: argparse.Namespace) -> dict[str, Any]:
         options.composed,
         options.pads,
     )
+    if options.what == "touch":
+        return bench_touch(options.cubes, chain)
     return bench_skin(options.cubes, chain)
