@@ -38,8 +38,6 @@ time of the middle of the window in µs, and CRC-32 of both."""
 def edges(
     millihertz: NDArray[np.uint32],
     phase: NDArray[np.float64],
-    counter_hz: int = COUNTER_HZ,
-    window_us: int = WINDOW_US,
 ) -> NDArray[np.void]:
     """Return what is captured of pads within a window.
 
@@ -48,20 +46,18 @@ def edges(
     Args:
         millihertz: (pads,) frequencies in mHz; 0 for a pad that does not oscillate.
         phase: (pads,) time from the beginning of the window to the first edge, in periods.
-        counter_hz: Frequency of the counter, in Hz.
-        window_us: Length of the window, in µs.
 
     Returns:
         (pads,) of the type `EDGES`.
     """
     found = np.zeros(len(millihertz), EDGES)
     hertz = 1e-3 * millihertz.astype(float)
-    periods = np.ceil(hertz * window_us * 1e-6 - phase) - 1
+    periods = np.ceil(hertz * WINDOW_US * 1e-6 - phase) - 1
     # A pad without two edges in the window has no period to capture.
     runs = periods >= 1
     hertz, phase, periods = hertz[runs], phase[runs], periods[runs]
-    found["first"][runs] = np.floor(phase / hertz * counter_hz)
-    found["last"][runs] = np.floor((phase + periods) / hertz * counter_hz)
+    found["first"][runs] = np.floor(phase / hertz * COUNTER_HZ)
+    found["last"][runs] = np.floor((phase + periods) / hertz * COUNTER_HZ)
     found["periods"][runs] = periods
     return found
 

@@ -47,10 +47,12 @@ def show_study(result: LayoutStudy) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from ..studies.layout_study import DEPTH
+
     console = Console(highlight=False)
     console.print(
         "narrowest indenter, mm, from which on the error stays below 20 % "
-        f"of the component's range; cube's centre {1e3 * result.depth:g} mm deep",
+        f"of the component's range; cube's centre {1e3 * DEPTH:g} mm deep",
         soft_wrap=True,
     )
     table = Table("", box=SIMPLE_HEAD, pad_edge=False)

@@ -337,7 +337,7 @@ def pad_stresses(
     return stresses
 
 
-def each_parity(solid: Solid, report: Callable[[str], None]) -> Iterator[Parity]:
+def each_parity(solid: Solid, report: Callable[[str], None] = lambda _: None) -> Iterator[Parity]:
     """Yield and report the parities of a body, so that those that share a factorisation of the
     stiffness follow one another."""
 

@@ -16,8 +16,6 @@ Source: E. Betti, Il Nuovo Cimento 7 (1872) (reciprocity); M. F. Wheeler as in p
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from cube_tensor_driver.core.arrays import Array
@@ -36,7 +34,6 @@ def compute_influence(
     body: Body,
     layout: Layout,
     level: int = 1,
-    report: Callable[[str], None] = lambda _: None,
 ) -> Influence:
     """Compute the influence functions of the pads in a body on rigid ground.
 
@@ -44,7 +41,6 @@ def compute_influence(
         body: The body, with ground.
         layout: Pads of the cube.
         level: Level of the mesh, 0 to 2.
-        report: Called as report(what) before every solve.
 
     Raises:
         ElasticError: The body has no ground, or the mesh does not fit into memory.
@@ -58,7 +54,7 @@ def compute_influence(
     check_memory(grid)
     solid = make_solid(body, layout, grid)
     d0 = body.side / 2
-    place, pads = _surface_influence(solid, layout, report)
+    place, pads = _surface_influence(solid, layout)
     return Influence(
         layout=layout,
         side=body.side,
@@ -70,11 +66,7 @@ def compute_influence(
     )
 
 
-def _surface_influence(
-    solid: Solid,
-    layout: Layout,
-    report: Callable[[str], None],
-) -> tuple[Array, Array]:
+def _surface_influence(solid: Solid, layout: Layout) -> tuple[Array, Array]:
     """Return positions (n, dim - 1) of the nodes on the surface, and the stress (P, n, dim) of P
     pads under unit forces there; lengths in d0 (half the side of the cube)."""
     dim = solid.dim
@@ -84,7 +76,7 @@ def _surface_influence(
     dofs = dim * nodes[:, None] + np.arange(dim)
 
     total: Array | float = 0.0
-    for parity in each_parity(solid, report):
+    for parity in each_parity(solid):
         # The weights of the pads are the right-hand sides, all of one parity in one solve.
         gaps = solid.pad_weights(layout, parity).T
         displacement = solid.solve(parity, solid.body @ gaps)

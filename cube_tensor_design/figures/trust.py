@@ -18,7 +18,7 @@ from cube_tensor_driver.views.figures.style import (
     symbol,
 )
 
-from ..studies.layout_study import MAX_TRUSTED_ERROR, LayoutStudy
+from ..studies.layout_study import DEPTH, MAX_TRUSTED_ERROR, LayoutStudy
 
 DIRECTION_DASHES = ("--", "-.", ":")
 """Line styles of the curves of gradients along x, y and z."""
@@ -66,7 +66,7 @@ def draw_trust(result: LayoutStudy) -> Figure:
         fontsize="small",
         labelspacing=0.1,
     )
-    depth = f"the cube's centre is {1e3 * result.depth:g} mm deep"
+    depth = f"the cube's centre is {1e3 * DEPTH:g} mm deep"
     figure.supxlabel(f"width of the indenter / mm ({depth})")
     figure.supylabel("largest error over all positions / range of the component")
     return figure

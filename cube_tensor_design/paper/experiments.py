@@ -87,7 +87,6 @@ class _Protocol:
 
 
 def experiments(
-    body: Body | None = None,
     finite: bool = False,
     progress: Progress | None = None,
 ) -> list[Experiment]:
@@ -96,11 +95,10 @@ def experiments(
     Plates that shear the body must hold it, so plates that slid while they pressed grip after that.
 
     Args:
-        body: The body, by default that of the paper.
         finite: Whether the material is neo-Hookean.
         progress: Called as progress(done, total, name) after every step.
     """
-    body = body or Body()
+    body = Body()
     protocols = _protocols(body)
     # The cube is calibrated in the same body, which has the symmetry of a slab.
     calibration = compute_response(body, LAYOUTS["planar"], "slab", meshes=1)
@@ -253,10 +251,10 @@ def dent(
     return plates(body, 0.0, bonded=bonded, rod=rod)
 
 
-def figure_4(body: Body | None = None) -> dict[str, Deformation]:
+def figure_4() -> dict[str, Deformation]:
     """Return the deformations of the paper's section 3: under shear only (key "zx"), and under a
     normal stress that grows along x (key "zz_x")."""
-    bench = VirtualBench(body or Body(), size=0.2)
+    bench = VirtualBench(Body(), size=0.2)
     return _deformations(bench, ("zx", "zz_x"))
 
 

@@ -32,6 +32,10 @@ SAME_DISPLACEMENT = 1e-9
 """Difference below which two displacements count as the same, in d0 (half the side of the cube)."""
 
 
+ROD_DEPTH = 1e-3
+"""Depth to which the rod is pressed where its position varies, in m."""
+
+
 @dataclass(frozen=True)
 class Rod:
     """A rod with a flat lower side whose edges are rounded by parabolas; lengths in m.

@@ -45,7 +45,7 @@ from ..fem.fem import Progress
 from ..fem.solid import lame
 from .experiments import SHEAR_SIGNS, dent
 from .newton import factors
-from .rod import Rod
+from .rod import ROD_DEPTH, Rod
 from .virtual_bench import LoadStep, VirtualBench
 
 Held = Literal["displacement", "force"]
@@ -91,7 +91,6 @@ class RodParts:
 def rod_parts(
     body: Body | None = None,
     places: Sequence[float] = (1e-3, 2e-3, 3e-3, 4e-3, 6e-3, 8e-3),
-    pressed: float = 1e-3,
     progress: Progress | None = None,
     held: Held = "displacement",
 ) -> dict[str, RodParts]:
@@ -102,7 +101,6 @@ def rod_parts(
     Args:
         body: The body, by default that of the paper.
         places: Positions of the rod along x, in m.
-        pressed: Depth of the rod without the cube, in m.
         progress: Called before every position.
         held: Quantity of the rod that the cube does not change.
 
@@ -119,7 +117,7 @@ def rod_parts(
             if progress is not None:
                 done = number * len(places) + row
                 progress(done, total, f"{rod} at {1e3 * place:g} mm")
-            step = dent(bench.body, Rod(pressed, place, edge_radius=radius))
+            step = dent(bench.body, Rod(ROD_DEPTH, place, edge_radius=radius))
             rows.append(split_signals(bench, step, signals, held))
         by_pads = np.moveaxis(np.array(rows), 1, 0)  # (pads, places, parts)
         for pads, parts in zip(PADS, by_pads, strict=True):

@@ -32,7 +32,7 @@ from ..fem.fem import Progress, compute_response
 from ..fem.line_load import line_load
 from ..fem.reciprocity import compute_influence
 from .experiments import SHEAR_SIGNS, dent, plane_estimator
-from .rod import Rod
+from .rod import ROD_DEPTH, Rod
 from .virtual_bench import VirtualBench
 
 GRID_STEP = 1e-4
@@ -72,7 +72,6 @@ class RodShear:
 def rod_shear(
     body: Body | None = None,
     places: Sequence[float] = tuple(np.arange(9) * 1e-3),
-    pressed: float = 1e-3,
     progress: Progress | None = None,
 ) -> RodShear:
     """Recover the shear σzx at the cube's place for each position of a rod.
@@ -80,7 +79,6 @@ def rod_shear(
     Args:
         body: The body, by default that of the paper.
         places: Positions of the rod along x, in m.
-        pressed: Depth of the rod, in m.
         progress: Called as progress(done, total, what) before every position.
     """
     body = body or Body()
@@ -108,7 +106,7 @@ def rod_shear(
     for number, place in enumerate(places):
         if progress is not None:
             progress(number, len(places), f"rod at {1e3 * place:g} mm")
-        step = dent(body, Rod(pressed, place))
+        step = dent(body, Rod(ROD_DEPTH, place))
         # The same rod at the same depth; with the cube it needs more force.
         pads = with_cube.run([step]).pads[0]
         modes = estimator @ pads

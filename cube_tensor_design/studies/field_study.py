@@ -184,9 +184,10 @@ def field_below(
     return np.concatenate([stress, gradient.reshape(len(points), 18)], axis=1)
 
 
-def field_example(pitch: float = 0.010, width: float = 0.012) -> FieldExample:
+def field_example() -> FieldExample:
     """Return the pressure under a contact between four cubes: the true one, and what interpolation
     computes with and without gradients."""
+    pitch, width = 0.010, 0.012
     skin = flat_skin(pitch, 0.05)
     centre = pitch * np.array([0.35, 0.25])
     force = FORCE * np.array([FRICTION, 0.0, -1.0])

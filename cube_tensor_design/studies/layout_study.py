@@ -42,6 +42,8 @@ from ..fem.memory import check_memory
 MAX_TRUSTED_ERROR = 0.2
 """Largest error of a component with which it counts as trusted, relative to the range that its true
 value takes while the indenter passes."""
+DEPTH = 5.5e-3
+"""Depth of the cube's centre below the surface, in m."""
 BOX_RATIO = 2.0
 """Ratio of the side of the computed box of elastomer to the side of the cube in it."""
 FRICTION = 0.3
@@ -78,7 +80,6 @@ class LayoutStudy:
         sides: (S,) sides of the cube, in m.
         widths: (W,) widths of the indenter, in m.
         offsets: (X,) positions of the indenter along x, in m.
-        depth: Depth of the cube's centre, in m.
         error: By layout (S, W, C), the largest |recovered - true| over the offsets divided by
             (max - min) of the true component; NaN where a layout does not observe it. The order is
             that of `COMPONENTS`.
@@ -87,15 +88,11 @@ class LayoutStudy:
     sides: Array
     widths: Array
     offsets: Array
-    depth: float
     error: dict[str, Array]
 
-    def trusted(self, limit: float = MAX_TRUSTED_ERROR) -> list[TrustedWidth]:
+    def trusted(self) -> list[TrustedWidth]:
         """Return the narrowest trusted indenter for each layout, side of the cube and observed
         component.
-
-        Args:
-            limit: Largest error that counts as trusted, relative to the range of the component.
         """
         rows = []
         for (name, error), (i, side) in itertools.product(
@@ -105,7 +102,7 @@ class LayoutStudy:
                 if np.isnan(error[i, 0, k]):
                     continue
                 # Every wider indenter must be trusted, too.
-                bad = np.flatnonzero(error[i, :, k] > limit)
+                bad = np.flatnonzero(error[i, :, k] > MAX_TRUSTED_ERROR)
                 first = bad[-1] + 1 if len(bad) else 0
                 width = float(self.widths[first]) if first < len(self.widths) else None
                 rows.append(TrustedWidth(name, float(side), component, width))
@@ -123,7 +120,7 @@ class LayoutStudy:
             "sides": self.sides.tolist(),
             "widths": self.widths.tolist(),
             "offsets": self.offsets.tolist(),
-            "depth": self.depth,
+            "depth": DEPTH,
             "components": list(COMPONENTS),
             "error": errors,
         }
@@ -136,16 +133,14 @@ class _Passage:
     side: float
     width: float
     offset: float
-    depth: float
-    poisson: float
 
     def field(self, x: Array) -> tuple[Array, Array]:
         """Return stress (n, 6) and gradient (n, 6, 3) at x (n, 3), in m from the cube's centre."""
         order = 4 + int(np.ceil(self.width / MAX_POINT_SPACING))
         force = [FRICTION, 0.0, -1.0]
         sources, forces = contact.disc(self.width / 2, force, (self.offset, 0.0), order)
-        points = x + np.array([0.0, LATERAL_OFFSET, -self.depth])
-        return contact.field(points, sources, forces, self.poisson)
+        points = x + np.array([0.0, LATERAL_OFFSET, -DEPTH])
+        return contact.field(points, sources, forces, POISSONS_RATIO)
 
     def components(self) -> Array:
         """Return true stress and gradient (15,) at the cube's centre, in Pa; the gradient is times
@@ -159,8 +154,6 @@ def layout_study(
     sides: Sequence[float] = (4e-3, 2e-3, 1e-3),
     widths: Sequence[float] = (1e-3, 2e-3, 5e-3, 10e-3, 15e-3, 20e-3),
     offsets: Sequence[float] = tuple(np.linspace(-12e-3, 12e-3, 9)),
-    depth: float = 5.5e-3,
-    poisson: float = POISSONS_RATIO,
     progress: Progress | None = None,
 ) -> LayoutStudy:
     """Slide a round indenter of each width over a cube of each side, along x.
@@ -171,23 +164,19 @@ def layout_study(
         sides: Sides of the cube, in m.
         widths: Diameters of the indenter, in m.
         offsets: Positions of the indenter along x, in m.
-        depth: Depth of the cube's centre, in m.
-        poisson: Poisson's ratio of the elastomer.
         progress: Called before every solve and at the end.
 
     Raises:
         ElasticError: The box of a cube would reach the surface.
     """
     box_height = BOX_RATIO * max(sides) / 2
-    if depth <= box_height:
+    if box_height >= DEPTH:
         raise ElasticError(
-            f"the cube's centre is {depth * 1e3:g} mm deep; a cube of {max(sides) * 1e3:g} mm "
+            f"the cube's centre is {DEPTH * 1e3:g} mm deep; a cube of {max(sides) * 1e3:g} mm "
             f"needs more than {box_height * 1e3:g} mm, or the study's box leaves the skin"
         )
-    passages = []
-    for side, width, offset in itertools.product(sides, widths, offsets):
-        passages.append(_Passage(side, width, offset, depth, poisson))
-    matrix, pads = _solve_box(passages, poisson, progress)
+    passages = list(itertools.starmap(_Passage, itertools.product(sides, widths, offsets)))
+    matrix, pads = _solve_box(passages, progress)
 
     shape = (len(sides), len(widths), len(offsets), len(COMPONENTS))
     components = [passage.components() for passage in passages]
@@ -203,14 +192,12 @@ def layout_study(
         sides=np.asarray(sides),
         widths=np.asarray(widths),
         offsets=np.asarray(offsets),
-        depth=depth,
         error=error,
     )
 
 
 def _solve_box(
     passages: Sequence[_Passage],
-    poisson: float,
     progress: Progress | None,
 ) -> tuple[Array, Array]:
     """Return response (pads, modes) and pad stresses (pads, passages) of a cube in its box."""
@@ -220,7 +207,7 @@ def _solve_box(
         BOX_RATIO,
         BOX_RATIO,
         side=1.0,
-        poisson=poisson,
+        poisson=POISSONS_RATIO,
         cube_young=np.inf,
     )
     layout = LAYOUTS["cube"]

@@ -117,12 +117,11 @@ def study_pads(
     widths: Sequence[float],
     cases: int,
     seed: int,
-    settings: Sequence[Setting] = THIN,
 ) -> dict[tuple[Setting, str], list[Errors]]:
-    """Return the errors of each setting and each of `FORMS` at each width (m)."""
+    """Return the errors of each of `THIN` and each of `FORMS` at each width (m)."""
     return {
         (setting, form): bench.study(widths, cases, seed)
-        for setting in settings
+        for setting in THIN
         for form, bench in _make_benches(setting, true).items()
     }
 

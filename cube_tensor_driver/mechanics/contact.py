@@ -171,45 +171,6 @@ def hertz_order(radius: float, depth: float) -> int:
     return max(_MIN_HERTZ_ORDER, math.ceil(_HERTZ_ORDER_PER_RADIUS * radius / depth))
 
 
-def rectangle(
-    sides: ArrayLike,
-    force: ArrayLike,
-    centre: ArrayLike = (0.0, 0.0),
-    order: int = 8,
-) -> tuple[Array, Array]:
-    """Return point forces that represent a uniform traction on a rectangle.
-
-    Args:
-        sides: Side lengths (2,) along x and y, in m.
-        force: Total force (3,) in N.
-        centre: Centre (2,) of the rectangle in m.
-        order: Number of Gauss points along each side.
-
-    Returns:
-        Sources (L, 3) in m and forces (L, 3) in N, with L = order^2.
-
-    Raises:
-        ElasticError: A side is not positive or `order` is below 1.
-    """
-    length = np.asarray(sides, dtype=np.float64)
-    if length.shape != (2,) or not np.all(length > 0.0):
-        raise ElasticError(f"rectangle sides are {sides!r}; give two positive lengths in m")
-    nodes, weights = _gauss_points(order)
-    x, y = np.meshgrid(
-        (nodes - 0.5) * length[0],
-        (nodes - 0.5) * length[1],
-        indexing="ij",
-    )
-    fractions = np.outer(weights, weights)
-    return _place_forces(
-        x.ravel(),
-        y.ravel(),
-        fractions.ravel(),
-        force,
-        centre,
-    )
-
-
 def _check(
     points: Array,
     sources: Array,

@@ -328,24 +328,6 @@ class Kernels:
         circular = self._rotate_loads(table, place, np.zeros(len(place)), ORDERS)
         return np.asarray((circular @ FIELD_FROM_CIRCULAR).swapaxes(1, 2))
 
-    def disc_pressure(
-        self,
-        place: Array,
-        size: float,
-        force: Array,
-    ) -> Array:
-        """Compute the pressure at the depth of the cubes under a Hertz contact.
-
-        Args:
-            place: Positions (N, 2) from the centre of the contact, in m.
-            size: Radius of the contact in m.
-            force: Force (3,) on the skin in N, along x, y and z.
-
-        Returns:
-            Pressure -σzz (N,) in Pa, positive in compression.
-        """
-        return -self.field(place, size)[:, _FIELD_ZZ] @ force
-
     def cross(
         self,
         place: Array,
@@ -541,19 +523,6 @@ class Kernels:
         weights = weights.reshape(4, *shape)
         neighbours = [weights[j] * table[first + j] for j in range(4)]
         return np.asarray(sum(neighbours))
-
-
-def hertz_pressure(distance: Array, size: float) -> Array:
-    """Compute the pressure in Pa on the surface in a Hertz contact with a force of 1 N.
-
-    Args:
-        distance: Distances (...) from the centre of the contact, in m.
-        size: Radius of the contact in m.
-    """
-    # p = 3 F / (2 pi a^2) sqrt(1 - r^2 / a^2), and 0 outside
-    inside = np.clip(1 - (distance / size) ** 2, 0, None)
-    peak = 3 / (2 * np.pi * size**2)
-    return np.asarray(peak * np.sqrt(inside))
 
 
 def _prior_spectrum(wavenumber: Array) -> Array:

@@ -69,8 +69,8 @@ When it presses for the second time, the plots of 10 s are full.
 
 
 @contextmanager
-def chromium(url: str, script: str = "") -> Iterator[webdriver.Chrome]:
-    """Open the page in a headless browser; script: JavaScript that runs before the page's own."""
+def chromium(url: str) -> Iterator[webdriver.Chrome]:
+    """Open the page in a headless browser."""
     options = webdriver.ChromeOptions()
     options.binary_location = shutil.which("chromium") or shutil.which("google-chrome") or ""
     for flag in FLAGS:
@@ -78,7 +78,6 @@ def chromium(url: str, script: str = "") -> Iterator[webdriver.Chrome]:
     browser = webdriver.Chrome(options, Service(shutil.which("chromedriver")))
     try:
         browser.set_script_timeout(MAX_WAIT_S)
-        browser.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": script})
         browser.get(url)
         yield browser
     finally:
