@@ -76,12 +76,12 @@ def read_recorded_loads(
         CalibrationError: The recorded calibration has another layout.
     """
     with open_bag(path) as source:
-        number = _find_cube(source, path, name)
+        number = find_cube(source, path, name)
         settings = source.recording.settings[-1]
         calibration = settings.calibrations[number]
         calibration.check(layout)
         rest = settings.rest_frequency[number, : layout.n_pads]
-        samples = _read_samples(source, number, layout.n_pads)
+        samples = read_samples(source, number, layout.n_pads)
         stamp_ns, frequency, temperature = samples
         reference_ns, state = _read_reference(
             source.bag,
@@ -125,7 +125,7 @@ def read_recorded_loads(
     return loads, replace(calibration, rest_frequency=rest)
 
 
-def _find_cube(
+def find_cube(
     source: BagSource,
     path: Path,
     name: str | None,
@@ -144,7 +144,7 @@ def _find_cube(
     return 0 if name is None else names.index(name)
 
 
-def _read_samples(
+def read_samples(
     source: BagSource,
     number: int,
     n_pads: int,

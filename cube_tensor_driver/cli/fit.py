@@ -44,6 +44,12 @@ def arguments(parser: Parser) -> None:
         "unloaded arm is turned through a few poses",
     )
     parser.add_argument(
+        "--creep",
+        type=Path,
+        metavar="BAG",
+        help="instead of a table, fit the creep of the foam to a bag with one press that is held",
+    )
+    parser.add_argument(
         "--symmetry",
         default="full",
         metavar="G",
@@ -78,6 +84,8 @@ def run(options: argparse.Namespace) -> int:
 
     if options.weight is not None:
         return run_weight(options)
+    if options.creep is not None:
+        return run_creep(options)
 
     from ..calibrate.fit import fit, measured_stress
     from ..config.calibration import named_layout, write_calibration
@@ -88,7 +96,9 @@ def run(options: argparse.Namespace) -> int:
     from ..views.figures.style import save
 
     if options.loads is None or options.layout is None:
-        raise ConfigError("./cube fit needs a table of loads and --layout, or --weight BAG")
+        raise ConfigError(
+            "./cube fit needs a table of loads and --layout, or --weight BAG, or --creep BAG"
+        )
     layout = named_layout(options.layout)
     loads, base, rest, rest_source = read_inputs(options, layout)
     # A calibration with a uid (unique id of a cube) can only be used for that cube.
@@ -134,6 +144,33 @@ def run_weight(options: argparse.Namespace) -> int:
             table.add_row(pad, *(f"{value:+.3f} ± {sd:.2g}" for value, sd in pairs))
         Console(highlight=False).print(table)
     write_calibration(options.output, calibration, f"./cube fit --weight {options.weight.name}")
+    print(f"wrote {options.output}: calibration {calibration.id}")
+    return 0
+
+
+def run_creep(options: argparse.Namespace) -> int:
+    """Fit the creep of the foam to a bag with one press, print it and write the calibration."""
+    from rich.console import Console
+
+    from ..calibrate.creep import fit_recorded_creep, reading_after_step
+    from ..config.calibration import write_calibration
+    from ..views.terminal.output import make_table
+
+    result, calibration = fit_recorded_creep(options.creep, options.cube)
+    table = make_table(("pad",), ("load, Pa", "creep from 1 s to 10 min, %", "to 1 h, %"))
+    at_once, *later = (reading_after_step(result.model, time) for time in (1.0, 600.0, 3600.0))
+    for pad, load, *readings in zip(
+        calibration.layout.pads, result.load, at_once, *later, strict=True
+    ):
+        growth = [f"{100 * (reading / readings[0] - 1):.2f}" for reading in readings[1:]]
+        table.add_row(pad, f"{load:.0f}", *growth)
+    console = Console(highlight=False)
+    console.print(table)
+    console.print(
+        f"{len(result.model.time)} relaxation times explain a hold of {result.hold_s:.0f} s to "
+        f"{100 * result.misfit:.2g} % of the load"
+    )
+    write_calibration(options.output, calibration, f"./cube fit --creep {options.creep.name}")
     print(f"wrote {options.output}: calibration {calibration.id}")
     return 0
 

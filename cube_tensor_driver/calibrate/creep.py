@@ -1,0 +1,343 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
+"""Identification of creep: the viscoelastic law of each pad from one press that is held.
+
+The stress of a pad is s = u - sum_k a_k r_k with its reading u and memories r_k, which are readings
+low-passed with relaxation times tau_k (`core/compensation/creep.py`). While a load is held, s is
+constant but unknown, and after it s = 0. So s and the amplitudes a_k follow from linear least
+squares. How the load came on does not matter, because memories are computed from measured readings.
+
+The relaxation times are a fixed number per decade: the smallest with which the law describes the
+readings. They reach far beyond the hold. What the readings do not determine continues smoothly in
+k, because the second differences of a_k are part of the sum of squares.
+
+How wrong this continuation is, is measured: the fit is repeated with the first part of the hold
+only. The difference of the two laws, moved along the relaxation times by the ratio of the two
+durations, is the deviation of the law.
+
+Source: J. D. Ferry, Viscoelastic Properties of Polymers (1980), 4.A and 11.F.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ..bags.source import open_bag
+from ..core.arrays import Array, Index
+from ..core.calibration import Calibration
+from ..core.compensation.creep import relaxed_share
+from ..core.compensation.models import CreepModel
+from ..core.errors import FitError
+from ..messages.codec import SECOND
+from .fit import measured_stress
+from .recorded_loads import find_cube, read_samples
+
+ORDERS = (1.0, 1.5, 2.0)
+"""Numbers of relaxation times per decade that are tried, in this order."""
+
+SHORTEST_TIME_S = 0.1
+"""Shortest relaxation time, in s. Faster creep belongs to the reading at once."""
+
+REACH = 20.0
+"""Least ratio of the longest relaxation time to the duration of the hold, so that the law has terms
+for the loads of an hour that follow from a hold of minutes."""
+
+GOOD_MISFIT = 2e-4
+"""Error of the law (rms), divided by the load, with which no more relaxation times are tried. It is
+small against the 0.5 % that the law shall keep, and can be seen through the noise of the pads."""
+
+MAX_MISFIT = 5e-3
+"""Error of the law (rms), divided by the load, above which the load counts as not held."""
+
+BEND = 0.15
+"""Expected second difference of successive amplitudes, divided by their mean. Power laws with
+exponents of 0.1 to 0.4 have 0.03 to 0.7."""
+
+REST_S = 2.0
+"""Duration without load at the begin of a recording, in s, that gives the zero of the readings."""
+
+SETTLE_S = 1.0
+"""Time from half the load to the first readings that are fitted, in s: the press must be done."""
+
+MIN_HOLD_S = 60.0
+"""Shortest duration of the hold that is accepted, in s."""
+
+MIN_LOAD_RATIO = 100.0
+"""Smallest load of a pad, divided by the noise of its readings, with which creep is determined."""
+
+BLOCKS_PER_E_FOLD = 12
+"""Number of means of the readings that are fitted while the time since the press grows by e."""
+
+GAIN_TIME_S = 1.0
+"""Time after a load began, in s, at which loads are measured for the calibration of gains."""
+
+MAX_RATE_HZ = 50.0
+"""Rate to which readings are averaged at most, because the time of a fit grows with it."""
+
+
+class CreepFit(NamedTuple):
+    """The law of creep that a recording determines.
+
+    Attributes:
+        model: The law.
+        load: Load of each pad in the hold (P,), in Pa.
+        hold_s: Duration of the hold, in s.
+        misfit: Error of the law (rms), divided by the load.
+    """
+
+    model: CreepModel
+    load: Array
+    hold_s: float
+    misfit: float
+
+
+class _Hold(NamedTuple):
+    """Readings of a press that is held, and of the recovery after it, as means of N blocks.
+
+    Attributes:
+        time: Time since the press (N,), in s.
+        is_loaded: 1 during the hold, 0 after it (N,).
+        n_readings: Number of readings in each block (N,).
+        reading: Readings of the pads (N, P), in Pa.
+    """
+
+    time: Array
+    is_loaded: Array
+    n_readings: Array
+    reading: Array
+
+
+def fit_recorded_creep(path: Path, name: str | None) -> tuple[CreepFit, Calibration]:
+    """Fit the law of creep of a cube to a bag with one press that is held.
+
+    Args:
+        path: Path of the bag.
+        name: Name of the cube; None: the only one.
+
+    Returns:
+        The fit, and the recorded calibration with the law and with gains that fit it.
+
+    Raises:
+        BagError: There is no such bag or cube.
+        FitError: The bag has no such press, or does not determine the law.
+    """
+    with open_bag(path) as source:
+        number = find_cube(source, path, name)
+        settings = source.recording.settings[0]
+        calibration = settings.calibrations[number]
+        n_pads = calibration.layout.n_pads
+        stamp_ns, frequency, temperature = read_samples(source, number, n_pads)
+    current = replace(calibration, rest_frequency=settings.rest_frequency[number, :n_pads])
+    is_complete = np.isfinite(frequency).all(axis=1)
+    stamp_ns, frequency = stamp_ns[is_complete], frequency[is_complete]
+    known = temperature[is_complete] if np.isfinite(temperature).all() else None
+    reading = measured_stress(current, frequency, known)
+    result = fit_creep(
+        (stamp_ns - stamp_ns[:1]) / SECOND, reading, calibration.noise, calibration.layout.pads
+    )
+    origin = f"{calibration.source}; creep fitted to {path.name}"
+    return result, replace(add_creep(calibration, result.model), source=origin)
+
+
+def fit_creep(seconds: Array, reading: Array, noise: Array, names: tuple[str, ...]) -> CreepFit:
+    """Fit the law of creep to a recording of one press that is held.
+
+    Args:
+        seconds: Times (N,), in s.
+        reading: Stresses by the pad law (N, P), in Pa.
+        noise: Standard deviation of a reading of each pad (P,), in Pa.
+        names: Names of the pads, for messages.
+
+    Raises:
+        FitError: The recording has no such press, or does not determine the law.
+    """
+    size = max(1, round(len(seconds) / MAX_RATE_HZ / max(np.ptp(seconds), 1e-9)))
+    seconds, reading = (_average(values, size) for values in (seconds, reading))
+    reading = reading - reading[seconds < seconds[0] + REST_S].mean(axis=0)
+    press, release = _find_hold(seconds, reading)
+    hold_s = release - press
+    blocks = _find_blocks(seconds, press, release)
+    means = _Hold(
+        time=np.array([seconds[block].mean() - press for block in blocks]),
+        is_loaded=np.array([1.0 * (seconds[block[0]] < release) for block in blocks]),
+        n_readings=np.array([len(block) * size for block in blocks]),
+        reading=np.array([reading[block].mean(axis=0) for block in blocks]),
+    )
+    load = means.reading[means.is_loaded > 0].mean(axis=0)
+    for pad in np.flatnonzero(np.abs(load) < MIN_LOAD_RATIO * noise).tolist():
+        raise FitError(
+            f"creep: pad {names[pad]} got {load[pad]:.0f} Pa, needed are "
+            f"{MIN_LOAD_RATIO * noise[pad]:.0f} Pa; press harder, so that every pad is loaded"
+        )
+
+    for order in ORDERS:
+        n_times = 1 + int(np.ceil(order * np.log10(REACH * hold_s / SHORTEST_TIME_S)))
+        time = SHORTEST_TIME_S * 10 ** (np.arange(n_times) / order)
+        memory = _find_memories(seconds, reading, time, blocks)
+        amplitude, error = _solve(means, memory, load, noise)
+        misfit = float(np.sqrt(np.mean((error / load) ** 2)))
+        if misfit < GOOD_MISFIT:
+            break
+    total = amplitude.sum(axis=1).max()
+    if misfit > MAX_MISFIT or total >= 1:
+        raise FitError(
+            f"creep: a held load would creep by {100 * total:.3g} % of the stress, and its law "
+            f"fits to {100 * misfit:.2g} % ({100 * MAX_MISFIT:g} % allowed); press within "
+            f"{SETTLE_S:g} s, and hold a constant load, such as a dead weight"
+        )
+
+    # The first part is shorter than the hold by the ratio of some successive relaxation times, and
+    # the law reaches as far beyond it as an hour lies beyond ten minutes.
+    shift = max(1, round(order * np.log10(6)))
+    first = (means.time < hold_s / 10 ** (shift / order)) & (means.is_loaded > 0)
+    early, _ = _solve(_Hold(*(part[first] for part in means)), memory[first], load, noise)
+    n_known = int(np.searchsorted(time, hold_s / 3))
+    slower, faster = amplitude[:, shift:n_known], amplitude[:, : n_known - shift]
+    # The amplitudes of a power law grow with the relaxation time, and so does the deviation.
+    growth = (slower * faster).sum(axis=1) / (faster**2).sum(axis=1)
+    beyond = np.zeros_like(amplitude)
+    beyond[:, shift:] = growth[:, None] * (amplitude - early)[:, :-shift]
+    # The fastest memory is the reading itself, so its amplitude changes all readings alike.
+    within = np.zeros_like(amplitude)
+    within[:, 0] = misfit
+    model = CreepModel(time, amplitude, np.array([within, beyond]))
+    return CreepFit(model, load, hold_s, misfit)
+
+
+def reading_after_step(model: CreepModel, seconds: float) -> Array:
+    """Return the readings of the pads after a step of the stress by 1 (P,).
+
+    Args:
+        model: The law.
+        seconds: Time after the step, in s.
+    """
+    times = np.concatenate([[0.0], np.geomspace(1e-4, seconds, 300)])
+    amplitude = model.amplitude.T
+    memory, reading = np.zeros_like(amplitude), np.ones(len(model.amplitude))
+    for step in np.diff(times):
+        ratio = step / model.time[:, None]
+        share = relaxed_share(ratio)
+        slope_share = 1 - share / ratio
+        # The new reading u_1 stands on both sides: u_1 = 1 + a r, and r contains u_1.
+        memory += share * (reading - memory) - slope_share * reading
+        weight = 1 - (amplitude * slope_share).sum(axis=0)
+        reading = (1 + (amplitude * memory).sum(axis=0)) / weight
+        memory += slope_share * reading
+    return reading
+
+
+def add_creep(calibration: Calibration, model: CreepModel) -> Calibration:
+    """Return a calibration with a law of creep, and with gains that fit it.
+
+    Gains are sensitivities `GAIN_TIME_S` after a load began. Without creep, a pad reads less then.
+
+    Args:
+        calibration: Calibration of the recording; it may have an older law of creep.
+        model: The new law.
+    """
+    gain = calibration.gain / reading_after_step(model, GAIN_TIME_S)
+    if calibration.creep is not None:
+        gain = gain * reading_after_step(calibration.creep, GAIN_TIME_S)
+    return replace(calibration, creep=model, gain=gain)
+
+
+def _average(values: Array, size: int) -> Array:
+    """Return the means of groups of `size` successive values along the first axis."""
+    count = len(values) // size
+    means: Array = values[: count * size].reshape(count, size, *values.shape[1:]).mean(axis=1)
+    return means
+
+
+def _find_hold(seconds: Array, reading: Array) -> tuple[float, float]:
+    """Return the times at which the load came on and went, in s.
+
+    Raises:
+        FitError: There is not one load that was held long enough after a time without load.
+    """
+    total = np.abs(reading).sum(axis=1)
+    is_loaded = total > 0.5 * np.quantile(total, 0.95)
+    begin, end = np.flatnonzero(is_loaded)[[0, -1]]
+    press, release = float(seconds[begin]), float(seconds[end])
+    if press - seconds[0] < REST_S:
+        raise FitError(
+            f"creep: the load begins {press - seconds[0]:.2g} s after the recording; record "
+            f"{REST_S:g} s or more without load first"
+        )
+    if not is_loaded[begin:end].all():
+        raise FitError("creep: the load came and went; press once, and hold it")
+    if release - press < MIN_HOLD_S:
+        raise FitError(
+            f"creep: the load was held for {release - press:.3g} s; hold it for {MIN_HOLD_S:g} s "
+            "or more, for loads of an hour 9 minutes"
+        )
+    return press, release
+
+
+def _find_blocks(seconds: Array, press: float, release: float) -> list[Index]:
+    """Return the numbers of the readings in each block, which grow with the time since a change."""
+    blocks: list[Index] = []
+    for begin, end in ((press, release), (release, np.inf)):
+        is_settled = (seconds > begin + SETTLE_S) & (seconds < end - SETTLE_S)
+        chosen = np.flatnonzero(is_settled)
+        place = np.floor(BLOCKS_PER_E_FOLD * np.log(seconds[chosen] - begin))
+        parts = np.split(chosen, np.flatnonzero(np.diff(place)) + 1)
+        blocks += [part for part in parts if len(part)]
+    return blocks
+
+
+def _find_memories(seconds: Array, reading: Array, time: Array, blocks: list[Index]) -> Array:
+    """Return the memories of the pads as means of blocks (N, K, P).
+
+    Args:
+        seconds: Times of the readings, in s.
+        reading: Readings of the pads (S, P), in Pa, of which the first is without load.
+        time: Relaxation times (K,), in s.
+        blocks: Numbers of the readings in each block.
+    """
+    ratio = np.diff(seconds, prepend=seconds[0] - 1)[:, None] / time
+    share = relaxed_share(ratio)[..., None]
+    slope_share = 1 - share / ratio[..., None]
+    memory = np.zeros((len(seconds), len(time), reading.shape[1]))
+    change = np.diff(reading, axis=0)
+    for n in range(1, len(seconds)):
+        before = memory[n - 1]
+        memory[n] = before + share[n] * (reading[n - 1] - before) + slope_share[n] * change[n - 1]
+    return np.array([memory[block].mean(axis=0) for block in blocks])
+
+
+def _solve(means: _Hold, memory: Array, load: Array, noise: Array) -> tuple[Array, Array]:
+    """Fit amplitudes to the means of readings by least squares with smooth amplitudes.
+
+    Args:
+        means: Readings.
+        memory: Memories of the pads (N, K, P), in Pa.
+        load: Load of each pad (P,), in Pa.
+        noise: Standard deviation of a reading of each pad (P,), in Pa.
+
+    Returns:
+        Amplitudes (P, K), and errors of the readings (N, P), in Pa.
+    """
+    n_times = memory.shape[1]
+    held = means.reading[means.is_loaded > 0]
+    # The creep during the hold is that of about half the relaxation times.
+    mean_amplitude = 2 * np.abs(held[-1] / held[0] - 1).mean() / n_times
+    bend = np.diff(np.eye(n_times), n=2, axis=0)
+    slope = np.diff(np.eye(n_times)[:2], axis=0)
+    smooth = np.concatenate([slope, bend]) / (BEND * mean_amplitude + 1e-9)
+    smooth = np.hstack([np.zeros((len(smooth), 1)), smooth])
+    amplitude = np.empty((len(load), n_times))
+    error = np.empty_like(means.reading)
+    for pad, pad_load in enumerate(load):
+        deviation = np.hypot(noise[pad] / np.sqrt(means.n_readings), 0.5 * GOOD_MISFIT * pad_load)
+        # Unknown are the stress under the load, and the amplitudes.
+        columns = np.column_stack([means.is_loaded, memory[..., pad]])
+        system = np.concatenate([columns / deviation[:, None], smooth])
+        right = np.concatenate([means.reading[:, pad] / deviation, np.zeros(len(smooth))])
+        solution = np.linalg.lstsq(system, right, rcond=None)[0]
+        amplitude[pad] = solution[1:]
+        error[:, pad] = means.reading[:, pad] - columns @ solution
+    return amplitude, error
