@@ -55,6 +55,17 @@ def pad_table(
     return table
 
 
+def index_cubes(cube: AnyArray, n_cubes: int) -> Index | slice:
+    """Return an index of the cubes of rows (N,) into tables of all cubes of a skin.
+
+    A scan of all cubes, the usual case, gets a slice, with which numpy copies nothing. Numbers that
+    the skin does not have are replaced by the nearest that it has.
+    """
+    if len(cube) == n_cubes and np.array_equal(cube, np.arange(n_cubes)):
+        return slice(None)
+    return np.minimum(np.maximum(cube, 0), n_cubes - 1).astype(np.intp)
+
+
 def multiply(left: AnyArray, right: AnyArray) -> AnyArray:
     """Multiply row vectors or matrices (..., n) by matrices (..., n, m), with the same bits
     everywhere.

@@ -16,7 +16,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from ..arrays import Array, Mask, PadMasks
+from ..arrays import Array, Mask, PadMasks, index_cubes
 from ..pipeline import Pipeline, Watch
 from ..rows import FrequencyRows, StressRows
 from ..status import COMPENSATION
@@ -56,7 +56,11 @@ class Compensation:
         if not self._active:
             self._pipeline.newest_offset = None
             return self._pipeline.process(rows, left_out, watch=watch, known=known, out=out)
-        for part in self._split(rows):
+        parts = self._split(rows)
+        if len(parts) == 1:
+            self._process_part(rows, left_out, watch, known, out)
+            return out
+        for part in parts:
             self._process_part(
                 rows.select(part),
                 None if left_out is None else left_out[part],
@@ -126,7 +130,8 @@ class Compensation:
         """
         pipeline = self._pipeline
         # Cube numbers that the skin does not have are refused or marked by the pipeline.
-        cube = np.clip(rows.cube, 0, len(pipeline.calibrations) - 1).astype(np.intp)
+        n_cubes = len(pipeline.calibrations)
+        cube = np.minimum(np.maximum(rows.cube, 0), n_cubes - 1).astype(np.intp)
         offset = np.zeros((len(rows), pipeline.n_pads), pipeline.dtype)
         before = {}
         bits = np.zeros(len(rows), np.uint16)
@@ -141,5 +146,5 @@ class Compensation:
         for effect, earlier in before.items():
             effect.update(rows, cube, v - earlier, out.left_out)
         if pipeline.newest_offset is None:
-            pipeline.newest_offset = np.zeros((len(pipeline.calibrations), pipeline.n_pads))
-        pipeline.newest_offset[cube] = offset
+            pipeline.newest_offset = np.zeros((n_cubes, pipeline.n_pads))
+        pipeline.newest_offset[index_cubes(cube, n_cubes)] = offset

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array, Single, Times
+from ..arrays import Array, Index, Single, Times, index_cubes
 from ..poses import CubePoses
 from ..rows import FrequencyRows
 
@@ -79,29 +79,49 @@ class ForcesAtCubes:
 
     def _interpolate(self, rows: FrequencyRows, motion: Motion) -> Single:
         """Return the specific forces (N, 3) of rows in the frames of their cubes; NaN: unknown."""
-        force = np.full((len(rows), 3), np.nan, np.float32)
+        # With the axis first, numpy computes all rows in one loop.
+        force = np.full((3, len(rows)), np.nan, np.float32)
+        n_instants = len(motion.time_ns)
         n_cubes = self._position.shape[1]
-        if not len(motion.time_ns):
-            return force
-        fields = np.array([self._at_cubes(motion, k) for k in range(len(motion.time_ns))])
-        cube = np.clip(rows.cube, 0, n_cubes - 1).astype(np.intp)
-        if len(fields) == 1:
-            force[:] = fields[0, cube]
-        else:
-            k = np.searchsorted(motion.time_ns[1:-1], rows.stamp_ns, side="right")
-            begin_ns, interval_ns = motion.time_ns[k], np.diff(motion.time_ns)[k]
-            with np.errstate(all="ignore"):  # a damaged recording may state equal instants
-                share = ((rows.stamp_ns - begin_ns) / interval_ns)[:, None]
-            before, after = fields[k, cube], fields[k + 1, cube]
-            force[:] = before + share * (after - before)
-            beyond_ns = np.maximum(begin_ns - rows.stamp_ns, rows.stamp_ns - begin_ns - interval_ns)
-            limit_ns = np.maximum(MAX_EXTRAPOLATION_NS, 2 * interval_ns)
-            force[(beyond_ns > limit_ns) | (interval_ns > MAX_INTERVAL_NS)] = np.nan
-        force[rows.cube != cube] = np.nan
+        cube = index_cubes(rows.cube, n_cubes)
+        if n_instants == 1:
+            force[:] = self._at_cubes(motion, 0)[:, cube]
+        elif n_instants:
+            number = np.searchsorted(motion.time_ns[1:-1], rows.stamp_ns, side="right")
+            # Few instants lie within the rows of a message, usually none.
+            for k in range(n_instants - 1):
+                between = self._interpolate_between(motion, k, rows.stamp_ns, cube)
+                np.copyto(force, between, where=number == k, casting="same_kind")
+        force[:, rows.cube >= n_cubes] = np.nan
+        column: Single = force.T
+        return column
+
+    def _interpolate_between(
+        self, motion: Motion, k: int, stamp_ns: Times, cube: Index | slice
+    ) -> Array:
+        """Return the specific forces (3, N) by the instants k and k + 1; NaN: unknown.
+
+        Args:
+            motion: Motion of the skin.
+            k: Number of the first instant.
+            stamp_ns: Time stamps of the rows (N,), in ns.
+            cube: Index of their cubes.
+        """
+        begin_ns, end_ns = motion.time_ns[k : k + 2].tolist()
+        interval_ns = end_ns - begin_ns
+        # A damaged recording may state equal instants.
+        if not 0 < interval_ns <= MAX_INTERVAL_NS:
+            return np.full((3, len(stamp_ns)), np.nan)
+        elapsed_ns = stamp_ns - begin_ns
+        beyond_ns = np.maximum(-elapsed_ns, elapsed_ns - interval_ns)
+        share = elapsed_ns / interval_ns
+        share[beyond_ns > max(MAX_EXTRAPOLATION_NS, 2 * interval_ns)] = np.nan
+        before, after = (self._at_cubes(motion, number)[:, cube] for number in (k, k + 1))
+        force: Array = before + share * (after - before)
         return force
 
     def _at_cubes(self, motion: Motion, k: int) -> Array:
-        """Return the specific force at each cube in its frame (cubes, 3) at one instant.
+        """Return the specific force at each cube in its frame (3, cubes) at one instant.
 
         Sums have a fixed order. The results of the newest instants are kept, because successive
         messages use them again.
@@ -122,5 +142,5 @@ class ForcesAtCubes:
             # The components in the frame of a cube are along the columns of its rotation.
             axes = self._rotation.transpose(1, 0, 2)
             in_cube = [a[0] * parent[0] + a[1] * parent[1] + a[2] * parent[2] for a in axes]
-            self._known[key] = np.array(in_cube).T
+            self._known[key] = np.array(in_cube)
         return self._known[key]

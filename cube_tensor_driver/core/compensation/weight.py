@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..arrays import Array, Index, Mask, Real
+from ..arrays import Array, Index, Mask, Real, index_cubes
 from ..pipeline import Pipeline
 from ..rows import FrequencyRows
 from ..status import WEIGHT
@@ -55,11 +55,11 @@ class Weight(Effect):
             self._response[number, : len(gain)] = gain * model.response
             if model.deviation is not None:
                 self._deviation[number, : len(gain)] = gain * model.deviation
-        # With the axis first, each of the three terms of a product is one contiguous table.
+        # With axes and pads first, numpy multiplies all cubes in one loop.
         stiffness = np.where(pipeline.stiffness > 0, pipeline.stiffness, np.inf)
-        table = np.moveaxis(self._response / stiffness[..., None], 2, 0)
+        table = (self._response / stiffness[..., None]).transpose(2, 1, 0)
         self._table = np.ascontiguousarray(table, pipeline.dtype)
-        self._newest_force = np.full((len(models), 3), np.nan)
+        self._newest_force = np.full((3, len(models)), np.nan)
 
     def applies(self, rows: FrequencyRows) -> bool:
         """Return whether the rows have a column of specific forces, known or not."""
@@ -69,13 +69,16 @@ class Weight(Effect):
         """Add the effect to the offsets of the pads; see `Effect.add_offset`."""
         if rows.specific_force is None:
             return np.zeros(len(rows), bool)
-        with np.errstate(invalid="ignore"):  # NaN stands for a force that is not known
-            is_credible = np.abs(rows.specific_force) < MAX_SPECIFIC_FORCE
-        is_known: Mask = is_credible.all(axis=1) & self._has_model[cube]
-        force = np.where(is_known[:, None], rows.specific_force, 0).astype(offset.dtype)
-        for axis, table in enumerate(self._table):
-            offset += table[cube] * force[:, axis, None]
-        self._newest_force[cube] = np.where(is_known[:, None], force, np.nan)
+        given = np.ascontiguousarray(rows.specific_force.T, offset.dtype)
+        # NaN, which stands for a force that is not known, fails the comparison.
+        is_known: Mask = (np.abs(given) < MAX_SPECIFIC_FORCE).all(axis=0) & self._has_model[cube]
+        force = np.where(is_known, given, 0)
+        table = self._table[..., index_cubes(cube, len(self._has_model))]
+        effect = table[0] * force[0]
+        effect += table[1] * force[1]
+        effect += table[2] * force[2]
+        offset += effect.T
+        self._newest_force[:, cube] = np.where(is_known, given, np.nan)
         return is_known
 
     def deviation(self, cube: int) -> Array:
@@ -83,7 +86,7 @@ class Weight(Effect):
 
         An unknown specific force is taken as 0 with a standard deviation of 1 g along each axis.
         """
-        force = self._newest_force[cube]
+        force = self._newest_force[:, cube]
         is_known = not np.isnan(force).any()
         pattern: Array = (
             self._deviation[cube] * force if is_known else self._response[cube] * STANDARD_GRAVITY
