@@ -180,12 +180,13 @@ def clock(seconds: float) -> str:
 
 
 def newtons(contact: Contact) -> str:
-    """Return normal and shear force of a contact as text in N.
+    """Return normal and shear force of a contact as text in N, and whether it slips.
 
     The shear force is left out if it is unknown (NaN), because no cube observes shear.
     """
     shear = "" if np.isnan(contact.shear_force) else f", shear {contact.shear_force:.2f} N"
-    return f"{contact.normal_force:.2f} N{shear}"
+    slips = ", slips" if contact.slips else ""
+    return f"{contact.normal_force:.2f} N{shear}{slips}"
 
 
 def headline(

@@ -16,6 +16,7 @@ import numpy as np
 
 from ..core.arrays import Array
 from ..core.errors import BagError
+from ..touch.slip import NO_CONTACTS, SLIP, Slip
 from ..touch.surface import Contact
 from ..touch.tracker.contact_tracker import TrackedContact
 from .codec import SECOND
@@ -46,6 +47,7 @@ _TRACKED_NUMBERS = (
     "area_uncertainty",
     "moment_uncertainty",
 )
+_FRICTION = ("friction", "friction_uncertainty", "friction_use")
 _VECTORS = {
     "position": "Point",
     "normal": "Vector3",
@@ -59,6 +61,7 @@ def contacts_message(
     stamp_ns: int,
     frame_id: str,
     contacts: Sequence[Contact] | Sequence[TrackedContact],
+    slip: Slip = NO_CONTACTS,
 ) -> Any:
     """Make a SkinContacts message.
 
@@ -67,6 +70,7 @@ def contacts_message(
         stamp_ns: Time stamp of the header, in ns since the Unix epoch.
         frame_id: Coordinate frame of the positions, normals and forces.
         contacts: The contacts: all with a tracker (`TrackedContact`) or all without one.
+        slip: State and friction of these contacts; without a tracker the default, empty arrays.
     """
     # Only tracked contacts have an id, a moment, further uncertainties and the mark `refined`.
     # Without a tracker, these arrays of the message stay empty.
@@ -78,6 +82,9 @@ def contacts_message(
     for name, kind in _VECTORS.items():
         vectors = [getattr(contact, name) for contact in contacts]
         fields[name] = [_make_xyz(make, kind, vector) for vector in vectors]
+    fields["slip"] = slip.state.astype(np.uint8)
+    fields |= {name: getattr(slip, name) for name in _FRICTION}
+    fields["slip_velocity"] = [_make_xyz(make, "Vector3", one) for one in slip.velocity]
     header = _make_header(make, stamp_ns, frame_id)
     return make(CONTACTS, header=header, **fields)
 
@@ -124,7 +131,7 @@ def traction_message(
 
 
 def decode_contacts(message: Any) -> list[Contact]:
-    """Return the contacts of a SkinContacts message, without the values of a tracker.
+    """Return the contacts of a SkinContacts message; of the values of a tracker only `slips`.
 
     Raises:
         ValueError: The arrays of the message have different lengths.
@@ -134,9 +141,10 @@ def decode_contacts(message: Any) -> list[Contact]:
         return np.array([vector.x, vector.y, vector.z])
 
     columns = [getattr(message, name) for name in (*_VECTORS, *_NUMBERS)]
+    slips = [state == SLIP for state in message.slip] or [False] * len(message.position)
     return [
-        Contact(read_xyz(position), read_xyz(normal), read_xyz(force), *numbers)
-        for position, normal, force, *numbers in zip(*columns, strict=True)
+        Contact(read_xyz(position), read_xyz(normal), read_xyz(force), *others)
+        for position, normal, force, *others in zip(*columns, slips, strict=True)
     ]
 
 

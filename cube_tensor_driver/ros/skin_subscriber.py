@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from rclpy.node import Node
@@ -156,27 +157,41 @@ class SkinSubscriberNode(CubeNode):
                 `LatestStress.health` returns it.
         """
 
+    def follow_stress(self, skin: FollowedSkin, health: Index) -> Any:
+        """Return a message to publish at once; called at each `stress` message if overridden.
+
+        Args:
+            skin: The state of the skin.
+            health: Health of each cube (cubes,), as in `compute_message`.
+        """
+
     def has_listeners(self, publisher: Any) -> bool:
         """Return whether the topic has a subscriber. Without one, nothing is computed."""
         return bool(publisher.get_subscription_count())
 
     def configure(self) -> None:
-        subscriber = SkinSubscriber(self, self.prepare)
+        is_followed = type(self).follow_stress is not SkinSubscriberNode.follow_stress
+
+        def receive(stamp_ns: int, rows: StressRows) -> None:
+            publish(self.follow_stress)
+
+        subscriber = SkinSubscriber(self, self.prepare, receive if is_followed else None)
         self.call_at_cleanup(subscriber.close)
         # The topic has the name of the node.
         publisher = self.own(
             self.create_lifecycle_publisher(self._message_type, self.get_name(), self._depth)
         )
 
-        def publish() -> None:
+        def publish(compute: Callable[[FollowedSkin, Index], Any]) -> None:
             skin = subscriber.skin
             if skin is None or not self.is_active or not self.has_listeners(publisher):
                 return
             # The health is computed at each publication, because a cube becomes stale by time
             # alone, without new rows.
             health = skin.newest.health(subscriber.now(), STALE_S)
-            message = self.compute_message(skin, health)
+            message = compute(skin, health)
             if message is not None:
                 publisher.publish(message)
 
-        self.own(self.create_timer(1.0 / self.value("rate"), publish))
+        compute = partial(publish, self.compute_message)
+        self.own(self.create_timer(1.0 / self.value("rate"), compute))

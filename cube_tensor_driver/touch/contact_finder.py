@@ -21,6 +21,7 @@ from ..mechanics.layer import Layer
 from .inverse import SurfaceInverse
 from .pad_measurement import model_pads
 from .pad_noise import noise_by_pad, noise_of_all_pads
+from .slip import NO_CONTACTS, Slip, SlipEstimator
 from .surface import Contact, Surface
 from .tracker.contact_tracker import ContactTracker, TrackedContact
 
@@ -77,16 +78,33 @@ class ContactSettings:
 class ContactFinder(Protocol):
     """Finds the contacts of one skin, by interpolation or by fits (`ContactSettings.method`)."""
 
-    def update(self, values: Array, left_out: PadMasks) -> list[Contact] | list[TrackedContact]:
+    @property
+    def contacts(self) -> Sequence[Contact] | Sequence[TrackedContact]:
+        """Contacts in the last call of `update`, the one with the largest normal force first."""
+
+    @property
+    def slip(self) -> Slip:
+        """Newest state and friction of these contacts; empty if the method is interpolation."""
+
+    def update(self, time_s: float, values: Array, left_out: PadMasks) -> None:
         """Find the contacts in the newest values.
 
         Args:
+            time_s: Time of the newest values in s.
             values: Components (cubes, 15) in Pa and Pa/m, NaN where unknown.
             left_out: Bit masks (cubes,), in which bit k is set if pad k (sensing element) of a cube
                 was not used for `values`.
+        """
+
+    def follow(self, time_s: float, values: Array) -> bool:
+        """Update `slip` from values for which the contacts need not be found.
+
+        Args:
+            time_s: Time of the values in s.
+            values: Components (cubes, 15) in Pa and Pa/m, NaN where unknown.
 
         Returns:
-            Contacts, the one with the largest normal force first.
+            Whether a contact has begun to slip.
         """
 
     def cloud(self, values: Array) -> Array | None:
@@ -130,9 +148,14 @@ class _InterpolationFinder:
     def __init__(self, settings: ContactSettings, poses: CubePoses) -> None:
         self._surface = Surface(poses, settings.depth)
         self._threshold = settings.least
+        self.contacts: list[Contact] = []
+        self.slip = NO_CONTACTS
 
-    def update(self, values: Array, left_out: PadMasks) -> list[Contact]:
-        return self._surface.contacts(values, self._threshold)
+    def update(self, time_s: float, values: Array, left_out: PadMasks) -> None:
+        self.contacts = self._surface.contacts(values, self._threshold)
+
+    def follow(self, time_s: float, values: Array) -> bool:
+        return False
 
     def cloud(self, values: Array) -> None:
         return None
@@ -162,8 +185,14 @@ class _InverseFinder:
         self._left_out = np.zeros(len(calibrations), np.uint32)
         self._inverse = SurfaceInverse.from_poses(poses, by_pad, layer, depth, model=model)
         self._tracker = ContactTracker(self._inverse, settings.least)
+        self._slip = SlipEstimator(self._inverse)
+        self.contacts: list[TrackedContact] = []
 
-    def update(self, values: Array, left_out: PadMasks) -> list[TrackedContact]:
+    @property
+    def slip(self) -> Slip:
+        return self._slip.slip
+
+    def update(self, time_s: float, values: Array, left_out: PadMasks) -> None:
         # The noise of a cube's components depends on the pads in use. So the noise matrices are
         # computed again for cubes whose pads in use have changed since the last scan.
         changed = np.flatnonzero(left_out != self._left_out)
@@ -171,7 +200,12 @@ class _InverseFinder:
             by_pad = noise_by_pad(self._pipeline, changed, left_out[changed])
             self._inverse.leave_out(changed, by_pad)
             self._left_out = left_out.copy()
-        return self._tracker.update(values)
+        self.contacts = self._tracker.update(values)
+        self._slip.adopt(self.contacts, values)
+        self._slip.update(time_s, values)
+
+    def follow(self, time_s: float, values: Array) -> bool:
+        return self._slip.update(time_s, values)
 
     def cloud(self, values: Array) -> Array:
         field = self._tracker.field

@@ -69,6 +69,7 @@ class Contact(NamedTuple):
         area: Area in m^2 on which the pressure exceeds half of its maximum.
         position_uncertainty: Standard deviation of the position along each axis, in m.
         force_uncertainty: Standard deviation of the normal force, in N.
+        slips: Whether the whole contact slides over the skin; False if it is not known.
     """
 
     position: Array
@@ -79,6 +80,7 @@ class Contact(NamedTuple):
     area: float
     position_uncertainty: float
     force_uncertainty: float
+    slips: bool = False
 
 
 class Surface:

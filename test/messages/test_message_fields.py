@@ -23,7 +23,8 @@ from cube_tensor_driver.core.calibration import Calibration
 from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rows import FrequencyRows, StressRows
-from cube_tensor_driver.messages.contacts import contacts_message, traction_message
+from cube_tensor_driver.messages.contacts import contacts_message, decode_contacts, traction_message
+from cube_tensor_driver.touch.slip import SLIP, STICK, UNKNOWN, Slip
 from cube_tensor_driver.touch.surface import Contact
 from cube_tensor_driver.touch.tracker.contact_tracker import TrackedContact
 
@@ -187,7 +188,9 @@ def distinct(kind: Callable, number: int) -> Contact | TrackedContact:
 @pytest.mark.parametrize("kind", [Contact, TrackedContact])
 def test_each_number_of_a_contact_is_in_its_field(kind):
     contacts = [distinct(kind, number) for number in range(3)]
-    message = contacts_message(make_message, START_NS + 5, "wrist", contacts)
+    numbers = np.arange(1.0, 10).reshape(3, 3) / 7
+    slip = Slip(np.array([UNKNOWN, STICK, SLIP]), *numbers, numbers + 5)
+    message = contacts_message(make_message, START_NS + 5, "wrist", contacts, slip)
     assert message.header.frame_id == "wrist"
     assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == START_NS + 5
     for name in ("position", "normal", "force"):
@@ -197,6 +200,16 @@ def test_each_number_of_a_contact_is_in_its_field(kind):
         has_it = name in kind._fields
         expected = [getattr(one, name) for one in contacts] if has_it else []
         np.testing.assert_array_equal(getattr(message, name), expected)
+    for name, expected in zip(
+        ("friction", "friction_uncertainty", "friction_use"), numbers, strict=True
+    ):
+        np.testing.assert_array_equal(getattr(message, name), expected)
+    got = [[one.x, one.y, one.z] for one in message.slip_velocity]
+    np.testing.assert_array_equal(got, slip.velocity)
+    assert message.slip.tolist() == [message.UNKNOWN, message.STICK, message.SLIP] == [0, 1, 2]
+    assert [one.slips for one in decode_contacts(message)] == [False, False, True]
+    without = contacts_message(make_message, START_NS, "wrist", contacts)
+    assert not any(one.slips for one in decode_contacts(without))
 
 
 def test_each_number_of_a_point_is_in_its_field():

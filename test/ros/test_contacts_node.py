@@ -218,8 +218,12 @@ def test_contacts_and_traction_of_a_pressed_skin_live_and_out_of_a_bag(ros, tmp_
         publisher.publish(stress_codec.encode(untouched, FRAME))
         return bool(contacts and clouds)
 
-    def answered(stamp: object) -> bool:
-        return all(one[-1].header.stamp == stamp for one in (contacts, clouds))
+    def answered(wanted: SkinContacts) -> bool:
+        stamp = wanted.header.stamp
+        if any(one[-1].header.stamp != stamp for one in (contacts, clouds)):
+            return False
+        # A contact that begins to slip is reported first at the place of the scan before.
+        return abs(contacts[-1].position[0].x - wanted.position[0].x) < 1e-5
 
     with Children(tmp_path) as children:
         given = {"method": "inverse", "rate": 100.0}
@@ -230,8 +234,7 @@ def test_contacts_and_traction_of_a_pressed_skin_live_and_out_of_a_bag(ros, tmp_
         live = []
         for number, data in enumerate(stress):
             publisher.publish(data)
-            stamp = deserialize_message(expected[0][number], SkinContacts).header.stamp
-            ros.wait(partial(answered, stamp))
+            ros.wait(partial(answered, deserialize_message(expected[0][number], SkinContacts)))
             live.append((contacts[-1], clouds[-1]))
         children.check()
 

@@ -100,20 +100,11 @@ class ContactWriter:
             recorded_ns: (M,) time at which each was recorded, in ns since the Unix epoch.
         """
         rows_per_message = len(stress) // len(messages)
-        begin = 0
         for number, stamp_ns in enumerate(messages.stamp_ns.tolist()):
-            if not self._is_due(stamp_ns):
-                continue
-            # The stress of all messages since the last computed contacts is included.
-            end = (number + 1) * rows_per_message
-            rows = stress.select(slice(begin, end))
+            begin = number * rows_per_message
+            rows = stress.select(slice(begin, begin + rows_per_message))
             self._latest.update(rows, stamp_ns * 1e-9)
-            begin = end
             self._write(stamp_ns, int(recorded_ns[number]))
-        if begin < len(stress):
-            last_ns = int(messages.stamp_ns[-1])
-            rows = stress.select(slice(begin, len(stress)))
-            self._latest.update(rows, last_ns * 1e-9)
 
     def _is_due(self, stamp_ns: int) -> bool:
         """Return whether contacts are due: a period has passed since the last, or time jumped back.
@@ -131,6 +122,9 @@ class ContactWriter:
     def _write(self, stamp_ns: int, recorded_ns: int) -> None:
         """Compute contacts and traction from the newest stress of each cube and write them.
 
+        They are written if they are due. Otherwise, the contacts are written with their new states
+        if one has begun to slip.
+
         Args:
             stamp_ns: Stamp of the messages, in ns since the Unix epoch.
             recorded_ns: Time of recording that the bag states for them, in ns.
@@ -139,10 +133,18 @@ class ContactWriter:
             raise BagError(f"{self._contacts}: no info says where the cubes are; record info")
         health = self._latest.health(stamp_ns * 1e-9, STALE_S)
         values = self._latest.usable_values(health)
-        contacts = self._finder.update(values, self._latest.left_out)
-        message = contacts_message(make_message, stamp_ns, self._frame_id, contacts)
+        finder, time_s = self._finder, stamp_ns * 1e-9
+        is_due = self._is_due(stamp_ns)
+        begins_to_slip = finder.follow(time_s, values)
+        if is_due:
+            finder.update(time_s, values, self._latest.left_out)
+        elif not begins_to_slip:
+            return
+        message = contacts_message(
+            make_message, stamp_ns, self._frame_id, finder.contacts, finder.slip
+        )
         self._writer.write(self._contacts, recorded_ns, serialise(message))
-        cloud = self._finder.cloud(values)
+        cloud = finder.cloud(values) if is_due else None
         if cloud is not None:
             message = traction_message(make_message, stamp_ns, self._frame_id, cloud)
             self._writer.write(self._traction, recorded_ns, serialise(message))

@@ -63,6 +63,9 @@ PUSH_COLOUR: Colour = (0.3, 0.5, 1.0)
 CONTACT_COLOUR: Colour = (1.0, 0.45, 0.75)
 """Colour of the rings and texts of contacts."""
 
+SLIP_COLOUR: Colour = (1.0, 0.1, 0.1)
+"""Colour of the text of a contact that slips."""
+
 MAX_CONTACTS = 8
 """Maximum number of contacts that are drawn. A message lists those with the largest forces first.
 """
@@ -227,7 +230,7 @@ class Canvas:
         crosses.colours[:, :3] = np.repeat(colours, 2, axis=0)
 
     def draw_contacts(self, contacts: SkinContacts | None) -> None:
-        """Draw each contact as a ring, with its normal and shear force as text.
+        """Draw each contact as a ring, with its normal and shear force as text, red if it slips.
 
         Args:
             contacts: The newest message of contacts; None: all rings and texts are hidden.
@@ -245,7 +248,8 @@ class Canvas:
             area = max(0.0, contacts.area[number])
             radius = float(np.sqrt(area / np.pi))
             rings[number] = _make_ring(position, normal, radius)
-            label.colour[3] = 1.0
+            slips = number < len(contacts.slip) and contacts.slip[number] == SkinContacts.SLIP
+            label.colour[:] = *(SLIP_COLOUR if slips else CONTACT_COLOUR), 1.0
             label.position[:] = position + max(radius, MIN_TEXT_DISTANCE_M) * normal
             normal_n, shear_n = contacts.normal_force[number], contacts.shear_force[number]
             self._markers.write_text(f"contact {number}", _force_text(normal_n, shear_n))

@@ -37,10 +37,13 @@ missing or damaged file may have been replaced."""
 class Contacts(SkinSubscriberNode):
     """Publishes `contacts` for the newest `stress`, at most `rate` times per second (parameter).
 
-    Without contacts the arrays of a message are empty. With the method `inverse` the node also
-    publishes `traction`, the force per area on the surface of the skin. The `ContactFinder` is set
-    up in another thread, because that may take long on a large skin and the node must answer
-    requests meanwhile. Nothing is published before it is ready.
+    With the method `inverse` the state of slip is updated at each `stress`. When a contact begins
+    to slip, the contacts of the last message are published again with their new states, because a
+    hand must react earlier than the next regular message. Without contacts the arrays of a message
+    are empty. With the method `inverse` the node also publishes `traction`, the force per area on
+    the surface of the skin. The `ContactFinder` is set up in another thread, because that may take
+    long on a large skin and the node must answer requests meanwhile. Nothing is published before it
+    is ready.
     """
 
     def __init__(self) -> None:
@@ -77,7 +80,7 @@ class Contacts(SkinSubscriberNode):
             return None
         self._processed_messages = skin.messages
         values, frame_id = skin.newest.usable_values(health), skin.info.header.frame_id
-        contacts = finder.update(values, skin.newest.left_out)
+        finder.update(1e-9 * skin.stamp_ns, values, skin.newest.left_out)
         # Computing the point cloud takes time, so it is done only while somebody subscribes.
         if self._traction is not None and self._has_traction_listeners():
             cloud = finder.cloud(values)
@@ -89,12 +92,19 @@ class Contacts(SkinSubscriberNode):
                     cloud,
                 )
                 self._traction.publish(message)
-        return contacts_message(
-            make_message,
-            skin.stamp_ns,
-            frame_id,
-            contacts,
-        )
+        return self._make_message(skin, finder)
+
+    def follow_stress(self, skin: FollowedSkin, health: Index) -> SkinContacts | None:
+        finder = self._finder
+        if finder is None:
+            return None
+        values = skin.newest.usable_values(health)
+        begins = finder.follow(1e-9 * skin.stamp_ns, values)
+        return self._make_message(skin, finder) if begins else None
+
+    def _make_message(self, skin: FollowedSkin, finder: ContactFinder) -> SkinContacts:
+        frame_id = skin.info.header.frame_id
+        return contacts_message(make_message, skin.stamp_ns, frame_id, finder.contacts, finder.slip)
 
     def _take_finder(self) -> ContactFinder | None:
         """Return the contact finder; None while it is being set up, or if the set-up has failed.

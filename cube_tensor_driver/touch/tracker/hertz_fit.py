@@ -21,6 +21,7 @@ import numpy as np
 from ...core.arrays import Array
 from ...mechanics.kernels import DISC_SIZES
 from .contact_estimate import ContactEstimate, ContactSum
+from .local_values import LocalValues
 from .node_fit import NodeFit
 
 SIZE_DEVIATION = 1.0
@@ -137,7 +138,9 @@ class HertzFit:
         columns = []
         model = 0.0
         for centre, log_size, force in zip(self.centres, self.log_sizes, self.forces, strict=True):
-            derivatives = self._derivatives(centre, np.exp(log_size), force)
+            derivatives = differentiate_response(
+                self._region.values, centre, np.exp(log_size), force, self._depth
+            )
             model = model + derivatives[:, :3] @ force
             columns.append(derivatives)
         self._jacobian = np.concatenate([*columns, self._others], axis=1)
@@ -235,38 +238,39 @@ class HertzFit:
             area_variance=float((2 * area) ** 2 * covariance[5, 5]),
         )
 
-    def _derivatives(self, centre: Array, size: float, force: Array) -> Array:
-        """Compute the derivatives of the whitened values by the parameters of one contact.
 
-        Args:
-            centre: Centre (2,) of the contact in m, on the skin laid flat.
-            size: Radius in m.
-            force: Force (3,) in N.
+def differentiate_response(
+    values: LocalValues, centre: Array, size: float, force: Array, depth: float
+) -> Array:
+    """Compute the derivatives of whitened values by the parameters of one Hertz contact.
 
-        Returns:
-            Derivatives (n C, 7). The first three columns are the response to unit forces.
-        """
-        step = _DIFFERENCE_STEP * self._depth
-        moved = self._respond(centre + step * _STENCIL, size)
-        wider, narrower = (
-            self._respond(centre[None], size * np.exp(sign * SIZE_STEP))[:, :, 0] @ force
-            for sign in (1, -1)
-        )
-        under_force = np.einsum("dak,a->dk", moved, force)
-        by_centre = (under_force[:, [1, 3]] - under_force[:, [2, 4]]) / (2 * step)
-        by_log_size = (wider - narrower) / (2 * SIZE_STEP)
-        # The mixture with this share of the wider contact has the second moment of the contact.
-        share = 1 / (1 + np.exp(2 * SIZE_STEP))
-        flatness = under_force[:, 0] - (share * wider + (1 - share) * narrower)
-        slopes = [by_centre, by_log_size[:, None], flatness[:, None]]
-        return np.concatenate([moved[:, :, 0], *slopes], axis=1)
+    Args:
+        values: Values of the cubes around the contact.
+        centre: Centre (2,) of the contact in m, in the frame of the home cube.
+        size: Radius in m.
+        force: Force (3,) in N, in this frame.
+        depth: Distance from the centres of the cubes to the surface, in m.
 
-    def _respond(self, centres: Array, size: float) -> Array:
-        """Return the whitened response (n C, 3, K) to 1 N along x, y and z on K Hertz contacts.
+    Returns:
+        Derivatives (n C, 7) by force f_x, f_y, f_z, centre c_x, c_y, logarithm of the radius, and
+        flatness. The first three columns are the response to unit forces.
+    """
 
-        Args:
-            centres: Centres (K, 2) of the contacts in m, on the skin laid flat.
-            size: Radius of all contacts in m.
-        """
-        _, white = self._region.values.respond(centres, size)
+    def respond(centres: Array, radius: float) -> Array:
+        """Return the whitened response (n C, 3, K) to 1 N along x, y and z on K contacts."""
+        _, white = values.respond(centres, radius)
         return np.asarray(white.reshape(len(white), 3, -1))
+
+    step = _DIFFERENCE_STEP * depth
+    moved = respond(centre + step * _STENCIL, size)
+    wider, narrower = (
+        respond(centre[None], size * np.exp(sign * SIZE_STEP))[:, :, 0] @ force for sign in (1, -1)
+    )
+    under_force = np.einsum("dak,a->dk", moved, force)
+    by_centre = (under_force[:, [1, 3]] - under_force[:, [2, 4]]) / (2 * step)
+    by_log_size = (wider - narrower) / (2 * SIZE_STEP)
+    # The mixture with this share of the wider contact has the second moment of the contact.
+    share = 1 / (1 + np.exp(2 * SIZE_STEP))
+    flatness = under_force[:, 0] - (share * wider + (1 - share) * narrower)
+    slopes = [by_centre, by_log_size[:, None], flatness[:, None]]
+    return np.concatenate([moved[:, :, 0], *slopes], axis=1)

@@ -21,6 +21,8 @@ class LocalValues:
         angle: Rotations (n,) of the cubes in rad, in this frame.
         known: Whether each of the C components of the cubes is known (n, C).
         count: Number of known values.
+        whitening: Matrices (n, C, C) by which the values of each cube are multiplied, so that their
+            noise has variance 1.
     """
 
     def __init__(self, inverse: SurfaceInverse, home: int, cubes: Index, scaled: Array) -> None:
@@ -51,7 +53,7 @@ class LocalValues:
         identity = np.eye(noise.shape[1])
         noise += identity * ~self.known[:, None] + 1e-9 * identity * noise
         self._noise_root = np.linalg.cholesky(noise)
-        self._whitening = np.linalg.inv(self._noise_root) * self.known[:, None]
+        self.whitening = np.linalg.inv(self._noise_root) * self.known[:, None]
 
     def is_valid(self, scaled: Array) -> bool:
         """Return whether the same values are known, and the same pads in use, as at the start.
@@ -71,7 +73,7 @@ class LocalValues:
             scaled: Values (cubes of the skin, C) in Pa. Unknown values give 0.
         """
         values = np.where(self.known, scaled[self.cubes], 0.0)
-        return np.asarray((self._whitening @ values[:, :, None]).ravel())
+        return np.asarray((self.whitening @ values[:, :, None]).ravel())
 
     def unwhiten(self, white: Array) -> Array:
         """Return the values (n, C) in Pa of which `whiten` makes `white` (n C,)."""
@@ -97,7 +99,7 @@ class LocalValues:
         shape = (len(self.place), count, -1, 3)
         values = response.reshape(shape).transpose(0, 2, 3, 1)
         values = values.reshape(*self.known.shape, -1)
-        return values, (self._whitening @ values).reshape(-1, 3 * count)
+        return values, (self.whitening @ values).reshape(-1, 3 * count)
 
 
 def unroll_points(inverse: SurfaceInverse, home: int, points: Index) -> Array:

@@ -1,0 +1,435 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
+"""Stick, slip and friction coefficient of the contacts of a skin.
+
+The contact tracker takes several milliseconds, too long for every scan (set of values of all cubes)
+at 1 kHz. Between its updates, force and position of each contact are followed in every scan: with
+the derivatives J of the values by force, position, radius and flatness of a Hertz contact, a change
+dy of the values is a change dp of these parameters (values divided by their noise, prior precision
+P)::
+
+    dp = (J' J + P)^-1 J' dy
+
+A body that sticks keeps its place on the skin, also while the skin deforms and while the rim of the
+contact slips (Cattaneo, Mindlin). When all of the contact slips (gross slip), Coulomb's law fixes
+the ratio of shear and normal force, and the contact moves along the shear force that the body
+exerts on the skin. So a contact slips if it moves in this direction while the ratio stays nearly
+the same. The centre of pressure of a body that is pulled above the surface moves, too, but in
+proportion to the change of the ratio. A body that rolls moves without a shear force along its way.
+
+Source: K. L. Johnson, Contact Mechanics (1985), 7.1 (sliding) and 7.2 (partial slip).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..core.arrays import AnyArray, Array, Index, Mask
+from ..mechanics.kernels import DISC_SIZES
+from .inverse import SurfaceInverse
+from .tracker.contact_tracker import TrackedContact
+from .tracker.hertz_fit import FORCE_DEVIATION, SIZE_DEVIATION, differentiate_response
+from .tracker.local_values import LocalValues
+from .tracker.region_fit import MIN_FACING
+
+UNKNOWN = 0
+"""State of a contact that is neither known to stick nor to slip: it is new, its force is below
+`MIN_FORCE_N`, or it moves as a rolling or tilting body does."""
+STICK = 1
+"""State of a contact that keeps its place on the skin; its rim may slip."""
+SLIP = 2
+"""State of a contact whose whole area slides over the skin (gross slip)."""
+
+N_CUBES = 16
+"""Number of cubes nearest to a contact from whose values its force and position are followed."""
+
+LAGS = np.array([2, 4, 8, 16, 32, 64])
+"""Durations, in scans, over which the motion of a contact is tested. The short ones find fast slip
+early; the long ones find slow slip, whose motion the noise hides over a short time."""
+
+MIN_DISTANCE_M = 10e-6
+"""Smallest motion in m that counts as slip; the noise of the position is 0.3 to 3 um for loads of
+1 to 10 N."""
+
+MIN_SPEED = 1e-3
+"""Smallest speed of slip in m/s. Slower motion may be creep of the elastomer or drift."""
+
+SIGNIFICANCE = 5.0
+"""Smallest motion that counts as slip, divided by its standard deviation from the noise of the
+pads. With Gaussian noise, 6 lags and 1000 scans a second exceed it by chance once in 5 minutes; the
+direction and `MIN_DISTANCE_M` must agree, too."""
+
+LEVER_M = 0.1
+"""Largest height in m above the surface at which a small shear force on a sticking body acts. It
+shifts the centre of pressure by the height times the ratio of shear and normal force.
+
+For larger ratios q the assumed height is smaller, `LEVER_M` / (1 + 2 q): a body that is pulled far
+above the surface tips over before the ratio gets large, and errors of the followed ratio are
+proportional to it.
+"""
+
+LEAK_M = 0.01
+"""Motion in m that is attributed to a change of the force ratio, or of the logarithm of the normal
+force, by 1. Where the skin deviates from the model, changes of the force look like motion."""
+
+MIN_RATIO = 0.1
+"""Smallest ratio of shear and normal force of a contact that slips. With less shear, its direction
+is not known well enough, and rolling looks like slip."""
+
+MIN_SHARE_OF_LARGEST = 0.5
+"""Smallest ratio of shear and normal force of a contact that slips, divided by the largest ratio so
+far. Friction held that one, and the coefficient of kinetic friction is rarely less than half of the
+static one."""
+
+MAX_RATIO_CHANGE = 0.2
+"""Largest change of the ratio of shear and normal force during slip, divided by the ratio, over the
+duration in which the motion is tested."""
+
+MIN_COSINE = 0.8
+"""Smallest cosine of the angle between motion and shear force of a contact that slips."""
+
+MIN_LATE_SHARE = 0.25
+"""Smallest share of the motion in a test duration that falls into its second half. With less, the
+contact has stopped."""
+
+MIN_FORCE_N = 0.05
+"""Smallest normal force in N of a contact whose state is estimated."""
+
+FOLLOWED_DEVIATION = 0.02
+"""Standard deviation of the followed ratio of shear and normal force, divided by the ratio, after
+the contact has moved by up to some millimetres since the last update of the contact tracker. It
+was 1.6 % (rms) in simulations of 24-pad cubes."""
+
+MAX_SHIFT_DEPTHS = 0.2
+"""Shift of a contact, divided by the depth of the cubes, after which the derivatives are computed
+again."""
+
+MAX_FORCE_CHANGE = 0.3
+"""Change of the force of a contact, divided by the force, after which the derivatives are computed
+again, because the radius of the contact changes with the force."""
+
+MAX_LINEARISATIONS = 2
+"""Largest number of contacts per scan whose derivatives are computed; each takes about 1 ms."""
+
+NEIGHBOUR_PITCHES = 3.0
+"""Distance of contacts, divided by the pitch (distance of neighbouring cubes), within which they
+are followed jointly."""
+
+
+class Slip(NamedTuple):
+    """State and friction of n contacts.
+
+    Attributes:
+        state: `UNKNOWN`, `STICK` or `SLIP` of each contact (n,).
+        friction: Friction coefficient (n,); NaN before the first slip.
+        friction_uncertainty: Standard deviation of the friction coefficient (n,).
+        friction_use: Ratio of shear and normal force, divided by the friction coefficient (n,); NaN
+            before the first slip.
+        velocity: Velocity (n, 3) of slip in m/s, in the skin's parent frame; 0 without slip, NaN if
+            the state is unknown.
+    """
+
+    state: Index
+    friction: Array
+    friction_uncertainty: Array
+    friction_use: Array
+    velocity: Array
+
+
+NO_CONTACTS = Slip(
+    state=np.zeros(0, np.intp),
+    friction=np.zeros(0),
+    friction_uncertainty=np.zeros(0),
+    friction_use=np.zeros(0),
+    velocity=np.zeros((0, 3)),
+)
+"""State and friction if nothing presses on the skin: empty arrays."""
+
+
+class SlipEstimator:
+    """Follows the contacts that a contact tracker has found from scan to scan.
+
+    Attributes:
+        slip: State and friction of the contacts in the newest scan, in the order of the contacts
+            in the last call of `adopt`.
+    """
+
+    def __init__(self, inverse: SurfaceInverse) -> None:
+        """Create an estimator without contacts.
+
+        Args:
+            inverse: Poses, noise and response of the cubes.
+        """
+        self._inverse = inverse
+        poses = inverse.poses
+        self._above_cubes = poses.position + inverse.depth * poses.rotation[:, :, 2]
+        count = min(N_CUBES, len(self._above_cubes))
+        n_values = count * len(inverse.columns)
+        # A load consists of force (3) in N and position (3) in m. A row of `past` is position,
+        # force divided by normal force along the surface (3), and logarithm of the normal force.
+        fields: list[tuple[str, type, tuple[int, ...]]] = [
+            ("id", int, ()),
+            ("normal", float, (3,)),
+            ("radius", float, ()),
+            ("ratio_deviation", float, ()),
+            ("largest_ratio", float, ()),
+            ("slips", bool, ()),
+            ("is_fitted", bool, ()),
+            ("sums", float, (3,)),
+            ("cubes", int, (count,)),
+            ("weights", float, (6, n_values)),
+            ("noise", float, ()),
+            ("values", float, (n_values,)),
+            ("load", float, (6,)),
+            ("linearised", float, (6,)),
+            ("past", float, (LAGS[-1] + 1, 7)),
+        ]
+        self._contacts: AnyArray = np.zeros(0, fields)
+        self._times = np.full(LAGS[-1] + 1, -np.inf)
+        self.slip = NO_CONTACTS
+
+    def adopt(self, found: Sequence[TrackedContact], values: Array) -> None:
+        """Take over the contacts that the tracker has found; call `update` afterwards.
+
+        Args:
+            found: The contacts.
+            values: Components (cubes, 15) in Pa and Pa/m in which they were found.
+        """
+        scaled = self._inverse.scaled(values)
+        rows = {number: row for row, number in enumerate(self._contacts["id"].tolist())}
+        contacts = np.zeros(len(found), self._contacts.dtype)
+        contacts["past"] = np.nan
+        for number, one in enumerate(found):
+            if one.id in rows:
+                contacts[number] = self._contacts[rows[one.id]]
+            ratio = one.shear_force / one.normal_force
+            deviation = np.hypot(ratio * one.force_uncertainty, one.shear_uncertainty)
+            row = contacts[number]
+            row["id"] = one.id
+            row["normal"] = one.normal
+            row["radius"] = np.sqrt(one.area / np.pi)
+            row["ratio_deviation"] = deviation / one.normal_force
+            certain = ratio - 3 * row["ratio_deviation"]
+            row["largest_ratio"] = max(row["largest_ratio"], certain)
+        self._contacts = contacts
+        if not found:
+            self.slip = NO_CONTACTS
+            return
+
+        before = _describe(self._follow(scaled), contacts["normal"])
+        contacts["load"] = [[*one.force, *one.position] for one in found]
+        contacts["values"] = self._gather(scaled)
+        after = _describe(contacts["load"], contacts["normal"])
+        # The difference of the followed and the fitted load is no motion.
+        contacts["past"] += (after - before)[:, None]
+
+        # As soon as the tracker has seen a contact slip, its exact ratios replace followed ones.
+        slips = contacts["slips"]
+        contacts["sums"][slips & ~contacts["is_fitted"]] = 0.0
+        contacts["is_fitted"] |= slips
+        ratio = np.linalg.norm(after[:, 3:6], axis=1)
+        _add_ratio(contacts, slips, ratio, contacts["ratio_deviation"])
+
+    def update(self, time_s: float, values: Array) -> bool:
+        """Estimate `slip` from the values of a scan.
+
+        Args:
+            time_s: Time of the scan in s. If it is that of the scan before, `values` are the same,
+                too.
+            values: Components (cubes, 15) in Pa and Pa/m, NaN where unknown.
+
+        Returns:
+            Whether a contact has begun to slip.
+        """
+        contacts = self._contacts
+        if not len(contacts):
+            return False
+        scaled = self._inverse.scaled(values)
+        loads = self._follow(scaled)
+        self._linearise_changed(loads, scaled)
+        newest = _describe(loads, contacts["normal"])
+        self._remember(time_s, newest)
+
+        change = newest[:, None] - contacts["past"][:, LAGS]
+        duration = time_s - self._times[LAGS]
+        moves, slips = self._test_lags(newest, change, duration)
+        slipped = slips.any(axis=1)
+        begins = bool((slipped & ~contacts["slips"]).any())
+        contacts["slips"] = slipped
+        ratio = np.linalg.norm(newest[:, 3:6], axis=1)
+        deviation = np.hypot(contacts["ratio_deviation"], FOLLOWED_DEVIATION * ratio)
+        _add_ratio(contacts, slipped & ~contacts["is_fitted"], ratio, deviation)
+
+        is_known = np.isfinite(change[:, 0, 0]) & (newest[:, 6] > np.log(MIN_FORCE_N))
+        state = np.where(is_known & ~moves.any(axis=1), STICK, UNKNOWN)
+        state[slipped] = SLIP
+        shortest = slips.argmax(axis=1)
+        velocity = change[np.arange(len(state)), shortest, :3] / duration[shortest, None]
+        velocity[state == STICK] = 0.0
+        velocity[state == UNKNOWN] = np.nan
+        with np.errstate(invalid="ignore"):  # no slip so far: 0 / 0 is NaN, unknown
+            inverse_sum, weight_sum, ratio_sum = contacts["sums"].T
+            friction = ratio_sum / weight_sum
+            uncertainty = inverse_sum / weight_sum
+        self.slip = Slip(state, friction, uncertainty, ratio / friction, velocity)
+        return begins
+
+    def _test_lags(self, newest: Array, change: Array, duration: Array) -> tuple[Mask, Mask]:
+        """Return whether each contact has moved, and slipped, over each lag (n, lags).
+
+        Args:
+            newest: Descriptions (n, 7) of the loads in this scan.
+            change: Their changes (n, lags, 7) over each lag.
+            duration: Durations (lags,) of the lags in s.
+        """
+        moved = change[..., :3]
+        turned = change[..., 3:6]
+        distance = np.linalg.norm(moved, axis=2)
+        ratio = newest[:, 3:6]
+        size = np.linalg.norm(ratio, axis=1)[:, None]
+
+        divisor = np.maximum(distance, 1e-12)
+        growth = np.einsum("nlk,nlk->nl", moved, turned) / divisor
+        tilt = LEVER_M / (1 + 2 * size) * np.maximum(growth, 0)
+        leak = LEAK_M * np.linalg.norm(change[..., 3:], axis=2)
+        # The force may have changed and returned within a lag.
+        explained = np.maximum.accumulate(tilt + leak, axis=1)
+        noise = SIGNIFICANCE * np.sqrt(2) * self._contacts["noise"]
+        threshold = np.maximum(noise, MIN_DISTANCE_M)[:, None]
+        moves = distance > threshold + explained
+        moves &= distance > MIN_SPEED * duration
+        # Each lag is twice the one before.
+        moves[:, 1:] &= distance[:, :-1] > MIN_LATE_SHARE * distance[:, 1:]
+
+        along = np.einsum("nlk,nk->nl", moved, ratio)
+        largest = MIN_SHARE_OF_LARGEST * self._contacts["largest_ratio"]
+        slips = moves & (along > MIN_COSINE * distance * size)
+        slips &= size > np.maximum(MIN_RATIO, largest)[:, None]
+        slips &= np.linalg.norm(turned, axis=2) < MAX_RATIO_CHANGE * size
+        return moves, slips
+
+    def _remember(self, time_s: float, newest: Array) -> None:
+        """Store the descriptions (n, 7) of the loads of a scan at a time in s."""
+        past = self._contacts["past"]
+        if time_s < self._times[0]:
+            # The time has jumped back, as at the start of another recording.
+            past[:] = np.nan
+        if time_s != self._times[0]:
+            past[:, 1:] = past[:, :-1].copy()
+            self._times = np.roll(self._times, 1)
+        past[:, 0] = newest
+        self._times[0] = time_s
+
+    def _gather(self, scaled: Array) -> Array:
+        """Return the values (n, values) in Pa of the cubes from which each contact is followed."""
+        values: Array = scaled[self._contacts["cubes"]]
+        return values.reshape(len(self._contacts), -1)
+
+    def _follow(self, scaled: Array) -> Array:
+        """Return force in N and position in m (n, 6) of each contact in a scan."""
+        contacts = self._contacts
+        # A value that is missing counts as unchanged.
+        change = np.nan_to_num(self._gather(scaled) - contacts["values"])
+        loads: Array = contacts["load"] + np.einsum("nkm,nm->nk", contacts["weights"], change)
+        return loads
+
+    def _linearise_changed(self, loads: Array, scaled: Array) -> None:
+        """Compute the derivatives for contacts that are new or have changed.
+
+        Args:
+            loads: Force in N and position in m (n, 6) of the contacts.
+            scaled: Values (cubes, C) in Pa.
+        """
+        change = loads - self._contacts["linearised"]
+        force = np.linalg.norm(loads[:, :3], axis=1)
+        limit = MAX_FORCE_CHANGE * np.maximum(force, MIN_FORCE_N)
+        has_changed = np.linalg.norm(change[:, :3], axis=1) > limit
+        shift = np.linalg.norm(change[:, 3:], axis=1)
+        has_changed |= shift > MAX_SHIFT_DEPTHS * self._inverse.depth
+        for row in np.flatnonzero(has_changed)[:MAX_LINEARISATIONS]:
+            self._linearise(int(row), loads, scaled)
+
+    def _linearise(self, row: int, loads: Array, scaled: Array) -> None:
+        """Compute the weights with which one contact follows from the values of the cubes near it.
+
+        Args:
+            row: Number of the contact.
+            loads: Force in N and position in m (n, 6) of all contacts.
+            scaled: Values (cubes, C) in Pa.
+        """
+        inverse = self._inverse
+        poses = inverse.poses
+        depth = inverse.depth
+        contact = self._contacts[row]
+        place = loads[row, 3:]
+        distance = np.linalg.norm(self._above_cubes - place, axis=1)
+        is_turned_away = poses.rotation[:, :, 2] @ contact["normal"] < MIN_FACING
+        distance[is_turned_away] = np.inf
+        cubes = np.argsort(distance)[: len(contact["cubes"])]
+        home = int(cubes[0])
+        usable = np.where(is_turned_away[:, None], np.nan, scaled)
+        local = LocalValues(inverse, home, cubes, usable)
+
+        # All derivatives are in the frame of the home cube. Those of this contact come first.
+        rotation = poses.rotation[home]
+        apart = np.linalg.norm(loads[:, 3:] - place, axis=1)
+        near = np.argsort(apart)[: np.sum(apart < NEIGHBOUR_PITCHES * inverse.pitch)]
+        sizes = np.clip(self._contacts["radius"], *(DISC_SIZES[[1, -3]] * depth))
+        centres = (loads[:, 3:] - poses.position[home]) @ rotation
+        forces = loads[:, :3] @ rotation
+        jacobian = np.concatenate(
+            [
+                differentiate_response(local, centres[one, :2], sizes[one], forces[one], depth)
+                for one in near
+            ],
+            axis=1,
+        )
+        precision = [FORCE_DEVIATION**-2] * 3 + [depth**-2] * 2 + [SIZE_DEVIATION**-2, 1.0]
+        matrix = jacobian.T @ jacobian + np.diag(np.tile(precision, len(near)))
+        solved = np.linalg.solve(matrix, jacobian.T)[:5].reshape(5, len(cubes), -1)
+        weights = np.einsum("knc,ncd->knd", solved, local.whitening)
+
+        noise = np.einsum("knc,ncp->knp", weights[3:], np.nan_to_num(inverse.by_pad[cubes]))
+        to_parent = np.zeros((6, 5))
+        to_parent[:3, :3] = rotation
+        to_parent[3:, 3:] = rotation[:, :2]
+        contact["noise"] = np.sqrt((noise**2).sum() / 2)
+        contact["weights"] = to_parent @ weights.reshape(5, -1)
+        contact["cubes"] = cubes
+        contact["values"] = scaled[cubes].ravel()
+        contact["load"] = loads[row]
+        contact["linearised"] = loads[row]
+
+
+def _describe(loads: Array, normal: Array) -> Array:
+    """Return position, force ratio along the surface, and logarithm of the normal force (n, 7).
+
+    Args:
+        loads: Force in N and position in m (n, 6) of the contacts.
+        normal: Normals (n, 3) out of the skin.
+    """
+    force = loads[:, :3]
+    pressing = -np.einsum("nk,nk->n", force, normal)
+    pressing = np.maximum(pressing, 1e-3 * MIN_FORCE_N)[:, None]
+    across = np.einsum("nk,nk->n", force, normal)[:, None] * normal
+    return np.concatenate([loads[:, 3:], (force - across) / pressing, np.log(pressing)], axis=1)
+
+
+def _add_ratio(contacts: AnyArray, chosen: Mask, ratio: Array, deviation: Array) -> None:
+    """Add force ratios of slipping contacts to the weighted mean that is the friction coefficient.
+
+    The pads' gains cause the same error in all ratios. So the deviation of the mean is the mean of
+    the deviations s, with the same weights 1 / s^2.
+
+    Args:
+        contacts: The contacts; `sums` are those of 1 / s, 1 / s^2 and ratio / s^2.
+        chosen: Contacts (n,) that slip.
+        ratio: Ratios (n,) of shear and normal force.
+        deviation: Standard deviations s (n,) of the ratios.
+    """
+    weight = deviation**-2
+    sums = np.stack([1 / deviation, weight, ratio * weight], axis=1)
+    contacts["sums"] += np.where(chosen[:, None], sums, 0.0)
