@@ -40,8 +40,12 @@ class Message(NamedTuple):
     sent_ns: int
 
 
-class RawSubscription:
-    """Takes the serialised messages of a topic with the numbers that DDS gave them."""
+class TopicLog(Generic[AnyRows]):
+    """Collects all rows (one cube at one sampling time each) of one batch topic.
+
+    Attributes:
+        count: Number of messages so far.
+    """
 
     def __init__(
         self,
@@ -49,14 +53,49 @@ class RawSubscription:
         kind: type,
         topic: str,
         quality: QoSProfile,
+        codec: MessageCodec[AnyRows],
+        skin: Skin,
     ) -> None:
+        """Subscribe to a topic.
+
+        Args:
+            node: Node of the subscription, which has no executor.
+            kind: Type of the messages.
+            topic: Name of the topic.
+            quality: Quality of service.
+            codec: Codec of the messages.
+            skin: The skin.
+        """
+        self.count = 0
         self._kind = kind
+        self._codec: MessageCodec[AnyRows] = codec
+        self._frame_id = skin.parent_frame.encode() + b"\0"
         self._subscription: Any = node.create_subscription(
             kind, topic, lambda _: None, quality, raw=True
         )
+        self._decoded: list[AnyRows] = []
+        self._waiting: list[Message] = []
+        self._sent_ns: list[AnyArray] = []
+        self._last_number = self._n_rows = self._unreadable = 0
+        self._gaps: list[tuple[int, int]] = []
 
-    def take(self) -> list[Message]:
-        """Return messages that have arrived since the last call."""
+    def take(self) -> None:
+        """Take what has arrived; to be called again and again."""
+        for message in self._take_raw():
+            self.count += 1
+            # A publisher whose start was not noticed begins at 1 again.
+            expected = self._last_number + 1 if message.number > self._last_number else 1
+            self._last_number = message.number
+            if message.number > expected:
+                # The place of a gap is counted in rows, so all rows before it must be decoded.
+                self._decode()
+                self._gaps.append((self._n_rows, message.number - expected))
+            self._waiting.append(message)
+        if len(self._waiting) >= MESSAGES_PER_DECODING:
+            self._decode()
+
+    def _take_raw(self) -> list[Message]:
+        """Return messages that have arrived since the last call, with the numbers of DDS."""
         taken: list[Message] = []
         handle = self._subscription.handle
         # The handle of the subscription must not be destroyed meanwhile.
@@ -69,45 +108,6 @@ class RawSubscription:
                 number, sent_ns = info["publication_sequence_number"], info["source_timestamp"]
                 taken.append(Message(data, number, sent_ns))
         return taken
-
-
-class TopicLog(Generic[AnyRows]):
-    """Collects all rows (one cube at one sampling time each) of one batch topic.
-
-    Attributes:
-        count: Number of messages so far.
-    """
-
-    def __init__(
-        self,
-        subscription: RawSubscription,
-        codec: MessageCodec[AnyRows],
-        skin: Skin,
-    ) -> None:
-        self.count = 0
-        self._codec: MessageCodec[AnyRows] = codec
-        self._frame_id = skin.parent_frame.encode() + b"\0"
-        self._subscription = subscription
-        self._decoded: list[AnyRows] = []
-        self._waiting: list[Message] = []
-        self._sent_ns: list[AnyArray] = []
-        self._last_number = self._n_rows = self._unreadable = 0
-        self._gaps: list[tuple[int, int]] = []
-
-    def take(self) -> None:
-        """Take what has arrived; to be called again and again."""
-        for message in self._subscription.take():
-            self.count += 1
-            # A publisher whose start was not noticed begins at 1 again.
-            expected = self._last_number + 1 if message.number > self._last_number else 1
-            self._last_number = message.number
-            if message.number > expected:
-                # The place of a gap is counted in rows, so all rows before it must be decoded.
-                self._decode()
-                self._gaps.append((self._n_rows, message.number - expected))
-            self._waiting.append(message)
-        if len(self._waiting) >= MESSAGES_PER_DECODING:
-            self._decode()
 
     def expect_new_publisher(self) -> None:
         """Expect the numbers to begin again, because the sending node makes a new publisher."""

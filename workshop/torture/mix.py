@@ -4,10 +4,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from cube_tensor_driver.config.yaml import read_yaml
 from cube_tensor_driver.simulation.faults import FRAME_FAULTS, PAD_FAULTS
 
 from ..checks.samples import CUT_FAULTS
@@ -24,19 +26,6 @@ PADS = 8
 RATE = 500.0
 """Sampling rate of all cubes of the tortured skin, in Hz."""
 
-ACTIONS = {
-    "stall reconstruction": "stop the process for `seconds`, less than its queue holds",
-    "stall subscriber": "stop another subscriber of stress for longer than its queue holds",
-    "rate": "have the hubs sample `value` times a second",
-    "tare": "tare the cubes of the hub whose load is held",
-    "clear": "clear the tare",
-    "restart reconstruction": "kill the process and start it again",
-    "reconfigure reconstruction": "deactivate, clean up, configure and activate it",
-    "cycle driver": "deactivate and activate it",
-    "restart driver": "kill the process and start it again",
-}
-"""Actions on the nodes, each with what is done."""
-
 Event = dict[str, Any]
 """A fault of a hub, with the key `kind` as in `simulation.faults`, or an action on a node, with the
 key `action`; other keys are its values."""
@@ -44,28 +33,8 @@ key `action`; other keys are its values."""
 ROUND_S = 30.0
 """Time, in seconds, after which the actions of `ROUND` are repeated."""
 
-ROUND: tuple[tuple[float, Event], ...] = (
-    (0.6, {"kind": "hold", "link": "hub0", "seconds": 5.0}),
-    (0.8, {"action": "stall reconstruction", "seconds": 1.0}),
-    (3.6, {"action": "tare"}),
-    (5.2, {"action": "clear"}),
-    (5.3, {"action": "rate", "value": RATE / 2}),
-    (6.4, {"action": "rate", "value": RATE}),
-    (8.2, {"kind": "hold", "link": "hub0", "seconds": 5.3}),
-    (11.1, {"action": "tare"}),
-    (12.2, {"action": "restart reconstruction"}),
-    (16.0, {"action": "clear"}),
-    (17.5, {"action": "reconfigure reconstruction"}),
-    (19.5, {"action": "cycle driver"}),
-    (21.5, {"action": "stall subscriber", "seconds": 3.0}),
-    (25.5, {"action": "restart driver"}),
-)
-"""Events of each round, by time in seconds after its begin.
-
-The load is held 2.9 s before a tare, because a tare takes the last whole second of what has arrived
-and a busy host is late. The rate does not change then: the place of a hub in the load depends on
-its period.
-"""
+ROUND: dict[float, Event] = read_yaml(Path(__file__).with_name("round.yaml"))
+"""Events of each round, by time in seconds after its begin."""
 
 FIRST_ROUND_ONLY = ("restart reconstruction", "restart driver")
 """Actions of the first round only. They end the life of a process, over which the growth of its
@@ -142,7 +111,7 @@ class _Mix:
         # A torture that is shorter than its last quiet seconds has one round without events.
         starts = np.arange(0.0, max(self._end, 0.1), ROUND_S)
         for start in starts.tolist():
-            for after, event in ROUND:
+            for after, event in ROUND.items():
                 # Rounds after the first leave out what would end the life of a process.
                 is_due = start == 0 or event.get("action") not in FIRST_ROUND_ONLY
                 if start + after < self._end and is_due:
@@ -217,7 +186,7 @@ class _Mix:
 
 def _disturbs_tare(at: float, seconds: float) -> bool:
     """Return whether a fault of the held hub would be too close to a tare."""
-    holds = [after for after, event in ROUND if event.get("kind") == "hold"]
+    holds = [after for after, event in ROUND.items() if event.get("kind") == "hold"]
     # The fault may last into the next round.
     rounds = np.arange(0.0, at + ROUND_S + 10, ROUND_S)
     hold_s = np.add.outer(rounds, holds)

@@ -24,7 +24,7 @@ from cube_tensor_driver.ros.qos import batch_profile
 
 from ..checks.record import NodeAction, Record, Span
 from .memory import MemoryMonitor
-from .message_log import RawSubscription, TopicLog
+from .message_log import TopicLog
 from .mix import RATE
 
 INSTANTS = 1000
@@ -65,10 +65,10 @@ class TortureRecorder:
         self.observer, self._skin = observer, skin
         quality = batch_profile(RATE)
         quality.depth = QUEUE_DEPTH
-        frequencies = RawSubscription(node, SkinFrequencies, "frequencies", quality)
-        stress = RawSubscription(node, SkinStress, "stress", quality)
-        self._frequencies = TopicLog(frequencies, frequency_codec, skin)
-        self.stress = TopicLog(stress, stress_codec, skin)
+        self._frequencies = TopicLog(
+            node, SkinFrequencies, "frequencies", quality, frequency_codec, skin
+        )
+        self.stress = TopicLog(node, SkinStress, "stress", quality, stress_codec, skin)
 
         self._links: dict[str, dict[str, str]] = {}
         self._totals: dict[str, str] = {}
