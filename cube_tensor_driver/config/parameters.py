@@ -9,6 +9,7 @@ and docs/parameters.md lists them.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -19,6 +20,16 @@ from .port import port_problem
 
 QUANTITIES = ("pressure", "shear", "gradient", *STRESS, "residual")
 """Names of the quantities that the colours of the cubes can show in RViz and Foxglove."""
+
+
+def hardware_problem(name: str) -> str:
+    """Return an error message for the name of a hardware component, or "" if it is valid.
+
+    The name, with "_" for "/", becomes a part of the name of topics.
+    """
+    if re.fullmatch("[A-Za-z_][A-Za-z0-9_/]*", name):
+        return ""
+    return f"found {name!r}, allowed: letters, digits, _ and /, with no digit first"
 
 
 class Parameter(NamedTuple):
@@ -172,6 +183,14 @@ RECONSTRUCTION = (
         "looks for none.",
         span=(0.0, 3600.0),
         minimum=1e-3,
+    ),
+    Parameter(
+        "hardware_name",
+        "",
+        "Name of a hardware component of ros2_control (cm_topic_hardware_component) in the URDF of "
+        "the robot. It gets the wrenches of all cubes, and of the whole skin, as state interfaces. "
+        "With an empty text they are not published.",
+        problem=hardware_problem,
     ),
     Parameter(
         "publish_period",

@@ -218,7 +218,7 @@ def face_force(stress: Real, side: Array | float) -> Array:
 def contact_wrench(
     stress: Real,
     gradient: Real,
-    side: float,
+    side: float | Array,
 ) -> tuple[Array, Array]:
     """Compute the force and the torque about the centre of a square whose normal n is +z.
 

@@ -37,6 +37,7 @@ from ..messages import (
 from ..motion import MissingMotion, make_motion_source
 from ..node import CubeNode, run
 from ..qos import LATCHED, scans_per_message
+from .state_interfaces import make_state_interfaces
 from .stress_publisher import StressPublisher
 from .taring import Taring, tare_folder
 
@@ -109,6 +110,7 @@ class Reconstruction(CubeNode):
             from .touch_publisher import TouchPublisher
 
             self._touch = TouchPublisher(self, skin, profile, false_alarms)
+        self._state_interfaces = make_state_interfaces(self, skin)
         self._info = self.own(self.create_publisher(SkinInfo, "info", LATCHED))
         self._taring = Taring(
             self,
@@ -204,6 +206,8 @@ class Reconstruction(CubeNode):
         self._publisher.publish(stress, stamp_ns, frame_id)
         if self._touch is not None:
             self._touch.publish(stress, rest_changes)
+        if self._state_interfaces is not None:
+            self._state_interfaces.publish(stress, stamp_ns)
         self._diagnostics.count(stress)
 
     def _note_compensation(self, rows: FrequencyRows, stamp_ns: int) -> FrequencyRows:

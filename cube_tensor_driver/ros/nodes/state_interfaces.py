@@ -1,0 +1,210 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
+"""Publishes wrenches as state interfaces of ros2_control, the framework of robot controllers.
+
+The hardware component ``cm_topic_hardware_component/CMTopicSystem`` of ros2_control turns two
+topics, ``<component>/names`` and ``<component>/values``, into state interfaces (numbers that
+controllers read). Its source decides what is sent here: it finds the names that belong to values by
+their common version, takes version 0 for "no data yet", warns in every cycle while it does not know
+the version, and returns the last values for ever if no more come.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+import zlib
+from array import array
+
+import numpy as np
+from rclpy.qos import qos_profile_sensor_data
+from std_msgs.msg import Header
+
+from ...config.skin import Skin
+from ...core.arrays import Array
+from ...core.errors import ConfigError
+from ...core.forces import Forces
+from ...core.rows import StressRows
+from ...core.status import INVALID
+from ...core.tensor import contact_wrench, rotation_from_rpy
+from ...device.links.session import SILENT_S
+from ..messages import message_class, pack_array, to_time
+from ..node import CubeNode
+from ..qos import DEFAULT_RATE_HZ
+
+COMPONENTS = ("force.x", "force.y", "force.z", "torque.x", "torque.y", "torque.z")
+"""Names of the state interfaces of a force-torque sensor: forces in N, torques in N m."""
+
+NAMES_PERIOD_S = 1.0
+"""Time, in s, between two messages with the names. They are repeated because the component does not
+get messages that were sent before it subscribed."""
+
+CHECK_PERIOD_S = 0.1
+"""Time, in s, between two checks for cubes whose last row is too old, and for new subscribers."""
+
+
+class SkinWrenches:
+    """The latest wrench of each cube of a skin and of the whole skin; NaN where it is not known.
+
+    The wrench of a cube acts on its face +z, in the frame of the cube. The wrench of the skin is
+    the sum of all cubes about the origin of the parent frame, in that frame; it is known only if
+    all of them are.
+
+    Attributes:
+        names: Names of the cubes, then that of the skin.
+    """
+
+    def __init__(self, skin: Skin, side: float | None, stale_s: float) -> None:
+        """Prepare the wrenches of a skin.
+
+        Args:
+            skin: The skin.
+            side: Side of the square face over which stress is integrated, in m; None: the side of
+                the cube itself.
+            stale_s: Time without a row after which the wrench of a cube is unknown, in s.
+
+        Raises:
+            ConfigError: The skin has the name of one of its cubes.
+        """
+        if skin.name in skin.names:
+            raise ConfigError(f"hardware_name: skin and cube are named {skin.name}; rename one")
+        self.names = [*skin.names, skin.name]
+        forces = Forces(skin, side)
+        self._side, self._position = forces.side, forces.position
+        self._rotation = np.array([rotation_from_rpy(*cube.rpy) for cube in skin.cubes])
+        self._wrench = np.full((len(skin.cubes), 6), np.nan)
+        self._arrived = np.full(len(skin.cubes), -np.inf)
+        self._stale_s = stale_s
+
+    def update(self, rows: StressRows, now: float) -> None:
+        """Take over new rows; of several rows of a cube, the last one counts.
+
+        Args:
+            rows: Rows of stress. Those of cubes that the skin does not have are ignored.
+            now: Time of arrival, in s from any origin.
+        """
+        rows = rows.select(rows.cube < len(self._wrench))
+        force, torque = contact_wrench(rows.stress, rows.gradient, self._side[rows.cube, None])
+        wrench = np.hstack([force, torque])
+        # `contact_wrench` counts unknown components as 0, which would look like no load.
+        wrench[rows.status & INVALID != 0] = np.nan
+        self._wrench[rows.cube] = wrench
+        self._arrived[rows.cube] = now
+
+    def forget_stale(self, now: float) -> bool:
+        """Make the wrenches of cubes unknown whose last row is too old.
+
+        Args:
+            now: Present time, in s, on the clock of `update`.
+
+        Returns:
+            Whether a wrench that was known has become unknown.
+        """
+        is_lost = (now - self._arrived > self._stale_s) & ~np.isnan(self._wrench[:, 0])
+        self._wrench[is_lost] = np.nan
+        return bool(is_lost.any())
+
+    def values(self) -> Array:
+        """Return the wrenches (cubes + 1, 6) in the order of `names`, with columns `COMPONENTS`."""
+        force, torque = (
+            np.einsum("nij,nj->ni", self._rotation, part)
+            for part in (self._wrench[:, :3], self._wrench[:, 3:])
+        )
+        about_origin = torque + np.cross(self._position, force)
+        total = np.hstack([force.sum(axis=0), about_origin.sum(axis=0)])
+        return np.vstack([self._wrench, total])
+
+
+def make_state_interfaces(node: CubeNode, skin: Skin) -> StateInterfaces | None:
+    """Return the publisher that the parameter `hardware_name` of a node asks for; None: none.
+
+    Args:
+        node: The node `reconstruction`, which is being configured.
+        skin: The skin.
+
+    Raises:
+        CubeError: The skin has the name of a cube, or pal_statistics_msgs is not installed.
+    """
+    component = node.value("hardware_name")
+    if not component:
+        return None
+    # A link counts as silent after three sample periods; rows wait for the publish period.
+    silent_s = max(SILENT_S, 3 / (skin.rate or DEFAULT_RATE_HZ))
+    stale_s = silent_s + node.value("publish_period")
+    wrenches = SkinWrenches(skin, node.value("wrench_side") or None, stale_s)
+    return StateInterfaces(node, skin, component, wrenches)
+
+
+class StateInterfaces:
+    """Publishes the wrenches of a skin for a hardware component, until the node is cleaned up."""
+
+    def __init__(self, node: CubeNode, skin: Skin, component: str, wrenches: SkinWrenches) -> None:
+        """Make the publishers.
+
+        Args:
+            node: The node, which is being configured.
+            skin: The skin.
+            component: Name of the hardware component in the URDF of the robot.
+            wrenches: The wrenches to publish.
+
+        Raises:
+            BagError: The package pal_statistics_msgs is not installed.
+        """
+        self._wrenches = wrenches
+        self._frame_id = skin.parent_frame
+        # Two threads use the wrenches if the driver runs in the same process.
+        self._lock = threading.Lock()
+        # ros2_control names the node of a component in this way.
+        topic = component.lower().replace("/", "_")
+        kinds = [
+            message_class("parameter hardware_name", f"pal_statistics_msgs/msg/Statistics{what}")
+            for what in ("Names", "Values")
+        ]
+        self._names_publisher, self._publisher = (
+            node.own(node.create_publisher(kind, f"{topic}/{what}", qos_profile_sensor_data))
+            for kind, what in zip(kinds, ("names", "values"), strict=True)
+        )
+        names = [f"state_interface.{one}/{part}" for one in wrenches.names for part in COMPONENTS]
+        # Another skin must have another version, also after a restart of the node.
+        version = zlib.crc32("\n".join(names).encode()) or 1
+        self._names = kinds[0](names=names, names_version=version)
+        self._values = kinds[1](names_version=version)
+        self._listeners = 0
+        self._names_at = 0.0
+        node.own(node.create_timer(CHECK_PERIOD_S, self._check))
+        node.call_at_cleanup(self._forget_all)
+
+    def publish(self, rows: StressRows, stamp_ns: int) -> None:
+        """Publish the wrenches of all cubes, with those of new rows.
+
+        Args:
+            rows: New rows of stress.
+            stamp_ns: Stamp of the message, in ns since the Unix epoch.
+        """
+        with self._lock:
+            self._wrenches.update(rows, time.monotonic())
+            self._send(stamp_ns)
+
+    def _check(self) -> None:
+        """Send the names if it is time or somebody has subscribed, and forget stale wrenches."""
+        now = time.monotonic()
+        listeners = self._names_publisher.get_subscription_count()
+        if listeners > self._listeners or now >= self._names_at:
+            self._names_publisher.publish(self._names)
+            self._names_at = now + NAMES_PERIOD_S
+        self._listeners = listeners
+        with self._lock:
+            if self._wrenches.forget_stale(now):
+                self._send(time.time_ns())
+
+    def _forget_all(self) -> None:
+        """Send NaN for all wrenches, because the component would keep the last ones for ever."""
+        with self._lock:
+            self._wrenches.forget_stale(np.inf)
+            self._send(time.time_ns())
+
+    def _send(self, stamp_ns: int) -> None:
+        self._values.header = Header(stamp=to_time(stamp_ns), frame_id=self._frame_id)
+        values: array[float] = pack_array("d", self._wrenches.values())
+        self._values.values = values
+        self._publisher.publish(self._values)
