@@ -192,12 +192,20 @@ class Reconstructor:
     def covariance(self, cube: int, left_out: int = 0) -> Array:
         """Return the covariance (15, 15) of the components of a cube's newest row.
 
-        It contains the noise of the pads and the deviations of what is compensated.
-        `Pipeline.covariance` states arguments and units.
+        It contains the noise of the pads, the deviations of what is compensated, and drift that
+        could not be followed. `Pipeline.covariance` states arguments and units.
         """
+        covariance = self.pipeline.covariance(cube, left_out)
         growth = self.compensation.growth(cube, left_out)
-        noise = self.pipeline.covariance(cube, left_out)
-        return noise if growth is None else noise + growth
+        if growth is not None:
+            covariance = covariance + growth
+        if self._drift.deviation[cube]:
+            # All pads of a cube drift alike, which reads as pressure from all sides.
+            one = self.calibrations[cube]
+            pads = one.modulus * (1 + one.beta) * self._drift.deviation[cube]
+            components = self.pipeline.matrix(cube, left_out) @ pads
+            covariance = covariance + np.outer(components, components)
+        return covariance
 
     def tare(self, cubes: Sequence[int] | None = None, duration: float = 1.0) -> Array:
         """Take the present load of cubes as their unloaded state.

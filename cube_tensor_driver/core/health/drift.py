@@ -4,7 +4,11 @@
 
 The frequency of a pad without load changes over minutes and hours (temperature, ageing). While
 nothing touches a cube, its rest frequencies follow the measured ones with a first-order low-pass
-filter. While something touches it, they are frozen.
+filter. While something touches it, its own frequencies cannot tell drift from load: what a load
+cannot do lies outside the span of the modes, where it changes no stress either. What the unloaded
+cubes of the skin have in common tells it, because a contact touches only some cubes, so a loaded
+cube follows their median. If too few are unloaded, it stays as it is, and the drift that it may
+have is a deviation.
 """
 
 from __future__ import annotations
@@ -41,6 +45,13 @@ fill the recording.
 """
 
 
+MIN_UNLOADED_CUBES = 3
+"""Smallest number of unloaded cubes of a layout whose median drift a loaded cube follows.
+
+A load on one of three, too small to be noticed, does not move their median.
+"""
+
+
 class DriftTracker:
     """Follows slow drift of the rest frequencies of one skin.
 
@@ -51,7 +62,12 @@ class DriftTracker:
 
     A cube is unloaded when all of its usable pads have been still and within `CONTACT_THRESHOLD`
     of their rest frequency for `RELEASE_S`. A load that stays below the threshold cannot be
-    distinguished from drift and becomes part of the rest frequency.
+    distinguished from drift and becomes part of the rest frequency. A loaded cube follows the
+    median of the unloaded cubes with its layout.
+
+    Attributes:
+        deviation: Standard deviation of the drift that a loaded cube may have and that is not
+            followed (cubes,), relative to the rest frequencies; 0 for an unloaded cube.
     """
 
     def __init__(self, pipeline: Pipeline, health: Health) -> None:
@@ -59,8 +75,17 @@ class DriftTracker:
         self._health = health
         self._rest_in_use = pipeline.rest_frequency
         self._tracked_rest = self._rest_in_use
-        self._unloaded_windows = np.zeros(len(pipeline.calibrations), int)
+        n_cubes = len(pipeline.calibrations)
+        self._unloaded_windows = np.zeros(n_cubes, int)
         self._windows = 0
+        # Rest frequencies at the last tare, windows since then in which a cube was unloaded, and
+        # windows since it was unloaded.
+        self._tared_rest = self._rest_in_use
+        self._followed_windows = np.zeros(n_cubes, int)
+        self._loaded_windows = np.zeros(n_cubes, int)
+        names = np.array([calibration.layout.name for calibration in pipeline.calibrations])
+        self._layouts = [np.flatnonzero(names == name) for name in np.unique(names)]
+        self.deviation = np.zeros(n_cubes)
 
     def step(self, time_constant: float) -> bool:
         """Move the tracked rest frequencies by the statistics of the window that has just ended.
@@ -86,14 +111,45 @@ class DriftTracker:
         follows = (is_settled & has_rows)[:, np.newaxis] & usable
         gain = min(1.0, WINDOW_S / time_constant)
         change = np.where(follows, (measured - self._tracked_rest) * gain, 0.0)
+        follows_others = (~is_settled & has_rows)[:, np.newaxis] & usable
+        self._follow_others(change, follows, follows_others)
         self._tracked_rest = self._tracked_rest + change
         return self._update_when_due()
+
+    def _follow_others(self, change: Array, follows: Mask, follows_others: Mask) -> None:
+        """Let loaded cubes follow the median of unloaded ones, and state what may be wrong then.
+
+        The drift of a loaded cube is taken to differ from that of the others as the drifts of the
+        others differ since the last tare, and to grow with the time for which it is loaded.
+
+        Args:
+            change: Changes of the tracked rest frequencies (cubes, P), in Hz; loaded cubes get one.
+            follows: Whether a pad follows its own frequency (cubes, P).
+            follows_others: Whether a pad is to follow the other cubes (cubes, P).
+        """
+        is_unloaded: Mask = np.asarray(follows.any(axis=1))
+        self._followed_windows += is_unloaded
+        self._loaded_windows = np.where(is_unloaded, 0, self._loaded_windows + 1)
+        drift = np.nanmean(self._tracked_rest / self._tared_rest - 1, axis=1)
+        for cubes in self._layouts:
+            unloaded = cubes[is_unloaded[cubes]]
+            rate = drift / np.maximum(self._followed_windows, 1)
+            spread = float(np.sqrt(np.mean(rate[cubes] ** 2)))
+            if len(unloaded) >= MIN_UNLOADED_CUBES:
+                ratio = change[unloaded] / self._tracked_rest[unloaded]
+                common = np.median(np.nan_to_num(ratio), axis=0)
+                others = np.where(follows_others[cubes], common * self._tracked_rest[cubes], 0.0)
+                change[cubes] += others
+                spread = float(np.std(rate[unloaded]))
+            self.deviation[cubes] = spread * self._loaded_windows[cubes]
 
     def _adopt_tare(self) -> None:
         """Track drift from the rest frequencies of the pipeline if a tare has replaced them."""
         current = self._pipeline.rest_frequency
         if not np.array_equal(current, self._rest_in_use, equal_nan=True):
-            self._rest_in_use = self._tracked_rest = current
+            self._rest_in_use = self._tracked_rest = self._tared_rest = current
+            self._followed_windows[:] = 0
+            self._loaded_windows[:] = 0
 
     def _is_at_rest(self, measured: Array, usable: Mask) -> Mask:
         """Return whether the usable pads of a cube are still and near their rest frequencies.
