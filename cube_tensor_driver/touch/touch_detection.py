@@ -123,7 +123,7 @@ class Touches(NamedTuple):
 class Touch:
     """Finds touches in the stress of a skin, scan by scan (samples of every cube).
 
-    The work of a scan does not depend on the load. Cubes that do not observe the stress zz find no
+    The work of a scan is bounded, whatever touches. Cubes that do not observe the stress zz find no
     touch.
 
     Attributes:
@@ -162,6 +162,10 @@ class Touch:
         if skin.elastomer is not None:
             self._estimate = estimate_forces(skin.poses, skin.elastomer, near, covariance)
 
+        nothing = np.zeros(0)
+        no_forces = np.zeros((0, 3))
+        no_cubes = np.zeros(0, np.intp)
+        self._no_touches = Touches(0, no_cubes, nothing, nothing, no_forces, no_forces)
         # The largest value of the neighbours is found faster if they are the first axis.
         self._near = near.T.copy()
         # Slow part of the values, NaN where unknown, and difference of the values from it, 0 there
@@ -222,9 +226,10 @@ class Touch:
         self._count[cube] += 1
 
         stale = self._stamp_ns < rows.stamp_ns.max() - STALE_NS
-        self._slow[stale] = np.nan
-        for state in (self._change, self._count, self._sum, self._touched):
-            state[stale] = 0
+        if stale.any():
+            self._slow[stale] = np.nan
+            for state in (self._change, self._count, self._sum, self._touched):
+                state[stale] = 0
         return self._locate(int(rows.stamp_ns.min()))
 
     def _restart(self, cubes: Index) -> None:
@@ -273,7 +278,8 @@ class Touch:
         excess = pressure - margin - DRIFT * TIME_CONSTANT_S
         score = excess / self._deviation[cube]
         # The upper limit makes a touch end within a few scans after any load.
-        after = np.clip(before + score - REFERENCE, 0, self.limit + REFERENCE)
+        after = np.maximum(before + score - REFERENCE, 0)
+        after = np.minimum(after, self.limit + REFERENCE)
         after = np.where(self._count[cube] < SETTLING_ROWS, before, after)
         self._sum[cube] = np.where(np.isnan(pressure), 0, after)
         self._touched = (self._sum > self.limit) | (self._touched & (self._sum > 0))
@@ -287,6 +293,10 @@ class Touch:
         Args:
             stamp_ns: Time of the earliest sample of the scan, in ns.
         """
+        if not self._touched.any():
+            self._reach[:] = 0
+            self._held[:] = False
+            return self._no_touches._replace(stamp_ns=stamp_ns)
         pressure = -self._change[:, PRESSURE]
         strength = np.where(self._touched, pressure, 0)
         is_largest = self._touched & (strength >= strength[self._near].max(axis=0))
@@ -312,11 +322,11 @@ class Touch:
             share: Possible share (m, 1) of drift and of earlier loads in the force.
         """
         estimate = self._estimate
-        if estimate is None or not len(cube):
+        if estimate is None:
             unknown = np.full((len(cube), 3), np.nan)
             return unknown, unknown
         near, kind = self._near[:, cube].T, estimate.kind[cube]
-        values = self._change[near].reshape(len(cube), -1, 1)
+        values = self._change[near].reshape(len(cube), near.shape[1] * len(COMPONENTS), 1)
         terms = values * estimate.weights[kind]
         force = terms.sum(axis=1)
 

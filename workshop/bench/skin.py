@@ -144,6 +144,7 @@ def bench_touch(cubes: int, bench: Bench) -> dict[str, Any]:
         "rate_hz": bench.rate,
         "duration_s": bench.duration,
         **{name: value for name, value in touch.items() if "touch" in name or name in cpu},
+        "latency_p99_ms_without_touch": without["latency_p99_ms"],
         **{f"{name}_without_touch": value for name, value in cpu.items()},
     }
 
