@@ -19,8 +19,6 @@ BAR_WIDTH = 20
 def say(
     text: str,
     style: str = "",
-    *,
-    stderr: bool = False,
 ) -> None:
     """Print a line as it is: square brackets are no markup, and long lines are not broken.
 
@@ -28,9 +26,8 @@ def say(
         text: The line.
         style: Colour or weight of the text in the notation of rich, such as "red" or "bold". It is
             ignored if the output is not a terminal.
-        stderr: Whether the line goes to stderr instead of stdout.
     """
-    console = Console(stderr=stderr, highlight=False)
+    console = Console(highlight=False)
     console.print(
         text,
         style=style,
