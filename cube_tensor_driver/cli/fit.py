@@ -50,6 +50,14 @@ def arguments(parser: Parser) -> None:
         help="instead of a table, fit the creep of the foam to a bag with one press that is held",
     )
     parser.add_argument(
+        "--rest",
+        type=Path,
+        nargs="+",
+        metavar="BAG",
+        help="instead of a table, fit the pads' drift and thermal stress over temperature to bags "
+        "in which the unloaded skin warms or cools; several cubes become -o FILE_CUBE.yaml",
+    )
+    parser.add_argument(
         "--symmetry",
         default="full",
         metavar="G",
@@ -86,6 +94,8 @@ def run(options: argparse.Namespace) -> int:
         return run_weight(options)
     if options.creep is not None:
         return run_creep(options)
+    if options.rest is not None:
+        return run_rest(options)
 
     from ..calibrate.fit import fit, measured_stress
     from ..config.calibration import named_layout, write_calibration
@@ -97,7 +107,8 @@ def run(options: argparse.Namespace) -> int:
 
     if options.loads is None or options.layout is None:
         raise ConfigError(
-            "./cube fit needs a table of loads and --layout, or --weight BAG, or --creep BAG"
+            "./cube fit needs a table of loads and --layout, or --weight BAG, --creep BAG or "
+            "--rest BAG"
         )
     layout = named_layout(options.layout)
     loads, base, rest, rest_source = read_inputs(options, layout)
@@ -123,6 +134,38 @@ def run(options: argparse.Namespace) -> int:
     header = f"./cube fit {table} --layout {options.layout} --symmetry {options.symmetry}"
     write_calibration(options.output, calibration, header)
     print(f"wrote {options.output}: calibration {calibration.id}")
+    return 0
+
+
+def run_rest(options: argparse.Namespace) -> int:
+    """Fit the effect of temperature to bags, print and draw it, and write the calibrations."""
+    from rich.console import Console
+
+    from ..calibrate.thermal import fit_thermal, read_warming
+    from ..config.calibration import write_calibration
+    from ..views.figures.calibration import draw_thermal_fit
+    from ..views.figures.style import save
+    from ..views.terminal.output import make_table
+
+    warming = read_warming(options.rest, options.cube)
+    fits = {name: fit_thermal(data) for name, (_, data) in warming.items()}
+    bags = " ".join(path.name for path in options.rest)
+    columns = ("lag, s", "degree", "before, Pa", "after, Pa", "deviation, Pa/K")
+    table = make_table(("cube",), columns)
+    for name, result in fits.items():
+        lags = " + ".join(f"{lag:.0f}" for lag in result.model.lag.tolist())
+        degree = str(result.model.coefficient.shape[1])
+        table.add_row(name, lags, degree, *(f"{size:.2f}" for size in result.sizes()))
+    Console(highlight=False).print(table)
+    for name, result in fits.items():
+        path, picture = options.output, options.figure
+        if len(fits) > 1:
+            path, picture = (one.with_stem(f"{one.stem}_{name}") for one in (path, picture))
+        base = warming[name][0]
+        calibration = result.calibration(base, f"{base.source}; temperature fitted to {bags}")
+        write_calibration(path, calibration, f"./cube fit --rest {bags}")
+        save(draw_thermal_fit(result), picture)
+        print(f"wrote {path}: calibration {calibration.id}")
     return 0
 
 

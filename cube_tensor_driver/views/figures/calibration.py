@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from ...calibrate.fit import Fit
+from ...calibrate.thermal import ThermalFit
 from ...core.arrays import Array
 from ...core.layout import Layout
 from .style import MARKERS, print_style
@@ -185,4 +186,38 @@ def draw_fit(fit: Fit, measured: Array) -> Figure:
         f"scatter {fit.scale:.2f} × stated noise, held-out error {100 * fit.held_out:.2g} %",
         fontsize=9,
     )
+    return figure
+
+
+@print_style()
+def draw_thermal_fit(fit: ThermalFit) -> Figure:
+    """Draw temperatures, and the pad stresses without load before and after the compensation.
+
+    Args:
+        fit: Result of the fit to N blocks of an unloaded cube.
+    """
+    data = fit.data
+    figure = Figure(figsize=(7, 6))
+    warm, before, after = figure.subplots(3, 1)
+    # The bags follow one another.
+    time = np.arange(len(data.seconds)) / 60
+    warm.plot(time, data.temperature, "k-", label="thermometer of the hub")
+    elastomer = fit.level + float(fit.model.reference)
+    lags = " + ".join(f"{lag:.0f} s" for lag in fit.model.lag.tolist())
+    warm.plot(time, elastomer, "C3--", label=f"elastomer, lag {lags}")
+    warm.set(ylabel="temperature / °C")
+    warm.legend(fontsize=7)
+    for axes, stress in ((before, data.stress - fit.offset), (after, fit.residual)):
+        for pad, values in enumerate(stress.T):
+            shade = str(0.7 * pad / max(1, len(stress.T) - 1))
+            axes.plot(time, values, color=shade, lw=0.8)
+    if fit.model.ramp is not None:
+        # Deviation of a typical pad, because the elastomer lags behind.
+        size = float(np.sqrt((fit.model.ramp**2).sum(axis=1).mean()))
+        bound = size * np.abs(data.temperature - elastomer)
+        after.fill_between(time, -bound, bound, color="C0", alpha=0.25, label="deviation")
+        after.legend(fontsize=7)
+    before.set(ylabel="before / Pa")
+    after.set(xlabel="time / min", ylabel="after / Pa")
+    before.set_title(f"stress of the {data.stress.shape[1]} pads without load", fontsize=9)
     return figure
