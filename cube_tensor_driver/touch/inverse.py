@@ -81,6 +81,8 @@ class SurfaceInverse:
             noise of each pad, with the pads in use.
         variant: Index (cubes,) of each cube's variant (calibration and pads in use) in the
             measurement model.
+        near: Indices (cubes, W) of the cubes nearest to each cube, which itself comes first.
+        revision: Number that increases when `leave_out` changes the pads in use.
     """
 
     def __init__(
@@ -170,6 +172,8 @@ class SurfaceInverse:
         if side < 1:
             raise ElasticError(f"{side} points a side of a patch; it must be at least 1")
         n = len(poses.position)
+        self.revision = 0
+        self._unrolled: dict[int, tuple[Array, Array]] = {}
         self.poses = poses
         self.depth = depth
         self.pitch = poses.pitch
@@ -210,6 +214,7 @@ class SurfaceInverse:
             self.spacing,
             side,
         )
+        self.near = self._windows.near
         self._known = self.observed
         self._prediction = MissingValuePrediction(self._windows, self.observed, self._known)
 
@@ -236,12 +241,13 @@ class SurfaceInverse:
             Positions (n, 2) in m and rotations (n,) about z in rad of these cubes, in the frame of
             the centre cube.
         """
-        place, angle = unroll(
-            self.poses,
-            np.array([centre]),
-            cubes[None],
-        )
-        return place[0], angle[0]
+        # The whole skin is laid flat at once and kept, because contacts stay at few cubes.
+        if centre not in self._unrolled:
+            everything = np.arange(len(self.poses.position))
+            place, angle = unroll(self.poses, np.array([centre]), everything[None])
+            self._unrolled[centre] = place[0], angle[0]
+        place, angle = self._unrolled[centre]
+        return place[cubes], angle[cubes]
 
     def leave_out(self, cubes: Index, by_pad: Array) -> None:
         """Change the pads that cubes use, for example because some pads are broken.
@@ -256,6 +262,7 @@ class SurfaceInverse:
             cubes: Indices (n,) of the cubes.
             by_pad: Noise matrices (n, 15, P) as from `noise_by_pad`, with the pads in use.
         """
+        self.revision += 1
         observed = by_pad[:, self.columns]
         self.by_pad[cubes] = observed * self._unit_factors[:, None]
         if self._variant_pads is None:

@@ -28,12 +28,11 @@ from typing import NamedTuple
 import numpy as np
 
 from ..core.arrays import AnyArray, Array, Index, Mask
-from ..mechanics.kernels import DISC_SIZES
 from .inverse import SurfaceInverse
+from .tracker.contact_estimate import Discs
 from .tracker.contact_tracker import TrackedContact
-from .tracker.hertz_fit import FORCE_DEVIATION, SIZE_DEVIATION, differentiate_response
-from .tracker.local_values import LocalValues
-from .tracker.region_fit import MIN_FACING
+from .tracker.hertz_fit import HertzFit, linearise
+from .tracker.local_values import MIN_FACING, CubeNoise, LocalValues
 
 UNKNOWN = 0
 """State of a contact that is neither known to stick nor to slip: it is new, its force is below
@@ -164,6 +163,7 @@ class SlipEstimator:
             inverse: Poses, noise and response of the cubes.
         """
         self._inverse = inverse
+        self._noise = CubeNoise(inverse)
         poses = inverse.poses
         self._above_cubes = poses.position + inverse.depth * poses.rotation[:, :, 2]
         count = min(N_CUBES, len(self._above_cubes))
@@ -362,7 +362,6 @@ class SlipEstimator:
         """
         inverse = self._inverse
         poses = inverse.poses
-        depth = inverse.depth
         contact = self._contacts[row]
         place = loads[row, 3:]
         distance = np.linalg.norm(self._above_cubes - place, axis=1)
@@ -371,25 +370,18 @@ class SlipEstimator:
         cubes = np.argsort(distance)[: len(contact["cubes"])]
         home = int(cubes[0])
         usable = np.where(is_turned_away[:, None], np.nan, scaled)
-        local = LocalValues(inverse, home, cubes, usable)
+        self._noise.update(usable, cubes)
+        local = LocalValues(inverse, self._noise, home, cubes)
 
         # All derivatives are in the frame of the home cube. Those of this contact come first.
         rotation = poses.rotation[home]
         apart = np.linalg.norm(loads[:, 3:] - place, axis=1)
         near = np.argsort(apart)[: np.sum(apart < NEIGHBOUR_PITCHES * inverse.pitch)]
-        sizes = np.clip(self._contacts["radius"], *(DISC_SIZES[[1, -3]] * depth))
-        centres = (loads[:, 3:] - poses.position[home]) @ rotation
-        forces = loads[:, :3] @ rotation
-        jacobian = np.concatenate(
-            [
-                differentiate_response(local, centres[one, :2], sizes[one], forces[one], depth)
-                for one in near
-            ],
-            axis=1,
-        )
-        precision = [FORCE_DEVIATION**-2] * 3 + [depth**-2] * 2 + [SIZE_DEVIATION**-2, 1.0]
-        matrix = jacobian.T @ jacobian + np.diag(np.tile(precision, len(near)))
-        solved = np.linalg.solve(matrix, jacobian.T)[:5].reshape(5, len(cubes), -1)
+        centres = (loads[near, 3:] - poses.position[home]) @ rotation
+        sizes = np.log(self._contacts["radius"][near])
+        fit = HertzFit(inverse, local, Discs(loads[near, :3] @ rotation, centres[:, :2], sizes))
+        linearise(inverse, [fit])
+        solved = (fit.covariance[:5] @ fit.jacobian.T).reshape(5, len(cubes), -1)
         weights = np.einsum("knc,ncd->knd", solved, local.whitening)
 
         noise = np.einsum("knc,ncp->knp", weights[3:], np.nan_to_num(inverse.by_pad[cubes]))

@@ -8,12 +8,12 @@ integrals. Their variances follow from the covariance of the nodes' forces.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from ...core.arrays import Array, Mask
-from .node_fit import NodeFit
+from ...core.arrays import Array
 
 _MIN_NORMAL_FORCE = 1e-12
 """Smallest absolute value, in N, of a normal force by which the first moment of the pressure is
@@ -66,16 +66,39 @@ class ContactSum(NamedTuple):
     root: Array
 
 
-def estimate_contact(fit: NodeFit, chosen: Mask) -> ContactEstimate:
-    """Integrate the traction on nodes (small contacts on a grid) over one contact.
+class Discs(NamedTuple):
+    """Parameters of J Hertz contacts on the skin laid flat around a cube.
+
+    Attributes:
+        forces: Forces (J, 3) in N.
+        centres: Centres (J, 2) in m.
+        log_sizes: Natural logarithms (J,) of the radii in m.
+    """
+
+    forces: Array
+    centres: Array
+    log_sizes: Array
+
+
+def discs_of(estimates: Sequence[ContactEstimate]) -> Discs:
+    """Return round Hertz contacts with the force, position and area of the estimates."""
+    areas = np.array([one.area for one in estimates])
+    return Discs(
+        np.array([one.force for one in estimates]),
+        np.array([one.place for one in estimates]),
+        np.log(areas / np.pi) / 2,
+    )
+
+
+def estimate_contact(nodes: Array, forces: Array, root: Array, size: float) -> ContactEstimate:
+    """Integrate the traction on nodes (small Hertz contacts on a grid) over one contact.
 
     Args:
-        fit: Posterior of the traction in the region of the contact.
-        chosen: Which nodes (q,) of the region belong to the contact.
+        nodes: Positions (q, 2) of the nodes in m, on the skin laid flat.
+        forces: Forces (3, q) of the nodes along x, y and z, in N.
+        root: Square root (3, q, n) of their covariance, in N.
+        size: Radius of a node in m.
     """
-    forces = fit.posterior.forces[:, chosen]
-    root = fit.posterior.root[:, chosen]
-    nodes = fit.places[chosen]
     force = forces.sum(axis=1)
     normal_force = min(float(force[2]), -_MIN_NORMAL_FORCE)
     place = forces[2] @ nodes / normal_force
@@ -91,7 +114,7 @@ def estimate_contact(fit: NodeFit, chosen: Mask) -> ContactEstimate:
     slopes[2, 2] = shear[0] * arm[:, 1] - shear[1] * arm[:, 0]
 
     # Each node is a Hertz contact itself.
-    own = _HERTZ_MOMENT * fit.size**2 * np.eye(2)
+    own = _HERTZ_MOMENT * size**2 * np.eye(2)
     spread = (arm * forces[2][:, None]).T @ arm / normal_force + own
     values, axes = np.linalg.eigh(spread)
     values = np.maximum(values, own[0, 0])

@@ -14,8 +14,9 @@ from ...mechanics.contact import hertz
 from ...mechanics.layer import FIELD
 from ..inverse import SurfaceInverse, TractionField
 from .contact_estimate import ContactSum
+from .hertz_fit import HertzFit
 from .local_values import unroll_points
-from .region_fit import RegionFit
+from .node_fit import NodeFit
 
 _MIN_RINGS = 4
 """Smallest number of rings of point forces that represent a Hertz contact when its force is shared
@@ -23,7 +24,7 @@ out among the points of the surface."""
 
 
 def add_fits(
-    inverse: SurfaceInverse, residual: TractionField, fits: list[RegionFit]
+    inverse: SurfaceInverse, residual: TractionField, fits: list[HertzFit | NodeFit]
 ) -> TractionField:
     """Add the traction of fits of regions to the residual field, which the fits do not explain.
 
@@ -33,7 +34,7 @@ def add_fits(
     traction = residual.traction.copy()
     pressure = residual.depth_pressure.copy()
     for fit in fits:
-        contacts = fit.to_contacts()
+        contacts = fit.to_contacts(inverse.spacing)
         points, share, below, rotation = _distribute(inverse, fit, contacts)
         local = np.einsum("mab,bm->ma", rotation, contacts.forces @ share.T)
         traction[points] += local / inverse.area
@@ -41,7 +42,7 @@ def add_fits(
     return TractionField(traction, pressure)
 
 
-def fit_variances(inverse: SurfaceInverse, fits: list[RegionFit]) -> Array:
+def fit_variances(inverse: SurfaceInverse, fits: list[HertzFit | NodeFit]) -> Array:
     """Compute the variances of the pressure that the fits of regions of contact describe.
 
     Returns:
@@ -50,7 +51,7 @@ def fit_variances(inverse: SurfaceInverse, fits: list[RegionFit]) -> Array:
     """
     total = np.zeros((len(inverse.points), 2))
     for fit in fits:
-        contacts = fit.to_contacts()
+        contacts = fit.to_contacts(inverse.spacing)
         points, share, below, _ = _distribute(inverse, fit, contacts)
         on_surface = share @ contacts.root[2] / inverse.area
         at_depth = below @ contacts.root.reshape(-1, contacts.root.shape[2])
@@ -60,7 +61,7 @@ def fit_variances(inverse: SurfaceInverse, fits: list[RegionFit]) -> Array:
 
 
 def _distribute(
-    inverse: SurfaceInverse, fit: RegionFit, contacts: ContactSum
+    inverse: SurfaceInverse, fit: HertzFit | NodeFit, contacts: ContactSum
 ) -> tuple[Index, Array, Array, Array]:
     """Return the effect of the q contacts of a fit at the m points of the surface around it.
 
@@ -71,7 +72,7 @@ def _distribute(
         point.
     """
     points = np.flatnonzero(np.isin(inverse.cube, fit.values.cubes))
-    place = unroll_points(inverse, fit.home, points)
+    place = unroll_points(inverse, fit.values.home, points)
     count = len(contacts.places)
     # The squares share the force of a contact by the rings within them, so rings must be narrow: at
     # a sixteenth of a spacing the error of the pressure is below its deviation.
@@ -94,7 +95,7 @@ def _distribute(
         pressure = -inverse.kernels.field(from_contacts, size)[:, FIELD.index("zz")]
         below[:, :, alike] = pressure.reshape(len(points), -1, 3).swapaxes(1, 2)
 
-    _, angle = inverse.unroll(fit.home, inverse.cube[points])
+    _, angle = inverse.unroll(fit.values.home, inverse.cube[points])
     rotation = np.zeros((len(points), 3, 3))
     rotation[:, 0, 0] = rotation[:, 1, 1] = np.cos(angle)
     rotation[:, 0, 1] = np.sin(angle)

@@ -1,14 +1,99 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Values of the cubes around a region of contact, divided by their noise."""
+"""Values of the cubes around a region, divided by their noise.
+
+The noise of a cube depends on the stress of its pads, whose gains are only known to `GAIN_ERROR`.
+It is computed again when this stress changes, cube by cube, because that takes long.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
-from ...core.arrays import Array, Index
+from ...core.arrays import Array, Index, Mask
 from ..inverse import SurfaceInverse
-from ..pad_noise import GAIN_ERROR, pad_stresses
+from ..pad_noise import GAIN_ERROR
+
+MIN_FACING = 0.5
+"""Smallest cosine of the angle between the outward normals of two cubes at which one of them
+responds to a contact above the other. On a bent skin, cubes that face away do not respond."""
+
+MAX_NOISE_CHANGE = 1.6
+"""Factor by which the variance of a pad's error grows or falls before the noise of its cube is
+computed again."""
+
+
+MODEL_ERROR = 1e-4
+"""Standard deviation of the error of each pad's predicted stress, divided by the largest stress of
+a pad in the surrounding cubes."""
+
+
+class CubeNoise:
+    """Noise of the C components of all cubes of a skin, for the stress of their pads.
+
+    Attributes:
+        whitening: Matrices (cubes, C, C) that transform the values of a cube so that their noise
+            has variance 1 and no correlation; 0 for unknown values.
+        known: Whether each component is known (cubes, C).
+        version: Number (cubes,) that increases when the noise of a cube is computed again.
+    """
+
+    def __init__(self, inverse: SurfaceInverse) -> None:
+        self._inverse = inverse
+        n, width, pads = inverse.by_pad.shape
+        self.whitening = np.zeros((n, width, width))
+        self.known = np.zeros((n, width), bool)
+        self.version = np.zeros(n, np.intp)
+        self._by_pad = np.zeros((n, width, pads))
+        self._to_pads = np.zeros((n, pads, width))
+        self._variance = np.zeros((n, pads))
+        self._peak = np.zeros(n)
+        self._revision = -1
+
+    def update(self, scaled: Array, cubes: Index) -> None:
+        """Compute the noise of cubes again whose pads in use, known values or stresses changed.
+
+        Args:
+            scaled: Values (cubes of the skin, C) in Pa, NaN where unknown.
+            cubes: Indices (n,) of the cubes that are needed.
+        """
+        inverse = self._inverse
+        if self._revision != inverse.revision:
+            # Other pads are in use: every cube is computed again when it is needed.
+            self._revision = inverse.revision
+            self._variance[:] = 0.0
+        known = np.isfinite(scaled[cubes]) & inverse.observed[cubes]
+        is_other = (known != self.known[cubes]).any(axis=1) | (self._variance[cubes, 0] == 0)
+        if is_other.any():
+            other = cubes[is_other]
+            self.known[other] = known[is_other]
+            self._by_pad[other] = np.where(known[is_other, :, None], inverse.by_pad[other], 0.0)
+            self._to_pads[other] = np.linalg.pinv(self._by_pad[other])
+            self._variance[other] = 0.0
+        values = np.where(known, scaled[cubes], 0.0)
+        stresses = (self._to_pads[cubes] @ values[:, :, None])[:, :, 0]
+        # Contacts that are not found yet and errors of the tables disturb all cubes around.
+        self._peak[cubes] = np.abs(stresses).max(axis=1)
+        floor = MODEL_ERROR * self._peak[inverse.near[cubes]].max(axis=1)
+        variance = 1 + (GAIN_ERROR * stresses) ** 2 + floor[:, None] ** 2
+        before = self._variance[cubes]
+        growth = np.maximum(variance, before) > MAX_NOISE_CHANGE * np.minimum(variance, before)
+        is_changed = growth.any(axis=1)
+        if is_changed.any():
+            self._whiten(cubes[is_changed], variance[is_changed])
+
+    def _whiten(self, cubes: Index, variance: Array) -> None:
+        """Compute the noise of cubes for variances (n, P) of their pads' errors."""
+        by_pad = self._by_pad[cubes]
+        noise = (by_pad * variance[:, None]) @ by_pad.swapaxes(1, 2)
+        # A 1 on the diagonal keeps the matrices of cubes with unknown values invertible, and the
+        # tiny increase those of components that are almost dependent.
+        identity = np.eye(noise.shape[1])
+        noise += identity * ~self.known[cubes][:, None] + 1e-9 * identity * noise
+        root = np.linalg.inv(np.linalg.cholesky(noise))
+        self.whitening[cubes] = root * self.known[cubes][:, None]
+        self._variance[cubes] = variance
+        self.version[cubes] += 1
 
 
 class LocalValues:
@@ -19,65 +104,68 @@ class LocalValues:
         cubes: Indices (n,) of the cubes.
         place: Positions (n, 2) of the cubes in m, in the frame of the home cube.
         angle: Rotations (n,) of the cubes in rad, in this frame.
+        variant: Index (n,) of each cube's variant in the measurement model.
+        whitening: Matrices (n, C, C) as in `CubeNoise`, of the last `refresh`.
         known: Whether each of the C components of the cubes is known (n, C).
         count: Number of known values.
-        whitening: Matrices (n, C, C) by which the values of each cube are multiplied, so that their
-            noise has variance 1.
+        disturbance: Standard deviation (n, C) in Pa of the response to other contacts.
     """
 
-    def __init__(self, inverse: SurfaceInverse, home: int, cubes: Index, scaled: Array) -> None:
-        """Compute the noise of the cubes.
+    whitening: Array
+    known: Mask
+    count: int
+
+    def __init__(self, inverse: SurfaceInverse, noise: CubeNoise, home: int, cubes: Index) -> None:
+        """Collect the noise of the cubes.
 
         Args:
-            inverse: Poses, noise and kernels of the skin.
+            inverse: Poses and kernels of the skin.
+            noise: Noise of all cubes, up to date for these cubes.
             home: Index of the cube around which the skin is laid flat.
             cubes: Indices (n,) of the cubes.
-            scaled: Values (cubes of the skin, C) in Pa, NaN where unknown.
         """
-        self._inverse = inverse
         self.home = home
         self.cubes = cubes
-        self.place, self.angle = inverse.unroll(home, cubes)
-        self._variant = inverse.variant[cubes]
-        values = scaled[cubes]
-        self.known = np.isfinite(values) & inverse.observed[cubes]
+        self._inverse = inverse
+        self._noise = noise
+        self.place, self.angle = inverse.unroll(home, self.cubes)
+        self.disturbance = np.zeros((len(self.cubes), len(inverse.columns)))
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Take over the newest noise of the cubes."""
+        self._versions = self._noise.version[self.cubes]
+        self.variant = self._inverse.variant[self.cubes]
+        whitening = self._noise.whitening[self.cubes]
+        self._disturbed = float(self.disturbance.sum())
+        # A cube that other contacts disturb counts less.
+        relative = (whitening @ self.disturbance[:, :, None])[:, :, 0]
+        weight = 1 / np.sqrt(1 + (relative**2).mean(axis=1))
+        self.whitening = whitening * weight[:, None, None]
+        self.known = self._noise.known[self.cubes]
         self.count = int(self.known.sum())
 
-        by_pad = np.where(self.known[:, :, None], inverse.by_pad[cubes], 0.0)
-        self._by_pad = by_pad
-        stresses = pad_stresses(by_pad, self.known, values)
-        gain_variance = (GAIN_ERROR * stresses[:, None]) ** 2
-        noise = (by_pad * (1 + gain_variance)) @ by_pad.swapaxes(1, 2)
-        # A 1 on the diagonal keeps the matrices of cubes with unknown values invertible, and the
-        # tiny increase those of components that are almost dependent.
-        identity = np.eye(noise.shape[1])
-        noise += identity * ~self.known[:, None] + 1e-9 * identity * noise
-        self._noise_root = np.linalg.cholesky(noise)
-        self.whitening = np.linalg.inv(self._noise_root) * self.known[:, None]
+    @property
+    def is_stale(self) -> bool:
+        """Whether the noise of the cubes or the disturbance has changed since `refresh`."""
+        sums = self._disturbed, float(self.disturbance.sum())
+        is_other = max(sums) > MAX_NOISE_CHANGE * min(sums)
+        return is_other or not np.array_equal(self._versions, self._noise.version[self.cubes])
 
-    def is_valid(self, scaled: Array) -> bool:
-        """Return whether the same values are known, and the same pads in use, as at the start.
+    @property
+    def has_same_values(self) -> bool:
+        """Whether the same components are known as at the last `refresh`."""
+        return np.array_equal(self.known, self._noise.known[self.cubes])
 
-        Args:
-            scaled: Values (cubes of the skin, C) in Pa, NaN where unknown.
-        """
-        inverse = self._inverse
-        by_pad = np.where(self.known[:, :, None], inverse.by_pad[self.cubes], 0.0)
-        known = np.isfinite(scaled[self.cubes]) & inverse.observed[self.cubes]
-        return np.array_equal(known, self.known) and np.array_equal(by_pad, self._by_pad)
-
-    def whiten(self, scaled: Array) -> Array:
+    def whiten(self, scaled: Array, others: Array | float) -> Array:
         """Return the values (n C,) of these cubes, transformed so that their noise has variance 1.
 
         Args:
             scaled: Values (cubes of the skin, C) in Pa. Unknown values give 0.
+            others: Response (n, C) in Pa to other contacts, which is subtracted.
         """
-        values = np.where(self.known, scaled[self.cubes], 0.0)
+        values = np.where(self.known, scaled[self.cubes] - others, 0.0)
         return np.asarray((self.whitening @ values[:, :, None]).ravel())
-
-    def unwhiten(self, white: Array) -> Array:
-        """Return the values (n, C) in Pa of which `whiten` makes `white` (n C,)."""
-        return np.asarray((self._noise_root @ white.reshape(*self.known.shape, 1))[:, :, 0])
 
     def respond(self, centres: Array, size: float) -> tuple[Array, Array]:
         """Compute the response of the cubes to Hertz contacts with a force of 1 N.
@@ -93,7 +181,7 @@ class LocalValues:
         count = len(centres)
         offset = (self.place[:, None] - centres).reshape(-1, 2)
         angle = np.repeat(self.angle, count)
-        variant = np.repeat(self._variant, count)
+        variant = np.repeat(self.variant, count)
         inverse = self._inverse
         response = inverse.kernels.response(offset, angle, variant, size)[:, inverse.columns]
         shape = (len(self.place), count, -1, 3)

@@ -16,8 +16,6 @@ evidence; the misfit t, never below 1, is the factor by which the values deviate
 noise explains, so that an imperfect model increases the stated deviations. An eigenvalue
 decomposition of K^1/2' B' B K^1/2 gives all of this for every s at once.
 
-Neighbouring contacts act on the same cubes. They take part with coarse nodes of their own.
-
 Source: C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learning (2006), 2.2 and
 5.4.1 (evidence).
 """
@@ -34,6 +32,7 @@ from ...mechanics.kernels import SHEAR_RATIO
 from ..inverse import SurfaceInverse
 from ..prior import AMPLITUDE
 from ..surface import square_points
+from .contact_estimate import ContactEstimate, ContactSum, Discs, discs_of, estimate_contact
 from .local_values import LocalValues, unroll_points
 from .pressure_regions import split_peaks
 
@@ -107,7 +106,7 @@ class NodeFit:
 
     Attributes:
         places: Positions (q, 2) of the nodes in m, on the skin laid flat.
-        step: Distance of neighbouring nodes in m.
+        spacing: Distance of neighbouring nodes in m.
         size: Radius of the Hertz contact of a node in m.
         response: Values (n, C, 3 q) in Pa/N of the cubes around the region, for forces along x of
             all nodes, then along y, then along z.
@@ -122,47 +121,34 @@ class NodeFit:
     misfit: float
     labels: Index
 
-    def __init__(
-        self, inverse: SurfaceInverse, points: Index, others: Index, values: LocalValues
-    ) -> None:
+    def __init__(self, inverse: SurfaceInverse, points: Index, values: LocalValues) -> None:
         """Compute the response of the cubes to the nodes.
 
         Args:
             inverse: Poses, points, noise and kernels of the skin.
             points: Indices of the points of the surface that form the region.
-            others: Indices of the points of other regions near this one.
             values: Values of the cubes around the region.
         """
         self.values = values
         around = np.flatnonzero(np.isin(inverse.cube, values.cubes))
         region = unroll_points(inverse, values.home, points)
-        self.places, self.step = _place_nodes(
+        self.places, self.spacing = _place_nodes(
             region, unroll_points(inverse, values.home, around), inverse
         )
-        self.size = _NODE_RADIUS * self.step
-        far = unroll_points(inverse, values.home, others)
+        self.size = _NODE_RADIUS * self.spacing
 
-        # Prior covariance for a pressure of variance 1 Pa^2. Nodes of other contacts are
-        # independent.
-        q = len(self.places)
+        # Prior covariance for a pressure of variance 1 Pa^2
         self._squares = cdist(self.places, self.places, "sqeuclidean")
         exponents = self._squares / (2 * (_LENGTHS[:, None, None] * inverse.depth) ** 2)
-        self._covariance = np.zeros((q + len(far), q + len(far)))
-        self._covariance[:q, :q] = self.step**4 * np.tensordot(_SHARES, np.exp(-exponents), 1)
-        other = np.arange(q, q + len(far))
-        self._covariance[other, other] = inverse.area**2
+        self._covariance = self.spacing**4 * np.tensordot(_SHARES, np.exp(-exponents), 1)
 
         self.response, white = values.respond(self.places, self.size)
-        self._white_response = white.reshape(len(white), 3, q)
-        if len(far):
-            _, white = values.respond(far, _NODE_RADIUS * inverse.spacing)
-            parts = [self._white_response, white.reshape(len(white), 3, -1)]
-            self._white_response = np.concatenate(parts, axis=2)
+        self._white_response = white.reshape(len(white), 3, -1)
         self._peak_width = _PEAK_WIDTH * inverse.depth
         self.is_sharp = False
-        self._decomposition = self._decompose(np.ones(q))
+        self._decomposition = self._decompose(np.ones(len(self.places)))
 
-    def solve(self, white: Array) -> None:
+    def step(self, white: Array) -> None:
         """Set `posterior` and `misfit` for new values of the same cubes.
 
         Args:
@@ -182,9 +168,8 @@ class NodeFit:
         self._scale = float(_SCALES[best])
         self.misfit = float(misfit[best])
         gain = 1 / (eigenvalues + self._scale**-2)
-        q = len(self.places)
-        forces = (basis @ (gain * projected)).reshape(3, -1)[:, :q]
-        root = (basis * np.sqrt(gain * self.misfit)).reshape(3, -1, len(gain))[:, :q]
+        forces = (basis @ (gain * projected)).reshape(3, -1)
+        root = (basis * np.sqrt(gain * self.misfit)).reshape(3, -1, len(gain))
         self.posterior = Posterior(forces, root, float(scores[best]))
 
     def sharpen(self, white: Array) -> None:
@@ -198,10 +183,10 @@ class NodeFit:
         """
         before = self.posterior, self.misfit, self._scale, self._decomposition
         square = self.posterior.forces[2] ** 2 + (self.posterior.root[2] ** 2).sum(axis=1)
-        smoothing = np.exp(-self._squares / (2 * self.step**2))
+        smoothing = np.exp(-self._squares / (2 * self.spacing**2))
         envelope = np.sqrt(smoothing @ square / smoothing.sum(axis=1))
         self._decomposition = self._decompose(np.maximum(envelope / envelope.max(), ENVELOPE_FLOOR))
-        self.solve(white)
+        self.step(white)
         if self.posterior.score > before[0].score - MIN_SCORE_GAIN:
             self.posterior, self.misfit, self._scale, self._decomposition = before
             self.is_sharp = True
@@ -213,17 +198,36 @@ class NodeFit:
         smoothing = np.exp(-self._squares / (2 * self._peak_width**2))
         pressure = -smoothing @ self.posterior.forces[2]
         root = smoothing @ self.posterior.root[2]
-        self.labels = split_peaks(pressure, root, self._squares < (1.5 * self.step) ** 2)
+        self.labels = split_peaks(pressure, root, self._squares < (1.5 * self.spacing) ** 2)
 
-    def response_to_others(self) -> Array:
-        """Return the whitened response (n C, 3 m) of the cubes to the m nodes of other contacts.
+    @property
+    def explained(self) -> Array:
+        """Values (n, C) in Pa of the cubes around the region under the traction on the nodes."""
+        return np.asarray(self.response @ self.posterior.forces.ravel())
 
-        The force on each node is one prior standard deviation, along x, then y, then z.
-        """
-        q = len(self.places)
-        deviation = self._scale * np.sqrt(np.diag(self._covariance)[q:])
-        scaled = self._white_response[:, :, q:] * deviation * _DEVIATIONS[:, None]
-        return np.asarray(scaled.reshape(len(scaled), -1))
+    @property
+    def discs(self) -> Discs:
+        """Round Hertz contacts that act on distant cubes like the traction on the nodes."""
+        return discs_of(self.estimate_contacts())
+
+    def estimate_contacts(self) -> list[ContactEstimate]:
+        """Return the integrals of the traction over each contact of the region."""
+        estimates = []
+        for label in range(self.labels.max() + 1):
+            own = self.labels == label
+            forces, root = self.posterior.forces[:, own], self.posterior.root[:, own]
+            estimates.append(estimate_contact(self.places[own], forces, root, self.size))
+        return estimates
+
+    @property
+    def shape_misfit(self) -> float:
+        """Misfit of all cubes around the region, as that of a `HertzFit` near its contacts."""
+        return self.misfit
+
+    def to_contacts(self, step: float) -> ContactSum:
+        """Describe the traction as a sum of Hertz contacts, the nodes; `step` is not needed."""
+        sizes = np.full(len(self.places), self.size)
+        return ContactSum(self.places, sizes, self.posterior.forces, self.posterior.root)
 
     def _decompose(self, envelope: Array) -> tuple[Array, Array, Array, Array]:
         """Compute the eigenvalues and eigenvectors from which every posterior follows.
@@ -236,19 +240,17 @@ class NodeFit:
             eigenvalues (3 q,) and eigenvectors (3 q, 3 q) of its square, and the matrix (3 q, 3 q)
             from the eigenvectors to the forces of the nodes.
         """
-        full = np.ones(len(self._covariance))
-        full[: len(envelope)] = envelope
-        covariance = self._covariance * np.outer(full, full)
+        covariance = self._covariance * np.outer(envelope, envelope)
         # This tiny increase of the diagonal makes up for rounding errors.
-        covariance[np.diag_indices(len(full))] *= 1 + 1e-8
+        covariance[np.diag_indices(len(covariance))] *= 1 + 1e-8
         root = np.linalg.cholesky(covariance)
         white = self._white_response
         parts = [white[:, axis] @ (root * _DEVIATIONS[axis]) for axis in range(3)]
         design = np.concatenate(parts, axis=1)
         eigenvalues, vectors = np.linalg.eigh(design.T @ design)
-        by_axis = vectors.reshape(3, len(full), -1)
+        by_axis = vectors.reshape(3, len(root), -1)
         basis = (root @ by_axis) * _DEVIATIONS[:, None, None]
-        return design, np.maximum(eigenvalues, 0), vectors, basis.reshape(3 * len(full), -1)
+        return design, np.maximum(eigenvalues, 0), vectors, basis.reshape(len(vectors), -1)
 
 
 def _place_nodes(region: Array, around: Array, inverse: SurfaceInverse) -> tuple[Array, float]:

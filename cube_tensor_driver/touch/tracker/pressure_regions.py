@@ -8,8 +8,6 @@ The pressure is that at the depth of the cubes' centres, below the points of the
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from ...core.arrays import Array, Index, Mask
@@ -50,7 +48,7 @@ class PressureRegions:
     cubes)."""
 
     def __init__(self, inverse: SurfaceInverse, min_pressure: float) -> None:
-        """Find the pairs of neighbouring points.
+        """Find the neighbours of all points.
 
         Args:
             inverse: Points of the surface.
@@ -59,10 +57,11 @@ class PressureRegions:
         self._min_pressure = min_pressure
         # A distance of 1.5 includes diagonal neighbours.
         tree = cKDTree(inverse.points)
-        self._pairs = tree.query_pairs(1.5 * inverse.spacing, output_type="ndarray")
-        self._wide_pairs = tree.query_pairs(JOIN_PITCHES * inverse.pitch, output_type="ndarray")
+        self._neighbours = _list_neighbours(tree, 1.5 * inverse.spacing)
+        self._wide_neighbours = _list_neighbours(tree, JOIN_PITCHES * inverse.pitch)
         self._cube = inverse.cube
         self._inside = np.zeros(len(inverse.points), bool)
+        self._regions: list[Index] = []
 
     def find(self, pressure: Array) -> list[Index]:
         """Find the regions in the newest scan.
@@ -75,33 +74,56 @@ class PressureRegions:
         """
         largest = float(pressure.max(initial=0.0))
         threshold = max(self._min_pressure, DETECTION_FRACTION * largest)
-        self._inside = pressure > np.where(self._inside, RELEASE_FRACTION, 1.0) * threshold
-        inside = np.flatnonzero(self._inside)
-        if not len(inside):
-            return []
+        before = self._inside
+        self._inside = pressure > np.where(before, RELEASE_FRACTION * threshold, threshold)
+        if not np.array_equal(self._inside, before):
+            self._regions = self._connect_points()
+        return sorted(self._regions, key=lambda region: -float(pressure[region].max()))
 
-        wide = self._connect(self._wide_pairs)
-        narrow = self._connect(self._pairs)
+    def _connect_points(self) -> list[Index]:
+        """Return the indices of the points of each region, without an order of the regions."""
+        inside = np.flatnonzero(self._inside)
+        wide = self._label(inside, self._wide_neighbours)
         regions = []
         for label in np.unique(wide):
-            is_own = wide == label
-            if len(np.unique(self._cube[inside[is_own]])) <= MAX_JOINED_CUBES:
-                regions.append(inside[is_own])
+            own = inside[wide == label]
+            if len(np.unique(self._cube[own])) <= MAX_JOINED_CUBES:
+                regions.append(own)
             else:
-                regions += [inside[narrow == one] for one in np.unique(narrow[is_own])]
-        return sorted(regions, key=lambda region: -float(pressure[region].max()))
+                narrow = self._label(own, self._neighbours)
+                regions += [own[narrow == one] for one in np.unique(narrow)]
+        return regions
 
-    def _connect(self, pairs: Index) -> Index:
-        """Return the number (n,) of the connected component of each of the n points in contact.
+    def _label(self, points: Index, neighbours: Index) -> Index:
+        """Return the number (n,) of the connected component of each of n points.
 
         Args:
-            pairs: Indices (pairs, 2) of the points that are connected if both are in contact.
+            points: Indices (n,) of the points.
+            neighbours: Indices (M, k) of the points to which each point is connected.
         """
-        joined = pairs[self._inside[pairs].all(axis=1)]
-        place = np.cumsum(self._inside) - 1
-        size = int(place[-1]) + 1
-        graph = coo_matrix((np.ones(len(joined)), place[joined].T), shape=(size, size))
-        return np.asarray(connected_components(graph, directed=False)[1])
+        # Every point takes the smallest label around it, until no label changes.
+        outside = len(self._inside)
+        labels = np.full(outside + 1, outside)
+        labels[points] = points
+        around = neighbours[points]
+        while True:
+            smallest = labels[around].min(axis=1)
+            # The label of a point is itself a point, whose label may already be smaller.
+            smallest = labels[smallest]
+            if np.array_equal(smallest, labels[points]):
+                return np.asarray(smallest)
+            labels[points] = smallest
+
+
+def _list_neighbours(tree: cKDTree, distance: float) -> Index:
+    """Return the indices (M, k) of the points within a distance of each point, itself included.
+
+    Missing neighbours have the index M.
+    """
+    found = tree.query_ball_point(tree.data, distance)
+    width = max(map(len, found))
+    rows = [one + [len(found)] * (width - len(one)) for one in found]
+    return np.array(rows, np.intp)
 
 
 def split_peaks(pressure: Array, root: Array, is_neighbour: Mask) -> Index:

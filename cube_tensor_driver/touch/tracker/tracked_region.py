@@ -1,0 +1,419 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
+"""One region of contact, followed from scan to scan, and the steps that fit its traction.
+
+A scan is a set of values of all cubes. A fit is either one of Hertz contacts (hertz_fit.py), which
+is tried first and suffices for balls, or one of the traction on nodes (node_fit.py). Of the two,
+the one with the greater evidence (probability of the values) is kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from enum import IntEnum
+
+import numpy as np
+
+from ...core.arrays import Array, Index
+from ..inverse import SurfaceInverse
+from .contact_estimate import Discs, discs_of
+from .hertz_fit import HertzFit, linearise
+from .local_values import MIN_FACING, CubeNoise, LocalValues
+from .node_fit import NodeFit
+
+MAX_CUBES = 48
+"""Largest number of cubes from whose values the traction in one region of contact is fitted. A
+wider region, such as that of a palm, is not fitted; its contact is the integral of the linear
+field."""
+
+NEAREST_CUBES = (21, 9)
+"""Numbers of cubes nearest to each cube below a region of contact that take part in the fit of the
+traction on nodes: all within two pitches (distance of neighbouring cubes), with diagonals. The
+second, smaller number is used if the first one gives more than `MAX_CUBES` cubes."""
+
+MAX_CHANGE = 0.25
+"""Relative change since the last fit of the traction on nodes above which the region is fitted
+again.
+
+It is the larger one of two changes: that of the largest pressure, and the share of surface points
+that have joined or left the region. The fit depends on the pressure, because the assumed errors of
+the pads' gains are proportional to the stress.
+"""
+
+MAX_MISFIT_GROWTH = 1.3
+"""Growth of the misfit since the last fit of a region above which the region is fitted again. The
+misfit is the squared deviation of the values from the fit, divided by the value that their noise
+causes. It grows when a contact moves or changes its shape."""
+
+MAX_HERTZ_MISFIT = 1.5
+"""Misfit of the nearest cubes above which Hertz contacts are compared with the traction on nodes.
+The misfit of the right model is 1 with a standard deviation of 0.12 for 9 cubes with 15 values
+each, and of 0.2 for planar cubes."""
+
+MAX_BAD_SCANS = 5
+"""Number of scans in a row with a misfit that has grown by `MAX_MISFIT_GROWTH` after which Hertz
+contacts are compared with the traction on nodes. A contact that begins elsewhere disturbs the
+others until its pressure is large enough to be found."""
+
+MAX_START_SIZE = 2.0
+"""Largest radius of a Hertz contact at the start of its fit, divided by the depth of the cubes'
+centres below the surface. From a radius that is much too large, Gauss-Newton steps do not converge
+to a small one."""
+
+MAX_HERTZ_ASPECT = 4.0
+"""Largest ratio of length to width of a contact for which the fit of a round Hertz contact is
+tried. Length and width are those that the fit on nodes (small contacts on a grid) has found."""
+
+MAX_DIRECT_PITCH = 2.5
+"""Largest pitch (distance of neighbouring cubes), in depths of the cubes' centres, at which Hertz
+contacts are tried before the traction on nodes. Between cubes that are farther apart, a fit that
+begins at the maximum of the field may end at the wrong side of a cube."""
+
+HOME_PITCHES = 0.55
+"""Distance of a Hertz contact from its home cube, in pitches, above which another cube that is
+nearer becomes the home cube, around which the skin is laid flat."""
+
+MAX_STALE_CHANGE = 0.003
+"""Change of a contact after which the response of distant cubes to it is computed again: shift,
+divided by the distance from the nearest other region, or change of the force, divided by the
+force."""
+
+START_ERROR = 0.15
+"""Standard deviation of the response of neighbouring cubes to a contact that is the integral of the
+linear field, divided by the response."""
+
+FIT_ERROR = 0.005
+"""Standard deviation of the response of neighbouring cubes to a fitted contact, divided by the
+response."""
+
+MAX_STEPS = 10
+"""Largest number of Gauss-Newton steps in the first fit of a Hertz contact."""
+
+STEP_WORK = 5
+"""Work of one Gauss-Newton step of a Hertz contact, in the unit of `MAX_WORK_PER_SCAN`: it takes as
+long as a new fit with this number of nodes."""
+
+
+Respond = Callable[[Index], tuple[Array, Array]]
+"""Function that returns the response (n, C) in Pa of n cubes to the other regions of contact, and
+its standard deviation."""
+
+
+class Work(IntEnum):
+    """Next step of the fit of a region of contact; the step with the smallest number comes first.
+
+    MOVE lets Hertz contacts follow the body that presses. BEGIN makes the first fit. CHOOSE tries
+    Hertz contacts in place of the traction on nodes. FIT makes a new fit of the traction on nodes.
+    SHARPEN improves it for the same values. NONE: nothing is to be done.
+    """
+
+    MOVE = 0
+    BEGIN = 1
+    CHOOSE = 2
+    FIT = 3
+    SHARPEN = 4
+    NONE = 5
+
+
+class TrackedRegion:
+    """A region of contact and its fit.
+
+    Attributes:
+        points: Indices (n,) of its points of the surface in the newest scan.
+        peak: Largest pressure in Pa at the depth of the cubes.
+        near: Other regions so close that the fit depends on theirs.
+        fit: Fit of the traction, if there is one.
+        others: Response (n, C) in Pa of the cubes of the fit to all other regions.
+        gap: Distance from the nearest other region in m.
+        response: Response (cubes, C) in Pa of the cubes to this region (`update_responses`).
+        start: Home cube and contact at which the first fit begins.
+        waited: Number of scans since the fit was last improved.
+    """
+
+    def __init__(self, inverse: SurfaceInverse, noise: CubeNoise) -> None:
+        self.points: Index = np.zeros(0, np.intp)
+        self.peak = 0.0
+        self.near: list[TrackedRegion] = []
+        self.fit: HertzFit | NodeFit | None = None
+        self.others: Array | float = 0.0
+        self.gap = np.inf
+        self.response = np.zeros((len(inverse.variant), len(inverse.columns)))
+        self._responding = np.zeros(len(inverse.variant), bool)
+        self.waited = 0
+        self._inverse = inverse
+        self._noise = noise
+        self._fitted_points = self.points
+        self._fitted_peak = 0.0
+        self._first_misfit = 1.0
+        self._is_hertz_due = inverse.pitch < MAX_DIRECT_PITCH * inverse.depth
+        self._is_tried = False
+        self._bad_scans = 0
+        self.start: tuple[int, Discs]
+        self._responded: tuple[int, Discs]
+
+    def begin_scan(self, points: Index, peak: float) -> None:
+        """Take over the points and the largest pressure of the newest scan, and follow the fit.
+
+        A fit whose values are not known any more, or that has left the region, is dropped.
+        """
+        self.points, self.peak = points, peak
+        self.waited += 1
+        self._is_tried = False
+        fit = self.fit
+        is_bad = fit is not None and fit.shape_misfit > MAX_MISFIT_GROWTH * self._first_misfit
+        is_bad = is_bad and self.has_fitted_neighbours
+        self._bad_scans = self._bad_scans + 1 if is_bad else 0
+        if isinstance(fit, HertzFit):
+            # Beside others, a prediction would make the mutual corrections of fits swing.
+            fit.predict(is_moving=not self.near)
+            self._follow_home(fit)
+        elif fit is not None and not fit.values.has_same_values:
+            self.fit = None
+
+    def _follow_home(self, fit: HertzFit) -> None:
+        """Lay the skin flat around another cube if the contacts have moved there.
+
+        A fit whose contacts have left the region, or pull at it, is dropped.
+        """
+        inverse = self._inverse
+        values = fit.values
+        centres = fit.found.centres
+        below = values.cubes[np.linalg.norm(centres[:, None] - values.place, axis=2).argmin(axis=1)]
+        around = inverse.near[inverse.cube[self.points], : NEAREST_CUBES[1]]
+        is_pressing = fit.found.forces[:, 2] < 0
+        if not (is_pressing & np.isin(below, around)).all():
+            self.fit = None
+            return
+        middle = np.linalg.norm(centres.mean(axis=0) - values.place, axis=1)
+        nearest = int(values.cubes[middle.argmin()])
+        from_home = float(middle[values.cubes == values.home][0])
+        if nearest != values.home and from_home > HOME_PITCHES * inverse.pitch:
+            cubes = np.unique(inverse.near[np.append(below, nearest)])
+            fit.move_home(self._collect(nearest, cubes))
+
+    def _collect(self, home: int, cubes: Index) -> LocalValues:
+        """Return the values of those of the cubes (n,) that do not face away from the home cube."""
+        normals = self._inverse.poses.rotation[:, :, 2]
+        facing = cubes[normals[cubes] @ normals[home] > MIN_FACING]
+        return LocalValues(self._inverse, self._noise, home, facing)
+
+    @property
+    def has_fitted_neighbours(self) -> bool:
+        """Whether all near regions have a fit, whose response this fit can subtract."""
+        return all(other.fit is not None for other in self.near)
+
+    @property
+    def relative_error(self) -> float:
+        """Standard deviation of the response to this region, divided by the response."""
+        return START_ERROR if self.fit is None else FIT_ERROR
+
+    @property
+    def discs(self) -> tuple[int, Discs]:
+        """Home cube of the region, and Hertz contacts that act like its traction."""
+        if self.fit is not None:
+            return self.fit.values.home, self.fit.discs
+        return self.start
+
+    def is_response_stale(self, cubes: Index) -> bool:
+        """Return whether the response of some cubes has to be computed again."""
+        if not self._responding[cubes].all():
+            return True
+        home, discs = self.discs
+        old_home, old = self._responded
+        if home != old_home or len(old.forces) != len(discs.forces):
+            return True
+        shift = np.abs(discs.centres - old.centres).max() / self.gap
+        change = np.abs(discs.forces - old.forces).max() / np.abs(discs.forces).max()
+        return bool(max(shift, change) > MAX_STALE_CHANGE)
+
+    def take_response(self, cubes: Index, response: Array) -> None:
+        """Take over the newest response (n, C) in Pa of some cubes (n,) to this region."""
+        self.response[cubes] = response
+        self._responding[:] = False
+        self._responding[cubes] = True
+        self._responded = self.discs
+
+    @property
+    def next_work(self) -> Work:
+        """Next step of the fit."""
+        fit = self.fit
+        if fit is None:
+            return Work.NONE if self._is_tried else Work.BEGIN
+        is_worse = fit.shape_misfit > MAX_MISFIT_GROWTH * self._first_misfit
+        if isinstance(fit, HertzFit):
+            if fit.is_unsettled or (is_worse and fit.is_moving):
+                return Work.MOVE
+            is_over = is_worse and self._bad_scans >= MAX_BAD_SCANS
+            is_over = is_over and self.has_fitted_neighbours
+            return Work.FIT if is_over and not self._is_tried else Work.NONE
+        changes = (
+            abs(self.peak / self._fitted_peak - 1),
+            _new_share(self.points, self._fitted_points),
+            _new_share(self._fitted_points, self.points),
+        )
+        if self._is_hertz_due:
+            return Work.CHOOSE
+        if (max(changes) > MAX_CHANGE or is_worse) and not self._is_tried:
+            return Work.FIT
+        return Work.NONE if fit.is_sharp else Work.SHARPEN
+
+    def improve(
+        self,
+        scaled: Array,
+        respond_to_others: Respond,
+    ) -> int:
+        """Do the next piece of work that makes the fit more exact.
+
+        Args:
+            scaled: Values (cubes, C) in Pa.
+            respond_to_others: Returns the response of cubes to the other regions.
+
+        Returns:
+            Work that this took, in the unit of `MAX_WORK_PER_SCAN`.
+        """
+        self.waited = 0
+        work, fit = self.next_work, self.fit
+        if fit is None and self._is_hertz_due:
+            return self._fit_hertz_directly(scaled, respond_to_others)
+        if isinstance(fit, HertzFit) and work == Work.MOVE:
+            return self._iterate(fit, scaled, 1)
+        if isinstance(fit, NodeFit) and work == Work.CHOOSE:
+            return self._replace_by_hertz(fit, scaled)
+        if isinstance(fit, NodeFit) and work == Work.SHARPEN:
+            fit.sharpen(fit.values.whiten(scaled, self.others))
+            self._is_hertz_due = fit.is_sharp
+            self._first_misfit = fit.shape_misfit
+            return len(fit.places) // 2
+        return self._fit_nodes(scaled, respond_to_others)
+
+    def _iterate(self, fit: HertzFit, scaled: Array, steps: int) -> int:
+        """Make up to a number of Gauss-Newton steps, and return their work."""
+        white = fit.values.whiten(scaled, self.others)
+        work = 0
+        for _ in range(steps):
+            linearise(self._inverse, [fit])
+            fit.step(white)
+            work += STEP_WORK * len(fit.found.forces)
+            if not fit.is_moving:
+                break
+        return work
+
+    def _fit_hertz_directly(
+        self,
+        scaled: Array,
+        respond_to_others: Respond,
+    ) -> int:
+        """Fit one Hertz contact that begins where the field has its contact."""
+        home, discs = self.start
+        self._is_hertz_due = False
+        cubes = self._inverse.near[home]
+        self._noise.update(scaled, cubes)
+        values = self._collect(home, cubes)
+        if not values.count:
+            self._is_tried = True
+            return 0
+        self.others, values.disturbance = respond_to_others(values.cubes)
+        values.refresh()
+        fit = HertzFit(self._inverse, values, discs)
+        work = self._iterate(fit, scaled, MAX_STEPS)
+        # While the fits of neighbours are not settled, the misfit says little.
+        is_good = not fit.is_unsettled and fit.shape_misfit < MAX_HERTZ_MISFIT
+        if is_good or self.near:
+            self._accept(fit)
+            self._first_misfit = MAX_HERTZ_MISFIT / MAX_MISFIT_GROWTH
+        return work
+
+    def _fit_nodes(self, scaled: Array, respond_to_others: Respond) -> int:
+        """Fit the traction on nodes, in place of the present fit."""
+        self._is_tried = True
+        inverse = self._inverse
+        points = inverse.points[self.points]
+        below = inverse.cube[self.points]
+        to_middle = np.linalg.norm(points - points.mean(axis=0), axis=1)
+        for count in NEAREST_CUBES:
+            cubes = np.unique(inverse.near[np.unique(below), :count])
+            if len(cubes) <= MAX_CUBES:
+                break
+        else:
+            return 0
+        self._noise.update(scaled, cubes)
+        values = self._collect(int(below[to_middle.argmin()]), cubes)
+        if not values.count:
+            return 0
+        self.others, values.disturbance = respond_to_others(values.cubes)
+        values.refresh()
+        fit = NodeFit(inverse, self.points, values)
+        fit.step(values.whiten(scaled, self.others))
+        fit.label_peaks()
+        self._is_hertz_due = True
+        self._accept(fit)
+        return len(fit.places)
+
+    def _replace_by_hertz(self, nodes: NodeFit, scaled: Array) -> int:
+        """Fit one Hertz contact for each contact on nodes, and keep them if they are likelier."""
+        self._is_hertz_due = False
+        starts = nodes.estimate_contacts()
+        if max(one.aspect for one in starts) > MAX_HERTZ_ASPECT:
+            return 1
+        discs = discs_of(starts)
+        sizes = np.minimum(discs.log_sizes, np.log(MAX_START_SIZE * self._inverse.depth))
+        fit = HertzFit(self._inverse, nodes.values, discs._replace(log_sizes=sizes))
+        work = self._iterate(fit, scaled, MAX_STEPS)
+        if not fit.is_unsettled and fit.score < nodes.posterior.score:
+            self._accept(fit)
+        return work
+
+    def _accept(self, fit: HertzFit | NodeFit) -> None:
+        """Replace the fit, and remember for what it was made."""
+        self.fit = fit
+        self._fitted_points, self._fitted_peak = self.points, self.peak
+        self._first_misfit = max(fit.shape_misfit, MAX_HERTZ_MISFIT / MAX_MISFIT_GROWTH)
+
+
+def update_responses(
+    inverse: SurfaceInverse, regions: Sequence[TrackedRegion], cubes: Index
+) -> None:
+    """Compute the response of cubes to regions of contact, as far as these have changed.
+
+    Distant cubes respond to a contact like to a round one. Those of a fit respond as the fit says.
+
+    Args:
+        inverse: Poses and kernels of the skin.
+        regions: Regions whose `response` is computed.
+        cubes: Indices (n,) of the cubes.
+    """
+    stale = [region for region in regions if region.is_response_stale(cubes)]
+    offsets, angles, sizes, forces = [], [], [], []
+    normals = inverse.poses.rotation[:, :, 2]
+    for region in stale:
+        home, discs = region.discs
+        place, angle = inverse.unroll(home, cubes)
+        # Cubes that face away do not respond.
+        is_facing = normals[cubes] @ normals[home] > MIN_FACING
+        for force, centre, log_size in zip(*discs, strict=True):
+            offsets.append(place - centre)
+            angles.append(angle)
+            sizes.append(np.full(len(cubes), np.exp(log_size)))
+            forces.append(is_facing[:, None] * force)
+    if stale:
+        variants = np.concatenate([inverse.variant[cubes]] * len(offsets))
+        response = inverse.kernels.response_to_forces(
+            np.concatenate(offsets),
+            np.concatenate(angles),
+            variants,
+            np.concatenate(sizes),
+            np.concatenate(forces),
+        )
+        by_disc = response[:, inverse.columns].reshape(len(offsets), len(cubes), -1)
+        for region in stale:
+            count = len(region.discs[1].forces)
+            region.take_response(cubes, by_disc[:count].sum(axis=0))
+            by_disc = by_disc[count:]
+    for region in regions:
+        if region.fit is not None:
+            region.response[region.fit.values.cubes] = region.fit.explained
+
+
+def _new_share(new: Index, old: Index) -> float:
+    """Return the share of the elements of one set that another set does not have."""
+    return 1 - float(np.isin(new, old).mean()) if len(new) else 0.0
