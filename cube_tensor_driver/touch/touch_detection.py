@@ -120,6 +120,13 @@ class Touches(NamedTuple):
     force_uncertainty: Array
 
 
+_NOTHING = np.zeros(0)
+_NO_FORCES = np.zeros((0, 3))
+
+NO_TOUCHES = Touches(0, np.zeros(0, np.intp), _NOTHING, _NOTHING, _NO_FORCES, _NO_FORCES)
+"""Touches of a scan in which nothing touches, with the time 0."""
+
+
 class Touch:
     """Finds touches in the stress of a skin, scan by scan (samples of every cube).
 
@@ -162,10 +169,6 @@ class Touch:
         if skin.elastomer is not None:
             self._estimate = estimate_forces(skin.poses, skin.elastomer, near, covariance)
 
-        nothing = np.zeros(0)
-        no_forces = np.zeros((0, 3))
-        no_cubes = np.zeros(0, np.intp)
-        self._no_touches = Touches(0, no_cubes, nothing, nothing, no_forces, no_forces)
         # The largest value of the neighbours is found faster if they are the first axis.
         self._near = near.T.copy()
         # Slow part of the values, NaN where unknown, and difference of the values from it, 0 there
@@ -296,7 +299,7 @@ class Touch:
         if not self._touched.any():
             self._reach[:] = 0
             self._held[:] = False
-            return self._no_touches._replace(stamp_ns=stamp_ns)
+            return NO_TOUCHES._replace(stamp_ns=stamp_ns)
         pressure = -self._change[:, PRESSURE]
         strength = np.where(self._touched, pressure, 0)
         is_largest = self._touched & (strength >= strength[self._near].max(axis=0))

@@ -20,6 +20,7 @@ from cube_tensor_driver.config.skin import Elastomer, read_skin
 from cube_tensor_driver.core.rows import StressRows, concatenate
 from cube_tensor_driver.mechanics import contact
 from cube_tensor_driver.msg import SkinTouch
+from cube_tensor_driver.ros.messages import to_ns
 from cube_tensor_driver.ros.nodes.touch_publisher import TouchPublisher
 
 SKIN = read_skin(package_data() / "config" / "skin_demo.yaml")
@@ -36,8 +37,9 @@ class Topic:
     def get_subscription_count(self) -> int:
         return self.subscribers
 
-    def publish(self, message: SkinTouch) -> None:
-        self.heard.append(deserialize_message(serialize_message(message), SkinTouch))
+    def publish(self, message: SkinTouch | bytes) -> None:
+        data = message if isinstance(message, bytes) else serialize_message(message)
+        self.heard.append(deserialize_message(data, SkinTouch))
 
 
 def scan(number: int, values: np.ndarray) -> StressRows:
@@ -63,10 +65,13 @@ def test_touch_of_each_scan_is_published():
 
     publisher.publish(concatenate([scan(number, idle) for number in range(60)]), 0)
     assert len(topic.heard) == 60 and not any(message.cube for message in topic.heard)
+    stamps_ns = [to_ns(message.header.stamp) for message in topic.heard]
+    assert stamps_ns == [START_NS + number * 1_000_000 for number in range(60)]
+    assert {message.header.frame_id for message in topic.heard} == {skin.parent_frame}
     publisher.publish(scan(60, load), 0)
     message = topic.heard[-1]
     assert message.header.frame_id == skin.parent_frame
-    assert 10**9 * message.header.stamp.sec + message.header.stamp.nanosec == START_NS + 60_000_000
+    assert to_ns(message.header.stamp) == START_NS + 60_000_000
     assert list(message.cube) == [5]
     assert message.pressure[0] == pytest.approx(-stress[5, 2], rel=1e-6)
     assert message.pressure_uncertainty[0] > 0.009 * message.pressure[0]

@@ -203,9 +203,10 @@ class Reconstruction(CubeNode):
         except CubeError as error:
             self._refuse(error)
             return
-        self._publisher.publish(stress, stamp_ns, frame_id)
+        # Touch comes first, because a reflex waits for it.
         if self._touch is not None:
             self._touch.publish(stress, rest_changes)
+        self._publisher.publish(stress, stamp_ns, frame_id)
         if self._state_interfaces is not None:
             self._state_interfaces.publish(stress, stamp_ns)
         self._diagnostics.count(stress)

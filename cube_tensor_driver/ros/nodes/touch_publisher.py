@@ -4,17 +4,27 @@
 
 from __future__ import annotations
 
+import struct
+
 import numpy as np
 from rclpy.qos import QoSProfile
+from rclpy.serialization import serialize_message
 from std_msgs.msg import Header
 
 from ...config.skin import Skin
 from ...core.rows import StressRows
+from ...messages.codec import SECOND
 from ...messages.types import TOUCH
 from ...msg import SkinTouch
-from ...touch.touch_detection import Touch, Touches
+from ...touch.touch_detection import NO_TOUCHES, Touch, Touches
 from ..messages import make_message, to_time
 from ..node import CubeNode
+
+STAMP = struct.Struct("<iI")
+"""Seconds and nanoseconds of the stamp in a serialised message (CDR, little endian)."""
+
+STAMP_OFFSET = 4
+"""Position of the stamp, in bytes. The bytes before it state the encoding."""
 
 
 class TouchPublisher:
@@ -39,6 +49,8 @@ class TouchPublisher:
         self._frame_id = skin.parent_frame
         self._publisher = node.own(node.create_lifecycle_publisher(SkinTouch, "touch", profile))
         self._rest_changes = 0
+        # Most messages say that nothing touches, and differ in their stamp only.
+        self._empty = bytearray(serialize_message(self._make_message(NO_TOUCHES)))
 
     def publish(self, rows: StressRows, rest_changes: int) -> None:
         """Find and publish the touches of one or several scans.
@@ -53,8 +65,13 @@ class TouchPublisher:
             self._touch.restart()
         for touches in self._touch(rows):
             # Without subscribers the touches are followed, too.
-            if self._publisher.get_subscription_count():
+            if not self._publisher.get_subscription_count():
+                continue
+            if len(touches.cube):
                 self._publisher.publish(self._make_message(touches))
+            else:
+                STAMP.pack_into(self._empty, STAMP_OFFSET, *divmod(touches.stamp_ns, SECOND))
+                self._publisher.publish(bytes(self._empty))
 
     def _make_message(self, touches: Touches) -> SkinTouch:
         shear_x, shear_y, along_z = touches.force.T
