@@ -110,6 +110,10 @@ MAX_FORCE_CHANGE = 0.3
 """Change of the force of a contact, divided by the force, after which the derivatives are computed
 again, because the radius of the contact changes with the force."""
 
+MAX_JUMP = 0.6
+"""Change of the force of a contact between two scans, divided by the force, after which its motion
+is not known. The response to a shift is proportional to the force."""
+
 MAX_LINEARISATIONS = 2
 """Largest number of contacts per scan whose derivatives are computed; each takes about 1 ms."""
 
@@ -343,12 +347,19 @@ class SlipEstimator:
             loads: Force in N and position in m (n, 6) of the contacts.
             scaled: Values (cubes, C) in Pa.
         """
-        change = loads - self._contacts["linearised"]
-        force = np.linalg.norm(loads[:, :3], axis=1)
-        limit = MAX_FORCE_CHANGE * np.maximum(force, MIN_FORCE_N)
-        has_changed = np.linalg.norm(change[:, :3], axis=1) > limit
+        contacts = self._contacts
+        change = loads - contacts["linearised"]
+        force = np.maximum(np.linalg.norm(loads[:, :3], axis=1), MIN_FORCE_N)
+        force_change = np.linalg.norm(change[:, :3], axis=1)
         shift = np.linalg.norm(change[:, 3:], axis=1)
+        has_changed = force_change > MAX_FORCE_CHANGE * force
         has_changed |= shift > MAX_SHIFT_DEPTHS * self._inverse.depth
+
+        # After a sudden change, as in a bounce, the derivatives tell no position.
+        is_lost = (force_change > MAX_JUMP * force) | (shift > self._inverse.depth)
+        is_lost &= contacts["noise"] > 0
+        loads[is_lost, 3:] = contacts["linearised"][is_lost, 3:]
+        contacts["past"][is_lost] = np.nan
         for row in np.flatnonzero(has_changed)[:MAX_LINEARISATIONS]:
             self._linearise(int(row), loads, scaled)
 
