@@ -101,8 +101,11 @@ class RubbedSkin:
 
     def pads(self, body: Body, normal: float, shear: Array, centre: Array) -> Array:
         """Stress (cubes, P) in Pa of each pad under a body."""
+        return self.pads_under(body.point_forces(normal, shear, centre))
+
+    def pads_under(self, load: tuple[Array, Array]) -> Array:
+        """Stress (cubes, P) in Pa of each pad under point forces."""
         cubes, setting = self.bench.poses.position[:, :2], self.bench.setting
-        load = body.point_forces(normal, shear, centre)
         return self.bench.pads_in(field_below(cubes, setting.depth, load, setting.poisson))
 
     def measure(self, pads: Array) -> Array:

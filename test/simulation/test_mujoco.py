@@ -309,6 +309,18 @@ def test_the_programs_of_the_page_run(mujoco, tmp_path, monkeypatch, capsys):
     assert not (tmp_path / "ports").exists()
 
 
+def test_the_gripper_of_the_page_holds_a_cup_with_little_force(mujoco, monkeypatch, capsys):
+    """It slips once, learns the friction of the scene, and holds the filled cup."""
+    page = (ROOT / "docs" / "examples.md").read_text()
+    (program,) = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    monkeypatch.chdir(ROOT)
+    names: dict = {}
+    exec(program, names)
+    force, needed, slid = map(float, re.findall(r"\d+\.\d+", capsys.readouterr().out))
+    assert needed < force < 1.3 * needed and slid < 6
+    assert np.nanmax(names["estimator"].slip.friction) == pytest.approx(0.8, rel=0.05)
+
+
 def test_without_mujoco_the_install_line_is_given(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(ConfigError, match=r"pip install 'cube-tensor-driver\[mujoco\]'"):

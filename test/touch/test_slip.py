@@ -11,7 +11,7 @@ from rubbed_skin import Body, RubbedSkin
 from cube_tensor_design.studies.traction_study import CUBES, Setting, TractionBench
 from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.defaults import CONTACT_PRESSURE
-from cube_tensor_driver.touch.slip import SLIP, STICK, SlipEstimator
+from cube_tensor_driver.touch.slip import SLIP, STICK, UNKNOWN, SlipEstimator
 from cube_tensor_driver.touch.tracker.contact_tracker import ContactTracker
 
 PERIOD_S = 1e-3
@@ -76,3 +76,59 @@ def test_gross_slip_is_reported_within_10_ms_with_its_friction(benches, seed):
     assert slip.friction_use[0] == pytest.approx(1, abs=0.05)
     velocity = np.mean(run.velocity[100:], axis=0)
     np.testing.assert_allclose(velocity[:2], speed * along, atol=0.25 * speed)
+
+
+@pytest.mark.parametrize(
+    ("body", "largest"), [(Body(0.6, 12e-3, True), 0.5), (Body(0.6, 8e-3, False), 0.13)]
+)
+def test_a_body_that_is_shaken_and_sticks_does_not_slip(benches, body, largest):
+    """Shear in turning directions, and a normal force that changes by a fifth. The force acts 15 mm
+    above the face of the punch, which tilts its pressure by as much as keeps the face in contact.
+    """
+    random = np.random.default_rng(4)
+    lever = 15e-3
+    skin, pads = RubbedSkin(benches[0], random), []
+    for time_s in np.arange(250) * PERIOD_S:
+        normal = 3.0 * (1 + 0.2 * np.sin(2 * np.pi * 3 * time_s))
+        share = np.array([np.sin(2 * np.pi * 4 * time_s), 0.3 * np.sin(2 * np.pi * 7 * time_s + 1)])
+        ratio = largest * share
+        sources, forces = body.point_forces(normal, ratio * normal, np.array([1e-3, 2e-3]))
+        if not body.is_ball:
+            # Pressure of a tilted punch, p0 (1 + 3 x e / a^2) / sqrt(1 - r^2 / a^2).
+            arm = sources[:, :2] - [1e-3, 2e-3]
+            forces[:, 2] *= 1 + 3 * lever * (arm @ ratio) / body.size**2
+        pads.append(skin.pads_under((sources, forces)))
+    run = Run(benches[0], skin.measure(np.array(pads)))
+    assert not run.begun and SLIP not in run.states
+    assert run.states.count(STICK) > 40
+
+
+def test_a_ball_that_rolls_does_not_slip(benches):
+    """It moves by 4 mm across its shear force, which is a third of what friction holds."""
+    random = np.random.default_rng(6)
+    body, skin = Body(0.9, 15e-3, True), RubbedSkin(benches[0], random)
+    places = np.array([[4e-5 * number - 2e-3, 1e-3] for number in range(100)])
+    pads = [skin.pads(body, 4.0, np.array([0.0, 1.2]), place) for place in places]
+    run = Run(benches[0], skin.measure(np.array(pads)))
+    assert SLIP not in run.states and run.states.count(UNKNOWN) > 80
+    assert np.isnan(run.velocity[-1]).all()
+
+
+def test_time_that_jumps_back_and_contacts_that_come_and_go(benches):
+    """At the start of another recording the motion before does not count."""
+    random = np.random.default_rng(8)
+    body, skin = Body(0.5, 5e-3, False), RubbedSkin(benches[0], random)
+    here, there = (
+        skin.measure(skin.pads(body, 3.0, np.array([1.5, 0.0]), np.array([x, 0.0]))[None])[0]
+        for x in (0.0, 1e-3)
+    )
+    tracker = ContactTracker(benches[0].inverse, CONTACT_PRESSURE)
+    estimator = SlipEstimator(benches[0].inverse)
+    estimator.adopt(tracker.update(here), here)
+    for number in range(4):
+        assert not estimator.update(9 + number * PERIOD_S, here)
+    assert estimator.slip.state.tolist() == [STICK]
+    assert not estimator.update(1.0, there)
+    assert estimator.slip.state.tolist() == [UNKNOWN]
+    estimator.adopt([], here)
+    assert not estimator.update(1.1, here) and not len(estimator.slip.state)
