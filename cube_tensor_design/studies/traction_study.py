@@ -68,7 +68,7 @@ assumes the value in pad_noise.py."""
 CASES = 16
 """Number of random loads for each setting and contact width."""
 SKIN_SIDE = 0.072
-"""Smallest side of the square skin, in m; a skin has a side of at least five pitches."""
+"""Side of the square skin, in m."""
 ORDER = 14
 """Order of the quadrature (number of rings of point forces) of a ball. With it the error of the
 stress at 4 mm below a contact of 20 mm is within 1e-3 of the peak."""
@@ -98,6 +98,7 @@ class Setting:
         poisson: True Poisson's ratio of the elastomer.
         thickness: True thickness of the elastomer.
         gain_error: Standard deviation of the pads' gains, relative to the calibrated ones.
+        side: Side of the square skin; it is at least five pitches.
     """
 
     cubes: str = CUBES[0]
@@ -109,6 +110,7 @@ class Setting:
     poisson: float = POISSONS_RATIO
     thickness: float = np.inf
     gain_error: float = GAIN_ERROR
+    side: float = SKIN_SIDE
 
 
 @dataclass(frozen=True, eq=False)
@@ -438,7 +440,7 @@ def sum_contacts(contacts: Sequence[Any]) -> TotalContact:
 
 
 def _place_cubes(setting: Setting) -> CubePoses:
-    skin = flat_skin(setting.pitch, max(SKIN_SIDE, 5 * setting.pitch))
+    skin = flat_skin(setting.pitch, max(setting.side, 5 * setting.pitch))
     if setting.cubes != "planar, crosswise":
         return skin
     cell = np.round(skin.position[:, :2] / setting.pitch)

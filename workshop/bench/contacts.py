@@ -16,6 +16,7 @@ import numpy as np
 
 from cube_tensor_design.studies.traction_study import (
     CUBES,
+    GAIN_ERROR,
     Setting,
     TractionBench,
     flat_punch,
@@ -32,6 +33,18 @@ FORCE_N = 3.0
 SCANS = 12
 """Number of scans of each load. The figures are those of the last one, the first time is given
 apart."""
+
+MOVING_SCANS = 120
+"""Number of scans while balls move over the skin."""
+
+RATE_HZ = 100.0
+"""Sampling rate of the balls that move, in Hz."""
+
+SPEED = 50e-3
+"""Speed of the balls that move, in m/s."""
+
+RADIUS_M = 12e-3
+"""Radius in m of the circle on which each ball moves."""
 
 DENSE = Setting()
 """Skin of 24-pad cubes, 8 mm apart and 5 mm deep."""
@@ -55,9 +68,9 @@ class Line(NamedTuple):
     outside: float | None = None
 
 
-def ellipse(length: float, width: float) -> Array:
-    """Return Hertz's pressure on an ellipse along x with 1 N, as in `Line.shape`."""
-    sources, forces = contact.hertz(1.0, (0, 0, 1), order=16)
+def ellipse(length: float, width: float, order: int = 16) -> Array:
+    """Return Hertz's pressure on an ellipse along x with 1 N, as `order` rings of point forces."""
+    sources, forces = contact.hertz(1.0, (0, 0, 1), order=order)
     scaled = sources[:, :2] * np.array([length, width]) / 2
     return np.column_stack([scaled, forces[:, 2]])
 
@@ -118,11 +131,15 @@ def values_under(
         force: Force (3,) in N.
         random: Source of gain errors and noise.
     """
+    return bench.measured(bench.pads_in(_field_under(bench, shape, centre, force)), random)
+
+
+def _field_under(bench: TractionBench, shape: Array, centre: Array, force: Array) -> Array:
+    """Return stress and gradient (cubes, 24) in Pa and Pa/m; arguments as in `values_under`."""
     sources = np.column_stack([shape[:, :2] + centre, np.zeros(len(shape))])
     below = bench.poses.position - [0, 0, bench.setting.depth]
     fields = contact.field(below, sources, shape[:, 2:] * force, bench.setting.poisson)
-    field = np.concatenate([part.reshape(len(below), -1) for part in fields], axis=1)
-    return bench.measured(bench.pads_in(field), random)
+    return np.concatenate([part.reshape(len(below), -1) for part in fields], axis=1)
 
 
 def bench_contacts(loads: int) -> dict[str, Any]:
@@ -133,7 +150,48 @@ def bench_contacts(loads: int) -> dict[str, Any]:
     Args:
         loads: Number of loads of each shape.
     """
-    return {name: _bench_line(line, loads) for name, line in LINES.items()}
+    result: dict[str, Any] = {name: _bench_line(line, loads) for name, line in LINES.items()}
+    for cubes in CUBES[:2]:
+        result[f"four balls that move, 289 {cubes} cubes"] = bench_moving_balls(cubes)
+    return result
+
+
+def bench_moving_balls(cubes: str) -> dict[str, float]:
+    """Measure the CPU time of a scan while four balls begin, move at 50 mm/s and end.
+
+    Args:
+        cubes: Kind of the cubes, one of `CUBES`.
+    """
+    bench = TractionBench(replace(DENSE, cubes=cubes, side=0.128, gain_error=0.0), side=2)
+    random = np.random.default_rng(3)
+    count = (len(bench.poses.position), len(bench.calibration.noise))
+    gain = 1 + GAIN_ERROR * random.standard_normal(count)
+    shape = ellipse(6e-3, 6e-3, order=6)
+    tracker = ContactTracker(bench.inverse, CONTACT_PRESSURE)
+    corners = 28e-3 * np.array([[-1, -1], [1, -1], [-1, 1], [1, 1]])
+    times_ms, errors = [], []
+    for scan in range(MOVING_SCANS):
+        pads, pressing = np.zeros(count), 0.0
+        for number, corner in enumerate(corners):
+            # Every ball begins 15 scans after the one before, and takes 10 scans to full force.
+            since, until = scan - 15 * number - 5, MOVING_SCANS - 10 * number - scan
+            share = float(np.clip(min(since, until) / 10, 0, 1))
+            angle = since / RATE_HZ * SPEED / RADIUS_M
+            centre = corner + RADIUS_M * np.array([np.cos(angle), np.sin(angle)])
+            force = share * FORCE_N * np.array([0.3, 0.0, -1.0])
+            pads = pads + bench.pads_in(_field_under(bench, shape, centre, force))
+            pressing += share * FORCE_N
+        values = bench.measured(pads * gain, random)
+        start_s = time.process_time()
+        found = tracker.update(values)
+        times_ms.append(1e3 * (time.process_time() - start_s))
+        if pressing > 3.9 * FORCE_N:
+            errors.append(sum(one.normal_force for one in found) / pressing - 1)
+    return {
+        "scan_cpu_mean_ms": float(np.mean(times_ms)),
+        "scan_cpu_p99_ms": float(np.percentile(times_ms, 99)),
+        "force_error_percent": float(100 * np.sqrt(np.mean(np.square(errors)))),
+    }
 
 
 def _bench_line(line: Line, loads: int) -> dict[str, float]:
