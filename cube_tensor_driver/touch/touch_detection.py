@@ -54,9 +54,9 @@ OVERSHOOT = 1.04
 limit but beyond it. With `REFERENCE` = 2 the true mean time between false alarms, from its integral
 equation, is 1.05 to 1.15 times the stated one."""
 
-SETTLING_ROWS = 50
+SETTLING_ROWS = 10
 """Number of samples of a cube from which its slow part is averaged before touch is looked for. They
-add 1 % to the standard deviation of the pressure."""
+add 5 % to the standard deviation of the pressure at first."""
 
 NEIGHBOURS = 9
 """Number of cubes that decide together where a touch is, and from which its force is estimated: the

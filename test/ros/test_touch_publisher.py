@@ -85,7 +85,8 @@ def test_touch_of_each_scan_is_published():
 
     # A tare changes all values: the touch stays, and no other begins.
     publisher.publish(scan(61, load - 500), 1)
-    assert [list(topic.heard[-1].cube)] == [[5]]
+    assert list(topic.heard[-1].cube) == [5]
+    assert topic.heard[-1].pressure[0] == pytest.approx(message.pressure[0], rel=1e-4)
     topic.subscribers = 0
     publisher.publish(scan(62, load - 500), 1)
     assert len(topic.heard) == 62
