@@ -373,3 +373,16 @@ def test_without_a_parameter_nothing_is_compensated_and_two_are_refused(start):
     assert not (stress_codec.decode(node.sent["stress"][0]).rows.status & COMPENSATION).any()
     with pytest.raises(AssertionError):
         start(gravity="world", imu="/imu")
+
+
+def test_the_tensor_of_a_cube_states_what_is_not_known_of_its_weight(start, monkeypatch):
+    """A covariance is kept from row to row, but what the compensation adds to it changes."""
+    fake_tf(monkeypatch, imu=IMU_FRAME)
+    node = start(imu="/imu")
+    node.on_rows(scan_at(0.1))
+    unknown = node._publisher._cubes._covariance(0, 0)
+    played(node, MovingSkin(), 0.1)
+    known = node._publisher._cubes._covariance(0, 0)
+    np.testing.assert_array_equal(known, node._reconstructor.pipeline.covariance(0))
+    # zz: 1 g along x and z, which RESPONSE turns into about 115 Pa
+    assert 80**2 < unknown[2, 2] - known[2, 2] < 150**2

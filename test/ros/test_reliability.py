@@ -396,10 +396,11 @@ def test_the_security_policy_allows_what_the_nodes_do(stage, tmp_path):
                 return {each for each in allowed if not any(fnmatch(one, each) for one in there())}
 
             # Discovery tells of a node before it tells of its last topic. The clock is there with
-            # use_sim_time, topics of cubes when somebody listens, and touch and traction with their
-            # parameters.
-            not_in_the_bag = {"/diagnostics", "/driver/info"} if name == "player" else set()
-            may_be_idle = {"/clock", "/cubes/*", "/touch", "/traction"} | not_in_the_bag
+            # use_sim_time, topics of cubes when somebody listens, and others with their parameters.
+            not_in_the_bag = {"/diagnostics", "/driver/info", "/compensation"}
+            by_parameter = {"/touch", "/traction", "/imu", "/tf", "/tf_static"}
+            may_be_idle = {"/clock", "/cubes/*"} | by_parameter
+            may_be_idle |= not_in_the_bag if name == "player" else set()
             stage.wait(lambda idle=idle, allowed=may_be_idle: idle() <= allowed)
             more = [one for one in there() if not any(fnmatch(one, each) for each in allowed)]
             assert more == [], (name, what)

@@ -20,7 +20,7 @@ from rosgraph_msgs.msg import Clock
 from ...bags.read import Bag, Entry
 from ...core.errors import BagError
 from ...messages.codec import SECOND
-from ...messages.types import FREQUENCIES, PACKAGE, STRESS, TOUCH
+from ...messages.types import COMPENSATION, FREQUENCIES, PACKAGE, STRESS, TOUCH
 from ...msg import ReplayState
 from ...processes.stop_signals import on_stop_signal
 from ...srv import SteerReplay
@@ -61,6 +61,7 @@ STATE_PERIOD_S = 0.1
 RECONSTRUCTED_TYPES = (
     STRESS,
     TOUCH,
+    COMPENSATION,
     f"{PACKAGE}/msg/StressTensorStamped",
     "geometry_msgs/msg/WrenchStamped",
 )

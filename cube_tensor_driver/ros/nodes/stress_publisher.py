@@ -290,8 +290,11 @@ class CubeTopics:
             # with pads that fail intermittently would grow for ever.
             if len(self._covariances) >= MAX_COVARIANCES:
                 self._covariances.clear()
-            self._covariances[key] = self._reconstructor.covariance(cube, left_out)
-        return self._covariances[key]
+            self._covariances[key] = self._reconstructor.pipeline.covariance(cube, left_out)
+        # The deviation of what is compensated changes from row to row.
+        growth = self._reconstructor.compensation.growth(cube, left_out)
+        noise = self._covariances[key]
+        return noise if growth is None else noise + growth
 
 
 def _find_listened(publishers: dict[int, Any]) -> list[int]:
