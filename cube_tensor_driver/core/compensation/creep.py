@@ -44,7 +44,7 @@ from .effect import Effect
 TIME_LIMITS_S = (0.0, 5.0, math.inf)
 """Limits of the relaxation times, in s, of the groups of memories that are advanced together."""
 
-STEPS_NS = (20_000_000, 200_000_000)
+STEPS_NS = (30_000_000, 200_000_000)
 """Shortest step, in ns, by which the memories of each group are advanced.
 
 The memories of the fastest fit have a relaxation time of 0.1 s, those of the second group at least
@@ -87,6 +87,14 @@ def advance(memory: Array, before: Array, now: Array, share: Array, slope_share:
     memory += share * (before - memory) + slope_share * (now - before)
 
 
+def choose(cube: Index, n_cubes: int) -> Index | slice:
+    """Return the rows of tables of cubes for the cubes of one scan, as a slice if it has all.
+
+    A scan has at most one row per cube, in rising order. A slice takes no copy.
+    """
+    return slice(None) if len(cube) == n_cubes else cube
+
+
 class _Memories:
     """Memories of all pads whose relaxation times lie between two limits.
 
@@ -121,43 +129,48 @@ class _Memories:
             self._offset[cube] += amplitude[cube] * value[cube]
             self._slope[cube] += amplitude[cube] / time * (self.reading[cube] - value[cube])
 
-    def offset(self, cube: Index, stamp_ns: Times) -> Array:
-        """Return sum_k a_k r_k for rows of cubes (N, P), with the reading of the last step."""
+    def line_at(self, cube: Index | slice, time_ns: Times) -> tuple[Array, Array]:
+        """Return what is subtracted from cubes at times (n,), and its slope, per second (n, P)."""
+        elapsed_s = 1e-9 * (time_ns - self.time_ns[cube])[:, None]
+        slope: Array = self._slope[cube]
+        return self._offset[cube] + slope * elapsed_s, slope
+
+    def offset_at(self, cube: Index, stamp_ns: Times) -> Array:
+        """Return sum_k a_k r_k for rows of cubes (n, P), with the reading of the last step."""
+        relaxed = self.value[:, cube]
+        reading = self.reading[cube]
         elapsed_ns = np.maximum(stamp_ns - self.time_ns[cube], 0)
-        offset: Array = self._offset[cube] + self._slope[cube] * (1e-9 * elapsed_ns[:, None])
-        # Over more than a step, the straight line leads too far.
-        late = np.flatnonzero(elapsed_ns >= 2 * self._step_ns)
-        if len(late):
-            slow = cube[late]
-            relaxed = self.value[:, slow]
-            self._relax(relaxed, elapsed_ns[late], self.reading[slow], self.reading[slow])
-            offset[late] = 0
-            for amplitude, value in zip(self.amplitude, relaxed, strict=True):
-                offset[late] += amplitude[slow] * value
+        self._relax(relaxed, elapsed_ns, reading, reading)
+        offset = np.zeros_like(reading)
+        for amplitude, value in zip(self.amplitude, relaxed, strict=True):
+            offset += amplitude[cube] * value
         return offset
 
     def update(
-        self, cube: Index, stamp_ns: Times, reading: Real, is_bad: Mask
-    ) -> tuple[Index, Array]:
+        self, cube: Index, stamp_ns: Times, reading: Real, bad: PadMasks
+    ) -> tuple[Index, Index, Array] | None:
         """Advance the memories of the cubes that are due.
 
         Args:
             cube: Numbers of the cubes of the rows of one scan (N,).
             stamp_ns: Time stamps (N,), in ns.
             reading: Readings of the pads (N, P).
-            is_bad: Whether a pad is not used (N, P); it keeps its last reading.
+            bad: Bit masks of the pads that are not used (N,); they keep their last reading.
 
         Returns:
-            Rows before which the load is not known (n,), which are the first of a cube and those
-            after a gap, and the larger readings before and after this time (n, P).
+            Rows whose cubes were advanced; those of them before which the load is not known (n,),
+            which are the first of a cube and those after a gap; and the larger readings before and
+            after this time (n, P). None: no cube is due.
         """
         elapsed_ns = stamp_ns - self.time_ns[cube]
         # A time stamp before the last one is from another clock: an interval of unknown length.
         is_lost = (self.time_ns[cube] == 0) | (elapsed_ns < 0)
         due = np.flatnonzero(is_lost | (elapsed_ns >= self._step_ns))
-        # A scan has at most one row per cube, in rising order, so it can be all cubes.
-        chosen = slice(None) if len(due) == len(self.time_ns) else cube[due]
-        now = np.where(is_bad[due], self.reading[chosen], reading[due])
+        if not len(due):
+            return None
+        chosen = choose(cube[due], len(self.time_ns))
+        is_bad = bad[due, None] >> np.arange(reading.shape[1], dtype=np.uint32) & 1 > 0
+        now = np.where(is_bad, self.reading[chosen], reading[due])
         before = np.where(is_lost[due, None], now, self.reading[chosen])
         is_gap = is_lost[due] | (elapsed_ns[due] > MAX_GAP_NS)
         steps_ns = np.where(is_lost[due], self._step_ns, elapsed_ns[due])
@@ -170,7 +183,7 @@ class _Memories:
         self.unknown[:, chosen] = np.where(is_lost[due], 1.0, unknown + share * (is_gap - unknown))
         self.time_ns[chosen], self.reading[chosen] = stamp_ns[due], now
         self.set_offset(chosen)
-        return due[is_gap], np.maximum(np.abs(before), np.abs(now))[is_gap]
+        return due, due[is_gap], np.maximum(np.abs(before), np.abs(now))[is_gap]
 
     def _relax(self, value: Array, elapsed_ns: Times, before: Array, now: Array) -> Array:
         """Advance memories over one interval each, by the equations of the module, in place.
@@ -217,6 +230,9 @@ class Creep(Effect):
         self._stiffness = pipeline.stiffness
         # The larger reading beside times in which the load is not known, stress / stiffness.
         self._scale = np.zeros(shape)
+        # What is subtracted is a straight line over the time since a step.
+        self._time_ns = np.zeros(len(self._models), np.int64)
+        self._offset, self._slope = np.zeros(shape), np.zeros(shape)
         self._rest, self._rest_version = pipeline.rest_frequency, pipeline.rest_version
 
         times = {time for model in self._models if model for time in model.time.tolist()}
@@ -242,20 +258,39 @@ class Creep(Effect):
     def add_offset(self, rows: FrequencyRows, cube: Index, offset: Real) -> Mask:
         if self._rest_version != self._pipeline.rest_version:
             self._shift_zero()
-        for group in self._groups:
-            offset += group.offset(cube, rows.stamp_ns)
-        between_ns = rows.stamp_ns - self._groups[0].time_ns[cube]
+        chosen = choose(cube, len(self._models))
+        between_ns = rows.stamp_ns - self._time_ns[chosen]
+        elapsed_s = 1e-9 * np.maximum(between_ns, 0)[:, None]
+        offset += self._offset[chosen] + self._slope[chosen] * elapsed_s
+        # Over more than a step, the straight line leads too far.
+        late = np.flatnonzero(between_ns >= 2 * STEPS_NS[0])
+        if len(late):
+            stamp_ns, numbers = rows.stamp_ns[late], cube[late]
+            straight = self._offset[numbers] + self._slope[numbers] * elapsed_s[late]
+            exact = sum(group.offset_at(numbers, stamp_ns) for group in self._groups)
+            offset[late] += exact - straight
         is_close = (between_ns >= 0) & (between_ns <= MAX_GAP_NS)
-        is_known: Mask = (self._has_model & self._is_certain)[cube] & is_close
+        is_known: Mask = (self._has_model & self._is_certain)[chosen] & is_close
         return is_known
 
     def update(self, rows: FrequencyRows, cube: Index, v: Real, bad: PadMasks) -> None:
-        is_bad = bad[:, None] >> np.arange(v.shape[1], dtype=np.uint32) & 1 > 0
         for group in self._groups:
-            lost, scale = group.update(cube, rows.stamp_ns, v, is_bad)
+            found = group.update(cube, rows.stamp_ns, v, bad)
+            # The steps of the slower group are longer, so it is not due before the faster one.
+            if found is None:
+                break
+            due, lost, scale = found
             self._scale[cube[lost]] = np.maximum(self._scale[cube[lost]], scale)
             self._is_certain[cube[lost]] = False
-        self._check_certainty()
+            self._set_line(choose(cube[due], len(self._models)))
+            self._check_certainty()
+
+    def _set_line(self, cube: Index | slice) -> None:
+        """Compute what all groups subtract from cubes: a value and a slope from a time on."""
+        self._time_ns[cube] = self._groups[0].time_ns[cube]
+        lines = [group.line_at(cube, self._time_ns[cube]) for group in self._groups]
+        self._offset[cube] = sum(offset for offset, _ in lines)
+        self._slope[cube] = sum(slope for _, slope in lines)
 
     def deviation(self, cube: int) -> Array:
         model = self._models[cube]
@@ -313,6 +348,7 @@ class Creep(Effect):
             group.value -= (1 - group.unknown[..., None]) * shift
             group.set_offset(slice(None))
             self._scale[moved] = np.minimum(self._scale, np.abs(group.reading))[moved]
+        self._set_line(slice(None))
 
     def state(self) -> Array:
         return np.concatenate([part.ravel() for part in self._parts()])
@@ -328,6 +364,7 @@ class Creep(Effect):
             part[:] = values.reshape(part.shape)
         for group in self._groups:
             group.set_offset(slice(None))
+        self._set_line(slice(None))
         self._is_certain[:] = False
         self._check_certainty()
         # The state refers to the rest frequencies of its time.
