@@ -54,7 +54,7 @@ def test_missing_system_packages_are_named_with_the_command(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("machine", "version"), [("aarch64", (3, 11)), ("x86_64", (3, 14)), ("x86_64", (3, 9))]
+    ("machine", "version"), [("aarch64", (3, 11)), ("x86_64", (3, 15)), ("x86_64", (3, 9))]
 )
 def test_a_platform_without_wheels_is_told_the_way_out(monkeypatch, machine, version):
     monkeypatch.setattr(platform, "machine", lambda: machine)
@@ -362,7 +362,7 @@ def test_no_python_is_said_with_the_way_out(tmp_path):
         env={"PATH": str(tmp_path)},
     )
     assert done.returncode == 1
-    assert "no Python 3.10 to 3.13 found" in done.stderr and "sudo apt install" in done.stderr
+    assert "no Python 3.10 to 3.14 found" in done.stderr and "sudo apt install" in done.stderr
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,7 @@ DISTRO_VARIABLE = "CUBE_DISTRO"
 OLDEST_PYTHON = (3, 10)
 """Oldest version of Python for which there are wheels."""
 
-NEWEST_PYTHON = (3, 13)
+NEWEST_PYTHON = (3, 14)
 """Newest version of Python for which there are wheels."""
 
 LINKED_FOLDERS = ("cube_tensor_driver", "launch", "config", "scripts", "rviz")
@@ -244,7 +244,7 @@ def check_system() -> None:
     if system != "Linux x86_64" or not OLDEST_PYTHON <= version <= NEWEST_PYTHON:
         raise SetupError(
             f"there are no ROS 2 wheels for {system} with Python {number}: "
-            "they exist for Linux x86_64 with Python 3.10 to 3.13.\n"
+            "they exist for Linux x86_64 with Python 3.10 to 3.14.\n"
             "The way out: install ROS 2 Humble or newer (https://docs.ros.org), source it, "
             "and run ./cube again."
         )

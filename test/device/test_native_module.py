@@ -4,9 +4,11 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import subprocess
 import sys
+import sysconfig
 import threading
 from ctypes import addressof
 
@@ -298,3 +300,17 @@ print(Decoder().feed(encode(Stats(1, 2, 3))))
         env=os.environ,
     )
     assert done.stdout == "[Stats(uptime_ms=1, taken=2, dropped=3, supply_mv=0)]\n"
+
+
+def test_a_free_threaded_python_is_told_why_the_wire_is_slow(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Such a Python does not look for modules of the stable ABI."""
+    assert "install a compiler" in native.NOT_COMPILED
+    spec = importlib.util.find_spec(native.__name__)
+    assert spec is not None and spec.loader is not None
+    with monkeypatch.context() as patch:
+        patch.setattr(sysconfig, "get_config_var", {"Py_GIL_DISABLED": 1}.get)
+        again = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(again)
+    assert "free-threaded" in again.NOT_COMPILED and "\n" not in again.NOT_COMPILED

@@ -7,6 +7,7 @@ Where it was not compiled, `wire` is None, and the same functions run in Python,
 
 from __future__ import annotations
 
+import sysconfig
 from ctypes import sizeof
 
 from ..track import LinkTrack
@@ -23,8 +24,10 @@ else:
 
 __all__ = ["NOT_COMPILED", "wire"]
 
-NOT_COMPILED = (
-    "the wire is decoded in Python, which is slower, because the module in C is missing or of "
-    "another version: install a compiler (sudo apt install gcc python3-dev) and install again"
+NOT_COMPILED = "the wire is decoded in Python, which is slower, because " + (
+    "a free-threaded Python loads no module of the stable ABI: use a Python with its lock (GIL)"
+    if sysconfig.get_config_var("Py_GIL_DISABLED")
+    else "the module in C is missing or of another version: install a compiler "
+    "(sudo apt install gcc python3-dev) and install again"
 )
 """Warning that is logged where `wire`, the wire module in C, is None."""
