@@ -7,6 +7,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -99,9 +100,26 @@ def test_links_counts_what_hubs_in_c_sent(tmp_path):
 LINKS = """
 import json
 import sys
+from types import SimpleNamespace
 from pathlib import Path
 from workshop.bench import links as bench_links
 bench_links.SETTLE_S = 0.2
 figures = bench_links.bench_links(cubes=3, rate=100.0, duration=1.0)
 Path(sys.argv[1]).write_text(json.dumps(figures))
 """
+
+
+@pytest.mark.parametrize("error_ns", [-300_000, 300_000])
+def test_the_latency_of_touch_counts_from_its_own_sample(error_ns):
+    """Although its stamp, which the clocks of the hubs give, is 0.3 ms off."""
+    rng = np.random.default_rng(2)
+    sampled_ns = 10**18 + np.arange(1000) * 1_000_000
+    touches = np.column_stack([sampled_ns + error_ns, sampled_ns + 2_000_000])
+    span = SimpleNamespace(start_ns=10**18 + 100_500_000, end_ns=10**18 + 899_500_000)
+    taken = SimpleNamespace(time_ns=rng.permutation(sampled_ns))
+    found = bench._summarise_touches(touches, taken, span)
+    assert found == {
+        "touch_messages": 799,
+        "touch_latency_p50_ms": 2.0,
+        "touch_latency_p99_ms": 2.0,
+    }
