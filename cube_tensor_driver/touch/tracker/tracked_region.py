@@ -26,10 +26,10 @@ MAX_CUBES = 48
 wider region, such as that of a palm, is not fitted; its contact is the integral of the linear
 field."""
 
-NEAREST_CUBES = (21, 9)
+NEAREST_CUBES = (21, 13, 9)
 """Numbers of cubes nearest to each cube below a region of contact that take part in the fit of the
-traction on nodes: all within two pitches (distance of neighbouring cubes), with diagonals. The
-second, smaller number is used if the first one gives more than `MAX_CUBES` cubes."""
+traction on nodes. On a square grid they lie within 2.2, 2 and 1.4 pitches (distances of
+neighbouring cubes). The first number that does not give more than `MAX_CUBES` cubes is used."""
 
 MAX_CHANGE = 0.25
 """Relative change since the last fit of the traction on nodes above which the region is fitted
@@ -179,7 +179,7 @@ class TrackedRegion:
         values = fit.values
         centres = fit.found.centres
         below = values.cubes[np.linalg.norm(centres[:, None] - values.place, axis=2).argmin(axis=1)]
-        around = inverse.near[inverse.cube[self.points], : NEAREST_CUBES[1]]
+        around = inverse.near[inverse.cube[self.points], : NEAREST_CUBES[-1]]
         is_pressing = fit.found.forces[:, 2] < 0
         if not (is_pressing & np.isin(below, around)).all():
             self.fit = None
