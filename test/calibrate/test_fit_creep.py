@@ -156,6 +156,10 @@ def test_presses_that_come_and_go_or_miss_a_pad_are_refused():
     twice = 1e3 * np.outer((time > 10) & (time % 100 > 5), np.ones(8))
     with pytest.raises(FitError, match="came and went; press once"):
         fit_creep(time, twice, np.ones(8), PLAIN.layout.pads)
+    more = 1 + 0.05 * ((time > 100) & (time < 200))
+    touched = 1e3 * np.outer(pressed(time, 10, 290) * more, np.ones(8))
+    with pytest.raises(FitError, match="and hold a constant load, such as a dead weight"):
+        fit_creep(time, touched, np.ones(8), PLAIN.layout.pads)
     uneven = 1e3 * np.outer((time > 10) & (time < 290), [1, 1, 1, 0.05, 1, 1, 1, 1])
     name = PLAIN.layout.pads[3].replace("+", r"\+")
     with pytest.raises(FitError, match=f"pad {name} got 50 Pa, needed are 100 Pa; press harder"):

@@ -161,7 +161,7 @@ def test_a_tare_holds_although_the_pads_are_still_recovering():
 
     The zero that it leaves wanders by 0.4 kPa in a minute without the compensation.
     """
-    zero = np.array([3e3, 0, -3e3, 0, 1e3, 0, 0, 0])
+    zero = np.full(8, -3e3)
     held = 600.0
     steps = [5.0, held - 5, 18, 3, 60]
     rates = [4, 1, 4, 50, 2]
