@@ -21,6 +21,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .bags.reprocess.table import frequency_table, reprocess_table
     from .bags.source import open_bag
     from .config.skin import read_skin
     from .core.errors import CubeError
@@ -40,9 +41,11 @@ __all__ = [
     "StressRows",
     "SurfaceInverse",
     "Touch",
+    "frequency_table",
     "open_bag",
     "open_links",
     "read_skin",
+    "reprocess_table",
     "simulate",
 ]
 
@@ -58,9 +61,11 @@ _HOMES = {
     "StressRows": ".core.rows",
     "SurfaceInverse": ".touch.inverse",
     "Touch": ".touch.touch_detection",
+    "frequency_table": ".bags.reprocess.table",
     "open_bag": ".bags.source",
     "open_links": ".device.live",
     "read_skin": ".config.skin",
+    "reprocess_table": ".bags.reprocess.table",
     "simulate": ".simulation.source",
 }
 """Module of each public name.

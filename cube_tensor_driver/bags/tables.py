@@ -26,7 +26,7 @@ _CUBE_NAME = pyarrow.dictionary(pyarrow.int32(), pyarrow.string())
 """Type of the column with the cubes' names. Dictionary encoding stores each name once, and only a
 number in each row."""
 
-_SCHEMA = pyarrow.schema(
+STRESS_SCHEMA = pyarrow.schema(
     [
         ("stamp_ns", pyarrow.int64()),
         ("cube", _CUBE_NAME),
@@ -40,6 +40,29 @@ _SCHEMA = pyarrow.schema(
     ]
 )
 """Names and types of the columns of a table of stress; `StressRows` states what they contain."""
+
+
+def stress_batch(rows: StressRows, cubes: pyarrow.Array) -> pyarrow.RecordBatch:
+    """Return rows of stress (samples of cubes) as Arrow columns with `STRESS_SCHEMA`.
+
+    Args:
+        rows: N rows.
+        cubes: Names of the cubes by their indices. A row whose index is beyond the last name gets
+            the last name, for which callers pass "unknown".
+    """
+    numbers = np.minimum(rows.cube, len(cubes) - 1).astype(np.int32)
+    columns = [
+        pyarrow.array(rows.stamp_ns),
+        pyarrow.DictionaryArray.from_arrays(numbers, cubes),
+        pyarrow.array(rows.sequence),
+        *map(pyarrow.array, rows.stress.T),
+        *map(pyarrow.array, rows.gradient.T),
+        pyarrow.array(rows.residual),
+        pyarrow.array(rows.status),
+        pyarrow.array(rows.observed),
+        pyarrow.array(rows.left_out),
+    ]
+    return pyarrow.RecordBatch.from_arrays(columns, schema=STRESS_SCHEMA)
 
 
 @contextmanager
@@ -108,11 +131,11 @@ class TableWriter(BufferedTable):
         super().__init__(path)
         self._cubes = pyarrow.array(cubes)
         self._is_csv = path.suffix == ".csv"
-        self._schema = _SCHEMA
+        self._schema = STRESS_SCHEMA
         if self._is_csv:
             # CSV has no dictionary encoding, so every row contains the name of its cube.
             plain = pyarrow.field("cube", pyarrow.string())
-            self._schema = _SCHEMA.set(1, plain)
+            self._schema = STRESS_SCHEMA.set(1, plain)
         make = pyarrow.csv.CSVWriter if self._is_csv else pyarrow.parquet.ParquetWriter
         with report_write_errors(path):
             self._writer = make(str(path), self._schema)
@@ -126,18 +149,4 @@ class TableWriter(BufferedTable):
             self._writer.close()
 
     def _append(self, rows: StressRows) -> None:
-        last = len(self._cubes) - 1
-        numbers = np.minimum(rows.cube, last).astype(np.int32)
-        names = pyarrow.DictionaryArray.from_arrays(numbers, self._cubes)
-        columns = [
-            pyarrow.array(rows.stamp_ns),
-            names.dictionary_decode() if self._is_csv else names,
-            pyarrow.array(rows.sequence),
-            *map(pyarrow.array, rows.stress.T),
-            *map(pyarrow.array, rows.gradient.T),
-            pyarrow.array(rows.residual),
-            pyarrow.array(rows.status),
-            pyarrow.array(rows.observed),
-            pyarrow.array(rows.left_out),
-        ]
-        self._writer.write_batch(pyarrow.RecordBatch.from_arrays(columns, schema=self._schema))
+        self._writer.write_batch(stress_batch(rows, self._cubes).cast(self._schema))

@@ -23,6 +23,7 @@ from sensor_msgs.msg import Imu
 
 from cube_tensor_driver.bags.metadata import quality, typestore
 from cube_tensor_driver.bags.reprocess.job import reconstruct
+from cube_tensor_driver.bags.reprocess.table import frequency_table, reprocess_table
 from cube_tensor_driver.bags.source import open_bag
 from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.config.calibration import write_calibration
@@ -310,6 +311,11 @@ def test_a_bag_gives_the_bits_of_the_node_from_every_state_on(start, monkeypatch
     write_bag(tmp_path / "later", node, later, range(40, 42))
     with open_bag(tmp_path / "later") as source:
         found = concatenate([stress for _, stress in reconstruct(source)])
+    with open_bag(tmp_path / "later") as source:
+        table = reprocess_table(frequency_table(source), source.skin)
+    for name in ("residual", "status", "left_out"):
+        assert table[name].to_numpy().tobytes() == getattr(found, name).tobytes(), name
+    assert table["stress_zz_Pa"].to_numpy().tobytes() == found.stress[:, 2].tobytes()
     expected = expected.select(slice(20, None))
     differs = (found.stress != expected.stress)[:, [0, 2, 4]].any(axis=1)
     # The state comes every 0.1 s; two messages of motion are lost until the next one.

@@ -1,0 +1,213 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
+"""Arrow tables of frequencies, and the function that computes tables of stress from them.
+
+Engines for many recordings (Ray, Dask, Daft, DuckDB) pass Arrow tables between their workers.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pyarrow
+import pyarrow.compute
+
+from ...core.arrays import AnyArray, Array
+from ...core.errors import BagError, LayoutError
+from ...core.reconstructor import CalibratedSkin, Reconstructor, RecordedHealth
+from ...core.rows import FrequencyRows
+from ..source import BagSource
+from ..tables import STRESS_SCHEMA, stress_batch
+
+COLUMNS = {
+    "cube": "cube",
+    "stamp_ns": "stamp_ns",
+    "sequence": "sequence",
+    "frequency_Hz": "frequency",
+    "temperature_degC": "temperature",
+    "pad_fault": "pad_fault",
+    "status": "status",
+    "specific_force_m_per_s2": "specific_force",
+}
+"""Column of a table of frequencies -> attribute of `FrequencyRows` that it contains. Frequencies
+(one per pad) and specific forces (x, y, z) are lists. A cube is its name."""
+
+REQUIRED = {"stamp_ns", "cube", "frequency_Hz"}
+"""Columns that a table of frequencies must have; the others may be missing or null."""
+
+
+def frequency_table(source: BagSource) -> pyarrow.Table:
+    """Read the frequencies of a whole bag into an Arrow table, one row per sample of a cube.
+
+    Beside the columns of `COLUMNS`, the table has what the stress also depends on:
+
+    - `part` (int32): number of the group of consecutive rows that are computed together.
+    - `recorded_left_out`, `recorded_status`: pads that were left out and the conditions of the pads
+      (bits of `status.py`) as the recorded stress states them; null where none was recorded.
+    - `recorded_rest_frequency`: frequencies without load of all pads of all cubes, in Hz, in the
+      first row to which they apply; null elsewhere. `recorded_creep` and `recorded_thermal`, where
+      these effects are compensated: likewise their states before the row.
+
+    Args:
+        source: An open bag, of which nothing was read yet.
+
+    Raises:
+        BagError: The bag is damaged, or the calibration of a cube changes within it.
+    """
+    recording = source.recording
+    recording.check_calibrations_stay()
+    cubes = pyarrow.array([*source.skin.names, "unknown"])
+    number = -1
+    changes: dict[str, Array] = {}
+    parts: list[pyarrow.Table] = []
+    for segment in source.segments():
+        rows = segment.messages.rows
+        changes |= segment.states
+        if segment.number != number:
+            number = segment.number
+            changes["rest_frequency"] = recording.settings[number].rest_frequency
+        # A change that came with messages without rows applies to the next row.
+        if not len(rows):
+            continue
+
+        health = recording.health_at(rows)
+        unknown = ~health.known
+        columns = {
+            "part": pyarrow.array(np.full(len(rows), len(parts), np.int32)),
+            "recorded_left_out": pyarrow.array(health.left_out, mask=unknown),
+            "recorded_status": pyarrow.array(health.status, mask=unknown),
+        }
+        values = rows.columns()
+        columns |= {name: _column(values[key]) for name, key in COLUMNS.items() if key in values}
+        numbers = np.minimum(rows.cube, len(cubes) - 1).astype(np.int32)
+        columns["cube"] = pyarrow.DictionaryArray.from_arrays(numbers, cubes)
+        for name, change in changes.items():
+            lists = [change.ravel(), *[None] * (len(rows) - 1)]
+            columns[f"recorded_{name}"] = pyarrow.array(lists, pyarrow.list_(pyarrow.float64()))
+        changes = {}
+        parts.append(pyarrow.table(columns))
+    if not parts:
+        raise BagError(f"{source.bag.path}: no frequencies on {source.topic}; record them")
+    # Columns that only some parts have are null in the others.
+    return pyarrow.concat_tables(parts, promote_options="default")
+
+
+def reprocess_table(frequencies: pyarrow.Table, skin: CalibratedSkin) -> pyarrow.Table:
+    """Compute the stress of one recording of one skin, from an Arrow table to an Arrow table.
+
+    The function reads and changes nothing else, so that engines can call it in any process. With a
+    table of `frequency_table` and the bag's skin, the values are those of `./cube reprocess`, bit
+    by bit. Without the columns of recorded health and rest frequencies (frequencies without load),
+    pads are checked from the frequencies alone and rest frequencies are those of the skin, as is
+    right for a skin with other calibrations.
+
+    The table must be a whole recording in the order of time, because the state of a row depends on
+    the rows before: the health of the pads, the last tare, creep and lagging temperature. A batch
+    that begins within a recording starts as after a restart of the node: with the calibrations'
+    rest frequencies, healthy pads and no creep.
+
+    Args:
+        frequencies: Rows (samples of cubes) with the columns that `frequency_table` states, of
+            which only those of `REQUIRED` must be there.
+        skin: The skin with the names and calibrations of the cubes.
+
+    Returns:
+        One row per row of frequencies, with the columns of `./cube reprocess --format parquet`.
+
+    Raises:
+        LayoutError: Columns are missing, or rows have cubes or pads that the skin does not have.
+    """
+    reconstructor = Reconstructor(skin)
+    if not len(frequencies):
+        return STRESS_SCHEMA.empty_table()
+    ends = [len(frequencies)]
+    if "part" in frequencies.column_names:
+        part = frequencies["part"].to_numpy()
+        ends = [*(np.flatnonzero(part[1:] != part[:-1]) + 1).tolist(), *ends]
+
+    names = pyarrow.array(skin.names, pyarrow.string())
+    cubes = pyarrow.array([*skin.names, "unknown"])
+    batches = []
+    for begin, end in pairwise([0, *ends]):
+        piece = frequencies.slice(begin, end - begin)
+        columns = {
+            name: piece[name].combine_chunks()
+            for name in piece.column_names
+            if piece[name].null_count < len(piece)
+        }
+        missing = REQUIRED - columns.keys()
+        if missing:
+            raise LayoutError(
+                f"no {', '.join(sorted(missing))} in the table; frequency_table makes one of a bag"
+            )
+        number = pyarrow.compute.index_in(columns["cube"].cast(pyarrow.string()), value_set=names)
+        columns["cube"] = number.fill_null(len(names)).cast(pyarrow.uint16())
+        _restore(reconstructor, columns)
+        rows = FrequencyRows.of(
+            **{key: _numbers(columns[name]) for name, key in COLUMNS.items() if name in columns}
+        )
+        health = _recorded_health(columns)
+        # As for a bag, pads are not examined where the health of all rows is recorded.
+        if health is not None and health.known.all():
+            stress = reconstructor.process_known(rows, health)
+        else:
+            stress = reconstructor.process(rows, health)
+        batches.append(stress_batch(stress, cubes))
+    return pyarrow.Table.from_batches(batches, STRESS_SCHEMA)
+
+
+def _column(values: AnyArray) -> pyarrow.Array:
+    """Return an array (N,) as a column of numbers, or (N, K) as a column of lists."""
+    if values.ndim == 1:
+        return pyarrow.array(values)
+    ends = np.arange(len(values) + 1, dtype=np.int32) * values.shape[1]
+    return pyarrow.ListArray.from_arrays(ends, values.ravel())
+
+
+def _numbers(column: pyarrow.Array) -> AnyArray:
+    """Return a column as an array (N,), or the lists of a column, of equal length K, as (N, K).
+
+    Raises:
+        LayoutError: The lists have different lengths.
+    """
+    if not pyarrow.types.is_nested(column.type):
+        return np.asarray(column.to_numpy(zero_copy_only=False))
+    lists = column.drop_null()
+    lengths = pyarrow.compute.list_value_length(lists).unique().to_pylist()
+    if len(lengths) > 1:
+        raise LayoutError(f"lists of {lengths} numbers in one column; they must be equally long")
+    return np.asarray(lists.flatten().to_numpy(zero_copy_only=False).reshape(len(lists), -1))
+
+
+def _recorded_health(columns: dict[str, Any]) -> RecordedHealth | None:
+    """Return the health of the pads that Arrow columns state; None: they state none."""
+    names = "recorded_left_out", "recorded_status"
+    if not columns.keys() >= {*names}:
+        return None
+    left_out, status = (_numbers(columns[name]).astype(float) for name in names)
+    known = ~np.isnan(left_out)
+    left_out, status = np.nan_to_num(left_out), np.nan_to_num(status)
+    return RecordedHealth(known, left_out.astype(np.uint32), status.astype(np.uint16))
+
+
+def _restore(reconstructor: Reconstructor, columns: dict[str, Any]) -> None:
+    """Set the rest frequencies and states of effects that Arrow columns state for their first row.
+
+    Raises:
+        LayoutError: A later row states some, or they are those of another skin.
+    """
+    for name, column in columns.items():
+        key = name.removeprefix("recorded_")
+        if key == name or not pyarrow.types.is_nested(column.type):
+            continue
+        if column[1:].null_count < len(column) - 1:
+            raise LayoutError(f"{name} changes within a part; keep the column part of its table")
+        value = _numbers(column)[0]
+        if key != "rest_frequency":
+            reconstructor.compensation.restore({key: value})
+        elif value.size == reconstructor.rest_frequency.size:
+            reconstructor.rest_frequency = value.reshape(reconstructor.rest_frequency.shape)
+        else:
+            raise LayoutError(f"{name} has {value.size} numbers; use the skin of its bag")
