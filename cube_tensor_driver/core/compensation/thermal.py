@@ -14,6 +14,7 @@ the result does not depend on how rows are put together. A row is one sample of 
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 
 import numpy as np
@@ -25,6 +26,10 @@ from ..rows import FrequencyRows
 from ..status import THERMAL
 from .creep import relaxed_share
 from .effect import Effect
+from .models import ThermalModel
+
+SECOND_NS = 1_000_000_000
+"""Number of nanoseconds in a second."""
 
 START_KELVIN = 1.0
 """Standard deviation, in K, of the difference between elastomer and thermometer at the first row.
@@ -74,82 +79,116 @@ class Thermal(Effect):
         Args:
             pipeline: Pipeline with the calibrations and the pads' stiffness.
         """
-        models = [calibration.thermal for calibration in pipeline.calibrations]
-        self._models, n, n_pads = models, len(models), pipeline.n_pads
-        present = [model for model in models if model is not None]
+        self._models = [calibration.thermal for calibration in pipeline.calibrations]
+        self._has_model = np.array([model is not None for model in self._models])
+        present = [model for model in self._models if model is not None]
         n_lags = max((len(model.lag) for model in present), default=0)
         n_degrees = max((model.coefficient.shape[1] for model in present), default=0)
-        self._has_model = np.array([model is not None for model in models])
+
+        n = len(self._models)
+        n_pads = pipeline.n_pads
         self._reference = np.zeros(n)
-        self._rate, self._weight = np.ones((n, n_lags)), np.zeros((n, n_lags))
+        self._rate = np.ones((n, n_lags))
+        self._weight = np.zeros((n, n_lags))
         self._coefficient = np.zeros((n_degrees, n, n_pads))
         # Pa per K of a pad (quadratic mean over the pads of a cube): slope, and deviation per lag.
-        self._slope, self._ramp = np.zeros(n), np.zeros(n)
-        for number, model in enumerate(models):
-            if model is None:
-                continue
-            lag = np.maximum(model.lag, MIN_LAG_S)
-            self._reference[number] = model.reference
-            self._rate[number, : len(lag)] = 1 / lag
-            self._weight[number, : len(lag)] = filter_weights(lag)
-            pads, degrees = model.coefficient.shape
-            self._coefficient[:degrees, number, :pads] = model.coefficient.T
-            self._slope[number] = np.sqrt((model.coefficient[:, 0] ** 2).mean())
-            if model.ramp is not None:
-                self._ramp[number] = np.sqrt((model.ramp**2).sum() / pads)
+        self._slope = np.zeros(n)
+        self._ramp = np.zeros(n)
+        for number, model in enumerate(self._models):
+            if model is not None:
+                self._take_model(number, model)
         stiffness = np.where(pipeline.stiffness > 0, pipeline.stiffness, np.inf)
         self._coefficient /= stiffness
 
         # State after the newest row: time, measured temperature, outputs of the filters, and
         # standard deviation of the elastomer's temperature because of what is unknown.
         self._time_ns = np.zeros(n, np.int64)
-        self._measured, self._unknown = np.full(n, np.nan), np.full(n, START_KELVIN)
+        self._measured = np.full(n, np.nan)
+        self._unknown = np.full(n, START_KELVIN)
         self._filtered = np.zeros((n, n_lags))
+
         # Temperature of the elastomer above the reference, and how far it lags behind, in K.
-        self._level, self._lag = np.zeros(n), np.full(n, np.nan)
+        self._level = np.zeros(n)
+        self._lag = np.full(n, np.nan)
         self._offset = np.zeros((n, n_pads), pipeline.dtype)
         self._is_known = np.zeros(n, bool)
+
+    def _take_model(self, number: int, model: ThermalModel) -> None:
+        """Enter the model of the cube with this number into the tables."""
+        lag = np.maximum(model.lag, MIN_LAG_S)
+        n_lags = len(lag)
+        self._reference[number] = model.reference
+        self._rate[number, :n_lags] = 1 / lag
+        self._weight[number, :n_lags] = filter_weights(lag)
+
+        pads, degrees = model.coefficient.shape
+        self._coefficient[:degrees, number, :pads] = model.coefficient.T
+        linear = model.coefficient[:, 0]
+        self._slope[number] = np.sqrt((linear**2).mean())
+        if model.ramp is not None:
+            self._ramp[number] = np.sqrt((model.ramp**2).sum() / pads)
 
     def applies(self, rows: FrequencyRows) -> bool:
         """Return whether a calibration has a model of temperature."""
         return bool(self._has_model.any())
 
-    def add_offset(self, rows: FrequencyRows, cube: Index, offset: Real) -> Mask:
+    def add_offset(
+        self,
+        rows: FrequencyRows,
+        cube: Index,
+        offset: Real,
+    ) -> Mask:
         """Add the effect to the offsets of the pads; see `Effect.add_offset`."""
         is_known = np.zeros(len(cube), bool)
         # A scan (at most one row per cube) begins where the cube number does not rise.
-        begins = [0, *(np.flatnonzero(np.diff(cube) <= 0) + 1).tolist(), len(cube)]
-        for scan in (slice(*ends) for ends in pairwise(begins)):
-            members, stamp_ns = cube[scan], rows.stamp_ns[scan]
+        begins = np.flatnonzero(np.diff(cube) <= 0) + 1
+        for begin, end in pairwise([0, *begins.tolist(), len(cube)]):
+            scan = slice(begin, end)
+            members = cube[scan]
+            stamp_ns = rows.stamp_ns[scan]
             elapsed_ns = stamp_ns - self._time_ns[members]
-            due = np.flatnonzero((elapsed_ns >= STEP_NS) | (elapsed_ns < 0))
-            if len(due):
-                measured = rows.temperature[scan][due].astype(float)
-                self._advance(members[due], stamp_ns[due], measured)
-                self._compute(members[due])
+            is_due = (elapsed_ns >= STEP_NS) | (elapsed_ns < 0)
+            if is_due.any():
+                due = members[is_due]
+                measured = rows.temperature[scan][is_due].astype(float)
+                self._advance(due, stamp_ns[is_due], measured)
+                self._compute(due)
+
             offset[scan] += self._offset[members]
             is_known[scan] = self._is_known[members]
         return is_known
 
     def _compute(self, cube: Index | slice) -> None:
         """Compute what is subtracted from cubes now, and whether it is known."""
-        filtered = np.zeros(len(self._filtered[cube]))
-        for number in range(self._weight.shape[1]):
-            filtered += self._weight[cube, number] * self._filtered[cube, number]
-        self._lag[cube] = self._measured[cube] - filtered
-        is_measured = ~np.isnan(self._measured[cube])
-        self._level[cube] = np.where(is_measured, filtered - self._reference[cube], 0)
+        filtered = self._filtered[cube]
+        weight = self._weight[cube]
+        level = np.zeros(len(filtered))
+        for number in range(weight.shape[1]):
+            level += weight[:, number] * filtered[:, number]
+
+        measured = self._measured[cube]
+        lag = measured - level
+        self._lag[cube] = lag
+        level = np.where(np.isnan(measured), 0, level - self._reference[cube])
+        self._level[cube] = level
+
         total = np.zeros(self._offset[cube].shape)
         for coefficient in self._coefficient[::-1]:
-            total = (total + coefficient[cube]) * self._level[cube, None]
+            total += coefficient[cube]
+            total *= level[:, None]
         self._offset[cube] = total
-        deviation = (
-            self._ramp[cube] * abs(self._lag[cube]) + self._slope[cube] * self._unknown[cube]
-        )
+
+        deviation = self._ramp[cube] * abs(lag)
+        deviation += self._slope[cube] * self._unknown[cube]
         # A temperature that has never been measured (NaN) fails the comparison.
         self._is_known[cube] = self._has_model[cube] & (deviation <= MAX_DEVIATION)
 
-    def _advance(self, cube: Index, stamp_ns: Times, measured: Array) -> None:
+    def _advance(
+        self,
+        cube: Index,
+        stamp_ns: Times,
+        measured: Array,
+    ) -> None:
         """Advance the filters of the cubes of one scan to its time stamps.
 
         Args:
@@ -158,24 +197,33 @@ class Thermal(Effect):
             measured: Measured temperatures (N,), in °C; NaN where they are unknown.
         """
         before = self._measured[cube]
-        is_first = np.isnan(before) & ~np.isnan(measured)
-        is_lost = np.isnan(measured) | (stamp_ns - self._time_ns[cube] > MAX_GAP_NS)
-        measured = np.where(np.isnan(measured), before, measured)
+        elapsed_ns = stamp_ns - self._time_ns[cube]
+        is_missing = np.isnan(measured)
+        is_first = np.isnan(before) & ~is_missing
+        is_lost = is_missing | (elapsed_ns > MAX_GAP_NS)
+        measured = np.where(is_missing, before, measured)
         before = np.where(is_first, measured, before)
-        filtered = np.where(is_first[:, None], measured[:, None], self._filtered[cube])
+        now = measured[:, None]
+        filtered = np.where(is_first[:, None], now, self._filtered[cube])
 
         # A time that went back is no time. Before the first temperature nothing is filtered.
-        elapsed = np.where(is_first, 0, np.maximum(stamp_ns - self._time_ns[cube], 0)) * 1e-9
-        steps = elapsed[:, None] * self._rate[cube]
+        elapsed_ns = np.maximum(elapsed_ns, 0)
+        elapsed_s = np.where(is_first, 0, elapsed_ns) * 1e-9
+        steps = elapsed_s[:, None] * self._rate[cube]
         share = relaxed_share(steps)
-        mean = np.where(steps > 0, share / np.where(steps > 0, steps, 1), 1)
-        rise = (measured - before)[:, None]
-        kept = (filtered - before[:, None]) * (1 - share)
-        self._filtered[cube] = measured[:, None] + kept - rise * mean
-        slowest = (1 - share).max(axis=1)
+        divisor = np.where(steps > 0, steps, 1)
+        mean = np.where(steps > 0, share / divisor, 1)
+        rest = 1 - share
+        kept = (filtered - before[:, None]) * rest
+        rise = now - before[:, None]
+        self._filtered[cube] = now + kept - rise * mean
+
+        slowest = rest.max(axis=1)
         lost = np.where(is_lost & ~is_first, LOST_KELVIN, 0)
-        self._unknown[cube] = self._unknown[cube] * slowest + lost * (1 - slowest)
-        self._measured[cube], self._time_ns[cube] = measured, stamp_ns
+        unknown = self._unknown[cube] * slowest
+        self._unknown[cube] = unknown + lost * (1 - slowest)
+        self._measured[cube] = measured
+        self._time_ns[cube] = stamp_ns
 
     def deviation(self, cube: int) -> Array:
         """Return patterns of one standard deviation of the pads' stresses; see `Effect.deviation`.
@@ -183,19 +231,21 @@ class Thermal(Effect):
         An unknown temperature is taken as the reference, with a standard deviation of 5 K.
         """
         model = self._models[cube]
+        n_pads = self._coefficient.shape[2]
         if model is None:
-            return np.zeros((self._coefficient.shape[2], 0))
-        level, lag = self._level[cube], self._lag[cube]
+            return np.zeros((n_pads, 0))
+        lag = self._lag[cube]
         unknown = LOST_KELVIN if np.isnan(lag) else self._unknown[cube]
-        patterns = [model.coefficient[:, :1] * unknown]
+        linear = model.coefficient[:, :1]
+        patterns = [linear * unknown]
         if model.ramp is not None:
             patterns.append(model.ramp * np.nan_to_num(lag))
         if model.deviation is not None:
             powers = 1 + np.arange(model.deviation.shape[1])
-            patterns.append(model.deviation * level**powers)
+            patterns.append(model.deviation * self._level[cube] ** powers)
         found = np.hstack(patterns)
-        missing = self._coefficient.shape[2] - len(found)
-        padded: Array = np.pad(found, ((0, missing), (0, 0)))
+        padded = np.zeros((n_pads, found.shape[1]))
+        padded[: len(found)] = found
         return padded
 
     def state(self) -> Array:
@@ -203,22 +253,25 @@ class Thermal(Effect):
         if not self._has_model.any():
             return np.zeros(0)
         # A float does not hold 64 bits, so the time is in two parts.
-        seconds, rest_ns = np.divmod(self._time_ns, 1_000_000_000)
+        seconds, rest_ns = np.divmod(self._time_ns, SECOND_NS)
         columns = seconds, rest_ns, self._measured, self._unknown, *self._filtered.T
         return np.concatenate(columns)
 
     def restore(self, state: Array) -> None:
         """Continue from a state that `state` returned; see `Effect.restore`."""
         n, n_lags = self._filtered.shape
-        if state.shape != ((4 + n_lags) * n,):
+        shape = 4 + n_lags, n
+        size = math.prod(shape)
+        if state.shape != (size,):
             raise LayoutError(
-                f"thermal: a state of {state.size} numbers for {n} cubes; it must have "
-                f"{(4 + n_lags) * n}: use the skin of the recording"
+                f"thermal: a state of {state.size} numbers for {n} cubes; it must have {size}: "
+                "use the skin of the recording"
             )
-        seconds, rest_ns, measured, unknown, *filtered = state.reshape(4 + n_lags, n)
-        self._time_ns = seconds.astype(np.int64) * 1_000_000_000 + rest_ns.astype(np.int64)
-        self._measured, self._unknown = measured.copy(), unknown.copy()
-        self._filtered = np.stack(filtered, axis=1)
+        table = state.reshape(shape).copy()
+        seconds, rest_ns = table[:2].astype(np.int64)
+        self._time_ns = seconds * SECOND_NS + rest_ns
+        self._measured, self._unknown = table[2:4]
+        self._filtered = table[4:].T.copy()
         self._compute(slice(None))
 
 
@@ -230,5 +283,6 @@ def filter_weights(lag: Array) -> Array:
     """
     difference = lag[:, None] - lag
     np.fill_diagonal(difference, lag)
-    weights: Array = np.prod(lag[:, None] / difference, axis=1)
+    ratio = lag[:, None] / difference
+    weights: Array = ratio.prod(axis=1)
     return weights
