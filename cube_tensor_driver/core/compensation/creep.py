@@ -76,17 +76,6 @@ def relaxed_share(ratio: Array) -> Array:
     return share
 
 
-def advance(memory: Array, before: Array, now: Array, share: Array, slope_share: Array) -> None:
-    """Advance memories (low-passed readings) over one interval, in place.
-
-    Args:
-        memory: Memories (..., P).
-        before, now: Readings at the begin and end of the interval (..., P).
-        share, slope_share: m and 1 - m tau / t of the module's equations (..., 1).
-    """
-    memory += share * (before - memory) + slope_share * (now - before)
-
-
 def choose(cube: Index, n_cubes: int) -> Index | slice:
     """Return the rows of tables of cubes for the cubes of one scan, as a slice if it has all.
 
@@ -106,7 +95,12 @@ class _Memories:
         reading: Reading of the pads in this row (C, P).
     """
 
-    def __init__(self, time: Array, amplitude: Array, step_ns: int) -> None:
+    def __init__(
+        self,
+        time: Array,
+        amplitude: Array,
+        step_ns: int,
+    ) -> None:
         """Start without any row.
 
         Args:
@@ -114,7 +108,9 @@ class _Memories:
             amplitude: Amplitudes (K, C, P).
             step_ns: Shortest step, in ns.
         """
-        self._time, self._step_ns, self.amplitude = time, step_ns, amplitude
+        self._time = time
+        self._step_ns = step_ns
+        self.amplitude = amplitude
         self.value = np.zeros_like(amplitude)
         self.unknown = np.ones(amplitude.shape[:2])
         self.time_ns = np.zeros(amplitude.shape[1], np.int64)
@@ -124,16 +120,24 @@ class _Memories:
 
     def set_offset(self, cube: Index | slice) -> None:
         """Compute what is subtracted from cubes now, and how fast it changes, per second."""
-        self._offset[cube] = self._slope[cube] = 0
+        reading = self.reading[cube]
+        offset = np.zeros_like(reading)
+        slope = np.zeros_like(reading)
         for time, amplitude, value in zip(self._time, self.amplitude, self.value, strict=True):
-            self._offset[cube] += amplitude[cube] * value[cube]
-            self._slope[cube] += amplitude[cube] / time * (self.reading[cube] - value[cube])
+            share = amplitude[cube]
+            relaxed = value[cube]
+            offset += share * relaxed
+            slope += share / time * (reading - relaxed)
+        self._offset[cube] = offset
+        self._slope[cube] = slope
 
     def line_at(self, cube: Index | slice, time_ns: Times) -> tuple[Array, Array]:
         """Return what is subtracted from cubes at times (n,), and its slope, per second (n, P)."""
-        elapsed_s = 1e-9 * (time_ns - self.time_ns[cube])[:, None]
+        elapsed_ns = time_ns - self.time_ns[cube]
+        elapsed_s = 1e-9 * elapsed_ns[:, None]
         slope: Array = self._slope[cube]
-        return self._offset[cube] + slope * elapsed_s, slope
+        offset = self._offset[cube] + slope * elapsed_s
+        return offset, slope
 
     def offset_at(self, cube: Index, stamp_ns: Times) -> Array:
         """Return sum_k a_k r_k for rows of cubes (n, P), with the reading of the last step."""
@@ -147,7 +151,11 @@ class _Memories:
         return offset
 
     def update(
-        self, cube: Index, stamp_ns: Times, reading: Real, bad: PadMasks
+        self,
+        cube: Index,
+        stamp_ns: Times,
+        reading: Real,
+        bad: PadMasks,
     ) -> tuple[Index, Index, Array] | None:
         """Advance the memories of the cubes that are due.
 
@@ -169,23 +177,39 @@ class _Memories:
         if not len(due):
             return None
         chosen = choose(cube[due], len(self.time_ns))
-        is_bad = bad[due, None] >> np.arange(reading.shape[1], dtype=np.uint32) & 1 > 0
-        now = np.where(is_bad, self.reading[chosen], reading[due])
-        before = np.where(is_lost[due, None], now, self.reading[chosen])
-        is_gap = is_lost[due] | (elapsed_ns[due] > MAX_GAP_NS)
-        steps_ns = np.where(is_lost[due], self._step_ns, elapsed_ns[due])
+        elapsed_ns = elapsed_ns[due]
+        is_lost = is_lost[due]
+        is_gap = is_lost | (elapsed_ns > MAX_GAP_NS)
+
+        pads = np.arange(reading.shape[1], dtype=np.uint32)
+        is_bad = bad[due, None] >> pads & 1 > 0
+        last = self.reading[chosen]
+        now = np.where(is_bad, last, reading[due])
+        before = np.where(is_lost[:, None], now, last)
 
         value = self.value[:, chosen]
+        steps_ns = np.where(is_lost, self._step_ns, elapsed_ns)
         share = self._relax(value, steps_ns, before, now)
+        # A slice has given a view of the memories, which `_relax` has changed in place.
         if not isinstance(chosen, slice):
             self.value[:, chosen] = value
         unknown = self.unknown[:, chosen]
-        self.unknown[:, chosen] = np.where(is_lost[due], 1.0, unknown + share * (is_gap - unknown))
-        self.time_ns[chosen], self.reading[chosen] = stamp_ns[due], now
-        self.set_offset(chosen)
-        return due, due[is_gap], np.maximum(np.abs(before), np.abs(now))[is_gap]
+        unknown = unknown + share * (is_gap - unknown)
+        self.unknown[:, chosen] = np.where(is_lost, 1.0, unknown)
 
-    def _relax(self, value: Array, elapsed_ns: Times, before: Array, now: Array) -> Array:
+        self.time_ns[chosen] = stamp_ns[due]
+        self.reading[chosen] = now
+        self.set_offset(chosen)
+        larger = np.maximum(np.abs(before), np.abs(now))
+        return due, due[is_gap], larger[is_gap]
+
+    def _relax(
+        self,
+        value: Array,
+        elapsed_ns: Times,
+        before: Array,
+        now: Array,
+    ) -> Array:
         """Advance memories over one interval each, by the equations of the module, in place.
 
         Args:
@@ -200,7 +224,8 @@ class _Memories:
         lengths_ns, number = np.unique(elapsed_ns, return_inverse=True)
         ratio = 1e-9 * lengths_ns / self._time[:, None]
         share = relaxed_share(ratio)
-        slope_share = (1 - share / np.maximum(ratio, 1e-12))[:, number, None]
+        slope_share = 1 - share / np.maximum(ratio, 1e-12)
+        slope_share = slope_share[:, number, None]
         share = share[:, number]
         change = now - before
         for one, m, b in zip(value, share[..., None], slope_share, strict=True):
@@ -232,19 +257,25 @@ class Creep(Effect):
         self._scale = np.zeros(shape)
         # What is subtracted is a straight line over the time since a step.
         self._time_ns = np.zeros(len(self._models), np.int64)
-        self._offset, self._slope = np.zeros(shape), np.zeros(shape)
-        self._rest, self._rest_version = pipeline.rest_frequency, pipeline.rest_version
+        self._offset = np.zeros(shape)
+        self._slope = np.zeros(shape)
+        self._rest = pipeline.rest_frequency
+        self._rest_version = pipeline.rest_version
 
-        times = {time for model in self._models if model for time in model.time.tolist()}
         self._groups: list[_Memories] = []
         # Relaxation time -> group and number of its memories.
         self._places: dict[float, tuple[_Memories, int]] = {}
-        for limits, step_ns in zip(pairwise(TIME_LIMITS_S), STEPS_NS, strict=True):
-            chosen = sorted(time for time in times if limits[0] < time <= limits[1])
+        times = {time for model in self._models if model for time in model.time.tolist()}
+        for (above, limit), step_ns in zip(pairwise(TIME_LIMITS_S), STEPS_NS, strict=True):
+            chosen = sorted(time for time in times if above < time <= limit)
+            if not chosen:
+                continue
             amplitude = np.zeros((len(chosen), *shape))
             group = _Memories(np.array(chosen), amplitude, step_ns)
-            self._groups += [group] if chosen else []
-            self._places |= {time: (group, k) for k, time in enumerate(chosen)}
+            self._groups.append(group)
+            for k, time in enumerate(chosen):
+                self._places[time] = group, k
+
         for cube, model in enumerate(self._models):
             if model is not None:
                 for time, column in zip(model.time.tolist(), model.amplitude.T, strict=True):
@@ -255,33 +286,50 @@ class Creep(Effect):
         """Return whether a cube of the skin has a law of creep."""
         return bool(self._groups)
 
-    def add_offset(self, rows: FrequencyRows, cube: Index, offset: Real) -> Mask:
+    def add_offset(
+        self,
+        rows: FrequencyRows,
+        cube: Index,
+        offset: Real,
+    ) -> Mask:
         if self._rest_version != self._pipeline.rest_version:
             self._shift_zero()
         chosen = choose(cube, len(self._models))
         between_ns = rows.stamp_ns - self._time_ns[chosen]
-        elapsed_s = 1e-9 * np.maximum(between_ns, 0)[:, None]
+        elapsed_ns = np.maximum(between_ns, 0)
+        elapsed_s = 1e-9 * elapsed_ns[:, None]
         offset += self._offset[chosen] + self._slope[chosen] * elapsed_s
+
         # Over more than a step, the straight line leads too far.
         late = np.flatnonzero(between_ns >= 2 * STEPS_NS[0])
         if len(late):
-            stamp_ns, numbers = rows.stamp_ns[late], cube[late]
+            numbers = cube[late]
+            stamp_ns = rows.stamp_ns[late]
             straight = self._offset[numbers] + self._slope[numbers] * elapsed_s[late]
             exact = sum(group.offset_at(numbers, stamp_ns) for group in self._groups)
             offset[late] += exact - straight
+
         is_close = (between_ns >= 0) & (between_ns <= MAX_GAP_NS)
-        is_known: Mask = (self._has_model & self._is_certain)[chosen] & is_close
+        is_certain = self._has_model & self._is_certain
+        is_known: Mask = is_certain[chosen] & is_close
         return is_known
 
-    def update(self, rows: FrequencyRows, cube: Index, v: Real, bad: PadMasks) -> None:
+    def update(
+        self,
+        rows: FrequencyRows,
+        cube: Index,
+        v: Real,
+        bad: PadMasks,
+    ) -> None:
         for group in self._groups:
             found = group.update(cube, rows.stamp_ns, v, bad)
             # The steps of the slower group are longer, so it is not due before the faster one.
             if found is None:
                 break
             due, lost, scale = found
-            self._scale[cube[lost]] = np.maximum(self._scale[cube[lost]], scale)
-            self._is_certain[cube[lost]] = False
+            doubtful = cube[lost]
+            self._scale[doubtful] = np.maximum(self._scale[doubtful], scale)
+            self._is_certain[doubtful] = False
             self._set_line(choose(cube[due], len(self._models)))
             self._check_certainty()
 
@@ -294,14 +342,16 @@ class Creep(Effect):
 
     def deviation(self, cube: int) -> Array:
         model = self._models[cube]
+        n_pads = self._scale.shape[1]
         if model is None:
-            return np.zeros((self._scale.shape[1], 0))
+            return np.zeros((n_pads, 0))
         patterns = [self._unknown(cube)]
         for pattern in () if model.deviation is None else model.deviation:
-            known = np.zeros(self._scale.shape[1])
+            known = np.zeros(n_pads)
             for time, column in zip(model.time.tolist(), pattern.T, strict=True):
                 group, k = self._places[time]
-                known[: len(column)] += column * group.value[k, cube, : len(column)]
+                pads = slice(len(column))
+                known[pads] += column * group.value[k, cube, pads]
             patterns.append(known * self._stiffness[cube])
         return np.stack(patterns, axis=1)
 
@@ -309,7 +359,8 @@ class Creep(Effect):
         """Find the cubes whose creep is no longer uncertain because of unknown earlier loads."""
         doubtful = np.flatnonzero(~self._is_certain)
         if len(doubtful):
-            self._is_certain[doubtful] = (self._unknown(doubtful) < MAX_UNKNOWN).all(axis=1)
+            is_small = self._unknown(doubtful) < MAX_UNKNOWN
+            self._is_certain[doubtful] = is_small.all(axis=1)
 
     def _unknown(self, cube: Index | int) -> Array:
         """Return the standard deviation of the pads' stresses by unknown loads (..., P), in Pa.
@@ -323,8 +374,10 @@ class Creep(Effect):
         for group in self._groups:
             for unknown, amplitude in zip(group.unknown, group.amplitude, strict=True):
                 share += unknown[cube, None] * amplitude[cube]
-        stress: Array = share * self._scale[cube] * self._stiffness[cube] / math.sqrt(3)
-        return stress
+        # Numbers equally likely from 0 to 1 have the root mean square 1 / sqrt(3).
+        largest = share * self._scale[cube] * self._stiffness[cube]
+        deviation: Array = largest / math.sqrt(3)
+        return deviation
 
     def zero_share(self) -> Array:
         """Return how much of a lasting error of the readings is not taken for creep (C, P).
@@ -340,18 +393,23 @@ class Creep(Effect):
 
     def _shift_zero(self) -> None:
         """Follow new rest frequencies: what they change has been wrong in earlier readings, too."""
-        shift = np.nan_to_num(self._pipeline.shift_of_zero(self._rest))
-        self._rest, self._rest_version = self._pipeline.rest_frequency, self._pipeline.rest_version
-        moved = shift != 0
+        pipeline = self._pipeline
+        shift = np.nan_to_num(pipeline.shift_of_zero(self._rest))
+        self._rest = pipeline.rest_frequency
+        self._rest_version = pipeline.rest_version
+        has_moved = shift != 0
         for group in self._groups:
             group.reading -= shift
-            group.value -= (1 - group.unknown[..., None]) * shift
+            known = 1 - group.unknown[..., None]
+            group.value -= known * shift
             group.set_offset(slice(None))
-            self._scale[moved] = np.minimum(self._scale, np.abs(group.reading))[moved]
+            size = np.abs(group.reading)
+            np.minimum(self._scale, size, out=self._scale, where=has_moved)
         self._set_line(slice(None))
 
     def state(self) -> Array:
-        return np.concatenate([part.ravel() for part in self._parts()])
+        parts = [part.ravel() for part in self._parts()]
+        return np.concatenate(parts)
 
     def restore(self, state: Array) -> None:
         parts = self._parts()

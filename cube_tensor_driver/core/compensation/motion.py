@@ -87,7 +87,8 @@ class ForcesAtCubes:
         if n_instants == 1:
             force[:] = self._at_cubes(motion, 0)[:, cube]
         elif n_instants:
-            number = np.searchsorted(motion.time_ns[1:-1], rows.stamp_ns, side="right")
+            inner_ns = motion.time_ns[1:-1]
+            number = np.searchsorted(inner_ns, rows.stamp_ns, side="right")
             # Few instants lie within the rows of a message, usually none.
             for k in range(n_instants - 1):
                 between = self._interpolate_between(motion, k, rows.stamp_ns, cube)
@@ -97,7 +98,11 @@ class ForcesAtCubes:
         return column
 
     def _interpolate_between(
-        self, motion: Motion, k: int, stamp_ns: Times, cube: Index | slice
+        self,
+        motion: Motion,
+        k: int,
+        stamp_ns: Times,
+        cube: Index | slice,
     ) -> Array:
         """Return the specific forces (3, N) by the instants k and k + 1; NaN: unknown.
 
@@ -114,33 +119,44 @@ class ForcesAtCubes:
             return np.full((3, len(stamp_ns)), np.nan)
         elapsed_ns = stamp_ns - begin_ns
         beyond_ns = np.maximum(-elapsed_ns, elapsed_ns - interval_ns)
+        max_beyond_ns = max(MAX_EXTRAPOLATION_NS, 2 * interval_ns)
         share = elapsed_ns / interval_ns
-        share[beyond_ns > max(MAX_EXTRAPOLATION_NS, 2 * interval_ns)] = np.nan
-        before, after = (self._at_cubes(motion, number)[:, cube] for number in (k, k + 1))
+        share[beyond_ns > max_beyond_ns] = np.nan
+        before = self._at_cubes(motion, k)[:, cube]
+        after = self._at_cubes(motion, k + 1)[:, cube]
         force: Array = before + share * (after - before)
         return force
 
     def _at_cubes(self, motion: Motion, k: int) -> Array:
         """Return the specific force at each cube in its frame (3, cubes) at one instant.
 
-        Sums have a fixed order. The results of the newest instants are kept, because successive
+        The results of the newest instants are kept, because successive
         messages use them again.
 
         Args:
             motion: Motion of the skin.
             k: Number of the instant.
         """
-        force, gradient = motion.specific_force[k], motion.gradient[k]
+        force = motion.specific_force[k]
+        gradient = motion.gradient[k]
         key = force.tobytes() + gradient.tobytes()
-        if key not in self._known:
-            if len(self._known) > MAX_KNOWN:
-                self._known.clear()
-            x, y, z = self._position
-            parent = [
-                s + (g[0] * x + g[1] * y + g[2] * z) for s, g in zip(force, gradient, strict=True)
-            ]
-            # The components in the frame of a cube are along the columns of its rotation.
-            axes = self._rotation.transpose(1, 0, 2)
-            in_cube = [a[0] * parent[0] + a[1] * parent[1] + a[2] * parent[2] for a in axes]
-            self._known[key] = np.array(in_cube)
-        return self._known[key]
+        if key in self._known:
+            return self._known[key]
+        if len(self._known) > MAX_KNOWN:
+            self._known.clear()
+
+        in_parent = force[:, None] + _multiply(gradient, self._position)
+        # The components in the frame of a cube are along the columns of its rotation.
+        axes = self._rotation.transpose(1, 0, 2)
+        in_cube = _multiply(axes, in_parent)
+        self._known[key] = in_cube
+        return in_cube
+
+
+def _multiply(matrix: Array, vector: Array) -> Array:
+    """Return products of matrices (3, 3) or (3, 3, n) and vectors (3, n), summed in fixed order."""
+    columns = matrix.reshape(3, 3, -1)
+    product: Array = columns[:, 0] * vector[0]
+    product += columns[:, 1] * vector[1]
+    product += columns[:, 2] * vector[2]
+    return product

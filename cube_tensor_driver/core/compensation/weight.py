@@ -45,39 +45,51 @@ class Weight(Effect):
         models = [calibration.weight for calibration in pipeline.calibrations]
         shape = len(models), pipeline.n_pads, 3
         # Stress on each pad per specific force, in Pa per m/s², and its standard deviation.
-        self._response, self._deviation = np.zeros(shape), np.zeros(shape)
+        self._response = np.zeros(shape)
+        self._deviation = np.zeros(shape)
         self._has_model = np.zeros(len(models), bool)
         for number, model in enumerate(models):
             if model is None:
                 continue
             self._has_model[number] = True
             gain = pipeline.calibrations[number].gain[:, None]
-            self._response[number, : len(gain)] = gain * model.response
+            pads = slice(len(gain))
+            self._response[number, pads] = gain * model.response
             if model.deviation is not None:
-                self._deviation[number, : len(gain)] = gain * model.deviation
+                self._deviation[number, pads] = gain * model.deviation
+
         # With axes and pads first, numpy multiplies all cubes in one loop.
         stiffness = np.where(pipeline.stiffness > 0, pipeline.stiffness, np.inf)
-        table = (self._response / stiffness[..., None]).transpose(2, 1, 0)
-        self._table = np.ascontiguousarray(table, pipeline.dtype)
+        table = self._response / stiffness[..., None]
+        self._table = np.ascontiguousarray(table.transpose(2, 1, 0), pipeline.dtype)
         self._newest_force = np.full((3, len(models)), np.nan)
 
     def applies(self, rows: FrequencyRows) -> bool:
         """Return whether the rows have a column of specific forces, known or not."""
         return rows.specific_force is not None
 
-    def add_offset(self, rows: FrequencyRows, cube: Index, offset: Real) -> Mask:
+    def add_offset(
+        self,
+        rows: FrequencyRows,
+        cube: Index,
+        offset: Real,
+    ) -> Mask:
         """Add the effect to the offsets of the pads; see `Effect.add_offset`."""
         if rows.specific_force is None:
             return np.zeros(len(rows), bool)
         given = np.ascontiguousarray(rows.specific_force.T, offset.dtype)
         # NaN, which stands for a force that is not known, fails the comparison.
-        is_known: Mask = (np.abs(given) < MAX_SPECIFIC_FORCE).all(axis=0) & self._has_model[cube]
+        is_credible = np.abs(given) < MAX_SPECIFIC_FORCE
+        is_known: Mask = is_credible.all(axis=0) & self._has_model[cube]
         force = np.where(is_known, given, 0)
-        table = self._table[..., index_cubes(cube, len(self._has_model))]
+
+        chosen = index_cubes(cube, len(self._has_model))
+        table = self._table[..., chosen]
         effect = table[0] * force[0]
         effect += table[1] * force[1]
         effect += table[2] * force[2]
         offset += effect.T
+
         self._newest_force[:, cube] = np.where(is_known, given, np.nan)
         return is_known
 
@@ -87,8 +99,8 @@ class Weight(Effect):
         An unknown specific force is taken as 0 with a standard deviation of 1 g along each axis.
         """
         force = self._newest_force[:, cube]
-        is_known = not np.isnan(force).any()
-        pattern: Array = (
-            self._deviation[cube] * force if is_known else self._response[cube] * STANDARD_GRAVITY
-        )
+        if np.isnan(force).any():
+            pattern: Array = self._response[cube] * STANDARD_GRAVITY
+        else:
+            pattern = self._deviation[cube] * force
         return pattern
