@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.arrays import Array, Complex, Index, Single
+from ..core.arrays import Array, Complex, Index
 from ..core.modes import COMPONENTS, STRESS
 from .cache import Arrays, load_or_compute
 from .circular import (
@@ -339,7 +339,7 @@ class Kernels:
         variant: Index,
         size: Array,
         force: Array,
-    ) -> Single:
+    ) -> Array:
         """Compute the measured components under Hertz contacts, and their derivatives.
 
         Args:
@@ -360,43 +360,44 @@ class Kernels:
         first, by_distance, distance_slope = self._distance_weights(distance, 2)
         size_row, *by_size = _cubic_weights(_size_index(size, self.depth), 3)
 
+        table = self._response.reshape(-1, 3 * len(self._order))
         # Rows of the table at four radii times four distances.
         neighbour = np.arange(-1, 3)
         rows = (size_row[:, None] + neighbour)[:, :, None] * self._response.shape[1]
         rows = rows + (first[:, None] + neighbour + 1)[:, None]
-        neighbours = self._rows.take(rows.reshape(-1, 16), axis=0)
+        neighbours = table.take(rows.reshape(-1, 16), axis=0)
         # Value, slope over the distance, first and second derivative by the logarithm of the radius
         over_distance = np.stack([by_distance, distance_slope / self.step])
         over_distance = over_distance[[0, 1, 0, 0]].transpose(2, 0, 1)
         over_size = np.stack(by_size)[[0, 0, 1, 2]].transpose(2, 0, 1)
         over_size[:, 2:] *= (_SIZE_LOG_STEP ** -np.array([1, 2]))[:, None]
         weights = over_size[..., None] * over_distance[:, :, None]
-        weights = weights.reshape(-1, 4, 16).astype(np.float32)
+        weights = weights.reshape(-1, 4, 16)
         parts = (weights @ neighbours).reshape(len(place), 4, 3, -1)
 
         # c = exp(i m phi) (R F_r + Z F_z + i T F_t), and its derivatives by r and by phi
-        cosine = np.cos(direction).astype(np.float32)[:, None]
-        sine = np.sin(direction).astype(np.float32)[:, None]
-        force_x, force_y, force_z = force.astype(np.float32).T[..., None]
+        cosine = np.cos(direction)[:, None]
+        sine = np.sin(direction)[:, None]
+        force_x, force_y, force_z = force.T[..., None]
         radial = cosine * force_x + sine * force_y
         tangential = cosine * force_y - sine * force_x
-        loads = np.empty((len(place), 4, len(self._order)), np.complex64)
+        loads = np.empty((len(place), 4, len(self._order)), complex)
         loads.real = radial[:, None] * parts[:, :, 0] + force_z[:, None] * parts[:, :, 1]
         loads.imag = tangential[:, None] * parts[:, :, 2]
         value, by_r, by_log, by_log_twice = loads.swapaxes(0, 1)
-        order = (1j * self._order).astype(np.complex64)
-        inverse = (1 / distance).astype(np.float32)[:, None]
+        order = (1j * self._order)
+        inverse = (1 / distance)[:, None]
         r, z, t = parts[:, 0].swapaxes(0, 1)
         t = 1j * t
         by_phi = order * value + tangential * r - radial * t
         moment = (inverse * (order * r - t) - 1j * parts[:, 1, 2]) / 2
         # Nearer than `_MIN_DISTANCE`, the value follows from the slope.
-        below = (true_distance - distance).astype(np.float32)[:, None]
+        below = (true_distance - distance)[:, None]
         r = r + below * parts[:, 1, 0]
         z = z + below * parts[:, 1, 1]
         t = t + 1j * below * parts[:, 1, 2]
 
-        circular = np.empty((len(place), 8, len(self._order)), np.complex64)
+        circular = np.empty((len(place), 8, len(self._order)), complex)
         circular[:, 0] = cosine * r - sine * t
         circular[:, 1] = sine * r + cosine * t
         circular[:, 2] = z
@@ -405,8 +406,9 @@ class Kernels:
         circular[:, 5] = by_log
         circular[:, 6] = by_log_twice
         circular[:, 7] = moment
-        circular *= self._fast_phases(direction - angle)[:, None]
-        return self._measure(_split(circular), variant).swapaxes(1, 2)
+        circular *= np.exp(1j * np.multiply.outer(direction - angle, self._order))[:, None]
+        measured: Array = self._measure(_split(circular), variant).swapaxes(1, 2)
+        return measured
 
     def response_to_forces(
         self,
