@@ -385,7 +385,7 @@ class Kernels:
         loads.real = radial[:, None] * parts[:, :, 0] + force_z[:, None] * parts[:, :, 1]
         loads.imag = tangential[:, None] * parts[:, :, 2]
         value, by_r, by_log, by_log_twice = loads.swapaxes(0, 1)
-        order = (1j * self._order)
+        order = 1j * self._order
         inverse = (1 / distance)[:, None]
         r, z, t = parts[:, 0].swapaxes(0, 1)
         t = 1j * t
