@@ -122,15 +122,14 @@ def reprocess_table(frequencies: pyarrow.Table, skin: CalibratedSkin) -> pyarrow
     reconstructor = Reconstructor(skin)
     if not len(frequencies):
         return STRESS_SCHEMA.empty_table()
-    ends = [len(frequencies)]
-    if "part" in frequencies.column_names:
-        part = frequencies["part"].to_numpy()
-        ends = [*(np.flatnonzero(part[1:] != part[:-1]) + 1).tolist(), *ends]
+    has_parts = "part" in frequencies.column_names
+    part = frequencies["part"].to_numpy() if has_parts else np.zeros(len(frequencies))
+    begins = (np.flatnonzero(np.diff(part)) + 1).tolist()
 
     names = pyarrow.array(skin.names, pyarrow.string())
     cubes = pyarrow.array([*skin.names, "unknown"])
     batches = []
-    for begin, end in pairwise([0, *ends]):
+    for begin, end in pairwise([0, *begins, len(frequencies)]):
         piece = frequencies.slice(begin, end - begin)
         columns = {
             name: piece[name].combine_chunks()
