@@ -19,7 +19,7 @@ elastomer, because neighbouring residuals are alike (W. K. Newey, K. D. West, Ec
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -33,6 +33,7 @@ from ..core.compensation.thermal import START_KELVIN, filter_weights
 from ..core.errors import BagError, FitError
 from ..core.oscillator import pad_frequency
 from ..core.pipeline import Pipeline
+from .recorded_loads import BlockMeans, find_cubes
 
 BLOCK_NS = 1_000_000_000
 """Duration, in ns, of the blocks whose mean temperatures and pad stresses are fitted."""
@@ -115,9 +116,12 @@ class ThermalFit:
         """Return quadratic means over the pads: stress without the load before and after the
         compensation, in Pa, and deviation of the linear coefficient, in Pa/K."""
         deviation = np.zeros(1) if self.model.deviation is None else self.model.deviation[:, 0]
-        changes = self.data.stress - self.offset, self.residual, deviation
-        before, after, slope = (float(np.sqrt((values**2).mean())) for values in changes)
-        return before, after, slope
+        change = self.data.stress - self.offset
+        return (
+            root_mean_square(change),
+            root_mean_square(self.residual),
+            root_mean_square(deviation),
+        )
 
     def calibration(self, base: Calibration, source: str) -> Calibration:
         """Return a calibration with the model, whose rest frequencies hold at the reference."""
@@ -160,63 +164,80 @@ def read_warming(paths: Sequence[Path], name: str | None) -> dict[str, tuple[Cal
     Raises:
         BagError: A bag has no such cube or states no temperature, or the bags differ.
     """
-    parts: list[tuple[Array, Array]] = []
+    parts: list[BlockMeans] = []
     names: list[str] = []
     for path in paths:
         with open_bag(path) as source:
             if names and names != list(source.skin.names):
                 raise BagError(f"{path}: its cubes are not those of {paths[0]}; fit it alone")
             names = list(source.skin.names)
-            if name is not None and name not in names:
-                raise BagError(f"{path}: no cube {name!r}; its cubes are {', '.join(names[:20])}")
+            cubes = find_cubes(source, path, name)
             settings = source.recording.settings[-1]
-            pads = [one.layout.n_pads for one in settings.calibrations]
             calibrations = [
-                replace(one, temperature=None, thermal=None, rest_frequency=rest[:n])
-                for one, rest, n in zip(
-                    settings.calibrations, settings.rest_frequency, pads, strict=True
+                replace(
+                    one,
+                    temperature=None,
+                    thermal=None,
+                    rest_frequency=rest[: one.layout.n_pads],
                 )
+                for one, rest in zip(settings.calibrations, settings.rest_frequency, strict=True)
             ]
             pipeline = Pipeline(calibrations)
-            n_blocks = (source.bag.end_ns - source.bag.start_ns) // BLOCK_NS + 1
-            sums = np.zeros((len(names), n_blocks, pipeline.n_pads + 2))
+            blocks = BlockMeans(source, BLOCK_NS, pipeline.n_pads + 1)
             for rows in source:
-                stress = np.nan_to_num(pipeline.pad_stress(rows, rows.pad_fault & np.uint32(0)))
-                ones = np.ones((len(rows), 1))
-                values = np.hstack([stress, rows.temperature[:, None], ones])
-                block = (rows.stamp_ns - source.bag.start_ns) // BLOCK_NS
-                is_used = np.isfinite(rows.temperature) & (block >= 0) & (block < n_blocks)
-                np.add.at(sums, (rows.cube[is_used], block[is_used]), values[is_used])
-            if not sums[..., -1].any():
+                # No pad is left out, because a constant set of pads is fitted.
+                left_out = np.zeros_like(rows.pad_fault)
+                stress = pipeline.pad_stress(rows, left_out)
+                values = np.nan_to_num(stress), rows.temperature[:, None]
+                blocks.add(rows, np.hstack(values))
+            if not blocks.counts.any():
                 raise BagError(
                     f"{path}: its rows state no temperature; record with hubs that measure it"
                 )
-            parts.append((sums, np.arange(float(n_blocks)) * (BLOCK_NS * 1e-9)))
+            parts.append(blocks)
     found = {}
-    for cube, cube_name in enumerate(names):
-        if name is None or name == cube_name:
-            warming = _join(parts, cube, calibrations[cube], f"{paths[0]}: cube {cube_name}")
-            found[cube_name] = calibrations[cube], warming
+    for cube in cubes:
+        label = f"{paths[0]}: cube {names[cube]}"
+        warming = _join(parts, cube, calibrations[cube], label)
+        found[names[cube]] = calibrations[cube], warming
     return found
 
 
 def _join(
-    parts: Sequence[tuple[Array, Array]], cube: int, calibration: Calibration, name: str
+    parts: Sequence[BlockMeans],
+    cube: int,
+    calibration: Calibration,
+    name: str,
 ) -> Warming:
-    """Return the means of one cube from sums (cubes, blocks, P + 2) of each bag."""
-    columns: list[Array] = []
-    first: list[int] = []
+    """Return the means of one cube in all bags.
+
+    Args:
+        parts: Means of the pads' stresses and of the temperature in each bag.
+        cube: Number of the cube.
+        calibration: Calibration of the cube.
+        name: Bag and cube, for messages.
+    """
+    tables: list[Array] = []
+    first = [0]
     n_rows = 0.0
-    for sums, seconds in parts:
-        has_rows = np.flatnonzero(sums[cube, :, -1])
-        counts = sums[cube, has_rows, -1:]
-        first.append(sum(len(one) for one in columns))
-        columns.append(np.hstack([seconds[has_rows, None], sums[cube, has_rows, :-1] / counts]))
-        n_rows += float(counts.sum())
-    table = np.concatenate(columns)
+    for part in parts:
+        number, means = part.of_cube(cube)
+        seconds = number * (BLOCK_NS * 1e-9)
+        tables.append(np.column_stack([seconds, means]))
+        first.append(first[-1] + len(number))
+        n_rows += part.counts[cube].sum()
+
+    table = np.concatenate(tables)
     n_pads = calibration.layout.n_pads
-    noise = calibration.noise.mean() / np.sqrt(max(n_rows / max(len(table), 1), 1))
-    return Warming(name, table[:, 0], tuple(first), table[:, -1], table[:, 1 : 1 + n_pads], noise)
+    rows_per_block = n_rows / max(len(table), 1)
+    return Warming(
+        name=name,
+        seconds=table[:, 0],
+        first=tuple(first[:-1]),
+        temperature=table[:, -1],
+        stress=table[:, 1 : 1 + n_pads],
+        noise=calibration.noise.mean() / np.sqrt(max(rows_per_block, 1)),
+    )
 
 
 def fit_thermal(data: Warming) -> ThermalFit:
@@ -232,33 +253,51 @@ def fit_thermal(data: Warming) -> ThermalFit:
             f"{data.name}: {len(data.seconds)} s in which the temperature varies by {span:.2g} K; "
             f"{MIN_BLOCKS} s and {MIN_RANGE:g} K are needed: record while the skin warms or cools"
         )
-    best = _search(data, 1, 1, 0.0)
-    slope = float(np.sqrt((best.values[1] ** 2).mean()))
+    unweighted = _search(data, 1, 1, 0.0)
+    slope = root_mean_square(unweighted.values[1])
     best = _search(data, 1, 1, slope)
     # Where the weights decide on the result, the data do not.
-    change = abs(float(np.sqrt((best.values[1] ** 2).mean())) / slope - 1)
+    change = abs(root_mean_square(best.values[1]) / slope - 1)
+
     two = _search(data, 2, 1, slope)
     if two.misfit < best.misfit + np.log(MAX_FILTER_RATIO):
         best = two
     curved = _search(data, len(best.lags), 2, slope)
     if curved.misfit < best.misfit + np.log(MAX_DEGREE_RATIO):
         best = curved
+
     result = _describe(data, best, slope)
     _check(result, slope, change)
     return result
 
 
-def _search(data: Warming, n_lags: int, degree: int, slope: float) -> _Solution:
+def root_mean_square(values: Array) -> float:
+    """Return the root of the mean of the squares of values (...)."""
+    return float(np.sqrt((values**2).mean()))
+
+
+def _search(
+    data: Warming,
+    n_lags: int,
+    degree: int,
+    slope: float,
+) -> _Solution:
     """Return the solution with the best lags, from a grid that becomes finer around the best."""
-    grid = list(itertools.combinations(LAGS_S[::-1].tolist(), n_lags))
-    best = min((_solve(data, lags, degree, slope) for lags in grid), key=_misfit)
+
+    def solve(choices: Iterable[tuple[float, ...]]) -> _Solution:
+        solutions = (_solve(data, lags, degree, slope) for lags in choices)
+        return min(solutions, key=lambda solution: solution.misfit)
+
+    best = solve(itertools.combinations(LAGS_S[::-1].tolist(), n_lags))
     step = LAGS_S[1] / LAGS_S[0]
     while step > MAX_LAG_STEP:
-        factors = itertools.product((1 / step, 1.0, step), repeat=n_lags)
-        near = [tuple(f * lag for f, lag in zip(each, best.lags, strict=True)) for each in factors]
-        # Filters with nearly the same lag would have huge weights of opposite signs.
-        distinct = [lags for lags in near if all(a > 1.2 * b for a, b in itertools.pairwise(lags))]
-        found = min((_solve(data, lags, degree, slope) for lags in distinct), key=_misfit)
+        near = []
+        for factors in itertools.product((1 / step, 1.0, step), repeat=n_lags):
+            lags = tuple(f * lag for f, lag in zip(factors, best.lags, strict=True))
+            # Filters with nearly the same lag would have huge weights of opposite signs.
+            if all(a > 1.2 * b for a, b in itertools.pairwise(lags)):
+                near.append(lags)
+        found = solve(near)
         if found.misfit < best.misfit - 1e-4:
             best = found
         else:
@@ -266,29 +305,32 @@ def _search(data: Warming, n_lags: int, degree: int, slope: float) -> _Solution:
     return best
 
 
-def _misfit(solution: _Solution) -> float:
-    return solution.misfit
-
-
 def _filter(data: Warming, lags: tuple[float, ...]) -> Array:
     """Return the temperature (N,) after low-pass filters in a row, which start at rest."""
     total = np.zeros(len(data.seconds))
     bounds = [*data.first, len(data.seconds)]
-    for lag, weight in zip(lags, filter_weights(np.array(lags)), strict=True):
+    weights = filter_weights(np.array(lags))
+    for lag, weight in zip(lags, weights, strict=True):
         for begin, end in itertools.pairwise(bounds):
             measured = data.temperature[begin:end]
             steps = np.diff(data.seconds[begin:end]) / lag
-            decay, mean = np.exp(-steps), -np.expm1(-steps) / steps
-            x = total_x = measured[0]
-            filtered = [total_x]
+            decay = np.exp(-steps)
+            rise = np.diff(measured) * (-np.expm1(-steps) / steps)
+            x = measured[0]
+            filtered = [x]
             for n, (before, now) in enumerate(itertools.pairwise(measured.tolist())):
-                x = now + (x - before) * decay[n] - (now - before) * mean[n]
+                x = now + (x - before) * decay[n] - rise[n]
                 filtered.append(x)
             total[begin:end] += weight * np.array(filtered)
     return total
 
 
-def _solve(data: Warming, lags: tuple[float, ...], degree: int, slope: float) -> _Solution:
+def _solve(
+    data: Warming,
+    lags: tuple[float, ...],
+    degree: int,
+    slope: float,
+) -> _Solution:
     """Solve for the coefficients.
 
     Args:
@@ -302,55 +344,76 @@ def _solve(data: Warming, lags: tuple[float, ...], degree: int, slope: float) ->
     start = np.exp(-data.seconds / lags[0])
     powers = [u**d for d in range(degree + 1)]
     columns = np.column_stack([*powers, start])
-    variance = data.noise**2 + (LAG_ERROR * slope * (data.temperature - filtered)) ** 2
+
+    lag_error = LAG_ERROR * slope * (data.temperature - filtered)
+    variance = data.noise**2 + lag_error**2
     weight = 1 / np.sqrt(variance)
     weighted = columns * weight[:, None]
+    stress = data.stress * weight[:, None]
+
     normal = weighted.T @ weighted
     # The start differs from rest by about 1 K.
-    normal[-1, -1] += 1 / (START_KELVIN * max(slope, 1.0)) ** 2
-    values = np.linalg.solve(normal, weighted.T @ (data.stress * weight[:, None]))
+    start_deviation = START_KELVIN * max(slope, 1.0)
+    normal[-1, -1] += 1 / start_deviation**2
+    values = np.linalg.solve(normal, weighted.T @ stress)
+
     residual = (data.stress - columns @ values) * weight[:, None]
     misfit = 0.5 * np.log((residual**2).mean()) - np.log(weight).mean()
     return _Solution(lags, degree, columns, weight, values, float(misfit))
 
 
-def _describe(data: Warming, best: _Solution, slope: float) -> ThermalFit:
+def _describe(
+    data: Warming,
+    best: _Solution,
+    slope: float,
+) -> ThermalFit:
     """Return the model of a solution, with its deviations."""
     degrees = slice(1, 1 + best.degree)
     residual = data.stress - best.columns @ best.values
     level = best.columns[:, 1]
     behind = data.temperature - data.temperature[0] - level
     covariance = residual.T @ residual / max(float((behind**2).sum()), 1e-12)
-    sizes, patterns = np.linalg.eigh(covariance)
-    ramp = (patterns * np.sqrt(np.maximum(sizes, 0)))[:, ::-1][:, :MAX_LAG_PATTERNS]
+    variances, directions = np.linalg.eigh(covariance)
+    patterns = directions * np.sqrt(np.maximum(variances, 0))
+    # The largest ones come last.
+    ramp = patterns[:, ::-1][:, :MAX_LAG_PATTERNS]
 
     # A small change of each lag moves the temperature; this counts as one more unknown.
     moved = []
     for number, lag in enumerate(best.lags):
         changed = list(best.lags)
         changed[number] = 1.05 * lag
-        moved.append((_filter(data, tuple(changed)) - data.temperature[0] - level) / 0.05)
+        shift = _filter(data, tuple(changed)) - data.temperature[0] - level
+        moved.append(shift / 0.05)
     columns = np.column_stack([best.columns, *moved])
     weighted = columns * best.weight[:, None]
     inverse = np.linalg.pinv(weighted.T @ weighted)
+
     block = (data.seconds // best.lags[0]).astype(int)
     starts = np.flatnonzero(np.diff(block, prepend=-1))
-    scores = weighted[:, :, None] * (residual * best.weight[:, None])[:, None]
+    weighted_residual = residual * best.weight[:, None]
+    scores = weighted[:, :, None] * weighted_residual[:, None]
     summed = np.add.reduceat(scores, starts, axis=0)
     spread = np.einsum("kl,blp->bkp", inverse, summed)
-    sign = np.sign(ramp[:, :1]) + (ramp[:, :1] == 0)
-    deviation = np.sqrt((spread**2).sum(axis=0)[degrees]).T * sign
+    size = np.sqrt((spread**2).sum(axis=0))
+
+    reference = round(float(data.temperature[0]), 3)
+    sign = np.where(ramp[:, :1] < 0, -1.0, 1.0)
     model = ThermalModel(
-        np.array(round(float(data.temperature[0]), 3)),
-        np.array(best.lags),
-        best.values[degrees].T,
-        deviation,
-        ramp,
+        reference=np.array(reference),
+        lag=np.array(best.lags),
+        coefficient=best.values[degrees].T,
+        deviation=size[degrees].T * sign,
+        ramp=ramp,
     )
     return ThermalFit(data, model, best.values[0], level, residual)
 
 
-def _check(fit: ThermalFit, slope: float, change: float) -> None:
+def _check(
+    fit: ThermalFit,
+    slope: float,
+    change: float,
+) -> None:
     """Raise FitError where a result cannot be trusted.
 
     Args:
@@ -359,9 +422,8 @@ def _check(fit: ThermalFit, slope: float, change: float) -> None:
         change: Relative difference of this mean with equal weights of all blocks.
     """
     data, model = fit.data, fit.model
-    worst = float(np.sqrt((fit.residual**2).mean(axis=0)).max())
-    deviation = model.deviation
-    stated = 0.0 if deviation is None else float(np.sqrt((deviation[:, 0] ** 2).mean()))
+    worst = max(root_mean_square(pad) for pad in fit.residual.T)
+    stated = fit.sizes()[2]
     size = max(stated / slope, change)
     fix = (
         "let nothing touch the skin, begin with half a minute at rest, warm it quickly, and record "

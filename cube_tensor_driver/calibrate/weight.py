@@ -21,6 +21,7 @@ from ..core.calibration import Calibration
 from ..core.compensation.models import WeightModel
 from ..core.errors import BagError
 from ..core.pipeline import Pipeline
+from .recorded_loads import BlockMeans, find_cubes
 
 BLOCK_NS = 500_000_000
 """Length of the blocks over which frequencies and specific forces are averaged, in ns."""
@@ -45,49 +46,51 @@ def fit_weight(path: Path, name: str | None = None) -> Calibration:
         BagError: The bag has no such cube, states no motion, or does not turn it enough.
     """
     with open_bag(path) as source:
-        names, calibrations = list(source.skin.names), source.recording.settings[0].calibrations
-        if name is not None and name not in names:
-            raise BagError(f"{path}: no cube {name!r}; its cubes are {', '.join(names[:20])}")
-        cubes = range(len(names)) if name is None else [names.index(name)]
+        calibrations = source.recording.settings[0].calibrations
+        names = source.skin.names
+        cubes = find_cubes(source, path, name)
         if len({calibrations[cube].id for cube in cubes}) > 1:
             raise BagError(f"{path}: its cubes have different calibrations; name one with --cube")
         pipeline = Pipeline(calibrations)
-        n_blocks = (source.bag.end_ns - source.bag.start_ns) // BLOCK_NS + 1
-        sums = np.zeros((len(names), n_blocks, pipeline.n_pads + 3))
-        counts = np.zeros((len(names), n_blocks, 1))
+        n_pads = np.array([calibration.layout.n_pads for calibration in calibrations])
+        pads = np.arange(pipeline.n_pads)
+        blocks = BlockMeans(source, BLOCK_NS, pipeline.n_pads + 3)
         for rows in source:
             if rows.specific_force is None:
                 raise BagError(
                     f"{path}: it states no motion of the skin; record it while the parameter imu "
                     "or gravity of the reconstruction is set"
                 )
-            values = np.hstack([pipeline.pad_stress(rows), rows.specific_force])
-            n_pads = np.array([c.layout.n_pads for c in calibrations])[rows.cube]
-            is_absent = np.arange(values.shape[1] - 3) >= n_pads[:, None]
-            values[:, :-3][is_absent] = 0
-            block = (rows.stamp_ns - source.bag.start_ns) // BLOCK_NS
-            is_used = np.isfinite(values).all(axis=1) & (block >= 0) & (block < n_blocks)
-            place = rows.cube[is_used], block[is_used]
-            np.add.at(sums, place, values[is_used])
-            np.add.at(counts, place, 1)
+            stress = pipeline.pad_stress(rows)
+            is_absent = pads >= n_pads[rows.cube, None]
+            stress[is_absent] = 0
+            blocks.add(rows, np.hstack([stress, rows.specific_force]))
 
-    responses, variances = [], []
+    responses = []
+    variances = []
     for cube in cubes:
-        has_rows = np.flatnonzero(counts[cube, :, 0])
-        means = sums[cube, has_rows] / counts[cube, has_rows]
-        response, variance = _fit_cube(means, has_rows.astype(float), f"{path}: cube {names[cube]}")
+        number, means = blocks.of_cube(cube)
+        label = f"{path}: cube {names[cube]}"
+        response, variance = _fit_cube(means, number.astype(float), label)
         gain = calibrations[cube].gain[:, None]
-        responses.append(response[: len(gain)] / gain)
-        variances.append(variance[: len(gain)] / gain**2)
+        present = slice(len(gain))
+        responses.append(response[present] / gain)
+        variances.append(variance[present] / gain**2)
+
     scatter = np.mean(variances, axis=0)
     # Cubes of one kind differ, and the common response is wrong by that for each of them.
     between = np.maximum(np.var(responses, axis=0) - scatter, 0)
-    model = WeightModel(np.mean(responses, axis=0), np.sqrt(scatter / len(responses) + between))
+    deviation = np.sqrt(scatter / len(responses) + between)
+    model = WeightModel(np.mean(responses, axis=0), deviation)
     base = calibrations[cubes[0]]
     return replace(base, weight=model, source=f"{base.source}; weight fitted to {path.name}")
 
 
-def _fit_cube(means: Array, time: Array, label: str) -> tuple[Array, Array]:
+def _fit_cube(
+    means: Array,
+    time: Array,
+    label: str,
+) -> tuple[Array, Array]:
     """Return the response of the pads of one cube with gains (P, 3), and its variance (P, 3).
 
     Args:
@@ -98,21 +101,29 @@ def _fit_cube(means: Array, time: Array, label: str) -> tuple[Array, Array]:
     Raises:
         BagError: The blocks are too few, or the specific force varies too little.
     """
-    pads, force = means[:, :-3], means[:, -3:]
+    pads = means[:, :-3]
+    force = means[:, -3:]
     if len(means) < MIN_BLOCKS:
         raise BagError(
             f"{label}: {len(means)} blocks of 0.5 s with a known motion; at least {MIN_BLOCKS} are "
             "needed, so record longer"
         )
-    spread = np.linalg.svd(force - force.mean(axis=0), compute_uv=False)[-1] / np.sqrt(len(force))
+    change = force - force.mean(axis=0)
+    smallest = np.linalg.svd(change, compute_uv=False)[-1]
+    spread = smallest / np.sqrt(len(force))
     if spread < MIN_SPREAD:
         raise BagError(
             f"{label}: its specific force varies by {spread:.2g} m/s² along one direction; at "
             f"least {MIN_SPREAD:g} are needed, so turn the arm until each axis has pointed upwards"
         )
-    columns = np.column_stack([force, np.ones(len(time)), time - time.mean()])
+
+    constant = np.ones(len(time))
+    drift = time - time.mean()
+    columns = np.column_stack([force, constant, drift])
     solution, *_ = np.linalg.lstsq(columns, pads, rcond=None)
     residual = pads - columns @ solution
-    variance = (residual**2).sum(axis=0) / (len(means) - columns.shape[1])
+    degrees_of_freedom = len(means) - columns.shape[1]
+    variance = (residual**2).sum(axis=0) / degrees_of_freedom
     inverse = np.linalg.inv(columns.T @ columns)
-    return solution[:3].T, variance[:, None] * np.diag(inverse)[:3]
+    spreads = np.diag(inverse)[:3]
+    return solution[:3].T, variance[:, None] * spreads

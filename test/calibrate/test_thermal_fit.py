@@ -190,7 +190,7 @@ WARM = ((30.0, 25.0), (60.0, 40.0))
         ({"knots": ((0.0, 25.0), (600.0, 26.0))}, None, "record while the skin warms or cools"),
         ({"seconds": 100.0}, None, "120 s and 3 K are needed"),
         ({"seconds": 130.0, "faces": "ground"}, None, "until the skin is warm throughout"),
-        ({"seconds": 10.0}, "c9", "no cube 'c9'; its cubes are c0, c1"),
+        ({"seconds": 10.0}, "c9", "no cube 'c9'; there are c0, c1"),
     ],
 )
 def test_a_bag_that_does_not_suit_is_refused_in_one_line(tmp_path, capsys, changes, name, text):

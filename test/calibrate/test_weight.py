@@ -117,7 +117,7 @@ def test_cubes_that_differ_widen_the_deviation_of_their_mean(tmp_path):
         ({"poses": POSES[:2] * 3}, None, "turn the arm until each axis has pointed upwards"),
         ({"poses": POSES[:1]}, None, "10 blocks of 0.5 s"),
         ({"motion": False}, None, "record it while the parameter imu or gravity"),
-        ({"poses": POSES[:1]}, "c9", "no cube 'c9'; its cubes are c0, c1, c2"),
+        ({"poses": POSES[:1]}, "c9", "no cube 'c9'; there are c0, c1, c2"),
     ],
 )
 def test_what_does_not_determine_it_is_one_line(tmp_path, changes, name, text):
