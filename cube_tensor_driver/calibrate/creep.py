@@ -34,7 +34,7 @@ from ..core.compensation.models import CreepModel
 from ..core.errors import FitError
 from ..messages.codec import SECOND
 from .fit import measured_stress
-from .recorded_loads import find_cube, read_samples
+from .recorded_loads import average_neighbours, find_cube, read_samples
 
 ORDERS = (1.0, 1.5, 2.0)
 """Numbers of relaxation times per decade that are tried, in this order."""
@@ -131,19 +131,26 @@ def fit_recorded_creep(path: Path, name: str | None) -> tuple[CreepFit, Calibrat
         calibration = settings.calibrations[number]
         n_pads = calibration.layout.n_pads
         stamp_ns, frequency, temperature = read_samples(source, number, n_pads)
-    current = replace(calibration, rest_frequency=settings.rest_frequency[number, :n_pads])
+    rest = settings.rest_frequency[number, :n_pads]
+    current = replace(calibration, rest_frequency=rest)
+
     is_complete = np.isfinite(frequency).all(axis=1)
-    stamp_ns, frequency = stamp_ns[is_complete], frequency[is_complete]
+    stamp_ns = stamp_ns[is_complete]
     known = temperature[is_complete] if np.isfinite(temperature).all() else None
-    reading = measured_stress(current, frequency, known)
-    result = fit_creep(
-        (stamp_ns - stamp_ns[:1]) / SECOND, reading, calibration.noise, calibration.layout.pads
-    )
+    reading = measured_stress(current, frequency[is_complete], known)
+    seconds = (stamp_ns - stamp_ns[:1]) / SECOND
+    result = fit_creep(seconds, reading, calibration.noise, calibration.layout.pads)
     origin = f"{calibration.source}; creep fitted to {path.name}"
-    return result, replace(add_creep(calibration, result.model), source=origin)
+    fitted = add_creep(calibration, result.model)
+    return result, replace(fitted, source=origin)
 
 
-def fit_creep(seconds: Array, reading: Array, noise: Array, names: tuple[str, ...]) -> CreepFit:
+def fit_creep(
+    seconds: Array,
+    reading: Array,
+    noise: Array,
+    names: tuple[str, ...],
+) -> CreepFit:
     """Fit the law of creep to a recording of one press that is held.
 
     Args:
@@ -155,9 +162,13 @@ def fit_creep(seconds: Array, reading: Array, noise: Array, names: tuple[str, ..
     Raises:
         FitError: The recording has no such press, or does not determine the law.
     """
-    size = max(1, round(len(seconds) / MAX_RATE_HZ / max(np.ptp(seconds), 1e-9)))
-    seconds, reading = (_average(values, size) for values in (seconds, reading))
-    reading = reading - reading[seconds < seconds[0] + REST_S].mean(axis=0)
+    rate_hz = len(seconds) / max(np.ptp(seconds), 1e-9)
+    size = max(1, round(rate_hz / MAX_RATE_HZ))
+    seconds = average_neighbours(seconds, size)
+    reading = average_neighbours(reading, size)
+    is_rest = seconds < seconds[0] + REST_S
+    reading = reading - reading[is_rest].mean(axis=0)
+
     press, release = _find_hold(seconds, reading)
     hold_s = release - press
     blocks = _find_blocks(seconds, press, release)
@@ -167,15 +178,18 @@ def fit_creep(seconds: Array, reading: Array, noise: Array, names: tuple[str, ..
         n_readings=np.array([len(block) * size for block in blocks]),
         reading=np.array([reading[block].mean(axis=0) for block in blocks]),
     )
-    load = means.reading[means.is_loaded > 0].mean(axis=0)
-    for pad in np.flatnonzero(np.abs(load) < MIN_LOAD_RATIO * noise).tolist():
+    held = means.reading[means.is_loaded > 0]
+    load = held.mean(axis=0)
+    needed = MIN_LOAD_RATIO * noise
+    for pad in np.flatnonzero(np.abs(load) < needed).tolist():
         raise FitError(
-            f"creep: pad {names[pad]} got {load[pad]:.0f} Pa, needed are "
-            f"{MIN_LOAD_RATIO * noise[pad]:.0f} Pa; press harder, so that every pad is loaded"
+            f"creep: pad {names[pad]} got {load[pad]:.0f} Pa, needed are {needed[pad]:.0f} Pa; "
+            "press harder, so that every pad is loaded"
         )
 
     for order in ORDERS:
-        n_times = 1 + int(np.ceil(order * np.log10(REACH * hold_s / SHORTEST_TIME_S)))
+        decades = np.log10(REACH * hold_s / SHORTEST_TIME_S)
+        n_times = 1 + int(np.ceil(order * decades))
         time = SHORTEST_TIME_S * 10 ** (np.arange(n_times) / order)
         memory = _find_memories(seconds, reading, time, blocks)
         amplitude, error = _solve(means, memory, load, noise)
@@ -193,14 +207,20 @@ def fit_creep(seconds: Array, reading: Array, noise: Array, names: tuple[str, ..
     # The first part is shorter than the hold by the ratio of some successive relaxation times, and
     # the law reaches as far beyond it as an hour lies beyond ten minutes.
     shift = max(1, round(order * np.log10(6)))
-    first = (means.time < hold_s / 10 ** (shift / order)) & (means.is_loaded > 0)
-    early, _ = _solve(_Hold(*(part[first] for part in means)), memory[first], load, noise)
-    n_known = int(np.searchsorted(time, hold_s / 3))
-    slower, faster = amplitude[:, shift:n_known], amplitude[:, : n_known - shift]
+    first_s = hold_s / 10 ** (shift / order)
+    is_first = (means.time < first_s) & (means.is_loaded > 0)
+    first = _Hold(*(part[is_first] for part in means))
+    early, _ = _solve(first, memory[is_first], load, noise)
+
     # The amplitudes of a power law grow with the relaxation time, and so does the deviation.
+    n_known = int(np.searchsorted(time, hold_s / 3))
+    slower = amplitude[:, shift:n_known]
+    faster = amplitude[:, : n_known - shift]
     growth = (slower * faster).sum(axis=1) / (faster**2).sum(axis=1)
+    change = amplitude - early
     beyond = np.zeros_like(amplitude)
-    beyond[:, shift:] = growth[:, None] * (amplitude - early)[:, :-shift]
+    beyond[:, shift:] = growth[:, None] * change[:, :-shift]
+
     # The fastest memory is the reading itself, so its amplitude changes all readings alike.
     within = np.zeros_like(amplitude)
     within[:, 0] = misfit
@@ -215,17 +235,19 @@ def reading_after_step(model: CreepModel, seconds: float) -> Array:
         model: The law.
         seconds: Time after the step, in s.
     """
-    times = np.concatenate([[0.0], np.geomspace(1e-4, seconds, 300)])
+    times = np.geomspace(1e-4, seconds, 300)
     amplitude = model.amplitude.T
-    memory, reading = np.zeros_like(amplitude), np.ones(len(model.amplitude))
-    for step in np.diff(times):
+    memory = np.zeros_like(amplitude)
+    reading = np.ones(len(model.amplitude))
+    for step in np.diff(times, prepend=0.0):
         ratio = step / model.time[:, None]
         share = relaxed_share(ratio)
         slope_share = 1 - share / ratio
         # The new reading u_1 stands on both sides: u_1 = 1 + a r, and r contains u_1.
         memory += share * (reading - memory) - slope_share * reading
+        known = 1 + (amplitude * memory).sum(axis=0)
         weight = 1 - (amplitude * slope_share).sum(axis=0)
-        reading = (1 + (amplitude * memory).sum(axis=0)) / weight
+        reading = known / weight
         memory += slope_share * reading
     return reading
 
@@ -245,13 +267,6 @@ def add_creep(calibration: Calibration, model: CreepModel) -> Calibration:
     return replace(calibration, creep=model, gain=gain)
 
 
-def _average(values: Array, size: int) -> Array:
-    """Return the means of groups of `size` successive values along the first axis."""
-    count = len(values) // size
-    means: Array = values[: count * size].reshape(count, size, *values.shape[1:]).mean(axis=1)
-    return means
-
-
 def _find_hold(seconds: Array, reading: Array) -> tuple[float, float]:
     """Return the times at which the load came on and went, in s.
 
@@ -261,10 +276,12 @@ def _find_hold(seconds: Array, reading: Array) -> tuple[float, float]:
     total = np.abs(reading).sum(axis=1)
     is_loaded = total > 0.5 * np.quantile(total, 0.95)
     begin, end = np.flatnonzero(is_loaded)[[0, -1]]
-    press, release = float(seconds[begin]), float(seconds[end])
-    if press - seconds[0] < REST_S:
+    press = float(seconds[begin])
+    release = float(seconds[end])
+    rest_s = press - seconds[0]
+    if rest_s < REST_S:
         raise FitError(
-            f"creep: the load begins {press - seconds[0]:.2g} s after the recording; record "
+            f"creep: the load begins {rest_s:.2g} s after the recording; record "
             f"{REST_S:g} s or more without load first"
         )
     if not is_loaded[begin:end].all():
@@ -277,19 +294,30 @@ def _find_hold(seconds: Array, reading: Array) -> tuple[float, float]:
     return press, release
 
 
-def _find_blocks(seconds: Array, press: float, release: float) -> list[Index]:
+def _find_blocks(
+    seconds: Array,
+    press: float,
+    release: float,
+) -> list[Index]:
     """Return the numbers of the readings in each block, which grow with the time since a change."""
     blocks: list[Index] = []
     for begin, end in ((press, release), (release, np.inf)):
         is_settled = (seconds > begin + SETTLE_S) & (seconds < end - SETTLE_S)
         chosen = np.flatnonzero(is_settled)
-        place = np.floor(BLOCKS_PER_E_FOLD * np.log(seconds[chosen] - begin))
-        parts = np.split(chosen, np.flatnonzero(np.diff(place)) + 1)
+        elapsed = seconds[chosen] - begin
+        place = np.floor(BLOCKS_PER_E_FOLD * np.log(elapsed))
+        bounds = np.flatnonzero(np.diff(place)) + 1
+        parts = np.split(chosen, bounds)
         blocks += [part for part in parts if len(part)]
     return blocks
 
 
-def _find_memories(seconds: Array, reading: Array, time: Array, blocks: list[Index]) -> Array:
+def _find_memories(
+    seconds: Array,
+    reading: Array,
+    time: Array,
+    blocks: list[Index],
+) -> Array:
     """Return the memories of the pads as means of blocks (N, K, P).
 
     Args:
@@ -298,18 +326,23 @@ def _find_memories(seconds: Array, reading: Array, time: Array, blocks: list[Ind
         time: Relaxation times (K,), in s.
         blocks: Numbers of the readings in each block.
     """
-    ratio = np.diff(seconds, prepend=seconds[0] - 1)[:, None] / time
-    share = relaxed_share(ratio)[..., None]
-    slope_share = 1 - share / ratio[..., None]
-    memory = np.zeros((len(seconds), len(time), reading.shape[1]))
+    ratio = np.diff(seconds)[:, None, None] / time[:, None]
+    share = relaxed_share(ratio)
+    slope_share = 1 - share / ratio
     change = np.diff(reading, axis=0)
-    for n in range(1, len(seconds)):
-        before = memory[n - 1]
-        memory[n] = before + share[n] * (reading[n - 1] - before) + slope_share[n] * change[n - 1]
+    memory = np.zeros((len(seconds), len(time), reading.shape[1]))
+    for n, before in enumerate(memory[:-1]):
+        relaxed = before + share[n] * (reading[n] - before)
+        memory[n + 1] = relaxed + slope_share[n] * change[n]
     return np.array([memory[block].mean(axis=0) for block in blocks])
 
 
-def _solve(means: _Hold, memory: Array, load: Array, noise: Array) -> tuple[Array, Array]:
+def _solve(
+    means: _Hold,
+    memory: Array,
+    load: Array,
+    noise: Array,
+) -> tuple[Array, Array]:
     """Fit amplitudes to the means of readings by least squares with smooth amplitudes.
 
     Args:
@@ -324,20 +357,25 @@ def _solve(means: _Hold, memory: Array, load: Array, noise: Array) -> tuple[Arra
     n_times = memory.shape[1]
     held = means.reading[means.is_loaded > 0]
     # The creep during the hold is that of about half the relaxation times.
-    mean_amplitude = 2 * np.abs(held[-1] / held[0] - 1).mean() / n_times
+    creep = np.abs(held[-1] / held[0] - 1).mean()
+    mean_amplitude = 2 * creep / n_times
     bend = np.diff(np.eye(n_times), n=2, axis=0)
     slope = np.diff(np.eye(n_times)[:2], axis=0)
     smooth = np.concatenate([slope, bend]) / (BEND * mean_amplitude + 1e-9)
-    smooth = np.hstack([np.zeros((len(smooth), 1)), smooth])
+    smooth = np.pad(smooth, ((0, 0), (1, 0)))
+    no_bend = np.zeros(len(smooth))
+
     amplitude = np.empty((len(load), n_times))
     error = np.empty_like(means.reading)
     for pad, pad_load in enumerate(load):
-        deviation = np.hypot(noise[pad] / np.sqrt(means.n_readings), 0.5 * GOOD_MISFIT * pad_load)
+        reading = means.reading[:, pad]
+        mean_noise = noise[pad] / np.sqrt(means.n_readings)
+        deviation = np.hypot(mean_noise, 0.5 * GOOD_MISFIT * pad_load)
         # Unknown are the stress under the load, and the amplitudes.
         columns = np.column_stack([means.is_loaded, memory[..., pad]])
         system = np.concatenate([columns / deviation[:, None], smooth])
-        right = np.concatenate([means.reading[:, pad] / deviation, np.zeros(len(smooth))])
+        right = np.concatenate([reading / deviation, no_bend])
         solution = np.linalg.lstsq(system, right, rcond=None)[0]
         amplitude[pad] = solution[1:]
-        error[:, pad] = means.reading[:, pad] - columns @ solution
+        error[:, pad] = reading - columns @ solution
     return amplitude, error
