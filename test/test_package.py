@@ -40,6 +40,7 @@ PRODUCTS = {
     "cube_tensor_driver": set(),
     "cube_tensor_design": {"cube_tensor_driver"},
     "cube_tensor_hub": {"cube_tensor_driver"},
+    "lerobot_camera_cube": {"cube_tensor_driver"},
     "workshop": {"cube_tensor_driver", "cube_tensor_design", "cube_tensor_hub"},
 }
 """Package -> the other packages of the repository that it may import."""
@@ -63,6 +64,7 @@ HOMES = {
     "launch": {"ros"},
     "viser": {"browser", "workshop"},
     "mujoco": {"simulation"},
+    "lerobot": {"lerobot_camera_cube"},
 }
 """Each heavy library -> the few folders of the driver, and the other packages, that import it."""
 
@@ -175,6 +177,8 @@ KEYS = {
 
 # Who exports to Zarr installs it; all others do without.
 NOT_PINNED = {"zarr"}
+# It has a pyproject.toml of its own, and whoever installs it has lerobot.
+PLUGIN = "lerobot_camera_cube"
 
 
 def test_every_dependency_is_declared_and_pinned():
@@ -194,7 +198,7 @@ def test_every_dependency_is_declared_and_pinned():
     for extra in project["optional-dependencies"].values():
         by_pip += extra
     of_pip = {re.match(r"[a-z0-9-]+", requirement)[0] for requirement in by_pip}
-    used = {module.split(".")[0] for _, module, _ in all_imports()}
+    used = {module.split(".")[0] for room, module, _ in all_imports() if room != PLUGIN}
     for module in used - sys.stdlib_module_names - set(PRODUCTS) - of_ros:
         wheel = WHEELS.get(module, module)
         key = KEYS.get(wheel, f"python3-{wheel}")

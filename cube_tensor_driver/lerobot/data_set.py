@@ -18,6 +18,7 @@ import pyarrow.parquet
 from ..config.skin import Skin
 from ..core.arrays import AnyArray
 from ..core.modes import COMPONENTS, STRESS
+from .columns import as_column
 from .plan import Episode
 from .statistics import Statistics
 from .topics import Topic
@@ -49,14 +50,6 @@ COUNTER_FEATURES = {
 }
 """Features that state the time and the numbers of each frame, its episode and its task, with their
 types. LeRobot requires them in every data set."""
-
-_IMAGE = pyarrow.struct(
-    [
-        ("bytes", pyarrow.binary()),
-        ("path", pyarrow.string()),
-    ]
-)
-"""Parquet type of an image as LeRobot stores it: the bytes of the image file, or its path."""
 
 
 class DataSet:
@@ -140,7 +133,7 @@ class DataSet:
         """
         arrays = {}
         for name, values in columns.items():
-            arrays[name] = _column(values)
+            arrays[name] = as_column(values)
         table = pyarrow.table(arrays)
         if self._writer is None:
             name = FILE_NAME.format(**self._place())
@@ -334,31 +327,6 @@ def _as_lists(
     for name, values in result.items():
         lists[name] = values.tolist()
     return lists
-
-
-def _column(values: AnyArray | list[bytes]) -> pyarrow.Array:
-    """Convert the values of a feature in n frames to a column of a Parquet file.
-
-    Args:
-        values: Contents of n image files, or an array (n, …). An array (n, 1) becomes n numbers,
-            one with more dimensions becomes nested lists.
-    """
-    if isinstance(values, list):
-        # LeRobot reads an image from the bytes if it has no path to an image file.
-        images = [{"bytes": image, "path": None} for image in values]
-        return pyarrow.array(images, _IMAGE)
-    flat = np.ascontiguousarray(values).reshape(-1)
-    array = pyarrow.array(flat)
-    shape = values.shape[1:]
-    if shape == (1,):
-        return array
-    # Lists are nested from the last dimension to the first: each step joins `size` successive
-    # numbers or lists to one list.
-    for size in reversed(shape):
-        lists = len(array) // size
-        offsets = size * np.arange(lists + 1, dtype=np.int32)
-        array = pyarrow.ListArray.from_arrays(offsets, array)
-    return array
 
 
 def _task_table(tasks: list[str]) -> pyarrow.Table:

@@ -1,0 +1,301 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
+"""Touch recorded live beside a LeRobot data set, whose frames refer to it by a number in a picture.
+
+`lerobot-record` 0.4.4 takes from a camera only a picture of 8 bits per colour, and from a robot
+only 32-bit numbers that it joins to one vector (function `build_dataset_frame` in the file
+lerobot/datasets/utils.py). Windows of stress (all samples since the last frame) fit into neither.
+They are written to a file of their own, and the picture of each frame contains the number under
+which its window is stored.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pyarrow
+import pyarrow.ipc
+
+from ..config.skin import Skin
+from ..core.arrays import AnyArray
+from ..core.errors import BagError, ConfigError, CubeError
+from ..core.reconstructor import Reconstructor
+from ..core.rows import StressRows, concatenate
+from ..device.live import LinkSource
+from .columns import as_column
+from .windows import Windows
+
+NUMBER = "frame_number"
+"""Column with the number of a frame: the time at which the frame was read, in ms since the Unix
+epoch, so that the frames of all recordings have different numbers."""
+
+NUMBER_BYTES = 6
+"""Size of a frame number (time of reading in ms since the Unix epoch), which reaches beyond the
+year 10000."""
+
+NUMBER_GRID = (2, 24)
+"""Rows and columns of black and white squares at the top of a picture, which show the 48 bits of
+the frame number, the highest bit first."""
+
+MIN_SQUARE = 8
+"""Smallest side, in pixels, of the squares that show a frame number, so that people see them. The
+data set must keep its pictures as PNG: compressed video can change single bits."""
+
+MIN_WIDTH = MIN_SQUARE * NUMBER_GRID[1]
+"""Smallest width of a picture, in pixels, that has room for the frame number."""
+
+MIN_HEIGHT = 4 * MIN_SQUARE
+"""Smallest height of a picture, in pixels. The frame number takes two squares of it."""
+
+UNKNOWN_GREY = 90
+"""Brightness (0 to 255) of the cubes whose stress along z is unknown."""
+
+
+class LiveWindows:
+    """Writes the stress of a live skin, divided into windows (all samples since the last frame).
+
+    A thread takes all samples as they arrive, so none waits for the recorder. Each window is as
+    long as its own number of samples, so a pause lengthens only one window. The windows are in
+    FOLDER/NUMBER.arrow, an Arrow stream that also a program that is killed leaves readable.
+    """
+
+    def __init__(
+        self,
+        source: LinkSource,
+        folder: Path,
+        *,
+        width: int,
+        height: int,
+        full_scale: float,
+    ) -> None:
+        """Begin to collect samples.
+
+        Args:
+            source: Live links of the skin. `close` closes them.
+            folder: Folder of the recordings; it is made if it does not exist.
+            width: Width of the pictures, in pixels.
+            height: Height of the pictures, in pixels.
+            full_scale: Pressure (compressive stress along z of the cube), in Pa, with the brightest
+                colour.
+
+        Raises:
+            ConfigError: The picture is too small for the frame number, or `full_scale` is not
+                above 0.
+        """
+        if width < MIN_WIDTH or height < MIN_HEIGHT:
+            raise ConfigError(
+                f"the picture has {width} x {height} pixels; at least {MIN_WIDTH} x {MIN_HEIGHT} "
+                "are needed to show the frame number"
+            )
+        if not full_scale > 0:
+            raise ConfigError(f"full_scale is {full_scale} Pa; it must be above 0")
+        folder.mkdir(parents=True, exist_ok=True)
+        self._folder = folder
+        self._source = source
+        self._cubes = len(source.skin.cubes)
+        self._full_scale = full_scale
+        self._pressure = np.full(self._cubes, np.nan)
+        self._cube_at = nearest_cubes(source.skin, width, height)
+        self._number = 0
+        self._writer: pyarrow.ipc.RecordBatchStreamWriter | None = None
+        self._file: pyarrow.NativeFile | None = None
+        self._rows: list[StressRows] = []
+        self._failure: CubeError | None = None
+        self._changed = threading.Condition()
+        self._thread = threading.Thread(target=self._collect, daemon=True)
+        self._thread.start()
+
+    def next_picture(self, timeout_s: float) -> AnyArray:
+        """Write all samples since the last call as one window and return the frame's picture.
+
+        Args:
+            timeout_s: Longest time, in s, to wait for a sample if there is none.
+
+        Returns:
+            Picture (height, width, 3) of 8 bits: the newest pressure of each cube in red, tension
+            in blue, and the frame number at the top.
+
+        Raises:
+            TimeoutError: No sample arrived.
+            CubeError: The thread that reads the links has failed.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._rows or self._failure, timeout_s)
+            parts, self._rows = self._rows, []
+        if not parts:
+            if self._failure is not None:
+                raise self._failure
+            raise TimeoutError(
+                f"skin {self._source.skin.name}: no sample in {timeout_s:g} s; check that the hubs "
+                "are connected and that no other program reads them"
+            )
+        rows = concatenate(parts)
+        # The clock of the computer may step back or stand still for longer than 1 ms.
+        self._number = max(self._number + 1, time.time_ns() // 1_000_000)
+        self._write(rows)
+        # In an assignment with repeated indices numpy keeps the last value, which is the newest.
+        self._pressure[rows.cube] = -rows.stress[:, 2]
+        return self._picture()
+
+    def close(self) -> None:
+        """Close the links and complete the file. Samples after the last frame are left out."""
+        self._source.close()
+        self._thread.join()
+        if self._writer is not None and self._file is not None:
+            self._writer.close()
+            self._file.close()
+            self._writer = None
+
+    def _collect(self) -> None:
+        """Reconstruct the stress of all samples as they arrive; runs in a thread of its own."""
+        reconstruct = Reconstructor(self._source.skin)
+        try:
+            for rows in self._source:
+                stress = reconstruct(rows)
+                with self._changed:
+                    self._rows.append(stress)
+                    self._changed.notify()
+        except CubeError as error:
+            with self._changed:
+                self._failure = error
+                self._changed.notify()
+
+    def _write(self, rows: StressRows) -> None:
+        """Write the rows (samples of cubes) of one frame as one batch of the Arrow stream."""
+        counts = np.bincount(rows.cube, minlength=self._cubes)[np.newaxis]
+        windows = Windows(counts, depth=int(counts.max()))
+        windows.add(np.zeros(len(rows), np.intp), rows)
+        (columns,) = windows.complete()
+        arrays = {NUMBER: pyarrow.array([self._number])}
+        for name, values in columns.items():
+            arrays[name] = as_column(values)
+        batch = pyarrow.record_batch(arrays)
+        if self._writer is None:
+            path = self._folder / f"{self._number}.arrow"
+            self._file = pyarrow.OSFile(str(path), "wb")
+            self._writer = pyarrow.ipc.new_stream(self._file, batch.schema)
+        self._writer.write_batch(batch)
+
+    def _picture(self) -> AnyArray:
+        """Return the picture of the newest pressures, with the frame number at the top."""
+        level = np.clip(self._pressure / self._full_scale, -1.0, 1.0)
+        colours = np.zeros((self._cubes, 3))
+        colours[:, 0] = 255 * np.maximum(level, 0)
+        colours[:, 2] = 255 * np.maximum(-level, 0)
+        colours[np.isnan(level)] = UNKNOWN_GREY
+        picture = colours.astype(np.uint8)[self._cube_at]
+
+        number = self._number.to_bytes(NUMBER_BYTES, "big")
+        bits = np.unpackbits(np.frombuffer(number, np.uint8)).reshape(NUMBER_GRID)
+        side = picture.shape[1] // NUMBER_GRID[1]
+        squares = 255 * bits.repeat(MIN_SQUARE, axis=0).repeat(side, axis=1)
+        rows, columns = squares.shape
+        picture[:rows, :columns] = squares[..., np.newaxis]
+        return picture
+
+
+class RecordedWindows:
+    """The windows (samples of one frame) in a folder that `LiveWindows` wrote, found by pictures.
+
+    Args:
+        folder: Folder of the recordings.
+
+    Raises:
+        BagError: The folder has no recordings.
+    """
+
+    def __init__(self, folder: Path | str) -> None:
+        self._frames: dict[int, pyarrow.RecordBatch] = {}
+        paths = sorted(Path(folder).glob("*.arrow"))
+        if not paths:
+            raise BagError(f"{folder}: no recordings (NUMBER.arrow); name the camera's folder")
+        for path in paths:
+            for batch in pyarrow.ipc.open_stream(pyarrow.memory_map(str(path))):
+                self._frames[batch[NUMBER][0].as_py()] = batch
+
+    def __len__(self) -> int:
+        """Return the number of frames that were read, including those that no data set kept."""
+        return len(self._frames)
+
+    def of(self, picture: AnyArray) -> dict[str, AnyArray]:
+        """Return the window that was recorded with a picture.
+
+        Args:
+            picture: Picture of the skin in a frame of the data set, (height, width, 3) or
+                (3, height, width) as LeRobot returns it.
+
+        Returns:
+            Features by the names that `./cube export lerobot` gives them, (samples, cubes, …) each.
+
+        Raises:
+            BagError: The folder has no window with the number in the picture.
+        """
+        return self.at(frame_number(picture))
+
+    def at(self, number: int) -> dict[str, AnyArray]:
+        """Return the window with a frame number (see `of`)."""
+        if number not in self._frames:
+            raise BagError(f"no window has the number {number}; name the folder of this data set")
+        batch = self._frames[number]
+        names = batch.schema.names
+        return {name: _as_array(batch[name]) for name in names if name != NUMBER}
+
+
+def frame_number(picture: AnyArray) -> int:
+    """Read the frame number (time of reading, in ms since the Unix epoch) from a picture.
+
+    Args:
+        picture: Picture of a skin, (height, width, 3) or (3, height, width).
+    """
+    pixels = np.asarray(picture, float)
+    grey = pixels.mean(axis=0 if len(pixels) == 3 else 2)
+    rows, columns = NUMBER_GRID
+    side = grey.shape[1] // columns
+    strip = grey[: rows * MIN_SQUARE, : columns * side]
+    squares = strip.reshape(rows, MIN_SQUARE, columns, side).mean(axis=(1, 3))
+    # Each number has bits of both kinds, so the threshold follows the scale of the picture.
+    bits = squares > 0.5 * (squares.min() + squares.max())
+    return int.from_bytes(np.packbits(bits).tobytes(), "big")
+
+
+def nearest_cubes(skin: Skin, width: int, height: int) -> AnyArray:
+    """Return the number of the cube that each pixel of a picture shows, (height, width).
+
+    The skin is seen along its thinnest direction, and each pixel shows the nearest cube.
+
+    Args:
+        skin: The skin.
+        width: Width of the picture, in pixels.
+        height: Height of the picture, in pixels.
+    """
+    position = skin.poses.position
+    offset = position - position.mean(axis=0)
+    thickness = np.ptp(offset, axis=0)
+    # In parent coordinates, so that a flat skin appears as in its skin file: x right, y up.
+    kept = np.sort(np.argsort(-thickness, kind="stable")[:2])
+    across, up = offset[:, kept].T
+    top = NUMBER_GRID[0] * MIN_SQUARE
+    free = height - top
+    extent = max(np.ptp(across) / width, np.ptp(up) / free)
+    # The margin shows the cubes at the edges as large as the others.
+    pixel = 1.2 * extent if extent > 0 else 1.0
+    columns = pixel * (np.arange(width) - width / 2)
+    nearest = np.zeros((height, width), np.intp)
+    for row in range(top, height):
+        y = pixel * (top + free / 2 - row)
+        distance = np.subtract.outer(columns, across) ** 2 + (y - up) ** 2
+        nearest[row] = distance.argmin(axis=1)
+    return nearest
+
+
+def _as_array(column: pyarrow.Array) -> AnyArray:
+    """Return the only entry of a column, nested lists of numbers, as an array."""
+    shape = []
+    while pyarrow.types.is_list(column.type):
+        shape.append(column.value_lengths()[0].as_py())
+        column = column.flatten()
+    values: AnyArray = column.to_numpy(zero_copy_only=False).reshape(shape or -1)
+    return values
