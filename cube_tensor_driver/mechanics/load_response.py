@@ -54,24 +54,34 @@ class LoadResponse:
         Raises:
             ElasticError: The layer does not contain this depth.
         """
-        spacing = 2 * np.pi / (PERIOD_DEPTHS * depth)
+        period = PERIOD_DEPTHS * depth
+        spacing = 2 * np.pi / period
         count = int(MAX_WAVENUMBER / depth / spacing)
         k: Array = spacing * np.arange(-count, count + 1.0)
         self._step = depth / POINTS_PER_DEPTH
-        distance = self._step * np.arange(PERIOD_DEPTHS // 2 * POINTS_PER_DEPTH)
+        n_points = PERIOD_DEPTHS // 2 * POINTS_PER_DEPTH
+        distance = self._step * np.arange(n_points)
 
         # The waves of -k_x are the complex conjugates of those of k_x, so half of them suffice. One
         # k_x at a time saves memory.
         field = np.zeros((len(distance), len(FIELD), 3))
+        cell = (spacing / (2 * np.pi)) ** 2
         for kx in k[count:, None]:
-            load = disc_spectrum(np.hypot(kx, k) * width / 2) * (spacing / (2 * np.pi)) ** 2
-            amplitude = (load[:, None, None] * layer.transfer(kx, k, depth)).sum(axis=0)
-            waves = np.exp(1j * kx * distance) * (2 if kx else 1)
+            wavenumber = np.hypot(kx, k)
+            load = disc_spectrum(wavenumber * width / 2) * cell
+            transfer = layer.transfer(kx, k, depth)
+            amplitude = (load[:, None, None] * transfer).sum(axis=0)
+
+            n_waves = 2 if kx else 1
+            waves = np.exp(1j * kx * distance) * n_waves
             field += np.multiply.outer(waves, amplitude).real
 
         circular = CIRCULAR_FROM_FIELD @ field
         # Towards +x, a force along x is radial, and one along y is across (circular.py).
-        parts = [circular[..., 0].real, circular[..., 2].real, circular[..., 1].imag]
+        radial = circular[..., 0].real
+        across = circular[..., 1].imag
+        along_z = circular[..., 2].real
+        parts = [radial, along_z, across]
         self._table = np.stack(parts, axis=1)
 
     def __call__(self, offset: Array, angle: Array) -> Array:
@@ -85,16 +95,20 @@ class LoadResponse:
             Components (N, 15, 3) in Pa/N and Pa/(m N), for a force along x, y and z; 0 beyond half
             of the period of the load.
         """
-        index = np.hypot(*offset.T) / self._step
+        x, y = offset.T
+        index = np.hypot(x, y) / self._step
         last = len(self._table) - 2
         first = np.minimum(index.astype(int), last)
         share = (index - first)[:, None, None]
-        parts = (1 - share) * self._table[first] + share * self._table[first + 1]
+        below = self._table[first]
+        above = self._table[first + 1]
+        parts = (1 - share) * below + share * above
         parts[index > last] = 0
 
-        direction = np.arctan2(offset[:, 1], offset[:, 0])
+        direction = np.arctan2(y, x)
         circular = rotate_loads(parts, direction, direction - angle, ORDERS)
-        return np.asarray((circular @ FIELD_FROM_CIRCULAR[:, _OBSERVED]).swapaxes(1, 2))
+        components = circular @ FIELD_FROM_CIRCULAR[:, _OBSERVED]
+        return np.asarray(components.swapaxes(1, 2))
 
 
 def disc_spectrum(x: Array) -> Array:
@@ -105,5 +119,7 @@ def disc_spectrum(x: Array) -> Array:
     """
     # Near x = 0, sin x - x cos x would lose all digits, so a Taylor series replaces it.
     safe = np.maximum(x, 1e-2)
-    exact = 3 * (np.sin(safe) - safe * np.cos(safe)) / safe**3
-    return np.where(x < 1e-2, 1 - x**2 / 10, exact)
+    difference = np.sin(safe) - safe * np.cos(safe)
+    exact = 3 * difference / safe**3
+    series = 1 - x**2 / 10
+    return np.where(x < 1e-2, series, exact)

@@ -154,20 +154,23 @@ class Touch:
         check_number("false_alarms", false_alarms, lambda x: 0 < x < math.inf, allowed)
         skin = as_skin(skin)
         n = len(skin.calibrations)
-        tests = 3600 * (skin.rate or DEFAULT_RATE_HZ) * n / false_alarms
-        limit = math.log(2 * REFERENCE**2 * tests) / (2 * REFERENCE) - OVERSHOOT
-        self.limit = max(0.0, limit)
+        rate_hz = skin.rate or DEFAULT_RATE_HZ
+        tests_per_alarm = 3600 * rate_hz * n / false_alarms
+        limit = math.log(2 * REFERENCE**2 * tests_per_alarm) / (2 * REFERENCE)
+        self.limit = max(0.0, limit - OVERSHOOT)
 
         self._pipeline = Pipeline(skin.calibrations)
-        covariance = np.array([self._pipeline.covariance(cube) for cube in range(n)])
+        covariances = [self._pipeline.covariance(cube) for cube in range(n)]
+        covariance = np.array(covariances)
         variance = np.diagonal(covariance, axis1=1, axis2=2)
         self._unobserved = np.isnan(variance)
         self._deviation = np.sqrt(variance[:, PRESSURE])
-        self._place = skin.poses.position / skin.poses.pitch
-        near = _find_neighbours(skin.poses.position)
+        poses = skin.poses
+        self._place = poses.position / poses.pitch
+        near = _find_neighbours(poses.position)
         self._estimate = None
         if skin.elastomer is not None:
-            self._estimate = estimate_forces(skin.poses, skin.elastomer, near, covariance)
+            self._estimate = estimate_forces(poses, skin.elastomer, near, covariance)
 
         # The largest value of the neighbours is found faster if they are the first axis.
         self._near = near.T.copy()
@@ -213,18 +216,22 @@ class Touch:
         if changed.any():
             self._use_pads(cube[changed], rows.left_out[changed])
 
-        elapsed_s = 1e-9 * (rows.stamp_ns - self._stamp_ns[cube])
+        elapsed_ns = rows.stamp_ns - self._stamp_ns[cube]
+        elapsed_s = 1e-9 * elapsed_ns
         elapsed_s = np.clip(elapsed_s, 0, TIME_CONSTANT_S)
         self._stamp_ns[cube] = rows.stamp_ns
 
-        values = np.hstack([rows.stress, rows.gradient]).astype(np.float64)
+        values = np.hstack([rows.stress, rows.gradient])
+        values = values.astype(np.float64)
         slow = self._slow[cube]
         # Where a slow part starts again, a load that is there stays.
         slow = np.where(np.isnan(slow), values - self._change[cube], slow)
         change = values - slow
         self._change[cube] = np.where(np.isnan(change), 0, change)
-        self._test(cube, -change[:, PRESSURE], elapsed_s)
-        gain = self._gain(cube, -change[:, PRESSURE], elapsed_s)
+
+        pressure = -change[:, PRESSURE]
+        self._test(cube, pressure, elapsed_s)
+        gain = self._gain(cube, pressure, elapsed_s)
         self._slow[cube] = slow + gain[:, None] * change
         self._count[cube] += 1
 
@@ -250,18 +257,31 @@ class Touch:
             covariance = self._pipeline.covariance(cube, mask)
             self._deviation[cube] = np.sqrt(covariance[PRESSURE, PRESSURE])
 
-    def _gain(self, cube: NDArray[np.uint16], pressure: Array, elapsed_s: Array) -> Array:
+    def _gain(
+        self,
+        cube: NDArray[np.uint16],
+        pressure: Array,
+        elapsed_s: Array,
+    ) -> Array:
         """Return the share (k,) of the difference by which the slow part of k cubes follows.
 
         The arguments are those of `_test`, which is called before.
         """
         if not self._touched.any():
-            self._count[cube[pressure < -MIN_RELEASE * self._deviation[cube]]] = 0
+            has_gone = pressure < -MIN_RELEASE * self._deviation[cube]
+            self._count[cube[has_gone]] = 0
         # The first samples are averaged.
-        gain = np.maximum(elapsed_s / TIME_CONSTANT_S, 1 / (self._count[cube] + 1))
-        return np.where((self._held | self._touched)[cube], 0, gain)
+        mean_gain = 1 / (self._count[cube] + 1)
+        gain = np.maximum(elapsed_s / TIME_CONSTANT_S, mean_gain)
+        is_kept = self._held | self._touched
+        return np.where(is_kept[cube], 0, gain)
 
-    def _test(self, cube: NDArray[np.uint16], pressure: Array, elapsed_s: Array) -> None:
+    def _test(
+        self,
+        cube: NDArray[np.uint16],
+        pressure: Array,
+        elapsed_s: Array,
+    ) -> None:
         """Add the pressures of k cubes to their sums.
 
         Args:
@@ -271,7 +291,8 @@ class Touch:
         """
         # While the slow part is held, drift and what remains of the load must not count as touch.
         margin = self._margin[cube]
-        growing = np.fmax(margin, REMAINDER * np.abs(pressure)) + DRIFT * elapsed_s
+        remainder = REMAINDER * np.abs(pressure)
+        growing = np.fmax(margin, remainder) + DRIFT * elapsed_s
         fading = (1 - elapsed_s / TIME_CONSTANT_S) * margin
         margin = np.where(self._held[cube], growing, fading)
         self._margin[cube] = margin
@@ -285,7 +306,10 @@ class Touch:
         after = np.minimum(after, self.limit + REFERENCE)
         after = np.where(self._count[cube] < SETTLING_ROWS, before, after)
         self._sum[cube] = np.where(np.isnan(pressure), 0, after)
-        self._touched = (self._sum > self.limit) | (self._touched & (self._sum > 0))
+
+        begins = self._sum > self.limit
+        lasts = self._touched & (self._sum > 0)
+        self._touched = begins | lasts
 
     def _locate(self, stamp_ns: int) -> Touches:
         """Return the touches and their forces.
@@ -302,20 +326,34 @@ class Touch:
             return NO_TOUCHES._replace(stamp_ns=stamp_ns)
         pressure = -self._change[:, PRESSURE]
         strength = np.where(self._touched, pressure, 0)
-        is_largest = self._touched & (strength >= strength[self._near].max(axis=0))
+        neighbours = strength[self._near].max(axis=0)
+        is_largest = self._touched & (strength >= neighbours)
         # Each scan spreads the reach by one pitch, which is fast compared with the high-pass.
         spread = SPREAD * self._reach[self._near].max(axis=0)
-        is_own = strength > np.maximum(spread, FAR * strength.max())
+        felt = np.maximum(spread, FAR * strength.max())
+        is_own = strength > felt
         self._reach = np.maximum(strength, spread)
         self._held = self._reach > self._deviation / 2
 
         cube = np.flatnonzero(is_largest & is_own)
-        cube = cube[np.argsort(-pressure[cube], kind="stable")]
+        order = np.argsort(-pressure[cube], kind="stable")
+        cube = cube[order]
         own = pressure[cube]
         margin = self._margin[cube]
-        deviation = np.sqrt(self._deviation[cube] ** 2 + margin**2 + (GAIN_ERROR * own) ** 2)
-        share = np.clip(margin / np.maximum(own, 1e-9), 0, 1)[:, None]
-        return Touches(stamp_ns, cube, own, deviation, *self._estimate_forces(cube, share))
+        variance = self._deviation[cube] ** 2
+        variance += margin**2
+        variance += (GAIN_ERROR * own) ** 2
+        share = margin / np.maximum(own, 1e-9)
+        share = np.clip(share, 0, 1)
+        force, force_deviation = self._estimate_forces(cube, share[:, None])
+        return Touches(
+            stamp_ns=stamp_ns,
+            cube=cube,
+            pressure=own,
+            pressure_uncertainty=np.sqrt(variance),
+            force=force,
+            force_uncertainty=force_deviation,
+        )
 
     def _estimate_forces(self, cube: Index, share: Array) -> tuple[Array, Array]:
         """Return the forces (m, 3) at m cubes and their standard deviations (m, 3), in N.
@@ -328,24 +366,32 @@ class Touch:
         if estimate is None:
             unknown = np.full((len(cube), 3), np.nan)
             return unknown, unknown
-        near, kind = self._near[:, cube].T, estimate.kind[cube]
-        values = self._change[near].reshape(len(cube), near.shape[1] * len(COMPONENTS), 1)
+        near = self._near[:, cube].T
+        kind = estimate.kind[cube]
+        n_values = near.shape[1] * len(COMPONENTS)
+        values = self._change[near].reshape(len(cube), n_values, 1)
         terms = values * estimate.weights[kind]
         force = terms.sum(axis=1)
+        square = force**2
 
-        pitches = np.linalg.norm(self._place[cube][:, None] - self._place[cube], axis=2)
+        place = self._place[cube]
+        pitches = np.linalg.norm(place[:, None] - place, axis=2)
         # A force does not disturb itself.
         np.fill_diagonal(pitches, np.inf)
-        variance = (
-            estimate.noise[kind] ** 2
-            + GAIN_ERROR**2 * (terms**2).sum(axis=1)
-            + np.einsum("mij,mj->mi", estimate.error[kind] ** 2, force**2)
-            + OTHER_LOADS**2 * pitches**-6 @ (force**2).sum(axis=1, keepdims=True)
-            + (share * force) ** 2
-        )
+        others = pitches**-6
+
+        variance = estimate.noise[kind] ** 2
+        variance += GAIN_ERROR**2 * (terms**2).sum(axis=1)
+        variance += np.einsum("mij,mj->mi", estimate.error[kind] ** 2, square)
+        variance += OTHER_LOADS**2 * others @ square.sum(axis=1, keepdims=True)
+        variance += (share * force) ** 2
+
         is_complete = np.isnan(self._slow[near]) == self._unobserved[near]
-        force[~is_complete.all(axis=(1, 2))] = np.nan
-        return force, np.where(np.isnan(force), np.nan, np.sqrt(variance))
+        is_unknown = ~is_complete.all(axis=(1, 2))
+        force[is_unknown] = np.nan
+        deviation = np.sqrt(variance)
+        deviation[is_unknown] = np.nan
+        return force, deviation
 
 
 def _find_neighbours(position: Array) -> Index:
@@ -358,5 +404,6 @@ def _find_neighbours(position: Array) -> Index:
     for one in position:
         # Rounding keeps neighbours at the same distance in the order of their numbers.
         distance = np.linalg.norm(position - one, axis=1).round(6)
-        near.append(np.argsort(distance, kind="stable")[:NEIGHBOURS])
+        order = np.argsort(distance, kind="stable")
+        near.append(order[:NEIGHBOURS])
     return np.array(near)

@@ -92,33 +92,47 @@ def estimate_forces(
     place, angle = unroll(poses, np.arange(n), near)
 
     noise = np.nan_to_num(covariance).reshape(n, -1)
-    noise_kind = np.unique(noise, axis=0, return_inverse=True)[1].reshape(n)
+    _, noise_kind = np.unique(noise, axis=0, return_inverse=True)
+    noise_kind = noise_kind.reshape(n)
     # Poses that differ by less than a micrometre or a tenth of a milliradian count as the same.
     keys = [place.reshape(n, -1) / 1e-6, angle / 1e-4, noise_kind[near]]
-    _, first, kind = np.unique(
-        np.hstack(keys).round(), axis=0, return_index=True, return_inverse=True
-    )
+    rounded = np.hstack(keys).round()
+    _, first, kind = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
 
     own = _grid(np.linspace(-MAX_PITCHES, MAX_PITCHES, 9))
     other = _grid(np.arange(-5.0, 6.0))
-    other = other[np.abs(other).max(axis=1) >= MIN_OTHER_PITCHES]
+    is_apart = np.abs(other).max(axis=1) >= MIN_OTHER_PITCHES
+    other = other[is_apart]
     sources = poses.pitch * np.concatenate([own, other])
     solved = []
     for cube in first.tolist():
         offset = place[cube, :, None] - sources
         angles = np.repeat(angle[cube], len(sources))
         signal = response(offset.reshape(-1, 2), angles)
-        signal = signal.reshape(*offset.shape[:2], -1, 3).swapaxes(1, 2)
-        solved.append(_solve(signal, len(own), covariance[near[cube]]))
-    return ForceEstimate(kind.reshape(n), *(np.array(part) for part in zip(*solved, strict=True)))
+        signal = signal.reshape(*offset.shape[:2], -1, 3)
+        signal = signal.swapaxes(1, 2)
+        estimate = _solve(signal, len(own), covariance[near[cube]])
+        solved.append(estimate)
+    weights, deviations, errors = zip(*solved, strict=True)
+    return ForceEstimate(
+        kind=kind.reshape(n),
+        weights=np.array(weights),
+        noise=np.array(deviations),
+        error=np.array(errors),
+    )
 
 
 def _grid(line: Array) -> Array:
     """Return the positions (n^2, 2) of a square grid from those (n,) along one side."""
-    return np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+    x, y = np.meshgrid(line, line)
+    return np.column_stack([x.ravel(), y.ravel()])
 
 
-def _solve(signal: Array, n_own: int, covariance: Array) -> tuple[Array, Array, Array]:
+def _solve(
+    signal: Array,
+    n_own: int,
+    covariance: Array,
+) -> tuple[Array, Array, Array]:
     """Compute weights, noise and error (`ForceEstimate`) for one kind of cube.
 
     Args:
@@ -126,24 +140,26 @@ def _solve(signal: Array, n_own: int, covariance: Array) -> tuple[Array, Array, 
         n_own: Number of the first positions, at which the load may be. Other loads are at the rest.
         covariance: Covariances (W, 15, 15) of the noise, NaN where a component is not observed.
     """
-    observed = np.isfinite(np.diagonal(covariance, axis1=1, axis2=2))
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    observed = np.isfinite(variance)
     noise = np.zeros(observed.shape * 2)
     each = np.arange(len(observed))
     noise[each, :, each] = covariance
     noise = noise[observed][:, observed]
 
     own, other = np.split(signal[observed], [n_own], axis=1)
-    total = FORCE**2 * _mean_square(own) + OTHER_FORCE**2 * _mean_square(other) + noise
-    solution = np.linalg.solve(total, FORCE**2 * own.mean(axis=1))
+    total = FORCE**2 * _mean_square(own)
+    total += OTHER_FORCE**2 * _mean_square(other)
+    total += noise
+    expected = FORCE**2 * own.mean(axis=1)
+    solution = np.linalg.solve(total, expected)
     weights = np.zeros((*observed.shape, 3))
     weights[observed] = solution
 
     error = np.einsum("cf,csl->sfl", solution, own) - np.eye(3)
-    return (
-        weights.reshape(-1, 3),
-        np.sqrt(np.einsum("if,ij,jf->f", solution, noise, solution)),
-        np.sqrt((error**2).mean(axis=0)),
-    )
+    mean_square = (error**2).mean(axis=0)
+    noise_variance = np.einsum("if,ij,jf->f", solution, noise, solution)
+    return weights.reshape(-1, 3), np.sqrt(noise_variance), np.sqrt(mean_square)
 
 
 def _mean_square(signal: Array) -> Array:
