@@ -181,6 +181,42 @@ def count_steps(progress: Progress | None, total: int) -> Callable[[str], None]:
     return report
 
 
+def solve_meshes(
+    body: Body,
+    layout: Layout,
+    meshes: int,
+    solve: Callable[[Solid, int], Array],
+) -> tuple[Array, float | None]:
+    """Solve a problem on finer and finer meshes.
+
+    Args:
+        body: The body.
+        layout: Pads of the cube.
+        meshes: Number of meshes, 1 to 3.
+        solve: Returns the result on a solid; its second argument is the number of the mesh, from 1.
+
+    Returns:
+        Result on the finest mesh, and its largest change from the mesh before, relative to the
+        largest entry of the result; None: there is one mesh.
+
+    Raises:
+        ElasticError: Pads overlap, or a mesh does not fit into memory.
+    """
+    check_pads(body, layout)
+    results = []
+    for level in range(meshes):
+        grid = make_mesh(body, layout, level)
+        check_memory(grid)
+        solid = make_solid(body, layout, grid)
+        results.append(solve(solid, level + 1))
+
+    fine = results[-1]
+    if meshes == 1:
+        return fine, None
+    change = np.abs(fine - results[-2]).max()
+    return fine, float(change / np.abs(fine).max())
+
+
 def _solve_mesh(
     body: Body,
     layout: Layout,

@@ -26,9 +26,8 @@ from numpy.polynomial.legendre import legvander
 from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.layout import Layout
 
-from .body import Body, check_pads, make_mesh
-from .fem import Progress, count_steps, make_solid
-from .memory import check_memory
+from .body import Body
+from .fem import Progress, count_steps, solve_meshes
 from .solid import Solid
 
 N_PROFILES = 6
@@ -85,26 +84,22 @@ def compute_thermal_stress(
         ElasticError: Pads overlap, or the mesh does not fit into memory.
     """
     body = replace(body, ground=True, confined=True)
-    check_pads(body, layout)
     report = count_steps(progress, meshes)
-    results = []
-    for level in range(meshes):
-        grid = make_mesh(body, layout, level)
-        check_memory(grid)
-        report(f"mesh {level + 1}")
-        results.append(_solve(make_solid(body, layout, grid), body, layout))
+
+    def solve(solid: Solid, number: int) -> Array:
+        report(f"mesh {number}")
+        return _solve(solid, body, layout)
+
+    pads, change = solve_meshes(body, layout, meshes, solve)
     report("done")
-    change = None
-    if meshes > 1:
-        fine, coarse = results[-1], results[-2]
-        change = float(np.abs(fine - coarse).max() / np.abs(fine).max())
-    return ThermalStress(body, layout, results[-1], change)
+    return ThermalStress(body, layout, pads, change)
 
 
 def _solve(solid: Solid, body: Body, layout: Layout) -> Array:
     """Return the stress (pads, profiles) under each profile of the temperature, in Pa/K."""
     # Lengths of the solid are in d0, and moduli are relative to that of the elastomer.
-    half, z = body.height / body.side, body.z / (body.side / 2)
+    half = body.height / body.side
+    z = body.z / (body.side / 2)
 
     def profiles(x: Array) -> Array:
         heights = (x[-1] + z) / half
@@ -113,13 +108,16 @@ def _solve(solid: Solid, body: Body, layout: Layout) -> Array:
     # In plane stress, the body is free along y and expands there without stress.
     n_held = 2 if layout.planar and body.plane == "stress" else 3
     parts = []
-    for number, expansion in enumerate((body.expansion, body.cube_expansion)):
+    expansions = body.expansion, body.cube_expansion
+    for number, expansion in enumerate(expansions):
         lam, mu = solid.moduli[number] or (0.0, 0.0)
         pressure = expansion * (n_held * lam + 2 * mu)
-        parts.append(pressure * solid.expansion_forces(profiles, in_cube=number == 1))
+        forces = solid.expansion_forces(profiles, in_cube=number == 1)
+        parts.append(pressure * forces)
     # A field that depends on the height alone is even under each mirror.
     parity = next(parity for parity in solid.parities if min(parity) >= 0)
     displacement = solid.solve(parity, parts[0] + parts[1])
     reactions = solid.body @ displacement - parts[0]
-    stress: Array = body.young * (solid.pad_weights(layout, parity) @ reactions)
+    weights = solid.pad_weights(layout, parity)
+    stress: Array = body.young * (weights @ reactions)
     return stress

@@ -19,9 +19,8 @@ import numpy as np
 from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.layout import Layout
 
-from .body import Body, check_pads, field_axes, make_mesh
-from .fem import Progress, count_steps, make_solid
-from .memory import check_memory
+from .body import Body, field_axes
+from .fem import Progress, count_steps, solve_meshes
 from .solid import Solid
 
 
@@ -72,25 +71,19 @@ def compute_weight(
     """
     # In a skin of equal cells it does not matter where the cells are cut along x.
     body = replace(body, ground=True, confined=True, x=0.0)
-    check_pads(body, layout)
     axes = field_axes(layout)
     report = count_steps(progress, meshes * len(axes))
-    results = []
-    for level in range(meshes):
-        grid = make_mesh(body, layout, level)
-        check_memory(grid)
-        solid = make_solid(body, layout, grid)
+
+    def solve(solid: Solid, mesh: int) -> Array:
         pads = np.zeros((layout.n_pads, 3))
         for number, axis in enumerate(axes):
-            report(f"mesh {level + 1}, force along {'xyz'[axis]}")
+            report(f"mesh {mesh}, force along {'xyz'[axis]}")
             pads[:, axis] = _solve(solid, body, layout, number)
-        results.append(pads)
+        return pads
+
+    pads, change = solve_meshes(body, layout, meshes, solve)
     report("done")
-    change = None
-    if meshes > 1:
-        fine, coarse = results[-1], results[-2]
-        change = float(np.abs(fine - coarse).max() / np.abs(fine).max())
-    return WeightResponse(body, layout, results[-1], change)
+    return WeightResponse(body, layout, pads, change)
 
 
 def _solve(solid: Solid, body: Body, layout: Layout, axis: int) -> Array:
@@ -105,8 +98,10 @@ def _solve(solid: Solid, body: Body, layout: Layout, axis: int) -> Array:
         for parity in solid.parities
         if all(sign in (0, want) for sign, want in zip(parity, wanted, strict=True))
     )
-    displacement = solid.solve(parity, (in_body + in_cube)[:, None])[:, 0]
+    force = in_body + in_cube
+    displacement = solid.solve(parity, force[:, None])[:, 0]
     reactions = solid.body @ displacement - in_body
     # Lengths of the solid are in d0, so stress is force per volume times d0.
-    stress: Array = body.side / 2 * (solid.pad_weights(layout, parity) @ reactions)
+    weights = solid.pad_weights(layout, parity)
+    stress: Array = body.side / 2 * (weights @ reactions)
     return stress
