@@ -70,7 +70,12 @@ def read_thermal_stress(name: str, n_pads: int) -> Stressed:
     data = read_yaml(shipped if shipped.is_file() else Path(name))
     try:
         pads = np.array(data["pads"], float)
-        layer = Stressed(float(data["height"]), float(data["depth"]), float(data["side"]), pads)
+        layer = Stressed(
+            height=float(data["height"]),
+            depth=float(data["depth"]),
+            side=float(data["side"]),
+            pads=pads,
+        )
     except (KeyError, TypeError, ValueError) as error:
         raise ConfigError(
             f"{name}: {error} does not suit; ./cube fem --temperature -o writes a file"
@@ -90,7 +95,13 @@ class WarmLayer:
         temperature: Temperature of each finite volume (cubes, `CELLS`), in °C, from the ground up.
     """
 
-    def __init__(self, height: Array, exchange: float, ground: float, air: float) -> None:
+    def __init__(
+        self,
+        height: Array,
+        exchange: float,
+        ground: float,
+        air: float,
+    ) -> None:
         """Begin with the temperatures that ground and air keep up for ever.
 
         Args:
@@ -104,33 +115,49 @@ class WarmLayer:
         inner = np.arange(CELLS - 1)
         # A finite volume exchanges heat with the next one, and the first one with the ground half
         # a volume below its centre.
-        for a, b in ((inner, inner + 1), (inner + 1, inner)):
+        outer = inner + 1
+        for a, b in ((inner, outer), (outer, inner)):
             matrix[:, a, b] += 1
             matrix[:, a, a] -= 1
         matrix[:, 0, 0] -= 2
-        to_air = 1 / (CONDUCTIVITY / (exchange * size[:, 0]) + 0.5)
+        air_resistance = CONDUCTIVITY / (exchange * size[:, 0])
+        to_air = 1 / (air_resistance + 0.5)
         matrix[:, -1, -1] -= to_air
         rate, self._vectors = np.linalg.eigh(matrix)
         self._rate = -rate * DIFFUSIVITY / size**2
         # Amplitudes of the eigenvectors in the steady state, per temperature of ground and air.
         self._from_ground = 2 * self._vectors[:, 0] / -rate
         self._from_air = to_air[:, None] * self._vectors[:, -1] / -rate
-        self._steady = self._amplitude = ground * self._from_ground + air * self._from_air
+        self._steady = self._find_steady(ground, air)
+        self._amplitude = self._steady
+
+    def _find_steady(self, ground: float, air: float) -> Array:
+        """Return the amplitudes of the steady state under temperatures of ground and air, in °C."""
+        steady: Array = ground * self._from_ground + air * self._from_air
+        return steady
 
     @property
     def temperature(self) -> Array:
-        temperature: Array = (self._vectors @ self._amplitude[:, :, None])[:, :, 0]
+        columns = self._vectors @ self._amplitude[:, :, None]
+        temperature: Array = columns[:, :, 0]
         return temperature
 
-    def advance(self, seconds: float, ground: float, air: float) -> None:
+    def advance(
+        self,
+        seconds: float,
+        ground: float,
+        air: float,
+    ) -> None:
         """Advance by a time in s, to the end of which ground and air change linearly, in °C."""
-        steady = ground * self._from_ground + air * self._from_air
-        if seconds > 0:
-            steps = self._rate * seconds
-            decay = np.exp(-steps)
-            slope = (steady - self._steady) * -np.expm1(-steps) / steps
-            self._amplitude = steady + (self._amplitude - self._steady) * decay - slope
-            self._steady = steady
+        if seconds <= 0:
+            return
+        steady = self._find_steady(ground, air)
+        steps = self._rate * seconds
+        decay = np.exp(-steps)
+        slope = (steady - self._steady) * -np.expm1(-steps) / steps
+        departure = self._amplitude - self._steady
+        self._amplitude = steady + departure * decay - slope
+        self._steady = steady
 
 
 class ThermalPads:
@@ -155,14 +182,20 @@ class ThermalPads:
             ground, air: Times in s and temperatures in °C, which are linear in between.
         """
         self._knots = [np.array(knots).T for knots in (ground, air)]
-        self._drift, self._seconds = drift, 0.0
-        self._layer = WarmLayer(height * layer.height, exchange, *self._outside(0.0))
+        self._drift = drift
+        self._seconds = 0.0
+        outside = self._outside(0.0)
+        self._layer = WarmLayer(height * layer.height, exchange, *outside)
 
         s = (2 * np.arange(CELLS) + 1) / CELLS - 1
         # Least squares: the polynomials are not quite orthogonal on a grid.
-        to_profiles = np.linalg.pinv(legvander(s, layer.pads.shape[1] - 1))
+        degree = layer.pads.shape[1] - 1
+        to_profiles = np.linalg.pinv(legvander(s, degree))
         self._to_stress = layer.pads @ to_profiles
-        to_centre = (s + 1) * layer.height / 2 - (layer.height - layer.depth)
+
+        height_above_ground = (s + 1) * layer.height / 2
+        centre = layer.height - layer.depth
+        to_centre = height_above_ground - centre
         self._in_cube = np.abs(to_centre) < layer.side / 2
 
     def _outside(self, seconds: float) -> tuple[float, float]:
@@ -180,10 +213,16 @@ class ThermalPads:
         Args:
             seconds: Simulated time in s; it should not decrease from call to call.
         """
-        times = np.unique(np.concatenate([knots[0] for knots in self._knots] + [[seconds]]))
-        for time in times[(times > self._seconds) & (times <= seconds)].tolist():
-            self._layer.advance(time - self._seconds, *self._outside(time))
+        knots = [times for times, _ in self._knots]
+        times = np.unique(np.concatenate([*knots, [seconds]]))
+        is_passed = (times > self._seconds) & (times <= seconds)
+        for time in times[is_passed].tolist():
+            outside = self._outside(time)
+            self._layer.advance(time - self._seconds, *outside)
             self._seconds = time
+
         rise = self._layer.temperature - REFERENCE_CELSIUS
         in_cube = rise[:, self._in_cube].mean(axis=1)
-        return rise @ self._to_stress.T, 1 + self._drift * in_cube[:, None]
+        stress = rise @ self._to_stress.T
+        factor = 1 + self._drift * in_cube[:, None]
+        return stress, factor

@@ -170,8 +170,10 @@ class SlipEstimator:
         self._noise = CubeNoise(inverse)
         poses = inverse.poses
         self._above_cubes = poses.position + inverse.depth * poses.rotation[:, :, 2]
+
         count = min(N_CUBES, len(self._above_cubes))
         n_values = count * len(inverse.columns)
+        n_scans = LAGS[-1] + 1
         # A load consists of force (3) in N and position (3) in m. A row of `past` is position,
         # force divided by normal force along the surface (3), and logarithm of the normal force.
         fields: list[tuple[str, type, tuple[int, ...]]] = [
@@ -189,10 +191,10 @@ class SlipEstimator:
             ("values", float, (n_values,)),
             ("load", float, (6,)),
             ("linearised", float, (6,)),
-            ("past", float, (LAGS[-1] + 1, 7)),
+            ("past", float, (n_scans, 7)),
         ]
         self._contacts: AnyArray = np.zeros(0, fields)
-        self._times = np.full(LAGS[-1] + 1, -np.inf)
+        self._times = np.full(n_scans, -np.inf)
         self.slip = NO_CONTACTS
 
     def adopt(self, found: Sequence[TrackedContact], values: Array) -> None:
@@ -203,12 +205,12 @@ class SlipEstimator:
             values: Components (cubes, 15) in Pa and Pa/m in which they were found.
         """
         scaled = self._inverse.scaled(values)
-        rows = {number: row for row, number in enumerate(self._contacts["id"].tolist())}
+        ids = self._contacts["id"].tolist()
         contacts = np.zeros(len(found), self._contacts.dtype)
         contacts["past"] = np.nan
         for number, one in enumerate(found):
-            if one.id in rows:
-                contacts[number] = self._contacts[rows[one.id]]
+            if one.id in ids:
+                contacts[number] = self._contacts[ids.index(one.id)]
             ratio = one.shear_force / one.normal_force
             deviation = np.hypot(ratio * one.force_uncertainty, one.shear_uncertainty)
             row = contacts[number]
@@ -223,16 +225,19 @@ class SlipEstimator:
             self.slip = NO_CONTACTS
             return
 
-        before = _describe(self._follow(scaled), contacts["normal"])
+        followed = self._follow(scaled)
+        before = _describe(followed, contacts["normal"])
         contacts["load"] = [[*one.force, *one.position] for one in found]
         contacts["values"] = self._gather(scaled)
         after = _describe(contacts["load"], contacts["normal"])
         # The difference of the followed and the fitted load is no motion.
-        contacts["past"] += (after - before)[:, None]
+        correction = after - before
+        contacts["past"] += correction[:, None]
 
         # As soon as the tracker has seen a contact slip, its exact ratios replace followed ones.
         slips = contacts["slips"]
-        contacts["sums"][slips & ~contacts["is_fitted"]] = 0.0
+        is_new = slips & ~contacts["is_fitted"]
+        contacts["sums"][is_new] = 0.0
         contacts["is_fitted"] |= slips
         ratio = np.linalg.norm(after[:, 3:6], axis=1)
         _add_ratio(contacts, slips, ratio, contacts["ratio_deviation"])
@@ -257,31 +262,51 @@ class SlipEstimator:
         newest = _describe(loads, contacts["normal"])
         self._remember(time_s, newest)
 
-        change = newest[:, None] - contacts["past"][:, LAGS]
+        earlier = contacts["past"][:, LAGS]
+        change = newest[:, None] - earlier
         duration = time_s - self._times[LAGS]
         moves, slips = self._test_lags(newest, change, duration)
         slipped = slips.any(axis=1)
-        begins = bool((slipped & ~contacts["slips"]).any())
+        begins = slipped & ~contacts["slips"]
         contacts["slips"] = slipped
+
         ratio = np.linalg.norm(newest[:, 3:6], axis=1)
         deviation = np.hypot(contacts["ratio_deviation"], FOLLOWED_DEVIATION * ratio)
-        _add_ratio(contacts, slipped & ~contacts["is_fitted"], ratio, deviation)
+        is_followed = slipped & ~contacts["is_fitted"]
+        _add_ratio(contacts, is_followed, ratio, deviation)
 
-        is_known = np.isfinite(change[:, 0, 0]) & (newest[:, 6] > np.log(MIN_FORCE_N))
-        state = np.where(is_known & ~moves.any(axis=1), STICK, UNKNOWN)
+        is_strong = newest[:, 6] > np.log(MIN_FORCE_N)
+        is_known = np.isfinite(change[:, 0, 0]) & is_strong
+        sticks = is_known & ~moves.any(axis=1)
+        state = np.where(sticks, STICK, UNKNOWN)
         state[slipped] = SLIP
+
         shortest = slips.argmax(axis=1)
-        velocity = change[np.arange(len(state)), shortest, :3] / duration[shortest, None]
+        each = np.arange(len(state))
+        moved = change[each, shortest, :3]
+        velocity = moved / duration[shortest, None]
         velocity[state == STICK] = 0.0
         velocity[state == UNKNOWN] = np.nan
+
         with np.errstate(invalid="ignore"):  # no slip so far: 0 / 0 is NaN, unknown
             inverse_sum, weight_sum, ratio_sum = contacts["sums"].T
             friction = ratio_sum / weight_sum
             uncertainty = inverse_sum / weight_sum
-        self.slip = Slip(state, friction, uncertainty, ratio / friction, velocity)
-        return begins
+        self.slip = Slip(
+            state=state,
+            friction=friction,
+            friction_uncertainty=uncertainty,
+            friction_use=ratio / friction,
+            velocity=velocity,
+        )
+        return bool(begins.any())
 
-    def _test_lags(self, newest: Array, change: Array, duration: Array) -> tuple[Mask, Mask]:
+    def _test_lags(
+        self,
+        newest: Array,
+        change: Array,
+        duration: Array,
+    ) -> tuple[Mask, Mask]:
         """Return whether each contact has moved, and slipped, over each lag (n, lags).
 
         Args:
@@ -297,7 +322,8 @@ class SlipEstimator:
 
         divisor = np.maximum(distance, 1e-12)
         growth = np.einsum("nlk,nlk->nl", moved, turned) / divisor
-        tilt = LEVER_M / (1 + 2 * size) * np.maximum(growth, 0)
+        lever = LEVER_M / (1 + 2 * size)
+        tilt = lever * np.maximum(growth, 0)
         leak = LEAK_M * np.linalg.norm(change[..., 3:], axis=2)
         # The force may have changed and returned within a lag.
         explained = np.maximum.accumulate(tilt + leak, axis=1)
@@ -309,10 +335,13 @@ class SlipEstimator:
         moves[:, 1:] &= distance[:, :-1] > MIN_LATE_SHARE * distance[:, 1:]
 
         along = np.einsum("nlk,nk->nl", moved, ratio)
+        is_along = along > MIN_COSINE * distance * size
         largest = MIN_SHARE_OF_LARGEST * self._contacts["largest_ratio"]
-        slips = moves & (along > MIN_COSINE * distance * size)
-        slips &= size > np.maximum(MIN_RATIO, largest)[:, None]
-        slips &= np.linalg.norm(turned, axis=2) < MAX_RATIO_CHANGE * size
+        min_ratio = np.maximum(MIN_RATIO, largest)
+        ratio_change = np.linalg.norm(turned, axis=2)
+        slips = moves & is_along
+        slips &= size > min_ratio[:, None]
+        slips &= ratio_change < MAX_RATIO_CHANGE * size
         return moves, slips
 
     def _remember(self, time_s: float, newest: Array) -> None:
@@ -337,7 +366,8 @@ class SlipEstimator:
         contacts = self._contacts
         # A value that is missing counts as unchanged.
         change = np.nan_to_num(self._gather(scaled) - contacts["values"])
-        loads: Array = contacts["load"] + np.einsum("nkm,nm->nk", contacts["weights"], change)
+        load_change = np.einsum("nkm,nm->nk", contacts["weights"], change)
+        loads: Array = contacts["load"] + load_change
         return loads
 
     def _linearise_changed(self, loads: Array, scaled: Array) -> None:
@@ -349,7 +379,8 @@ class SlipEstimator:
         """
         contacts = self._contacts
         change = loads - contacts["linearised"]
-        force = np.maximum(np.linalg.norm(loads[:, :3], axis=1), MIN_FORCE_N)
+        force = np.linalg.norm(loads[:, :3], axis=1)
+        force = np.maximum(force, MIN_FORCE_N)
         force_change = np.linalg.norm(change[:, :3], axis=1)
         shift = np.linalg.norm(change[:, 3:], axis=1)
         has_changed = force_change > MAX_FORCE_CHANGE * force
@@ -360,10 +391,17 @@ class SlipEstimator:
         is_lost &= contacts["noise"] > 0
         loads[is_lost, 3:] = contacts["linearised"][is_lost, 3:]
         contacts["past"][is_lost] = np.nan
-        for row in np.flatnonzero(has_changed)[:MAX_LINEARISATIONS]:
-            self._linearise(int(row), loads, scaled)
 
-    def _linearise(self, row: int, loads: Array, scaled: Array) -> None:
+        changed = np.flatnonzero(has_changed).tolist()
+        for row in changed[:MAX_LINEARISATIONS]:
+            self._linearise(row, loads, scaled)
+
+    def _linearise(
+        self,
+        row: int,
+        loads: Array,
+        scaled: Array,
+    ) -> None:
         """Compute the weights with which one contact follows from the values of the cubes near it.
 
         Args:
@@ -378,7 +416,8 @@ class SlipEstimator:
         distance = np.linalg.norm(self._above_cubes - place, axis=1)
         is_turned_away = poses.rotation[:, :, 2] @ contact["normal"] < MIN_FACING
         distance[is_turned_away] = np.inf
-        cubes = np.argsort(distance)[: len(contact["cubes"])]
+        n_cubes = len(contact["cubes"])
+        cubes = np.argsort(distance)[:n_cubes]
         home = int(cubes[0])
         usable = np.where(is_turned_away[:, None], np.nan, scaled)
         self._noise.update(usable, cubes)
@@ -387,15 +426,19 @@ class SlipEstimator:
         # All derivatives are in the frame of the home cube. Those of this contact come first.
         rotation = poses.rotation[home]
         apart = np.linalg.norm(loads[:, 3:] - place, axis=1)
-        near = np.argsort(apart)[: np.sum(apart < NEIGHBOUR_PITCHES * inverse.pitch)]
+        n_near = np.sum(apart < NEIGHBOUR_PITCHES * inverse.pitch)
+        near = np.argsort(apart)[:n_near]
+        forces = loads[near, :3] @ rotation
         centres = (loads[near, 3:] - poses.position[home]) @ rotation
         sizes = np.log(self._contacts["radius"][near])
-        fit = HertzFit(inverse, local, Discs(loads[near, :3] @ rotation, centres[:, :2], sizes))
+        fit = HertzFit(inverse, local, Discs(forces, centres[:, :2], sizes))
         linearise(inverse, [fit])
+
         solved = (fit.covariance[:5] @ fit.jacobian.T).reshape(5, len(cubes), -1)
         weights = np.einsum("knc,ncd->knd", solved, local.whitening)
 
-        noise = np.einsum("knc,ncp->knp", weights[3:], np.nan_to_num(inverse.by_pad[cubes]))
+        by_pad = np.nan_to_num(inverse.by_pad[cubes])
+        noise = np.einsum("knc,ncp->knp", weights[3:], by_pad)
         to_parent = np.zeros((6, 5))
         to_parent[:3, :3] = rotation
         to_parent[3:, 3:] = rotation[:, :2]
@@ -415,13 +458,19 @@ def _describe(loads: Array, normal: Array) -> Array:
         normal: Normals (n, 3) out of the skin.
     """
     force = loads[:, :3]
-    pressing = -np.einsum("nk,nk->n", force, normal)
-    pressing = np.maximum(pressing, 1e-3 * MIN_FORCE_N)[:, None]
-    across = np.einsum("nk,nk->n", force, normal)[:, None] * normal
-    return np.concatenate([loads[:, 3:], (force - across) / pressing, np.log(pressing)], axis=1)
+    outward = np.einsum("nk,nk->n", force, normal)[:, None]
+    pressing = np.maximum(-outward, 1e-3 * MIN_FORCE_N)
+    shear = force - outward * normal
+    parts = [loads[:, 3:], shear / pressing, np.log(pressing)]
+    return np.concatenate(parts, axis=1)
 
 
-def _add_ratio(contacts: AnyArray, chosen: Mask, ratio: Array, deviation: Array) -> None:
+def _add_ratio(
+    contacts: AnyArray,
+    chosen: Mask,
+    ratio: Array,
+    deviation: Array,
+) -> None:
     """Add force ratios of slipping contacts to the weighted mean that is the friction coefficient.
 
     The pads' gains cause the same error in all ratios. So the deviation of the mean is the mean of
