@@ -61,7 +61,8 @@ class Weight(Effect):
         # With axes and pads first, numpy multiplies all cubes in one loop.
         stiffness = np.where(pipeline.stiffness > 0, pipeline.stiffness, np.inf)
         table = self._response / stiffness[..., None]
-        self._table = np.ascontiguousarray(table.transpose(2, 1, 0), pipeline.dtype)
+        table = table.transpose(2, 1, 0)
+        self._table = np.ascontiguousarray(table, pipeline.dtype)
         self._newest_force = np.full((3, len(models)), np.nan)
 
     def applies(self, rows: FrequencyRows) -> bool:
@@ -81,6 +82,8 @@ class Weight(Effect):
         # NaN, which stands for a force that is not known, fails the comparison.
         is_credible = np.abs(given) < MAX_SPECIFIC_FORCE
         is_known: Mask = is_credible.all(axis=0) & self._has_model[cube]
+        newest = np.where(is_known, given, np.nan)
+        self._newest_force[:, cube] = newest
         force = np.where(is_known, given, 0)
 
         chosen = index_cubes(cube, len(self._has_model))
@@ -89,8 +92,6 @@ class Weight(Effect):
         effect += table[1] * force[1]
         effect += table[2] * force[2]
         offset += effect.T
-
-        self._newest_force[:, cube] = np.where(is_known, given, np.nan)
         return is_known
 
     def deviation(self, cube: int) -> Array:
