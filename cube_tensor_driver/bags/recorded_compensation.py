@@ -50,11 +50,11 @@ class CompensationReader:
     """
 
     def __init__(self, bag: Bag, topic: str, poses: CubePoses) -> None:
-        """Prepare to read.
+        """Prepare to read the messages of `compensation` that were recorded with frequencies.
 
         Args:
             bag: Open bag.
-            topic: Topic of the frequencies.
+            topic: Topic of the frequencies. The name of the topic of compensation follows from it.
             poses: Poses of the cubes in the SkinInfo messages.
         """
         self._bag, self._topic = bag, topic.removesuffix("frequencies") + "compensation"
@@ -71,10 +71,15 @@ class CompensationReader:
         self._wanted_ns = 0
 
     def at(self, stamp_ns: int) -> RecordedCompensation:
-        """Return what is stated for the message of frequencies with a stamp.
+        """Return the compensation that the bag has recorded for one message of frequencies.
 
         Args:
-            stamp_ns: Stamp of the header, in ns since the Unix epoch.
+            stamp_ns: Stamp in the header of the message of frequencies, in ns since the Unix epoch.
+
+        Returns:
+            Motion of the skin and states of effects (creep, temperature) from the message of
+            `compensation` with this stamp. If the bag has none: unknown motion if an earlier
+            message has one, else no compensation.
         """
         if stamp_ns < self._wanted_ns - MAX_DISORDER_NS:
             self._restart()

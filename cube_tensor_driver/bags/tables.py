@@ -81,7 +81,7 @@ class BufferedTable:
     """Base class of tables of stress, which collects rows (samples of cubes) to large parts."""
 
     def __init__(self, path: Path) -> None:
-        """Prepare the table; `path` is the file or folder that errors name."""
+        """Begin an empty table of stress; `path` is the file or folder that errors name."""
         self._path = path
         self._waiting: list[StressRows] = []
         self._waiting_rows = 0

@@ -47,11 +47,13 @@ REACH = 20.0
 for the loads of an hour that follow from a hold of minutes."""
 
 GOOD_MISFIT = 2e-4
-"""Error of the law (rms), divided by the load, with which no more relaxation times are tried. It is
-small against the 0.5 % that the law shall keep, and can be seen through the noise of the pads."""
+"""Error of the creep law (rms difference between the measured and the computed stress readings of
+the pads), divided by the load. At or below this error, no further relaxation times are tried. It is
+small against the largest error that is accepted (0.5 %) and visible above the noise of the pads."""
 
 MAX_MISFIT = 5e-3
-"""Error of the law (rms), divided by the load, above which the load counts as not held."""
+"""Largest error of the creep law (rms difference between the measured and the computed stress
+readings of the pads), divided by the load. With a larger error, the load was not held constant."""
 
 BEND = 0.15
 """Expected second difference of successive amplitudes, divided by their mean. Power laws with

@@ -86,7 +86,11 @@ the best one if its misfit is at most this multiple of the lowest misfit."""
 
 SIMILAR_MISFIT = 0.06
 """An explanation of the presses (rotation of the cube, order of its pads) with at most this misfit
-counts as equally good as the best one, even if that has a far lower misfit."""
+counts as equally good as the best one, even if the best one has a far lower misfit.
+
+The misfit is the root of the unexplained fraction of the squared stresses on the pads: 0.06 means
+that the rms of the unexplained stresses is 6 % of the rms of all stresses.
+"""
 
 MAX_MISFIT = 0.5
 """Largest misfit (root of the unexplained fraction of the squared stresses on the pads) with which

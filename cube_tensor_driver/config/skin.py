@@ -211,7 +211,9 @@ class Skin:
 def contact_parameters(skin: Skin) -> dict[str, str | float]:
     """Return the parameters of the node `contacts` that follow from a skin file.
 
-    If the file describes the elastomer, contacts are found by the method inverse.
+    If the file describes the elastomer, the parameter `method` gets the value "inverse": contacts
+    are found by solving for the traction on the surface (linear inverse problem of elasticity).
+    Otherwise no parameter follows, and the node keeps its defaults.
     """
     elastomer = skin.elastomer
     if elastomer is None:
@@ -276,11 +278,14 @@ def check_skin(path: Path) -> tuple[Skin | None, list[str]]:
 
 
 def check_skin_data(data: Any, folder: Path) -> tuple[Skin | None, list[str]]:
-    """Check the content of a skin file, with the same result as `check_skin`.
+    """Check the content of a skin file.
 
     Args:
         data: The content of the file, as plain values (mappings, lists, numbers, texts).
         folder: The folder in which the file is or will be. Calibrations are named relative to it.
+
+    Returns:
+        The skin and an empty list, or None and all mistakes (errors only), one line each.
     """
     schema_mistakes = _SCHEMA.mistakes(data)
     mistakes = [line for _, line in schema_mistakes]

@@ -207,7 +207,8 @@ class Calibration:
 
     @property
     def modes(self) -> Modes:
-        """The M modes (linear stress fields) that the response of the layout refers to."""
+        """The M modes (linear stress fields). The response matrix (P, M) turns their amplitudes
+        into the stresses on the P pads of this pad layout."""
         return default_modes(self.layout)
 
     @property

@@ -122,8 +122,8 @@ class Modes:
         """
         rows = np.zeros((len(COMPONENTS), FIELD_SIZE))
         for row, name in zip(rows, COMPONENTS, strict=True):
-            # The modes of `PAPER` have separate amplitudes for sigma_zx and sigma_xz. The published
-            # component is the mean of the two.
+            # The modes of Kiyota & Shinoda (`PAPER`) have separate amplitudes for sigma_zx and
+            # sigma_xz. The driver's component zx, in its messages, is the mean of the two.
             transposed = name[1::-1] + name[2:]
             for entry in {name, transposed}:
                 _, place = _parse_terms(entry)[0]

@@ -219,13 +219,16 @@ class Pipeline:
     def unloaded_factor(self, cube: Index, temperature: Real, offset: Real | None = None) -> Array:
         """Return the ratio of the frequencies without load to the rest frequencies (N, P).
 
-        It is the factor of temperature, and that of the offset o that compensation subtracts: the
-        pad law o = (f - f0) / (f0 (1 + beta) / beta - f), solved for f / f0.
+        The ratio is the product of two factors. One is that of temperature. The other is the ratio
+        f / f0 at which the stress of a pad, divided by its stiffness, is the offset o that
+        compensation subtracts. It follows from the pad law
+        o = (f - f0) / (f0 (1 + beta) / beta - f), where beta is the ratio of the parasitic to the
+        active capacitance of a pad without load.
 
         Args:
             cube: Numbers of the cubes (N,).
             temperature: Temperatures (N,), in °C; NaN where they are unknown.
-            offset: Offsets (N, P); None: those of the newest rows.
+            offset: Offsets o (N, P), stress / stiffness; None: those of the newest rows (samples).
         """
         factor = self.temperature_factor(cube, temperature)
         if offset is None and self.newest_offset is not None:

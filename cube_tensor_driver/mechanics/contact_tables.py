@@ -63,8 +63,13 @@ _LAST_DISTANCE = REACH_DEPTHS * POINTS_PER_DEPTH
 """Index of the largest tabulated distance between a round contact and a cube."""
 
 _GRID_ROWS = int(np.ceil(np.arcsinh(REACH_DEPTHS) / GRID_STEP)) + 2
-"""Number of rows of the polygon tables, one for each value of d, the distance of the line through a
-polygon's edge from the point of the surface above the cube."""
+"""Number of rows of the tables of stress at a cube under polygons of traction on the surface.
+
+Row k is for d = sinh(k `GRID_STEP`) from 0 to `REACH_DEPTHS`, where d is the distance of the line
+through a polygon's edge from the point of the surface above the cube, divided by the depth of the
+cubes' centres. There are two rows more than steps: the one for d = 0, and one beyond the end, which
+the interpolation between neighbouring rows needs.
+"""
 
 _CENTRE_COLUMN = int(np.ceil(np.arcsinh(MAX_LEG_RATIO) / GRID_STEP))
 """Index of the column of the polygon tables for t = 0, where t is the length along the line through

@@ -72,8 +72,8 @@ def contacts_message(
         contacts: The contacts: all with a tracker (`TrackedContact`) or all without one.
         slip: State and friction of these contacts; without a tracker the default, empty arrays.
     """
-    # Only tracked contacts have an id, a moment, further uncertainties and the mark `refined`.
-    # Without a tracker, these arrays of the message stay empty.
+    # Only tracked contacts have an id, a moment (torque about the normal), further uncertainties,
+    # and `refined` (force from a fit of the traction). Without a tracker, these arrays stay empty.
     tracked = [contact for contact in contacts if isinstance(contact, TrackedContact)]
     fields: dict[str, Any] = {name: _collect(contacts, name) for name in _NUMBERS}
     fields |= {name: _collect(tracked, name) for name in _TRACKED_NUMBERS}

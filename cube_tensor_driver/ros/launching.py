@@ -112,7 +112,7 @@ class FromSkin(Substitution):  # type: ignore[misc]
     """A launch substitution whose text is made from the skin file in the argument `config`."""
 
     def __init__(self, make: Callable[[Skin], str]) -> None:
-        """Store `make`, which returns the text for a skin."""
+        """Store `make`, which returns the text of this substitution for the skin that was read."""
         super().__init__()
         self._make = make
 

@@ -122,7 +122,12 @@ class SimulatedSource:
         return False
 
     def statistics(self) -> dict[str, object]:
-        """Return the number of rows and scans and the simulated time since the iteration began."""
+        """Return how much the latest iteration over this source has simulated.
+
+        Returns:
+            Numbers of rows (samples of one cube) and scans (samples of all cubes), and the
+            simulated time in s.
+        """
         return {
             "rows given": self.scans * len(self.skin.cubes),
             "scans given": self.scans,

@@ -248,10 +248,12 @@ class Surface:
         return np.asarray(component[is_touched][nearest], np.intp)
 
     def _contact(self, loaded: _LoadedSurface, chosen: Mask) -> Contact:
-        """Compute force, position and uncertainty of the contact on some patches.
+        """Compute force, position and uncertainty of a contact.
+
+        A patch is a square grid of points above one cube; the patches of all cubes cover the skin.
 
         Args:
-            loaded: Pressure and shear at the points of all patches.
+            loaded: Pressure and shear in Pa at the points of all patches.
             chosen: Whether the patch of each cube (cubes,) belongs to the contact.
         """
         rotation = self.poses.rotation[chosen]

@@ -55,8 +55,9 @@ limit but beyond it. With `REFERENCE` = 2 the true mean time between false alarm
 equation, is 1.05 to 1.15 times the stated one."""
 
 SETTLING_ROWS = 10
-"""Number of samples of a cube from which its slow part is averaged before touch is looked for. They
-add 5 % to the standard deviation of the pressure at first."""
+"""Number of first samples of a cube whose mean is the start of the slowly drifting part of its
+pressure, which is subtracted. Touch is only looked for after them. At first, the error of this mean
+adds 5 % to the standard deviation of the remaining pressure."""
 
 NEIGHBOURS = 9
 """Number of cubes that decide together where a touch is, and from which its force is estimated: the

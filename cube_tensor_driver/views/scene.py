@@ -166,7 +166,13 @@ QUANTITIES = {
         of=lambda values, residual: residual,
     ),
 }
-"""Name -> quantity, for all quantities that markers (RViz) and the page can show in colours."""
+"""Name -> quantity, for all quantities that markers (RViz) and the page can show in colours.
+
+The residual of a cube (rms deviation of its pads from the fitted stress field) has the unit σ, here
+the standard deviation of the noise; σ with two indices, such as σzz, is a component of stress. The
+attributes `size` and `min_top` are the size of the unit and the smallest upper end of an automatic
+range of colours, in SI units.
+"""
 
 
 def automatic(

@@ -121,8 +121,9 @@ class Conditions:
     def add(self, cube: Index, bits: StatusBits) -> None:
         """Add conditions that rows of the present window of 0.5 s show.
 
-        Only the first one of a pad in a window is added, because a broken pad shows its condition
-        in every row, and the kernel asks only for the first.
+        Only the first condition of a pad in a window is added, because a broken pad shows its
+        condition in every row. The kernel (the function that computes stress from rows) stops for
+        this call only at the first such row, so that later ones cost no time.
 
         Args:
             cube: Numbers of different cubes (n,).

@@ -1,3 +1,6 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""The kernel: one pass over the rows of a scan, in C where it is compiled, else in numpy."""
+"""The kernel computes stress, residual and status from the frequencies of all cubes in one pass.
+
+It is in C where that is compiled, else in numpy.
+"""

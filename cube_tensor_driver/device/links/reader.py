@@ -176,7 +176,12 @@ class Reader:
         self._wake()
 
     def take_lag_s(self) -> float:
-        """Return the largest value of `behind_s` since the last call of this method, in s."""
+        """Return by how much this thread came too late since the last call of this method.
+
+        Returns:
+            Largest time, in s, for which received bytes waited in a port before the thread came to
+            read them (largest `behind_s`).
+        """
         lag_s, self._lag_s = self._lag_s, 0.0
         return lag_s
 

@@ -57,12 +57,12 @@ MATCH_PITCHES = 1.0
 neighbouring cubes). A contact farther away from all previous ones is a new one."""
 
 COARSE_DEVIATION = 0.1
-"""Standard deviation of the force, divided by the force, that is stated for a contact whose force
-is the integral of the linear field, because its region is not fitted yet.
+"""Relative standard deviation that is stated for the force of a contact without a fit. Such a
+force is the traction on the surface, which the linear inverse problem of elasticity yields from the
+values of all cubes, integrated over the area of the contact.
 
-Such integrals were off by 1 to 9 % for balls, punches and rods on skins whose cubes are two or
-three depths (of their centres below the surface) apart. Beside other contacts, the integral also
-replaces a fit with a larger deviation.
+These integrals were off by 1 to 9 % for balls, punches and rods on skins whose cubes are two or
+three depths (of their centres below the surface) apart.
 """
 
 

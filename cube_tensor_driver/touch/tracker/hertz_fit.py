@@ -129,7 +129,11 @@ class HertzFit:
 
     @property
     def explained(self) -> Array:
-        """Values (n, C) in Pa of the cubes around the region under the contacts `found`."""
+        """Values that the contacts `found` (result of the last step) cause.
+
+        They are the C components of stress and gradient (times d0, half the side of a cube) of each
+        of n cubes around the region, (n, C), in Pa.
+        """
         change = np.zeros((len(self.found.forces), _N_PARAMETERS))
         change[:, :3] = self.found.forces - self._at.forces
         change[:, 3:5] = self.found.centres - self._at.centres
@@ -153,10 +157,14 @@ class HertzFit:
             self.found = found._replace(centres=found.centres + shift, forces=forces)
 
     def move_home(self, values: LocalValues) -> None:
-        """Go on with the values of other cubes, in the frame of another home cube.
+        """Continue the fit around another home cube, and rotate the contacts into its frame.
+
+        The home cube is the cube around which the curved skin is laid flat for the fit; positions
+        and forces are in its frame.
 
         Args:
-            values: Values of cubes around another cube, which is one of those of the present fit.
+            values: Source of the measured stress and gradient of the cubes around the new home
+                cube. The new home cube is one of the cubes of the present fit.
         """
         (number,) = np.flatnonzero(self.values.cubes == values.home)
         place, angle = self.values.place[number], self.values.angle[number]
@@ -172,10 +180,17 @@ class HertzFit:
         self.last_step = np.inf
 
     def linearise(self, slopes: Single) -> None:
-        """Take over the response of the cubes to the contacts `found`, and its derivatives.
+        """Store the values of the cubes under the contacts `found`, and how these values change.
+
+        The results (`jacobian`, `covariance`) serve the next Gauss-Newton step.
 
         Args:
-            slopes: Values (J, n, 8, C) as from `Kernels.response_slopes`.
+            slopes: For each of J contacts and n cubes, 8 sets of the C components of stress and
+                gradient (times d0, half the side of a cube): (J, n, 8, C). Sets 0 to 2 are those
+                under a force of 1 N along x, y and z, in Pa/N. Sets 3 to 6 are the derivatives
+                by x and y of the contact's centre (Pa/m), and the first and second derivative by
+                the logarithm of its radius (Pa). Set 7 is that under a moment of 1 N m about z, in
+                Pa/(N m).
         """
         self._at = self.found
         distance = np.linalg.norm(self.values.place[:, None] - self._at.centres, axis=2)
@@ -292,9 +307,14 @@ class HertzFit:
 
 
 def linearise(inverse: SurfaceInverse, fits: Sequence[HertzFit]) -> None:
-    """Compute the response of the cubes to the contacts of all fits, and its derivatives.
+    """Compute the stress of the cubes under the contacts of each fit, and store it in the fits.
 
-    All fits together take little longer than one.
+    Its derivatives by the parameters of the contacts (force, centre, radius, flatness, moment) are
+    computed and stored, too. All fits together take little longer than one.
+
+    Args:
+        inverse: Kernels (stress in the skin under contacts of unit force).
+        fits: Fits, whose `linearise` gets the results.
     """
     if not fits:
         return

@@ -51,7 +51,12 @@ nodes are placed beyond the border of the skin, where no field is computed."""
 
 ENVELOPE_FLOOR = 0.03
 """Smallest prior standard deviation of the force of a node (one of the small contacts whose sum is
-the traction), divided by that of the strongest node, in a fit whose prior was made narrower."""
+the traction), divided by that of the strongest node.
+
+A second fit of the same values gets a prior that is proportional to the forces of the first fit
+(their smoothed envelope), so that force spread over nodes without contact disappears. The limit
+lets a node keep a little force that the first fit did not find there.
+"""
 
 MIN_SCORE_GAIN = 1.0
 """Smallest decrease of -2 ln(evidence) for which a narrower prior of the traction replaces the

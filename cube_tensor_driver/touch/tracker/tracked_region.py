@@ -116,18 +116,23 @@ class Work(IntEnum):
 
 
 class TrackedRegion:
-    """A region of contact and its fit.
+    """A region of contact on the surface, and the fit of the traction (force per area) in it.
+
+    The response of a cube is what contacts add to its C components: those components of stress and
+    gradient (times d0, half the side of a cube), in Pa, that the pads determine.
 
     Attributes:
-        points: Indices (n,) of its points of the surface in the newest scan.
-        peak: Largest pressure in Pa at the depth of the cubes.
-        near: Other regions so close that the fit depends on theirs.
-        fit: Fit of the traction, if there is one.
-        others: Response (n, C) in Pa of the cubes of the fit to all other regions.
+        points: Indices (k,) of the k points of the surface in the region, in the newest scan.
+        peak: Largest pressure in Pa at the depth of the cubes' centres.
+        near: Other regions within `NEIGHBOUR_REACH_PITCHES`. Their contacts change the values of
+            the same cubes, so the fit of this region subtracts the response to them.
+        fit: Fit of the traction to n cubes around the region; None: not fitted yet.
+        others: Response (n, C) of the n cubes of the fit to all other regions.
         gap: Distance from the nearest other region in m.
-        response: Response (cubes, C) in Pa of the cubes to this region (`update_responses`).
-        start: Home cube and contact at which the first fit begins.
-        waited: Number of scans since the fit was last improved.
+        response: Response (cubes, C) of all cubes of the skin to this region.
+        start: Index of the home cube (around which the skin is laid flat; its frame is that of the
+            fit) and the Hertz contact at which the first fit begins.
+        waited: Number of scans (sets of values of all cubes) since the fit was last improved.
     """
 
     def __init__(self, inverse: SurfaceInverse, noise: CubeNoise) -> None:
