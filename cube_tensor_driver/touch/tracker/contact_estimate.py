@@ -57,7 +57,8 @@ class ContactSum(NamedTuple):
         places: Centres (q, 2) in m.
         sizes: Radii (q,) in m.
         forces: Forces (3, q) in N, along x, y and z.
-        root: Square root (3, q, n) of the covariance of the forces, in N.
+        root: Square root R (3, q, n) of the covariance of the forces, in N. With its first two axes
+            joined, R R' is the covariance (3 q, 3 q); n is at most 3 q.
     """
 
     places: Array
@@ -67,11 +68,13 @@ class ContactSum(NamedTuple):
 
 
 class Discs(NamedTuple):
-    """Parameters of J Hertz contacts on the skin laid flat around a cube.
+    """Parameters of J Hertz contacts on the skin laid flat around the home cube of a fit.
+
+    The frame is that of the home cube: x and y along the surface, z out of the skin.
 
     Attributes:
-        forces: Forces (J, 3) in N.
-        centres: Centres (J, 2) in m.
+        forces: Forces (J, 3) on the skin, along x, y and z, in N.
+        centres: Centres (J, 2) along x and y, in m from the home cube.
         log_sizes: Natural logarithms (J,) of the radii in m.
     """
 
@@ -96,7 +99,8 @@ def estimate_contact(nodes: Array, forces: Array, root: Array, size: float) -> C
     Args:
         nodes: Positions (q, 2) of the nodes in m, on the skin laid flat.
         forces: Forces (3, q) of the nodes along x, y and z, in N.
-        root: Square root (3, q, n) of their covariance, in N.
+        root: Square root R (3, q, n) of their covariance, in N: with its first two axes joined,
+            R R' is the covariance (3 q, 3 q).
         size: Radius of a node in m.
     """
     force = forces.sum(axis=1)

@@ -200,7 +200,11 @@ class ContactTracker:
         return FieldDeviation(*np.sqrt(variance).T)
 
     def _response_to_fits(self) -> Array:
-        """Return the values (cubes, C) in Pa that the traction of all fits causes."""
+        """Return the values that the traction of all fits causes.
+
+        They are the C components of stress and gradient (times d0, half the side of a cube) that
+        the pads determine, for all cubes of the skin (cubes, C), in Pa.
+        """
         fitted = [region for region in self._regions if region.fit is not None]
         update_responses(self._inverse, fitted, np.arange(len(self._scaled)))
         return np.asarray(sum((region.response for region in fitted), 0 * self._scaled))
@@ -209,7 +213,8 @@ class ContactTracker:
         """Find the regions of the newest scan, and their fits among those of the previous scan.
 
         Args:
-            pressure: Pressure (M,) in Pa at the depth of the cubes.
+            pressure: Pressure (M,) in Pa at the depth of the cubes' centres, below each of the M
+                points of the surface.
         """
         found = self._pressure_regions.find(pressure)[:MAX_REGIONS]
         owner = np.full(len(pressure), len(self._regions))
@@ -235,7 +240,12 @@ class ContactTracker:
             region.gap = float(np.partition(row, 1)[1]) if len(row) > 1 else np.inf
 
     def _region_distances(self, found: list[Index]) -> Array:
-        """Return the smallest distance (n, n) in m of the points of each pair of regions."""
+        """Return the distances (n, n), in m, of n regions: for each pair of regions, the smallest
+        distance between a point of one and a point of the other.
+
+        Args:
+            found: Indices of the points of the surface in each region.
+        """
         if not found:
             return np.zeros((0, 0))
         first = np.cumsum([0, *(len(one) for one in found[:-1])])
@@ -258,13 +268,31 @@ class ContactTracker:
                     region.response[values.cubes] = region.fit.explained
 
     def _respond(self, cubes: Index, but: TrackedRegion) -> tuple[Array, Array]:
-        """Return the newest response (n, C) in Pa of n cubes as `_sum_others` does."""
+        """Compute the response to all regions but one where contacts have changed, and return it.
+
+        Args:
+            cubes: Indices (n,) of the cubes that respond.
+            but: Region that is left out.
+
+        Returns:
+            As `_sum_others`: change (n, C), in Pa, of the C measured components of each cube by the
+            other regions, and its standard deviation (n, C), in Pa.
+        """
         others = [region for region in self._regions if region is not but]
         update_responses(self._inverse, others, cubes)
         return self._sum_others(cubes, but)
 
     def _sum_others(self, cubes: Index, but: TrackedRegion) -> tuple[Array, Array]:
-        """Return the response (n, C) in Pa of n cubes to all regions but one, and its deviation."""
+        """Return the response of some cubes to all regions of contact but one.
+
+        Args:
+            cubes: Indices (n,) of the cubes that respond.
+            but: Region that is left out.
+
+        Returns:
+            Change (n, C), in Pa, of the C measured components of each cube by the other regions,
+            and its standard deviation (n, C), in Pa.
+        """
         total = np.zeros((2, len(cubes), len(self._inverse.columns)))
         for region in self._regions:
             if region is not but:
@@ -274,7 +302,12 @@ class ContactTracker:
         return total[0], total[1]
 
     def _start(self, contact: TrackedContact) -> tuple[int, Discs]:
-        """Return the home cube and the Hertz contact at which the fit of a contact begins."""
+        """Return the start of the fit of a contact.
+
+        Returns:
+            Index of the home cube (the cube nearest to the contact, around which the skin is laid
+            flat for the fit), and the Hertz contact from which the fit begins, in its frame.
+        """
         inverse = self._inverse
         above = inverse.poses.position + inverse.depth * inverse.poses.rotation[:, :, 2]
         home = int(np.linalg.norm(above - contact.position, axis=1).argmin())
@@ -335,7 +368,8 @@ class ContactTracker:
         Args:
             own: Indices (n,) of the points.
             force: Force (M, 3) in N on the square of each point, in the frame of its cube.
-            count: Number of points with significant pressure.
+            count: Number of points of the region of contact, where the pressure is above the
+                threshold; the area follows from it.
         """
         inverse = self._inverse
         rotation = inverse.poses.rotation[inverse.cube[own]]

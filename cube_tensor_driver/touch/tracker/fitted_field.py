@@ -30,6 +30,15 @@ def add_fits(
 
     The traction of a fit is averaged over the square that each point represents, so that the sum
     over all points times the area of a square is the force.
+
+    Args:
+        inverse: Points and kernels of the skin.
+        residual: Traction and pressure that explain what the fits leave of the values.
+        fits: Fits of all regions of contact.
+
+    Returns:
+        Traction (M, 3) and pressure at the depth of the cubes' centres (M,), in Pa, at the M points
+        of the surface.
     """
     traction = residual.traction.copy()
     pressure = residual.depth_pressure.copy()
@@ -68,8 +77,8 @@ def _distribute(
     Returns:
         Indices (m,) of the points; shares (m, q) of the force of each contact that act on the
         square of each point; pressure (m, 3 q) in Pa/N at the cubes' depth, for forces along x of
-        all contacts, then y, then z; and rotations (m, 3, 3) from the home cube to the cube of each
-        point.
+        all contacts, then y, then z; and rotations (m, 3, 3) from the frame of the home cube
+        (around which the skin is laid flat) to that of the cube below each point.
     """
     points = np.flatnonzero(np.isin(inverse.cube, fit.values.cubes))
     place = unroll_points(inverse, fit.values.home, points)

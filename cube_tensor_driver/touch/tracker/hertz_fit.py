@@ -46,7 +46,8 @@ Hertz contact has flatness 0, a rigid flat punch flatness 1.
 """
 
 SHAPE_CUBES = 9
-"""Number of cubes nearest to the contacts whose values show whether the shape is right."""
+"""Number of cubes nearest to the contacts whose deviations from the fit show whether the contacts
+have the shape (Hertz pressure in a circle) that the fit assumes."""
 
 SETTLED_STEP = 0.02
 """Size of a Gauss-Newton step below which a fit has converged. The size is the larger one of two
@@ -71,19 +72,24 @@ then both directions along x and along y."""
 
 
 class HertzFit:
-    """Hertz contacts in a region, fitted to the values of the cubes around it.
+    """J Hertz contacts in a region, fitted to C components of each of n cubes around the region.
+
+    The components are those of stress and gradient that the pads determine. Whitened values are
+    components transformed so that their noise has variance 1 and no correlation.
 
     Attributes:
-        found: Parameters that the last step has found.
-        score: -2 ln of the evidence (Laplace approximation), comparable with that of the nodes.
-        misfit: Factor, at least 1, by which the squared values deviate more than their noise
-            explains.
-        shape_misfit: The same factor for the cubes nearest to the contacts (`SHAPE_CUBES`), which
-            a wrong shape changes more than contacts elsewhere do.
+        found: Parameters (force, centre, radius) of the contacts that the last step has found.
+        score: -2 ln of the evidence (probability of the values, in Laplace approximation),
+            comparable with the score of a fit of the traction on nodes.
+        misfit: Squared deviation of the values from the fit, divided by the value that their noise
+            causes; at least 1.
+        shape_misfit: Mean squared deviation of the whitened values of the cubes nearest to the
+            contacts (`SHAPE_CUBES`), which a wrong shape changes more than contacts elsewhere do.
         last_step: Size of the last step: shift divided by the depth of the cubes' centres, or
             change of the logarithm of the radius.
-        jacobian: Derivatives (n C, 8 J) of the whitened values by the parameters.
-        covariance: Covariance (8 J, 8 J) of the parameters for a misfit of 1.
+        jacobian: Derivatives (n C, 8 J) of the whitened values by the 8 parameters of each contact:
+            force (3), centre (2), logarithm of the radius, flatness, moment.
+        covariance: Covariance (8 J, 8 J) of these parameters for a misfit of 1.
     """
 
     def __init__(self, inverse: SurfaceInverse, values: LocalValues, starts: Discs) -> None:
@@ -111,7 +117,11 @@ class HertzFit:
 
     @property
     def is_moving(self) -> bool:
-        """Whether the response has to be linearised again before the next step."""
+        """Whether the response of the cubes must be linearised again before the next step.
+
+        This is so if the contacts are more than `SETTLED_STEP` from those at which the response
+        was linearised, if no step was made yet, or if the noise of the cubes has changed.
+        """
         shift = np.abs(self.found.centres - self._at.centres).max() / self._depth
         growth = np.abs(self.found.log_sizes - self._at.log_sizes).max()
         is_settled = max(shift, growth) < SETTLED_STEP and np.isfinite(self.last_step)
@@ -119,7 +129,8 @@ class HertzFit:
 
     @property
     def is_unsettled(self) -> bool:
-        """Whether the last step was so large that the linearised response is not exact."""
+        """Whether the last step was larger than `MAX_UNFOLLOWED_STEP`, so that the response of the
+        cubes, linearised before the step, is not exact after it."""
         return self.last_step > MAX_UNFOLLOWED_STEP
 
     @property
@@ -143,10 +154,11 @@ class HertzFit:
         return np.asarray(self._explained + self._columns @ change.ravel())
 
     def predict(self, is_moving: bool) -> None:
-        """Begin a new scan.
+        """Begin a new scan (set of values of all cubes).
 
         Args:
-            is_moving: Whether the contacts are expected to go on as between the last two scans.
+            is_moving: Whether centres and forces are extrapolated, by their changes between the
+                last two scans; otherwise the contacts of the last scan are the start.
         """
         found, previous = self.found, self._previous
         self._previous = found
@@ -214,7 +226,8 @@ class HertzFit:
         """Make a Gauss-Newton step from the parameters at which the response is linearised.
 
         Args:
-            white: Whitened values (n C,) as from `LocalValues.whiten`.
+            white: Whitened values (n C,), C components of each of n cubes, transformed by
+                `LocalValues.whiten` so that their noise has variance 1 and no correlation.
         """
         at = self._at
         residual = white - self._model
@@ -254,7 +267,7 @@ class HertzFit:
 
         Args:
             step: Shift in m. It is at least the spacing of the points at which the traction is
-                evaluated, because differences over less than that vanish there.
+                evaluated, because contacts shifted by less have the same traction there.
         """
         count = len(self.found.forces)
         shifts = np.concatenate([step * _STENCIL, np.zeros((2, 2))])

@@ -29,7 +29,9 @@ a pad in the surrounding cubes."""
 
 
 class CubeNoise:
-    """Noise of the C components of all cubes of a skin, for the stress of their pads.
+    """Noise of all cubes of a skin, which grows with the stress of their pads.
+
+    C is the number of components of stress and gradient that some cube determines.
 
     Attributes:
         whitening: Matrices (cubes, C, C) that transform the values of a cube so that their noise
@@ -54,7 +56,8 @@ class CubeNoise:
         """Compute the noise of cubes again whose pads in use, known values or stresses changed.
 
         Args:
-            scaled: Values (cubes of the skin, C) in Pa, NaN where unknown.
+            scaled: Components of stress and gradient (times d0, half the side of a cube), in Pa
+                (cubes of the skin, C); NaN where unknown.
             cubes: Indices (n,) of the cubes that are needed.
         """
         inverse = self._inverse
@@ -83,7 +86,13 @@ class CubeNoise:
             self._whiten(cubes[is_changed], variance[is_changed])
 
     def _whiten(self, cubes: Index, variance: Array) -> None:
-        """Compute the noise of cubes for variances (n, P) of their pads' errors."""
+        """Compute the whitening matrices of n cubes, which make their noise uncorrelated.
+
+        Args:
+            cubes: Indices (n,) of the cubes.
+            variance: Variances (n, P) of the errors of the stresses on their P pads, divided by the
+                variance of the pad's noise without load.
+        """
         by_pad = self._by_pad[cubes]
         noise = (by_pad * variance[:, None]) @ by_pad.swapaxes(1, 2)
         # A 1 on the diagonal keeps the matrices of cubes with unknown values invertible, and the
@@ -97,14 +106,18 @@ class CubeNoise:
 
 
 class LocalValues:
-    """Values of some cubes around a region, divided by their noise, on the skin laid flat.
+    """Noise and positions of n cubes around a region of contact, on the skin laid flat.
+
+    The values of a cube are C components of stress and gradient; `whiten` divides them by their
+    noise. The skin is laid flat around one cube, the home cube, whose frame is that of the fit.
 
     Attributes:
-        home: Index of the cube around which the skin is laid flat.
+        home: Index of the home cube.
         cubes: Indices (n,) of the cubes.
         place: Positions (n, 2) of the cubes in m, in the frame of the home cube.
-        angle: Rotations (n,) of the cubes in rad, in this frame.
-        variant: Index (n,) of each cube's variant in the measurement model.
+        angle: Rotations (n,) of the cubes about z in rad, in the frame of the home cube.
+        variant: Number (n,) of the matrix of the measurement model that applies to each cube, which
+            depends on its calibration and its pads in use.
         whitening: Matrices (n, C, C) as in `CubeNoise`, of the last `refresh`.
         known: Whether each of the C components of the cubes is known (n, C).
         count: Number of known values.
@@ -133,7 +146,8 @@ class LocalValues:
         self.refresh()
 
     def refresh(self) -> None:
-        """Take over the newest noise of the cubes."""
+        """Copy the newest noise of the cubes, and reduce the weight of cubes that other contacts
+        disturb."""
         self._versions = self._noise.version[self.cubes]
         self.variant = self._inverse.variant[self.cubes]
         whitening = self._noise.whitening[self.cubes]
@@ -175,8 +189,9 @@ class LocalValues:
             size: Radius of the contacts in m.
 
         Returns:
-            Values (n, C, 3 K) in Pa/N, and values (n C, 3 K) divided by their noise: for forces
-            along x of all contacts, then along y, then along z.
+            Values (n, C, 3 K) in Pa/N of the C components of n cubes, and the same values divided
+            by their noise (n C, 3 K), in 1/N. The last axis holds forces along x of all contacts,
+            then along y, then along z.
         """
         count = len(centres)
         offset = (self.place[:, None] - centres).reshape(-1, 2)

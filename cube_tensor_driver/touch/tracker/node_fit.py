@@ -154,10 +154,11 @@ class NodeFit:
         self._decomposition = self._decompose(np.ones(len(self.places)))
 
     def step(self, white: Array) -> None:
-        """Set `posterior` and `misfit` for new values of the same cubes.
+        """Compute `posterior` (forces of the nodes) and `misfit` for new values of the same cubes.
 
         Args:
-            white: Values (n C,) divided by their noise, as from `LocalValues.whiten`.
+            white: Values (n C,), C components of stress and gradient of each of n cubes,
+                transformed by `LocalValues.whiten` so that their noise has variance 1.
         """
         design, eigenvalues, vectors, basis = self._decomposition
         projected = vectors.T @ (design.T @ white)
@@ -226,11 +227,19 @@ class NodeFit:
 
     @property
     def shape_misfit(self) -> float:
-        """Misfit of all cubes around the region, as that of a `HertzFit` near its contacts."""
+        """Squared deviation of the values from the fit, divided by the value that noise causes.
+
+        It is `misfit`, that of all cubes around the region, because nodes assume no shape. A
+        `HertzFit` computes the property of this name from the cubes nearest to its contacts.
+        """
         return self.misfit
 
     def to_contacts(self, step: float) -> ContactSum:
-        """Describe the traction as a sum of Hertz contacts, the nodes; `step` is not needed."""
+        """Describe the traction as a sum of small Hertz contacts, one for each node.
+
+        Args:
+            step: Not used here; `HertzFit.to_contacts` needs it.
+        """
         sizes = np.full(len(self.places), self.size)
         return ContactSum(self.places, sizes, self.posterior.forces, self.posterior.root)
 
@@ -238,12 +247,14 @@ class NodeFit:
         """Compute the eigenvalues and eigenvectors from which every posterior follows.
 
         Args:
-            envelope: Prior standard deviation (q,) of each node, relative to each other.
+            envelope: Prior standard deviation (q,) of the force of each of q nodes, divided by the
+                largest one.
 
         Returns:
-            With the unknowns in which the prior is the identity: whitened response (n C, 3 q),
-            eigenvalues (3 q,) and eigenvectors (3 q, 3 q) of its square, and the matrix (3 q, 3 q)
-            from the eigenvectors to the forces of the nodes.
+            The response D (n C, 3 q) of the whitened values (C of each of n cubes) to unknowns that
+            have independent priors of variance 1; eigenvalues (3 q,) and eigenvectors (3 q, 3 q) of
+            D' D; and the matrix (3 q, 3 q) from amplitudes of the eigenvectors to the forces of the
+            nodes.
         """
         covariance = self._covariance * np.outer(envelope, envelope)
         # This tiny increase of the diagonal makes up for rounding errors.

@@ -132,8 +132,8 @@ def split_peaks(pressure: Array, root: Array, is_neighbour: Mask) -> Index:
     Nodes are small contacts on a grid. `VALLEY`, `MIN_FALL` and `MIN_PEAK` define what a peak is.
 
     Args:
-        pressure: Pressure (q,) at the nodes.
-        root: Square root (q, n) of its covariance.
+        pressure: Pressure (q,) at the nodes, in any unit.
+        root: Square root R (q, n) of its covariance R R' (q, q), in the unit of the pressure.
         is_neighbour: Whether two nodes are neighbours (q, q).
 
     Returns:

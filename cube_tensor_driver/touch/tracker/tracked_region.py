@@ -46,14 +46,20 @@ misfit is the squared deviation of the values from the fit, divided by the value
 causes. It grows when a contact moves or changes its shape."""
 
 MAX_HERTZ_MISFIT = 1.5
-"""Misfit of the nearest cubes above which Hertz contacts are compared with the traction on nodes.
-The misfit of the right model is 1 with a standard deviation of 0.12 for 9 cubes with 15 values
-each, and of 0.2 for planar cubes."""
+"""Misfit (squared deviation of the values from the fit, divided by the value that noise causes) of
+the cubes nearest to Hertz contacts, above which a fit of the traction on nodes (small contacts on a
+grid) is tried instead. The misfit of the right model is 1 with a standard deviation of 0.12 for 9
+cubes with 15 values each, and of 0.2 for planar cubes."""
 
 MAX_BAD_SCANS = 5
-"""Number of scans in a row with a misfit that has grown by `MAX_MISFIT_GROWTH` after which Hertz
-contacts are compared with the traction on nodes. A contact that begins elsewhere disturbs the
-others until its pressure is large enough to be found."""
+"""Number of scans (sets of values of all cubes) in a row with too large a misfit (squared deviation
+of the values from the fit, divided by its value for noise) after which a fit on nodes (small
+contacts on a grid) is tried instead of Hertz contacts.
+
+A misfit is too large if it exceeds `MAX_MISFIT_GROWTH` times the one of the first fit. One bad scan
+does not suffice, because a new contact elsewhere disturbs the fit until its pressure is large
+enough to be found.
+"""
 
 MAX_START_SIZE = 2.0
 """Largest radius of a Hertz contact at the start of its fit, divided by the depth of the cubes'
@@ -70,21 +76,26 @@ contacts are tried before the traction on nodes. Between cubes that are farther 
 begins at the maximum of the field may end at the wrong side of a cube."""
 
 HOME_PITCHES = 0.55
-"""Distance of a Hertz contact from its home cube, in pitches, above which another cube that is
-nearer becomes the home cube, around which the skin is laid flat."""
+"""Largest distance of Hertz contacts (of their mean centre) from their home cube, the cube around
+which the skin is laid flat for the fit, in pitches (distances of neighbouring cubes). Beyond this
+distance, the cube nearest to the contacts becomes the home cube."""
 
 MAX_STALE_CHANGE = 0.003
-"""Change of a contact after which the response of distant cubes to it is computed again: shift,
-divided by the distance from the nearest other region, or change of the force, divided by the
-force."""
+"""Largest change of a contact with which the computed stress of distant cubes under this contact
+stays in use.
+
+The change is the larger one of the shift, divided by the distance from the nearest other region of
+contact, and the change of the force, divided by the force.
+"""
 
 START_ERROR = 0.15
-"""Standard deviation of the response of neighbouring cubes to a contact that is the integral of the
-linear field, divided by the response."""
+"""Relative standard deviation of the stress that a contact without a fit causes in the cubes around
+other contacts. Its force is only the integral of the traction that the linear inverse problem of
+elasticity yields from the values of all cubes."""
 
 FIT_ERROR = 0.005
-"""Standard deviation of the response of neighbouring cubes to a fitted contact, divided by the
-response."""
+"""Relative standard deviation of the stress that a fitted contact causes in the cubes around other
+contacts."""
 
 MAX_STEPS = 10
 """Largest number of Gauss-Newton steps in the first fit of a Hertz contact."""
@@ -95,8 +106,9 @@ long as a new fit with this number of nodes."""
 
 
 Respond = Callable[[Index], tuple[Array, Array]]
-"""Function that returns the response (n, C) in Pa of n cubes to the other regions of contact, and
-its standard deviation."""
+"""Function that takes the indices of n cubes and returns their response to all other regions of
+contact: changes (n, C), in Pa, of their C measured components, and the standard deviations of these
+changes (n, C), in Pa."""
 
 
 class Work(IntEnum):
@@ -157,9 +169,15 @@ class TrackedRegion:
         self._responded: tuple[int, Discs]
 
     def begin_scan(self, points: Index, peak: float) -> None:
-        """Take over the points and the largest pressure of the newest scan, and follow the fit.
+        """Begin a new scan (set of values of all cubes), and move Hertz contacts to where they are
+        expected in it.
 
-        A fit whose values are not known any more, or that has left the region, is dropped.
+        A Hertz fit is dropped if its contacts have left the region or pull at it. A fit on nodes is
+        dropped if other components of the cubes are known than before.
+
+        Args:
+            points: Indices of the points of the surface that form the region in this scan.
+            peak: Largest pressure in Pa at these points, at the depth of the cubes' centres.
         """
         self.points, self.peak = points, peak
         self.waited += 1
@@ -197,7 +215,13 @@ class TrackedRegion:
             fit.move_home(self._collect(nearest, cubes))
 
     def _collect(self, home: int, cubes: Index) -> LocalValues:
-        """Return the values of those of the cubes (n,) that do not face away from the home cube."""
+        """Return the input of a fit: the cubes that do not face away from its home cube.
+
+        Args:
+            home: Index of the home cube, around which the skin is laid flat for the fit.
+            cubes: Indices (n,) of the cubes from which those that respond are chosen: their outward
+                normals and that of the home cube have a cosine above `MIN_FACING`.
+        """
         normals = self._inverse.poses.rotation[:, :, 2]
         facing = cubes[normals[cubes] @ normals[home] > MIN_FACING]
         return LocalValues(self._inverse, self._noise, home, facing)
@@ -209,18 +233,23 @@ class TrackedRegion:
 
     @property
     def relative_error(self) -> float:
-        """Standard deviation of the response to this region, divided by the response."""
+        """Relative standard deviation of the stress that this region causes in other cubes."""
         return START_ERROR if self.fit is None else FIT_ERROR
 
     @property
     def discs(self) -> tuple[int, Discs]:
-        """Home cube of the region, and Hertz contacts that act like its traction."""
+        """Index of the home cube (around which the skin is laid flat), and Hertz contacts in its
+        frame that act on distant cubes like the traction of this region."""
         if self.fit is not None:
             return self.fit.values.home, self.fit.discs
         return self.start
 
     def is_response_stale(self, cubes: Index) -> bool:
-        """Return whether the response of some cubes has to be computed again."""
+        """Return whether the stored response of some cubes to this region is out of date.
+
+        It is, if it was not computed for all of these cubes, or if the contacts have changed by
+        more than `MAX_STALE_CHANGE` since.
+        """
         if not self._responding[cubes].all():
             return True
         home, discs = self.discs
@@ -232,7 +261,12 @@ class TrackedRegion:
         return bool(max(shift, change) > MAX_STALE_CHANGE)
 
     def take_response(self, cubes: Index, response: Array) -> None:
-        """Take over the newest response (n, C) in Pa of some cubes (n,) to this region."""
+        """Store the newest response of some cubes to this region.
+
+        Args:
+            cubes: Indices (n,) of the cubes.
+            response: Change (n, C), in Pa, of their C measured components by this region.
+        """
         self.response[cubes] = response
         self._responding[:] = False
         self._responding[cubes] = True
@@ -270,7 +304,8 @@ class TrackedRegion:
         """Do the next piece of work that makes the fit more exact.
 
         Args:
-            scaled: Values (cubes, C) in Pa.
+            scaled: The C measured components of stress and gradient (times d0, half the side of a
+                cube) of all cubes (cubes, C), in Pa.
             respond_to_others: Returns the response of cubes to the other regions.
 
         Returns:
@@ -308,7 +343,11 @@ class TrackedRegion:
         scaled: Array,
         respond_to_others: Respond,
     ) -> int:
-        """Fit one Hertz contact that begins where the field has its contact."""
+        """Fit one Hertz contact, from the contact `start` that the linear inverse problem found.
+
+        The fit is kept if its steps have converged and its misfit is small, or if other regions are
+        near, whose fits change its misfit later.
+        """
         home, discs = self.start
         self._is_hertz_due = False
         cubes = self._inverse.near[home]
@@ -369,7 +408,8 @@ class TrackedRegion:
         return work
 
     def _accept(self, fit: HertzFit | NodeFit) -> None:
-        """Replace the fit, and remember for what it was made."""
+        """Make `fit` the fit of this region, and store the points, the largest pressure and the
+        misfit with which later scans are compared."""
         self.fit = fit
         self._fitted_points, self._fitted_peak = self.points, self.peak
         self._first_misfit = max(fit.shape_misfit, MAX_HERTZ_MISFIT / MAX_MISFIT_GROWTH)
@@ -378,9 +418,10 @@ class TrackedRegion:
 def update_responses(
     inverse: SurfaceInverse, regions: Sequence[TrackedRegion], cubes: Index
 ) -> None:
-    """Compute the response of cubes to regions of contact, as far as these have changed.
+    """Compute the response of cubes (change of their components, in Pa) to regions of contact.
 
-    Distant cubes respond to a contact like to a round one. Those of a fit respond as the fit says.
+    Only regions whose contacts have changed are computed, as round Hertz contacts, because distant
+    cubes hardly depend on the shape. The cubes of a region's own fit get the values of this fit.
 
     Args:
         inverse: Poses and kernels of the skin.
@@ -420,5 +461,6 @@ def update_responses(
 
 
 def _new_share(new: Index, old: Index) -> float:
-    """Return the share of the elements of one set that another set does not have."""
+    """Return the fraction (0 to 1) of the indices in `new` that are not in `old`; 0 if `new` is
+    empty."""
     return 1 - float(np.isin(new, old).mean()) if len(new) else 0.0
