@@ -37,14 +37,16 @@ from .fit import measured_stress
 from .recorded_loads import average_neighbours, find_cube, read_samples
 
 ORDERS = (1.0, 1.5, 2.0)
-"""Numbers of relaxation times per decade that are tried, in this order."""
+"""Numbers of relaxation times of the creep law per decade (factor 10 of time) that are tried, in
+this order, until its error is at most `GOOD_MISFIT` of the load."""
 
 SHORTEST_TIME_S = 0.1
-"""Shortest relaxation time, in s. Faster creep belongs to the reading at once."""
+"""Shortest relaxation time of the creep law, in s. Creep that is faster than this counts as part of
+the immediate response of a pad to a load."""
 
 REACH = 20.0
-"""Least ratio of the longest relaxation time to the duration of the hold, so that the law has terms
-for the loads of an hour that follow from a hold of minutes."""
+"""Smallest ratio of the longest relaxation time of the creep law to the duration for which the load
+was held. It makes a law from a hold of minutes serve for loads that last an hour."""
 
 GOOD_MISFIT = 2e-4
 """Error of the creep law (rms difference between the measured and the computed stress readings of
@@ -56,29 +58,33 @@ MAX_MISFIT = 5e-3
 readings of the pads), divided by the load. With a larger error, the load was not held constant."""
 
 BEND = 0.15
-"""Expected second difference of successive amplitudes, divided by their mean. Power laws with
-exponents of 0.1 to 0.4 have 0.03 to 0.7."""
+"""Expected second difference of the creep law's amplitudes at successive relaxation times, divided
+by their mean. Creep that grows as a power of time has 0.03 to 0.7 for exponents of 0.1 to 0.4."""
 
 REST_S = 2.0
-"""Duration without load at the begin of a recording, in s, that gives the zero of the readings."""
+"""Duration at the begin of a recording, in s, in which the cube must be unloaded. The mean stress
+readings of the pads in it are subtracted from all readings."""
 
 SETTLE_S = 1.0
-"""Time from half the load to the first readings that are fitted, in s: the press must be done."""
+"""Time, in s, from the moment at which half of the load is reached to the first stress reading that
+is fitted, in which the load must become constant. As much is left out at the end of the load."""
 
 MIN_HOLD_S = 60.0
-"""Shortest duration of the hold that is accepted, in s."""
+"""Shortest duration, in s, for which the load must be held constant to determine creep."""
 
 MIN_LOAD_RATIO = 100.0
 """Smallest load of a pad, divided by the noise of its readings, with which creep is determined."""
 
 BLOCKS_PER_E_FOLD = 12
-"""Number of means of the readings that are fitted while the time since the press grows by e."""
+"""Number of averaged stress readings that are fitted for each growth of the time since the press by
+the factor e (2.718). Averages over logarithmic intervals suffice, because creep slows down."""
 
 GAIN_TIME_S = 1.0
 """Time after a load began, in s, at which loads are measured for the calibration of gains."""
 
 MAX_RATE_HZ = 50.0
-"""Rate to which readings are averaged at most, because the time of a fit grows with it."""
+"""Largest rate, in Hz, of the averaged stress readings of the pads from which creep is fitted. The
+computing time of the fit grows with the rate."""
 
 
 class CreepFit(NamedTuple):

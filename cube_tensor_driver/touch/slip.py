@@ -79,9 +79,9 @@ MIN_RATIO = 0.1
 is not known well enough, and rolling looks like slip."""
 
 MIN_SHARE_OF_LARGEST = 0.5
-"""Smallest ratio of shear and normal force of a contact that slips, divided by the largest ratio so
-far. Friction held that one, and the coefficient of kinetic friction is rarely less than half of the
-static one."""
+"""Smallest ratio of shear to normal force at which a contact can slip, divided by the largest ratio
+of this contact so far. Friction has held the largest ratio, and the coefficient of kinetic friction
+is rarely less than half of the static one."""
 
 MAX_RATIO_CHANGE = 0.2
 """Largest change of the ratio of shear and normal force during slip, divided by the ratio, over the
@@ -91,8 +91,8 @@ MIN_COSINE = 0.8
 """Smallest cosine of the angle between motion and shear force of a contact that slips."""
 
 MIN_LATE_SHARE = 0.25
-"""Smallest share of the motion in a test duration that falls into its second half. With less, the
-contact has stopped."""
+"""Smallest fraction of a contact's motion, during one of the durations `LAGS`, that must fall into
+the second half of this duration for slip. With less, the contact has stopped."""
 
 MIN_FORCE_N = 0.05
 """Smallest normal force in N of a contact whose state is estimated."""
@@ -103,19 +103,22 @@ the contact has moved by up to some millimetres since the last update of the con
 was 1.6 % (rms) in simulations of 24-pad cubes."""
 
 MAX_SHIFT_DEPTHS = 0.2
-"""Shift of a contact, divided by the depth of the cubes, after which the derivatives are computed
-again."""
+"""Shift of a contact, divided by the depth of the cubes' centres below the surface, after which the
+derivatives of the cubes' values by the contact's force and position are computed again."""
 
 MAX_FORCE_CHANGE = 0.3
-"""Change of the force of a contact, divided by the force, after which the derivatives are computed
-again, because the radius of the contact changes with the force."""
+"""Change of the force of a contact, divided by the force, after which the derivatives of the cubes'
+values by the contact's force and position are computed again, because the radius of the contact
+changes with the force."""
 
 MAX_JUMP = 0.6
-"""Change of the force of a contact between two scans, divided by the force, after which its motion
-is not known. The response to a shift is proportional to the force."""
+"""Change of the force of a contact between two scans (sets of values of all cubes), divided by the
+force, above which the motion of the contact is unknown. The motion follows from changes of the
+cubes' values, which are proportional to the force."""
 
 MAX_LINEARISATIONS = 2
-"""Largest number of contacts per scan whose derivatives are computed; each takes about 1 ms."""
+"""Largest number of contacts per scan (set of values of all cubes) for which the derivatives of the
+cubes' values by force and position are computed. Each contact takes about 1 ms."""
 
 NEIGHBOUR_PITCHES = 3.0
 """Distance of contacts, divided by the pitch (distance of neighbouring cubes), within which they

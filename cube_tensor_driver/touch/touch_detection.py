@@ -76,12 +76,13 @@ DRIFT = 0.5
 cube that drift together by 1.3e-6 of their frequency per second cause it."""
 
 REMAINDER = 0.02
-"""Largest share of a pressure that remains after the load has gone, because the foam of the pads
-creeps."""
+"""Largest fraction of the pressure under a load that a cube still measures just after the load has
+gone, because the foam of the pads creeps."""
 
 RESTART_MARGIN = 4.0
-"""Pressure, in standard deviations of the noise, that must not count as touch after the slow part
-has started again under a load, because it then rests on single samples."""
+"""Pressure, in standard deviations of the noise, that does not count as touch for some time after a
+cube's slow part (the average that follows slow drift, which is subtracted) has started again under
+a load. The slow part is then the mean of few samples, and so is less exact."""
 
 OTHER_LOADS = 1.0
 """Error of a force due to another load, divided by the force of the other load and by the cube of
@@ -89,8 +90,9 @@ the ratio of the pitch to its distance. At a pitch of 8 to 12 mm and depths of 4
 of 8 and 24 pads have 0.5 to 1.7 at two to three pitches and less farther away."""
 
 MIN_RELEASE = 8.0
-"""Smallest fall of the pressure below its slow part, in standard deviations, at which a load has
-ended that was taken for the slow part. The slow part then starts again."""
+"""Smallest fall of a cube's pressure below its slow part (the average that follows slow drift), in
+standard deviations of the noise, at which the slow part starts again. So large a fall means that
+the slow part had adapted to a load, which has ended now."""
 
 STALE_NS = 1_000_000_000
 """Time, in ns, without a sample of a cube after which nothing is known of it."""
