@@ -20,7 +20,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ...core.arrays import Array, Single
+from ...core.arrays import Array
 from ...mechanics.kernels import DISC_SIZES
 from ..inverse import SurfaceInverse
 from .contact_estimate import ContactEstimate, ContactSum, Discs
@@ -191,7 +191,7 @@ class HertzFit:
         self.values = values
         self.last_step = np.inf
 
-    def linearise(self, slopes: Single) -> None:
+    def linearise(self, slopes: Array) -> None:
         """Store the values of the cubes under the contacts `found`, and how these values change.
 
         The results (`jacobian`, `covariance`) serve the next Gauss-Newton step.
