@@ -493,7 +493,6 @@ def test_study_says_where_to_trust(monkeypatch, tmp_path, capsys):
         np.array([2e-3, 1e-3]),
         np.array([2e-3, 1e-2]),
         np.arange(3.0),
-        5e-3,
         error,
     )
     monkeypatch.setattr(
