@@ -51,6 +51,7 @@ ROS = (
     "std_msgs",
     "std_srvs",
     "visualization_msgs",
+    "tf2_ros_py",
 )
 UBUNTU_OF = {"humble": "jammy", "jazzy": "noble", "kilted": "noble", "lyrical": "resolute"}
 
