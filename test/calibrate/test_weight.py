@@ -127,7 +127,10 @@ def test_what_does_not_determine_it_is_one_line(tmp_path, changes, name, text):
 
 
 def test_a_tare_from_a_bag_is_that_of_a_cube_without_weight(tmp_path):
-    """Of 100 rows with 8 ppm of noise; 5 Pa of drift are 10 ppm, the weight above 100 ppm."""
+    """Two poses give the same rest frequencies, although their weights differ by above 200 ppm.
+
+    The tolerance covers the noise of a mean of 100 rows (8 ppm each) and a drift of 5 Pa (10 ppm).
+    """
     heavy = {"weight": WeightModel(RESPONSE)}
     folder = make_bag(tmp_path / "bag", [[0, 0, G], [G, 0, 0]], cubes=1, **heavy)
     with open_bag(folder) as source:

@@ -130,7 +130,7 @@ def test_tcp_both_ways_and_lost(server: socket.socket) -> None:
 def test_links_without_file_descriptors(
     pty: tuple[int, str], server: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As on Windows: pyserial and the socket move the bytes, and say when the other end is gone."""
+    """As on Windows, pyserial and the socket move the bytes and tell that the other end is gone."""
     monkeypatch.setattr(Link, "HAS_DESCRIPTORS", False)
     master, path = pty
     port, tcp_link = opened(Link(LinkConfig("a", path))), opened(Link(LinkConfig("b", url(server))))

@@ -54,7 +54,8 @@ class Robot:
 
     def get_observation(self):
         if len(self.numbers) == 20:
-            time.sleep(0.2)  # the stall
+            # A recorder that pauses for 200 ms, once, is what this program tests.
+            time.sleep(0.2)
         self.read_ns.append(time.time_ns())
         picture = self.cameras["skin"].read_latest()
         self.numbers.append(frame_number(picture))

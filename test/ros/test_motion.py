@@ -46,9 +46,16 @@ from cube_tensor_driver.ros.nodes.reconstruction import Reconstruction
 START_NS = 1_700_000_000_000_000_000
 CUBES = [((0.02, 0.0, 0.01), (0.3, 0.0, 0.0)), ((-0.2, 0.1, 0.0), (0.0, 1.2, 0.4))]
 """Positions in m and roll, pitch, yaw of the cubes in the parent frame."""
-IMU_POINT, IMU_AXES = np.array([0.15, -0.2, 0.1]), rotation_from_rpy(0.1, 0.2, -1.0)
-IMU_S, ROW_S, DELAY_S = 0.005, 0.004, 0.003
-"""Periods of IMU and rows, and the delay with which samples of the IMU arrive."""
+IMU_POINT = np.array([0.15, -0.2, 0.1])
+"""Position of the IMU in the parent frame, in m."""
+IMU_AXES = rotation_from_rpy(0.1, 0.2, -1.0)
+"""Rotation from the axes of the IMU to those of the parent frame."""
+IMU_PERIOD_S = 0.005
+"""Sample period of the IMU, in s."""
+ROW_PERIOD_S = 0.004
+"""Sample period of the cubes, in s."""
+IMU_DELAY_S = 0.003
+"""Time from a sample of the IMU to its arrival, in s."""
 RESPONSE = np.array(
     [
         [3.133, 0, -3.044],
@@ -151,7 +158,7 @@ def scan_at(t: float, moving: MovingSkin | None = None) -> FrequencyRows:
     c = illustrative("planar")
     f = pad_frequency(pads, c.rest_frequency, c.beta, c.modulus).astype(np.float32)
     cube = np.arange(2, dtype=np.uint16)
-    return FrequencyRows.of(cube, f, stamp_ns=stamps, sequence=round(t / ROW_S))
+    return FrequencyRows.of(cube, f, stamp_ns=stamps, sequence=round(t / ROW_PERIOD_S))
 
 
 def true_force(moving: MovingSkin, t: float, cube: int) -> np.ndarray:
@@ -197,10 +204,10 @@ IMU_FRAME = (quaternion(IMU_AXES), IMU_POINT, 0)
 def played(node, moving: MovingSkin, seconds: float) -> FrequencyRows:
     """Play an IMU and rows, each when it arrives; returns the rows."""
     sent, scans = 0, []
-    for k in range(round(seconds / ROW_S)):
-        t = 0.1 + k * ROW_S
-        while sent * IMU_S + DELAY_S <= t:
-            node._motion.on_imu(imu_message(moving, sent * IMU_S))
+    for k in range(round(seconds / ROW_PERIOD_S)):
+        t = 0.1 + k * ROW_PERIOD_S
+        while sent * IMU_PERIOD_S + IMU_DELAY_S <= t:
+            node._motion.on_imu(imu_message(moving, sent * IMU_PERIOD_S))
             sent += 1
         scans.append(scan_at(t, moving))
         node.on_rows(scans[-1])
@@ -293,7 +300,7 @@ def test_a_bag_gives_the_bits_of_the_node_from_every_state_on(start, monkeypatch
     rows = played(node, MovingSkin(), 0.5)
     node._motion._samples.clear()
     for k in range(150, 200):
-        scan = scan_at(0.1 + k * ROW_S)
+        scan = scan_at(0.1 + k * ROW_PERIOD_S)
         node.on_rows(scan)
         rows = concatenate([rows, scan])
     expected = concatenate([stress_codec.decode(one).rows for one in node.sent["stress"]])
@@ -342,7 +349,7 @@ def test_a_missing_imu_is_one_line_and_the_node_goes_on(start, monkeypatch, case
     node, moving = start(imu="/imu"), MovingSkin()
     row_s = {"stopped": 0.6, "clock": -40.0}.get(case, 0.1)
     for k in range(0 if case == "none" else 20):
-        message = imu_message(moving, k * IMU_S)
+        message = imu_message(moving, k * IMU_PERIOD_S)
         if case == "no_acceleration":
             message.linear_acceleration_covariance[0] = -1.0
         node._motion.on_imu(message)

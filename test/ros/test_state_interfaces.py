@@ -92,7 +92,10 @@ def test_wrenches_are_the_integral_of_traction(skin_file):
 
 
 def test_an_unknown_wrench_is_nan(skin_file):
-    """Of a cube without rows, with an invalid row, or with too old a row; and so is the sum."""
+    """A cube without rows, with an invalid row or with too old a row has an unknown wrench.
+
+    The wrench of the whole skin is unknown then, too.
+    """
     skin = read_skin(skin_file)
     wrenches = SkinWrenches(skin, None, STALE_S)
 

@@ -19,7 +19,10 @@ from cube_tensor_driver.simulation.cubes import SimulatedCubes
 from cube_tensor_driver.simulation.imperfections import Imperfections, read_imperfections
 from cube_tensor_driver.simulation.temperature import CELLS, WarmLayer, read_thermal_stress
 
-HEIGHT, DIFFUSIVITY = 11e-3, 1.25e-7  # m, m²/s
+HEIGHT = 11e-3
+"""Thickness of the layer of elastomer, in m."""
+DIFFUSIVITY = 1.25e-7
+"""Thermal diffusivity of the elastomer, in m²/s."""
 UNLOADED = np.zeros((2, 6)), np.zeros((2, 6, 3))
 
 

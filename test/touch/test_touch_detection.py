@@ -24,7 +24,10 @@ from cube_tensor_driver.mechanics.load_response import LoadResponse
 from cube_tensor_driver.touch.pad_noise import GAIN_ERROR, noise_of_all_pads
 from cube_tensor_driver.touch.touch_detection import DRIFT, OVERSHOOT, REFERENCE, Touch
 
-DEPTH, RATE = 5e-3, 1000
+DEPTH = 5e-3
+"""Depth of the cubes' centres below the surface, in m."""
+RATE = 1000
+"""Scans per second."""
 START_NS = 10**18
 
 
@@ -132,9 +135,12 @@ def test_a_small_touch_is_found_in_two_scans_wherever_it_is(make_skin, pitch, la
 
 @pytest.mark.parametrize(("layout", "limit"), [("cube", 0.01), ("planar", 0.04)])
 def test_forces_and_their_deviations(make_skin, layout, limit):
-    """Of small and strong, narrow and wide contacts anywhere above a cube, with pads whose gains
-    are off by 1 %: 24 loads leave 0.7 to 1.3 of the ratio of error and deviation open, and errors
-    due to the place are not normally distributed."""
+    """Small and large forces of narrow and wide contacts come out as exactly as it is stated.
+
+    The contacts are anywhere above a cube, and the pads' gains are off by 1 %. With 24 loads,
+    chance alone lets the ratio of error and deviation vary from 0.7 to 1.3. Errors due to the place
+    are not normally distributed.
+    """
     run = Run(make_skin(8, layout=layout, known=True))
     middle = run.skin.poses.position[27, :2]
     run.feed(200)

@@ -234,22 +234,16 @@ class _Memories:
 
 
 class Creep(Effect):
-    """Computes what earlier loads still do to the pads of one skin.
-
-    Attributes:
-        key: Name of the effect.
-        bit: Status bit of rows from which the effect is subtracted.
-        is_recursive: Whether the effect depends on the stresses of earlier rows.
-    """
+    """Computes what earlier loads still do to the pads of one skin; `Effect` has the attributes."""
 
     key = "creep"
     bit = CREEP
     is_recursive = True
 
     def __init__(self, pipeline: Pipeline) -> None:
+        super().__init__(pipeline)
         self._pipeline = pipeline
         self._models = [calibration.creep for calibration in pipeline.calibrations]
-        self._has_model = np.array([model is not None for model in self._models])
         self._is_certain = np.ones(len(self._models), bool)
         shape = len(self._models), pipeline.n_pads
         self._stiffness = pipeline.stiffness
@@ -281,10 +275,6 @@ class Creep(Effect):
                 for time, column in zip(model.time.tolist(), model.amplitude.T, strict=True):
                     group, k = self._places[time]
                     group.amplitude[k, cube, : len(column)] = column
-
-    def applies(self, rows: FrequencyRows) -> bool:
-        """Return whether a cube of the skin has a law of creep."""
-        return bool(self._groups)
 
     def add_offset(
         self,

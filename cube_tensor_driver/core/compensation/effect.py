@@ -7,15 +7,16 @@ A row is one sample of one cube, P the largest number of pads of a cube.
 
 from __future__ import annotations
 
-from typing import Protocol
+from abc import ABC, abstractmethod
 
 import numpy as np
 
 from ..arrays import Array, Index, Mask, PadMasks, Real
+from ..pipeline import Pipeline
 from ..rows import FrequencyRows
 
 
-class Effect(Protocol):
+class Effect(ABC):
     """One effect on the pads that is no load, such as weight or creep.
 
     Attributes:
@@ -29,9 +30,20 @@ class Effect(Protocol):
     bit: int
     is_recursive: bool
 
+    def __init__(self, pipeline: Pipeline) -> None:
+        """Find the cubes whose calibration has a model of the effect.
+
+        Args:
+            pipeline: Pipeline with the calibrations and the pads' stiffness.
+        """
+        models = [getattr(calibration, self.key) for calibration in pipeline.calibrations]
+        self._has_model = np.array([model is not None for model in models])
+
     def applies(self, rows: FrequencyRows) -> bool:
         """Return whether the effect is to be subtracted from rows of this source."""
+        return bool(self._has_model.any())
 
+    @abstractmethod
     def add_offset(self, rows: FrequencyRows, cube: Index, offset: Real) -> Mask:
         """Add the effect to offsets (N, P), as far as it is known.
 
@@ -56,6 +68,7 @@ class Effect(Protocol):
         """
         return
 
+    @abstractmethod
     def deviation(self, cube: int) -> Array:
         """Return what is not known about the effect on a cube's newest row.
 

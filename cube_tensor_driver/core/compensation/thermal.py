@@ -61,26 +61,15 @@ MIN_LAG_S = 1e-3
 
 
 class Thermal(Effect):
-    """Computes what temperature does to the pads of one skin.
-
-    Attributes:
-        key: Name of the effect.
-        bit: Status bit of rows from which the effect is subtracted.
-        is_recursive: Whether the effect depends on the stresses of earlier rows.
-    """
+    """Computes what temperature does to the pads of one skin; `Effect` has the attributes."""
 
     key = "thermal"
     bit = THERMAL
     is_recursive = False
 
     def __init__(self, pipeline: Pipeline) -> None:
-        """Take the models of the skin's calibrations.
-
-        Args:
-            pipeline: Pipeline with the calibrations and the pads' stiffness.
-        """
+        super().__init__(pipeline)
         self._models = [calibration.thermal for calibration in pipeline.calibrations]
-        self._has_model = np.array([model is not None for model in self._models])
         present = [model for model in self._models if model is not None]
         n_lags = max((len(model.lag) for model in present), default=0)
         n_degrees = max((model.coefficient.shape[1] for model in present), default=0)
@@ -127,10 +116,6 @@ class Thermal(Effect):
         self._slope[number] = np.sqrt((linear**2).mean())
         if model.ramp is not None:
             self._ramp[number] = np.sqrt((model.ramp**2).sum() / pads)
-
-    def applies(self, rows: FrequencyRows) -> bool:
-        """Return whether a calibration has a model of temperature."""
-        return bool(self._has_model.any())
 
     def add_offset(
         self,

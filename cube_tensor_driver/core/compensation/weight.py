@@ -24,34 +24,22 @@ because it is an error of the source and would look like a load."""
 
 
 class Weight(Effect):
-    """Computes what weight and inertia do to the pads of one skin.
-
-    Attributes:
-        key: Name of the effect.
-        bit: Status bit of rows from which the effect is subtracted.
-        is_recursive: Whether the effect depends on the stresses of earlier rows.
-    """
+    """Computes what weight and inertia do to the pads of one skin; `Effect` has the attributes."""
 
     key = "weight"
     bit = WEIGHT
     is_recursive = False
 
     def __init__(self, pipeline: Pipeline) -> None:
-        """Take the models of the skin's calibrations.
-
-        Args:
-            pipeline: Pipeline with the calibrations and the pads' stiffness.
-        """
+        super().__init__(pipeline)
         models = [calibration.weight for calibration in pipeline.calibrations]
         shape = len(models), pipeline.n_pads, 3
         # Stress on each pad per specific force, in Pa per m/s², and its standard deviation.
         self._response = np.zeros(shape)
         self._deviation = np.zeros(shape)
-        self._has_model = np.zeros(len(models), bool)
         for number, model in enumerate(models):
             if model is None:
                 continue
-            self._has_model[number] = True
             gain = pipeline.calibrations[number].gain[:, None]
             pads = slice(len(gain))
             self._response[number, pads] = gain * model.response

@@ -123,6 +123,7 @@ class Intake:
             reads = [read for read in self._read_ready(is_open) if read.result]
             if reads or time.monotonic() >= until:
                 return False, UsualSamples([], [], []), reads
+            # Windows has no call that waits for serial ports and sockets together.
             time.sleep(ASK_PERIOD_S)
 
     def _read_in_python(self, timeout_s: float) -> tuple[bool, UsualSamples, list[LinkRead]]:

@@ -90,6 +90,7 @@ def _listen(links: list[tuple[Link, Port]]) -> None:
     until = time.monotonic() + ANSWER_S
     while links and time.monotonic() < until:
         links = [(link, port) for link, port in links if not _has_answered(link, port)]
+        # Windows has no call that waits for serial ports and sockets together.
         time.sleep(ASK_PERIOD_S)
 
 
