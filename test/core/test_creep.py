@@ -88,6 +88,21 @@ def test_the_inverse_is_exact_at_any_interval(interval, tolerance):
     assert (found.status[1:] & (CREEP | COMPENSATION) == CREEP).all()
 
 
+def test_more_samples_on_a_straight_line_change_nothing():
+    """The memories are exact for a reading that is a straight line between samples.
+
+    The tolerance is the rounding of the frequencies' difference to that without load.
+    """
+    ends = []
+    for interval in (0.25, 1.0, 5.0):
+        time = np.arange(0, 60 + interval / 2, interval)
+        pads = time[:, None] * (LOAD @ RESPONSE.T) / 60
+        reconstructor = Reconstructor([CREEPING], np.float64)
+        reconstructor.process(rows_of(time, pads))
+        ends.append(reconstructor.compensation.states()["creep"])
+    np.testing.assert_allclose(ends[1:], [ends[0]] * 2, rtol=1e-9, atol=1e-100)
+
+
 def assert_same(found: StressRows, expected: StressRows) -> None:
     for field in fields(found):
         np.testing.assert_array_equal(
