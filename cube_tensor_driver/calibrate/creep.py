@@ -36,7 +36,7 @@ from ..messages.codec import SECOND
 from .fit import measured_stress
 from .recorded_loads import average_neighbours, find_cube, read_samples
 
-ORDERS = (1.0, 1.5, 2.0)
+TIMES_PER_DECADE = (1.0, 1.5, 2.0)
 """Numbers of relaxation times of the creep law per decade (factor 10 of time) that are tried, in
 this order, until its error is at most `GOOD_MISFIT` of the load."""
 
@@ -195,7 +195,7 @@ def fit_creep(
             "press harder, so that every pad is loaded"
         )
 
-    for order in ORDERS:
+    for order in TIMES_PER_DECADE:
         decades = np.log10(REACH * hold_s / SHORTEST_TIME_S)
         n_times = 1 + int(np.ceil(order * decades))
         time = SHORTEST_TIME_S * 10 ** (np.arange(n_times) / order)

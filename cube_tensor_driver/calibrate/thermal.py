@@ -54,7 +54,7 @@ LAGS_S = np.geomspace(3.0, 1500.0, 26)
 """Time constants, in s, among which the search for the best lags begins."""
 
 MAX_LAG_STEP = 1.01
-"""Ratio of two lags in the search at which it ends."""
+"""Ratio of successive estimates of a lag (time constant) below which the search for it ends."""
 
 LAG_ERROR = 0.05
 """Error of the filters as a share of the lag, with which residuals are weighted."""

@@ -88,7 +88,11 @@ MAX_RATIO_CHANGE = 0.2
 duration in which the motion is tested."""
 
 MIN_COSINE = 0.8
-"""Smallest cosine of the angle between motion and shear force of a contact that slips."""
+"""Smallest cosine of the angle between motion and shear force of a contact that slips.
+
+A body that slides pulls the skin along its motion. One that moves across its shear force rolls or
+tilts.
+"""
 
 MIN_LATE_SHARE = 0.25
 """Smallest fraction of a contact's motion, during one of the durations `LAGS`, that must fall into

@@ -42,8 +42,8 @@ DEFAULT_RATE_HZ = 1000.0
 """Sampling rate of each cube, in Hz, that is assumed if the skin file states none."""
 
 TIME_CONSTANT_S = 1.0
-"""Time constant of the high-pass, in s. The pressure of a load that grows by less than `DRIFT` plus
-2 standard deviations of its noise in this time (2.3 Pa/s with 24 pads) counts as drift."""
+"""Time constant of the high-pass, in s. The pressure of a load that grows by less than `MAX_DRIFT`
+plus 2 standard deviations of its noise in this time (2.3 Pa/s with 24 pads) counts as drift."""
 
 REFERENCE = 2.0
 """Reference value of the CUSUM, in standard deviations of the noise. It is half of the smallest
@@ -71,7 +71,7 @@ FAR = 1e-4
 """Largest ratio of the pressure of a cube at least seven pitches away from a load to the largest
 pressure, at a pitch of 8 mm, a depth of 5 mm, and with a shear force of half the normal one."""
 
-DRIFT = 0.5
+MAX_DRIFT = 0.5
 """Largest drift of the pressure, in Pa/s, at which the rate of false alarms holds. All pads of a
 cube that drift together by 1.3e-6 of their frequency per second cause it."""
 
@@ -146,8 +146,8 @@ class Touch:
         Args:
             skin: Skin as from `read_skin`, or the path of a skin file.
             false_alarms: Rate of touches found in noise alone, per hour, of the whole skin. It
-                holds for noise as in the calibrations, for drift up to `DRIFT`, and at the sampling
-                rate in the skin file.
+                holds for noise as in the calibrations, for drift up to `MAX_DRIFT`, and at the
+                sampling rate in the skin file.
 
         Raises:
             ConfigError: The rate is not above 0.
@@ -295,14 +295,14 @@ class Touch:
         # While the slow part is held, drift and what remains of the load must not count as touch.
         margin = self._margin[cube]
         remainder = REMAINDER * np.abs(pressure)
-        growing = np.fmax(margin, remainder) + DRIFT * elapsed_s
+        growing = np.fmax(margin, remainder) + MAX_DRIFT * elapsed_s
         fading = (1 - elapsed_s / TIME_CONSTANT_S) * margin
         margin = np.where(self._held[cube], growing, fading)
         self._margin[cube] = margin
 
         before = self._sum[cube]
         # A pressure that drifts steadily is ahead of its slow part by one time constant.
-        excess = pressure - margin - DRIFT * TIME_CONSTANT_S
+        excess = pressure - margin - MAX_DRIFT * TIME_CONSTANT_S
         score = excess / self._deviation[cube]
         # The upper limit makes a touch end within a few scans after any load.
         after = np.maximum(before + score - REFERENCE, 0)

@@ -22,7 +22,7 @@ from cube_tensor_driver.mechanics.kernels import Kernels
 from cube_tensor_driver.mechanics.layer import Layer
 from cube_tensor_driver.mechanics.load_response import LoadResponse
 from cube_tensor_driver.touch.pad_noise import GAIN_ERROR, noise_of_all_pads
-from cube_tensor_driver.touch.touch_detection import DRIFT, OVERSHOOT, REFERENCE, Touch
+from cube_tensor_driver.touch.touch_detection import MAX_DRIFT, OVERSHOOT, REFERENCE, Touch
 
 DEPTH = 5e-3
 """Depth of the cubes' centres below the surface, in m."""
@@ -105,7 +105,7 @@ def test_false_alarms_in_noise_are_as_many_as_stated(make_skin):
     run = Run(make_skin(10), false_alarms=60 * 3600 / seconds)
     run.feed(RATE)
     drift = np.zeros((100, 15))
-    drift[:, 2] = -DRIFT
+    drift[:, 2] = -MAX_DRIFT
     # A steady drift is ahead of its slow part by a second.
     scans = [run.rows((1 + number / RATE) * drift) for number in range(seconds * RATE)]
     touched = [set(found.cube.tolist()) for rows in scans for found in run.touch(rows)]

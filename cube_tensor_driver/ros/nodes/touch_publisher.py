@@ -24,7 +24,7 @@ STAMP = struct.Struct("<iI")
 """Seconds and nanoseconds of the stamp in a serialised message (CDR, little endian)."""
 
 STAMP_OFFSET = 4
-"""Position of the stamp, in bytes. The bytes before it state the encoding."""
+"""Byte offset of the time stamp from the start of a serialised message, after its encoding."""
 
 
 class TouchPublisher:
