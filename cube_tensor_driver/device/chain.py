@@ -14,7 +14,7 @@ import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from functools import partial
 
 from ..core.errors import LinkError
@@ -27,13 +27,13 @@ from .links.link import Link, LinkConfig, LinkState
 from .links.link_log import LinkLogger, Log
 from .links.reader import LOGGED_ERRORS, LinkFrames, Reader
 from .scans.cube_table import CubeAddress
-from .scans.row_account import RowAccount, RowCounts
+from .scans.row_counts import RowCounts
 from .scans.scan import MakeRows, ScanBuilder, empty_rows
 from .scans.sequence import Arrival, SampleAccount
 from .track import LinkTrack
 from .wire.decoder import unpack_all
 from .wire.native import NOT_COMPILED, wire
-from .wire.protocol import VERSION, Ack, Command, Hello, Request, Sample, Stats, Time
+from .wire.protocol import VERSION, Ack, Command, Hello, Sample, Stats, Time
 
 MAX_SCANS = 4
 """Largest number of scans (one sample of every cube) whose rows one callback receives. If the
@@ -75,16 +75,19 @@ class LinkReport:
     values: dict[str, object]
 
 
-@dataclass
 class _LinkRecord:
     """Data that `LiveLinks` keeps for one link.
+
+    Args:
+        name: Name of the link in the skin file.
+        log: Logger for events of the link.
 
     Attributes:
         track: Sample numbers and clock values of the link, on which `account` and `clock` work.
         account: Counters of the samples of the link: delivered, missing, duplicate.
         clock: Conversion of the device times of the hub to host time.
+        logger: Logger of the link, which counts the lines that it left out.
         problems: Texts about the cubes of the hub that do not fit the skin file.
-        account_errors: Texts about counters that contradict each other; empty if all is right.
         events: States other than OPEN since the last report, and the reason of each.
         logged_version: Protocol version, other than the driver's, that was logged last for this
             link; None before.
@@ -94,22 +97,17 @@ class _LinkRecord:
         reported: Counters of the samples at the last report.
     """
 
-    track: LinkTrack
-    account: SampleAccount
-    clock: HubClock
-    problems: list[str] = field(default_factory=list)
-    account_errors: list[str] = field(default_factory=list)
-    events: deque[tuple[LinkState, str]] = field(default_factory=lambda: deque(maxlen=MAX_EVENTS))
-    logged_version: int | None = None
-    hub_changes: int = 0
-    was_open: bool = False
-    reported: dict[str, int] = field(default_factory=dict)
-
-    @classmethod
-    def new(cls) -> _LinkRecord:
-        """Return the record of a link from which nothing has come yet."""
-        track = LinkTrack()
-        return cls(track, SampleAccount(track), HubClock(track))
+    def __init__(self, name: str, log: Log) -> None:
+        self.track = LinkTrack()
+        self.account = SampleAccount(self.track)
+        self.clock = HubClock(self.track)
+        self.logger = LinkLogger(name, log)
+        self.problems: list[str] = []
+        self.events: deque[tuple[LinkState, str]] = deque(maxlen=MAX_EVENTS)
+        self.logged_version: int | None = None
+        self.hub_changes = 0
+        self.was_open = False
+        self.reported: dict[str, int] = {}
 
 
 class LiveLinks:
@@ -146,26 +144,24 @@ class LiveLinks:
         on_end: Callable[[], None] = lambda: None,
     ) -> None:
         self._configs = tuple(links)
-        self._scans = ScanBuilder(len(links), cubes)
-        self._records = [_LinkRecord.new() for _ in links]
+        self._scans = ScanBuilder(len(links), cubes, make_rows)
+        self._rows = self._scans.counts
         self._on_rows = on_rows
         self._on_end = on_end
         self._rate = rate
         self._scans_per_call = scans_per_call
         self._max_scans = max(MAX_SCANS, scans_per_call + 1)
-        self._make_rows = make_rows
         self._clock_ns = clock_ns
         self._is_host_clock = is_host_clock
         self._clock_watch = HostClockWatch(clock_ns)
         self._log: Log = log or logging.getLogger(__name__)
         if wire is None:
             self._log.warning(NOT_COMPILED)
-        self._loggers = [LinkLogger(config.name, self._log) for config in self._configs]
-        self._rows = RowAccount(self._scans)
+        self._records = [_LinkRecord(config.name, self._log) for config in self._configs]
         # The reader's thread holds this lock while it changes sample counters and clocks, and
         # `report` holds it while it reads them from another thread.
         self._lock = threading.RLock()
-        self._step_ns = 0
+        self._was_clock_set = False  # whether the host's clock was set since the last `receive`
         self._errors = 0
         self._overloaded_until = 0.0  # monotonic time, in s
         # Number of missing samples at the last callback if received bytes have always been waiting
@@ -209,9 +205,8 @@ class LiveLinks:
         period_us = _period_us(rate)
         if self._reader is None or period_us is None:
             return
-        request = Request(Command.SET_PERIOD, period_us)
         for link in range(len(self._configs)):
-            self._reader.send(link, request)
+            self._reader.set_period(link, period_us)
 
     @property
     def failure(self) -> Exception | None:
@@ -238,7 +233,7 @@ class LiveLinks:
 
         A row is one sample of one cube.
         """
-        return self._rows.counts
+        return replace(self._rows)
 
     def report(self) -> list[LinkReport]:
         """Return the state of each link, and its problems since the last call of this method.
@@ -247,10 +242,10 @@ class LiveLinks:
         """
         if self._reader is None:
             return []
-        links = zip(self._reader.links, self._records, self._loggers, strict=True)
+        links = zip(self._reader.links, self._records, strict=True)
         lag_s = self._reader.take_lag_s()
         with self._lock:
-            return [self._report(link, record, logger, lag_s) for link, record, logger in links]
+            return [_report(link, record, lag_s) for link, record in links]
 
     def receive(
         self,
@@ -272,9 +267,9 @@ class LiveLinks:
             self._add_usual(usual)
         if received:
             self._handle_received(received)
-        self._step_ns = 0
+        self._was_clock_set = False
         self._deliver()
-        self._rows.check()
+        self._rows.check(self._scans.rows_waiting())
 
     def _deliver_whole(self, usual: UsualSamples) -> bool:
         """Call `on_rows` at once if these samples are whole scans of all links that deliver.
@@ -293,7 +288,7 @@ class LiveLinks:
             self._count_overload(sum(len(part.cubes) for part in scans[:-1]))
             scans = scans[-1:]
         for part in scans:
-            self._give_rows(partial(self._scans.build_whole, part, self._make_rows))
+            self._give_rows(partial(self._scans.build_whole, part))
         return bool(scans)
 
     def _is_overloaded(self) -> bool:
@@ -340,10 +335,9 @@ class LiveLinks:
             received: Frames of each read.
         """
         with self._lock:
-            now_ns, step_ns = self._check_host_clock()
-            is_set = bool(step_ns or self._step_ns)
+            now_ns = self._read_clock()
             for read in received:
-                if is_set:
+                if self._was_clock_set:
                     # The host's clock was set, so that the arrival may be a time of the old clock.
                     # A question for the hub's time that was asked before the step and answered
                     # after it says nothing about the hub's clock (asked_ns = 0: not used).
@@ -359,21 +353,11 @@ class LiveLinks:
                     self._count_error(error)
 
     def _read_clock(self) -> int:
-        """Return the time of the host's clock, in ns, for bytes that have arrived just now."""
-        now_ns, step_ns = self._check_host_clock()
-        self._step_ns += step_ns
-        return now_ns
-
-    def _check_host_clock(self) -> tuple[int, int]:
-        """Look for a step of the host's clock, and move the clocks of all hubs by it.
-
-        Returns:
-            Time of the host's clock, and how far it was set since the last call (0: not set), both
-            in ns.
-        """
+        """Return the time of the host's clock, in ns; move the clocks of all hubs if it was set."""
         now_ns, step_ns = self._clock_watch.look()
         if not step_ns or not self._is_host_clock():
-            return now_ns, 0
+            return now_ns
+        self._was_clock_set = True
         text = f"the host's clock was set by {1e-9 * step_ns:+.6g} s: stamps follow it at once"
         self._log.warning(text)
         with self._lock:
@@ -382,7 +366,7 @@ class LiveLinks:
                 record.clock.problems.add(text)
         if self._reader is not None:
             self._reader.forget_questions()
-        return now_ns, step_ns
+        return now_ns
 
     def _handle_frames(self, read: LinkFrames) -> None:
         """Count the frames of one read of a link and add their samples to the scans.
@@ -411,7 +395,6 @@ class LiveLinks:
                     record.clock.add_answer(read.asked_ns, frame.device_us, read.arrival_ns)
             elif isinstance(frame, Stats):
                 record.account.stats(frame)
-                record.account_errors = record.account.contradictions()
             elif isinstance(frame, Ack) and frame.request == Command.START:
                 record.account.expect_restart()
         self._add_samples(read, samples)
@@ -445,7 +428,7 @@ class LiveLinks:
         if self._is_overloaded():
             self._count_overload(self._scans.drop_oldest(self._max_scans))
         while self._scans.is_complete(self._scans_per_call):
-            self._give_rows(partial(self._scans.build, self._make_rows, self._max_scans))
+            self._give_rows(partial(self._scans.build, self._max_scans))
 
     def _give_rows(self, build: Callable[[], FrequencyRows | None]) -> None:
         """Call `on_rows` with the rows (samples of cubes) that a function builds, if there are any.
@@ -463,7 +446,7 @@ class LiveLinks:
 
     def _count_error(self, error: Exception) -> None:
         """Count and log an error, and count the rows (samples of cubes) that it has lost."""
-        lost = self._rows.count_lost(error)
+        lost = self._rows.count_lost(self._scans.rows_waiting(), error)
         self._errors += 1
         if self._errors in LOGGED_ERRORS:
             self._log.error(
@@ -481,12 +464,13 @@ class LiveLinks:
         problems = self._scans.cubes.learn(link, hello)
         if problems is None:
             return
-        record, logger = self._records[link], self._loggers[link]
+        record = self._records[link]
         record.problems = problems
         record.hub_changes += 1
-        logger.info(f"hub {hello.hub_uid:#x} with {hello.n_cubes} cubes of {hello.n_pads} pads")
+        cubes = f"{hello.n_cubes} cubes of {hello.n_pads} pads"
+        record.logger.info(f"hub {hello.hub_uid:#x} with {cubes}")
         for problem in problems:
-            logger.error(problem)
+            record.logger.error(problem)
 
     def _on_state(self, link: int, state: LinkState, error: LinkError | None) -> None:
         """Log a change of the state of a link, and keep it for the next report.
@@ -508,70 +492,58 @@ class LiveLinks:
             self._scans.set_live(link, False)
             self._deliver()
 
-        if error is None or error.kind != "no_port" or not self._is_port_expected(link):
-            self._loggers[link].change(state, error)
+        # A simulator may make the port after the driver was started. So until the link has been
+        # open once, a missing port is not logged.
+        is_expected = self._configs[link].is_simulated and not record.was_open
+        if error is None or error.kind != "no_port" or not is_expected:
+            record.logger.change(state, error)
 
-    def _is_port_expected(self, link: int) -> bool:
-        """Return whether the port of a link is still to be made by a simulator.
 
-        Then it is normal that the port does not exist yet.
-        """
-        return self._configs[link].is_simulated and not self._records[link].was_open
+def _report(link: Link, record: _LinkRecord, lag_s: float) -> LinkReport:
+    """Return the report of one link, and clear its problems and past states.
 
-    def _report(
-        self,
-        link: Link,
-        record: _LinkRecord,
-        logger: LinkLogger,
-        lag_s: float,
-    ) -> LinkReport:
-        """Return the report of one link, and clear its problems and past states.
+    Args:
+        link: The link.
+        record: Data that is kept for the link.
+        lag_s: Longest time since the last report for which received bytes waited to be read, in s.
+    """
+    counters = record.account.counters()
+    notes = [] if link.error is None else [str(link.error)]
+    notes += _loss_notes(record.reported, counters, lag_s)
+    notes += record.problems
+    notes += record.account.contradictions()
+    record.reported = counters
+    if link.period_problem:
+        notes.append(link.period_problem)
 
-        Args:
-            link: The link.
-            record: Data that is kept for the link.
-            logger: Logger of the link, which counts the lines that it left out.
-            lag_s: Longest time since the last report for which received bytes waited to be read,
-                in s.
-        """
-        counters = record.account.counters()
-        notes = [*_loss_notes(record.reported, counters, lag_s)]
-        record.reported = counters
-        notes += [*record.problems, *record.account_errors]
-        if link.error is not None:
-            notes.insert(0, str(link.error))
-        if link.period_problem:
-            notes.append(link.period_problem)
-
-        other = link.decoder.other_version
-        if other is not None:
-            notes.append(
-                f"the hub speaks protocol version {other}, this driver version {VERSION}: "
-                "update the older one"
-            )
-            if other != record.logged_version:
-                record.logged_version = other
-                # This line appears at most once per report, so it needs no limit of its rate.
-                self._log.error(f"link {link.config.name}: {notes[-1]}")
-
-        # The reader's thread may add problems and events at the same time. Replacing the set and
-        # removing single events are atomic in Python, so that nothing is lost.
-        problems, record.clock.problems = record.clock.problems, set()
-        notes += sorted(problems)
-        past_states = []
-        while record.events:
-            state, text = record.events.popleft()
-            past_states.append(state)
-            if text not in notes:
-                notes.append(text)
-        return LinkReport(
-            name=link.config.name,
-            hub_uid=None if link.hello is None else link.hello.hub_uid,
-            state=link.state,
-            past_states=tuple(past_states),
-            notes=tuple(notes),
-            values=_report_values(link, record, logger, counters),
+    other = link.decoder.other_version
+    if other is not None:
+        notes.append(
+            f"the hub speaks protocol version {other}, this driver version {VERSION}: "
+            "update the older one"
         )
+        if other != record.logged_version:
+            record.logged_version = other
+            record.logger.error(notes[-1])
+
+    # The reader's thread may add problems and events at the same time. Replacing the set and
+    # removing single events are atomic in Python, so that nothing is lost.
+    problems, record.clock.problems = record.clock.problems, set()
+    notes += sorted(problems)
+    past_states = []
+    while record.events:
+        state, text = record.events.popleft()
+        past_states.append(state)
+        if text not in notes:
+            notes.append(text)
+    return LinkReport(
+        name=link.config.name,
+        hub_uid=None if link.hello is None else link.hello.hub_uid,
+        state=link.state,
+        past_states=tuple(past_states),
+        notes=tuple(notes),
+        values=_report_values(link, record),
+    )
 
 
 def _period_us(rate: float | None) -> int | None:
@@ -606,35 +578,28 @@ def _loss_notes(before: dict[str, int], now: dict[str, int], lag_s: float) -> li
     return [f"{lost + dropped} of {taken} samples lost or dropped since the last report: {place}"]
 
 
-def _report_values(
-    link: Link,
-    record: _LinkRecord,
-    logger: LinkLogger,
-    counters: dict[str, int],
-) -> dict[str, object]:
+def _report_values(link: Link, record: _LinkRecord) -> dict[str, object]:
     """Return the counters of one link and its hub, and the values of its clock, by name.
 
     The names carry the units. Values that are not known yet are "unknown".
     """
     clock = record.clock
     bound_ns = clock.bound_ns
-    delay_us: object = "unknown"
-    error_us: object = "unknown"
-    if bound_ns is not None:
-        delay_us = round(1e-3 * clock.delay_ns, 1)
-        error_us = round(1e-3 * bound_ns, 1)
     values: dict[str, object] = {
         **link.counters,
-        **counters,
+        **record.reported,
         "clock offset s": round(1e-9 * clock.offset_ns, 6),
         "clock drift ppm": round(clock.drift_ppm, 2),
         "clock jitter us": round(1e-3 * clock.jitter_ns, 1),
-        "clock delay us": delay_us,
-        "clock error at most us": error_us,
+        "clock delay us": "unknown",
+        "clock error at most us": "unknown",
         "clock resets": clock.resets,
         "hub changes": record.hub_changes,
-        "log lines left out": logger.left_out,
+        "log lines left out": record.logger.left_out,
     }
+    if bound_ns is not None:
+        values["clock delay us"] = round(1e-3 * clock.delay_ns, 1)
+        values["clock error at most us"] = round(1e-3 * bound_ns, 1)
     stats = record.account.stats_frame
     if stats is not None:
         values["hub uptime s"] = stats.uptime_ms / 1000

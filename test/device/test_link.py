@@ -341,7 +341,7 @@ def test_tcp_refused(server: socket.socket) -> None:
 def test_tcp_unresolved(monkeypatch: pytest.MonkeyPatch) -> None:
     """The resolver is replaced: a real one may need the network, or take half a minute."""
 
-    def no_such_host(host: str, port: int, **options: object) -> list[object]:
+    def no_such_host(*arguments: object) -> list[object]:
         raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
 
     monkeypatch.setattr(tcp.socket, "getaddrinfo", no_such_host)

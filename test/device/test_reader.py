@@ -155,6 +155,10 @@ class Watch:
         for item in self.batches[-1]:
             self.frames.put(item)
 
+    def mark(self) -> None:
+        """Send IDENTIFY, which the reader never sends, to mark a time among the requests."""
+        self.reader.links[0].write(encode(Request(Command.IDENTIFY)))
+
     def _on_state(self, link: int, state: LinkState, error: LinkError | None) -> None:
         self.states.put((link, state, error, time.monotonic()))
 
@@ -268,12 +272,6 @@ def test_who_comes_first_waits_for_those_that_deliver(
         assert together <= 2  # the scheduler may have held up the reader
     else:
         assert together >= 8  # the reader may have been awake already
-        watch.reader.send(1, Request(Command.STOP))
-        later.expect(Command.STOP)
-        sent = time.monotonic()
-        hub.sample(10)
-        assert watch.frame(Sample, link=0).sequence == 10
-        assert time.monotonic() - sent < 1.0, "a stopped link is not waited for"
     later.unplug()
 
 
@@ -440,7 +438,7 @@ def test_a_hub_with_another_period_is_asked_once_and_named(
         hub.hello(period_us=period_us)
     hub.sample(1)
     watch.frame(Sample)
-    watch.reader.send(0, Request(Command.IDENTIFY, 1))
+    watch.mark()
     between = hub.before(Command.IDENTIFY)
     assert Command.SET_PERIOD not in between
     assert problem in watch.reader.links[0].period_problem
@@ -496,16 +494,6 @@ def test_slow_samples_are_not_silence(start: Start, hub: PtyHub) -> None:
     assert 0.9 - 0.05 <= at - last < 0.9 + SCHEDULER_S
 
 
-def test_stopped_link_is_not_silent(start: Start, hub: PtyHub) -> None:
-    watch = start(LinkConfig("a", hub.port))
-    hub.greet()
-    watch.reader.send(0, Request(Command.STOP))
-    hub.expect(Command.STOP)
-    with pytest.raises(queue.Empty):
-        while watch.states.get(timeout=3 * SILENT_S)[1] is not LinkState.SILENT:
-            pass
-
-
 def test_link_without_a_byte_is_opened_anew(start: Start, hub: PtyHub, monkeypatch) -> None:
     monkeypatch.setattr(session_module, "REOPEN_S", 0.4)
     watch = start(LinkConfig("a", hub.port))
@@ -524,30 +512,23 @@ def test_another_period_is_set_again(start: Start, hub: PtyHub) -> None:
     hub.expect(Command.START)
 
 
-def test_requests_are_remembered_over_a_reopening(start: Start, tmp_path: Path) -> None:
+def test_the_period_is_remembered_over_a_reopening(start: Start, tmp_path: Path) -> None:
     port = tmp_path / "hub"
     watch = start(LinkConfig("a", str(port)))
     watch.state(LinkState.WAITING, "no_port")
-    with pytest.raises(LinkError, match="wait until it opens") as refused:
-        watch.reader.send(0, Request(Command.IDENTIFY, 3))
-    assert refused.value.kind == "closed"
-    watch.reader.send(0, Request(Command.SET_PERIOD, 4000))
+    watch.reader.set_period(0, 4000)
+    for _ in range(2):
+        hub = PtyHub(port)
+        hub.expect(Command.HELLO)
+        hub.hello()
+        assert hub.expect(Command.SET_PERIOD).argument == 4000
+        hub.expect(Command.START)
+        hub.unplug()
+        watch.state(LinkState.WAITING, "no_port")
     hub = PtyHub(port)
-    hub.expect(Command.HELLO)
-    hub.hello()
-    assert hub.expect(Command.SET_PERIOD).argument == 4000
-    hub.expect(Command.START)
-    watch.state(LinkState.OPEN)
-    watch.reader.send(0, Request(Command.IDENTIFY, 3))
-    assert hub.expect(Command.IDENTIFY).argument == 3
-    watch.reader.send(0, Request(Command.STOP))
-    hub.expect(Command.STOP)
-    hub.unplug()
-    watch.state(LinkState.WAITING, "no_port")
-    hub = PtyHub(port)
-    hub.expect(Command.HELLO)
-    hub.hello()
-    hub.expect(Command.STOP)
+    hub.greet(period_us=4000)
+    watch.reader.set_period(0, 5000)
+    assert hub.expect(Command.SET_PERIOD).argument == 5000
     hub.unplug()
 
 
@@ -653,7 +634,7 @@ def test_slow_links_delay_nobody(start: Start, hub: PtyHub, monkeypatch) -> None
         hub.greet()
         watch.state(LinkState.OPEN, link=2)
         for _ in range(2000):
-            watch.reader.send(2, Request(Command.SET_PERIOD, 10_000))
+            watch.reader.set_period(2, 10_000)
         watch.state(LinkState.WAITING, "overflow", link=2)
         delays = []
         for k in range(200):
@@ -727,7 +708,7 @@ def test_a_hub_that_does_not_know_the_time_is_not_asked_again_until_it_restarts(
     hub.expect(Command.TIME)
     hub.send(encode(Ack(Command.TIME, Result.UNKNOWN)))
     watch.frame(Ack)
-    watch.reader.send(0, Request(Command.IDENTIFY))
+    watch.mark()
     hub.expect(Command.IDENTIFY)
     assert hub.before(Command.HELLO) == []
     hub.hello()
@@ -841,5 +822,5 @@ def test_one_thread_and_nothing_left_behind(hub: PtyHub) -> None:
         hub.expect(Command.HELLO)
         reader.close()
         reader.close()
-        reader.send(0, Request(Command.START))  # too late, and harmless
+        reader.set_period(0, 5000)  # too late, and harmless
     assert (threading.active_count(), open_files()) == (threads, files)

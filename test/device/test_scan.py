@@ -18,7 +18,7 @@ from cube_tensor_driver.device.links.link import LinkConfig, LinkState
 from cube_tensor_driver.device.links.link_log import LinkLogger
 from cube_tensor_driver.device.links.reader import LinkFrames
 from cube_tensor_driver.device.scans.cube_table import CubeAddress
-from cube_tensor_driver.device.scans.row_account import RowCounts
+from cube_tensor_driver.device.scans.row_counts import RowCounts
 from cube_tensor_driver.device.scans.scan import ScanBuilder
 from cube_tensor_driver.device.wire.protocol import Hello, Sample
 
@@ -221,7 +221,7 @@ def test_unknown_cubes_are_counted_and_left_out():
     scan.add(0, [sample(0, [[1.0, 1.0], [2.0, 2.0], [3.0, 3.0], [4.0, 4.0]])], [0])
     rows = scan.build()
     assert rows.cube.tolist() == [0] and rows.frequency.tolist() == [[2.0, 2.0]]
-    assert (scan.cubes.unknown_cube, scan.cubes.wrong_pads) == (3, 0)
+    assert (scan.counts.unknown_cube, scan.counts.wrong_pads) == (3, 0)
 
 
 def test_another_number_of_pads_names_both_and_invents_nothing():
@@ -230,7 +230,7 @@ def test_another_number_of_pads_names_both_and_invents_nothing():
     assert "cube a" in problem and "reports 2 pads" in problem and "layout has 8" in problem
     scan.add(0, [sample(0, [[1.0, 2.0], [3.0, 4.0]])], [0])
     rows = scan.build()
-    assert rows.cube.tolist() == [1] and scan.cubes.wrong_pads == 1
+    assert rows.cube.tolist() == [1] and scan.counts.wrong_pads == 1
     # narrower than the skin's widest cube: the rest is not measured
     assert rows.frequency[0, :2].tolist() == [3.0, 4.0] and np.isnan(rows.frequency[0, 2:]).all()
 
@@ -272,7 +272,7 @@ def test_two_cubes_with_one_uid_give_rows_of_one():
     scan.add(1, [sample(0, [[4.0, 4.0], [5.0, 5.0]])], [0])
     rows = scan.build()
     assert rows.cube.tolist() == [0, 1] and rows.frequency[:, 0].tolist() == [1.0, 3.0]
-    assert scan.cubes.unknown_cube == 3 and scan.rows_waiting() == 0
+    assert scan.counts.unknown_cube == 3 and scan.rows_waiting() == 0
     assert scan.cubes.learn(1, hello([5, 7])) is None
     scan.set_live(0, False)
     assert scan.cubes.learn(1, hello([5, 7])) == [

@@ -25,7 +25,7 @@ from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.device.chain import LinkReport
 from cube_tensor_driver.device.links.link import LinkState
-from cube_tensor_driver.device.scans.row_account import RowCounts
+from cube_tensor_driver.device.scans.row_counts import RowCounts
 from cube_tensor_driver.ros.compat import make_executor, with_number
 from cube_tensor_driver.ros.diagnostics.links import LinkDiagnostics
 from cube_tensor_driver.ros.diagnostics.reconstruction import (

@@ -16,7 +16,7 @@ import os
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -123,7 +123,8 @@ class Reader:
         self._on_frames = on_frames
         self._on_end = on_end
         self._clock_ns = clock_ns
-        self._requests: deque[tuple[int, Request]] = deque()
+        # Links and the periods to set on them, from other threads.
+        self._periods: deque[tuple[int, int]] = deque()
         self._stopping = False
         self._lag_s = 0.0
         # Number of links that deliver samples, and the longest wait for the frames of all of them
@@ -151,28 +152,16 @@ class Reader:
         )
         self._thread.start()
 
-    def send(self, link: int, request: Request) -> None:
-        """Let the reader's thread send a request to a hub. Any thread may call this method.
+    def set_period(self, link: int, period_us: int) -> None:
+        """Let the reader's thread set another sample period on a hub. Any thread may call this.
 
-        START, STOP and SET_PERIOD are stored and sent again each time the link is opened, so they
-        are accepted while the link is not open.
+        The period is set again each time the link is opened.
 
         Args:
             link: Index of the link.
-            request: The request.
-
-        Raises:
-            LinkError: With the kind `closed`: the link is not open and the request is none of these
-                three.
+            period_us: Sample period, in µs.
         """
-        target = self.links[link]
-        remembered = request.request in (Command.START, Command.STOP, Command.SET_PERIOD)
-        if not remembered and not target.is_open:
-            raise LinkError(
-                f"link {target.config.name!r} is {target.state.value}: wait until it opens",
-                "closed",
-            )
-        self._requests.append((link, request))
+        self._periods.append((link, period_us))
         self._wake()
 
     def take_lag_s(self) -> float:
@@ -260,13 +249,20 @@ class Reader:
             # it receives as delivering; in the other order it would undo the closing.
             for i, error in failed.items():
                 self._drop(i, error)
-            if self._requests:
-                self._send_requests()
+            while self._periods:
+                i, period_us = self._periods.popleft()
+                with self._closing_on_error(i) as session:
+                    session.set_period(period_us)
             now = time.monotonic()
             if now >= tick_at:
                 tick_at = now + TICK_S
-                for i in range(len(self.links)):
-                    self._check_timers(i, now)
+                for i, link in enumerate(self.links):
+                    with self._closing_on_error(i) as session:
+                        if link.is_open:
+                            session.check_timers(now)
+                        elif session.open(now):
+                            self._intake.update()
+                            session.begin()
                 self._plan_gathering()
 
     def _handle_reads(
@@ -320,29 +316,11 @@ class Reader:
         period_s = 1e-6 * min(periods_us, default=0)
         self._gather_s = min(MAX_WAIT_PERIODS * period_s, MAX_WAIT_S)
 
-    def _send_requests(self) -> None:
-        """Send the requests that other threads have given to `send`."""
-        while self._requests:
-            i, request = self._requests.popleft()
-            try:
-                self._sessions[i].send(request)
-            except LinkError as error:
-                self._drop(i, error)
-
-    def _check_timers(self, i: int, now: float) -> None:
-        """Check the timers of one open link; open a closed one if its pause is over.
-
-        Args:
-            i: Index of the link.
-            now: Monotonic time, in s.
-        """
-        session = self._sessions[i]
+    @contextlib.contextmanager
+    def _closing_on_error(self, i: int) -> Iterator[Session]:
+        """Yield the session of a link; close the link if a LinkError is raised in the block."""
         try:
-            if session.link.is_open:
-                session.check_timers(now)
-            elif session.open(now):
-                self._intake.update()
-                session.begin()
+            yield self._sessions[i]
         except LinkError as error:
             self._drop(i, error)
 

@@ -3,7 +3,7 @@
 """Requests to one hub and handling of its answers, each time its port is opened.
 
 After each opening, the hub is asked for HELLO; when HELLO has come, the hub is sent its settings
-(sample period, START or STOP). A hub that restarts while its port stays open sends no samples until
+(sample period, START). A hub that restarts while its port stays open sends no samples until
 its next HELLO, on which it is started again. A hub that delivers samples is asked for its time
 about once a second.
 
@@ -78,7 +78,6 @@ class Session:
         self._period_us = period_us
         # Sample period, in µs, in the hub's answer to the last SET_PERIOD; None before the answer.
         self._answered_us: int | None = None
-        self._is_started = True  # whether the hub is to send samples: START, not STOP
         self._has_hello = False  # whether HELLO has come since the port was opened
         self._opened_at = self._last_sample = 0.0
         self._retry_at = self._check_port_at = self._hello_at = self._ask_time_at = 0.0
@@ -91,8 +90,8 @@ class Session:
 
     @property
     def is_delivering(self) -> bool:
-        """Whether samples are expected: the link is open, HELLO has come, the hub is started."""
-        return self.link.state is LinkState.OPEN and self._has_hello and self._is_started
+        """Whether samples are expected: the link is open, and HELLO has come."""
+        return self.link.state is LinkState.OPEN and self._has_hello
 
     def open(self, now: float) -> bool:
         """Open the link if the pause after the last attempt is over or its device file changed.
@@ -147,26 +146,20 @@ class Session:
         self._retry_at = time.monotonic() + link.increase_pause()
         self.set_state(LinkState.WAITING, error)
 
-    def send(self, request: Request) -> None:
-        """Send a request to the hub if the link is open.
-
-        SET_PERIOD, START and STOP are also stored and sent again each time the link is opened.
+    def set_period(self, period_us: int) -> None:
+        """Set another sample period on the hub, now if the link is open, and at each HELLO.
 
         Args:
-            request: The request.
+            period_us: Sample period, in µs.
 
         Raises:
             LinkError: Sending failed, so the link must be closed.
         """
-        if request.request == Command.SET_PERIOD:
-            self._period_us = request.argument
-            self._answered_us = None
-            self.actual_us = max(self.actual_us, request.argument)
-        elif request.request in (Command.START, Command.STOP):
-            self._is_started = request.request == Command.START
-            self._last_sample = time.monotonic()
+        self._period_us = period_us
+        self._answered_us = None
+        self.actual_us = max(self.actual_us, period_us)
         if self.link.is_open:
-            self.link.write(encode(request))
+            self._send(Command.SET_PERIOD, period_us)
 
     def take(self, frame: Frame) -> bool:
         """Update the state of the link from one received frame.
@@ -300,18 +293,10 @@ class Session:
         expected = (self._period_us, self._answered_us)
         has_other_period = self._period_us is not None and frame.period_us not in expected
         if not self._has_hello or link.state is LinkState.SILENT or has_other_period:
-            self._has_hello = True
-            self._configure()
-
-    def _configure(self) -> None:
-        """Send the hub the requested sample period, if there is one, and START or STOP."""
-        self._knows_time = True
-        if self._period_us is not None:
-            self.link.write(encode(Request(Command.SET_PERIOD, self._period_us)))
-        command = Command.START if self._is_started else Command.STOP
-        self.link.write(encode(Request(command)))
-        if not self._is_started:
-            self.set_state(LinkState.OPEN)
+            self._has_hello = self._knows_time = True
+            if self._period_us is not None:
+                self._send(Command.SET_PERIOD, self._period_us)
+            self._send(Command.START)
 
     def _check_silence(self, now: float) -> None:
         """Set the state SILENT if no sample has come for the time limit.
@@ -325,7 +310,7 @@ class Session:
         link = self.link
         silence = now - self._last_sample
         limit = max(3e-6 * self.actual_us, SILENT_S) - TICK_S
-        if not self._is_started or link.state is not LinkState.OPEN or silence <= limit:
+        if link.state is not LinkState.OPEN or silence <= limit:
             return
         link.silences += 1
         self._hello_at = now
@@ -346,7 +331,7 @@ class Session:
             now: Monotonic time, in s.
         """
         self._hello_at = now + HELLO_S
-        self.link.write(encode(Request(Command.HELLO)))
+        self._send(Command.HELLO)
 
     def _ask_time(self, now: float) -> None:
         """Send the request TIME (report your clock), and schedule the next one.
@@ -356,11 +341,14 @@ class Session:
         """
         self._ask_time_at = now + ASK_TIME_S
         self._question = (self._question + 1) % (1 << 32)
-        request = encode(Request(Command.TIME, self._question))
         # The clock is read before the request is written, so that the time of asking is not later
         # than the true one.
         self.asked_ns = self._clock_ns()
-        self.link.write(request)
+        self._send(Command.TIME, self._question)
+
+    def _send(self, command: Command, argument: int = 0) -> None:
+        """Send a request to the hub; raise LinkError if that fails."""
+        self.link.write(encode(Request(command, argument)))
 
 
 def _period_problem(asked_us: int | None, actual_us: int, result: int) -> str:

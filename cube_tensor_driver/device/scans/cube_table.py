@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..wire.protocol import Hello, Sample
+from .row_counts import RowCounts
 
 MAX_NAMES = 8
 """Largest number of cubes that one log message lists by name. If there are more, the message ends
@@ -84,20 +85,23 @@ class CubeTable:
     Args:
         n_links: Number of links.
         addresses: For each cube of the skin, the uid, or the link and index, to find it by.
+        counts: Numbers of rows, of which those of unknown cubes and of cubes with another number of
+            pads are counted here.
 
     Attributes:
         n_pads: Largest number of pads of a cube of the skin.
         uids: Unique number of each cube by its index in the skin, as the hubs report it.
-        unknown_cube: Number of rows left out because the skin does not have the cube.
-        wrong_pads: Number of rows left out because the skin has the cube with another number of
-            pads.
     """
 
-    def __init__(self, n_links: int, addresses: Sequence[CubeAddress]) -> None:
+    def __init__(
+        self,
+        n_links: int,
+        addresses: Sequence[CubeAddress],
+        counts: RowCounts,
+    ) -> None:
         self.n_pads = max(address.n_pads for address in addresses)
         self.uids: dict[int, int] = {}
-        self.unknown_cube = 0
-        self.wrong_pads = 0
+        self._counts = counts
         self._addresses = tuple(addresses)
         self._pads = np.array([address.n_pads for address in addresses])
         self._hubs = [_HubCubes() for _ in range(n_links)]
@@ -174,8 +178,8 @@ class CubeTable:
         # Cubes of a sample beyond the number that HELLO has reported also count as unknown.
         n_known = int(is_known.sum())
         n_fitting = int(fits.sum())
-        self.unknown_cube += sample.n_cubes - n_known
-        self.wrong_pads += n_known - n_fitting
+        self._counts.unknown_cube += sample.n_cubes - n_known
+        self._counts.wrong_pads += n_known - n_fitting
         rows = np.flatnonzero(fits)
         kept = Sample(
             sequence=sample.sequence,

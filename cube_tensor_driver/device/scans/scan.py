@@ -19,6 +19,7 @@ from ..links.intake import UsualSamples
 from ..wire.native import wire
 from ..wire.protocol import NOT_MEASURED, TEMPERATURE_UNKNOWN, Sample
 from .cube_table import CubeAddress, CubeTable, RowIndex
+from .row_counts import RowCounts
 
 MAX_SCANS_AHEAD = 4
 """Number of scans (one sample of each link) by which one link may be ahead of the slowest one. If
@@ -93,12 +94,22 @@ class ScanBuilder:
         n_links: Number of links.
         addresses: For each cube of the skin, the uid, or the link and index, to find it by.
 
+        make_rows: Makes the rows to fill, for example in the memory of a message.
+
     Attributes:
+        counts: Numbers of rows (samples of cubes) by what happened to them.
         cubes: Table that tells which cube of the skin each row of a sample belongs to.
     """
 
-    def __init__(self, n_links: int, addresses: Sequence[CubeAddress]) -> None:
-        self.cubes = CubeTable(n_links, addresses)
+    def __init__(
+        self,
+        n_links: int,
+        addresses: Sequence[CubeAddress],
+        make_rows: MakeRows = empty_rows,
+    ) -> None:
+        self.counts = RowCounts()
+        self.cubes = CubeTable(n_links, addresses, self.counts)
+        self._make_rows = make_rows
         self._live: set[int] = set()
         # The scans that were not built yet, oldest first. Each has the samples by link in
         # _pending, and the host time of the sample that was added first in _pending_ns.
@@ -187,18 +198,13 @@ class ScanBuilder:
             return True
         return n_scans == 1 and self._holds_late_sample(missing)
 
-    def build(
-        self,
-        make_rows: MakeRows = empty_rows,
-        max_scans: int | None = None,
-    ) -> FrequencyRows | None:
+    def build(self, max_scans: int | None = None) -> FrequencyRows | None:
         """Convert the oldest scans that every link has reached to rows, and remove these scans.
 
         A scan is one sample of each link, a row one sample of one cube. A link has reached a scan
         if it has a sample in this scan or in a later one.
 
         Args:
-            make_rows: Makes the rows to fill, for example in the memory of a message.
             max_scans: Largest number of scans to convert; None for all. Afterwards, `is_complete`
                 tells whether there are more.
 
@@ -206,24 +212,25 @@ class ScanBuilder:
             The rows; None if no cube of these scans is in the skin.
         """
         taken = self._deferred or self._take_scans(max_scans)
-        parts, self._deferred = _split_by_span(taken)
-        if not parts:
+        if not taken:
             return None
-        rows = make_rows(sum(len(part.cubes) for part in parts), self.cubes.n_pads)
-        raws = [part.sample.raw for part in parts]
-        if wire is None or not all(raws):
-            start = 0
-            for part in parts:
-                end = start + len(part.cubes)
-                _fill(rows.select(slice(start, end)), part)
-                start = end
-            return rows
+        # Rows that are too late for this message are left for the next one.
+        end_ns = min(part.stamp_ns for part in taken) + MAX_SPAN_NS
+        parts = [part for part in taken if part.stamp_ns <= end_ns]
+        self._deferred = [part for part in taken if part.stamp_ns > end_ns]
+
+        sizes = [len(part.cubes) for part in parts]
+        rows = self._make_rows(sum(sizes), self.cubes.n_pads)
         np.concatenate([part.cubes for part in parts], out=rows.cube)
-        rows.status[:] = 0
-        if any(part.status for part in parts):
-            counts = [len(part.cubes) for part in parts]
-            rows.status[:] = np.repeat([part.status for part in parts], counts)
-        _place(rows, raws, [part.stamp_ns for part in parts])
+        rows.status[:] = np.repeat([part.status for part in parts], sizes)
+        raws = [part.sample.raw for part in parts]
+        if wire is not None and all(raws):
+            _place(rows, raws, [part.stamp_ns for part in parts])
+            return rows
+        start = 0
+        for part, size in zip(parts, sizes, strict=True):
+            _fill(rows.select(slice(start, start + size)), part)
+            start += size
         return rows
 
     def order_whole(
@@ -270,14 +277,9 @@ class ScanBuilder:
             scans.append(WholeScans(np.tile(cubes, end - begin), raws[part], stamps_ns[part]))
         return scans[::-1]
 
-    def build_whole(self, scans: WholeScans, make_rows: MakeRows) -> FrequencyRows:
-        """Convert whole scans (one sample of each link, all cubes of its hub) to rows.
-
-        Args:
-            scans: The scans.
-            make_rows: Makes the rows to fill, for example in the memory of a message.
-        """
-        rows = make_rows(len(scans.cubes), self.cubes.n_pads)
+    def build_whole(self, scans: WholeScans) -> FrequencyRows:
+        """Convert whole scans (one sample of each link, all cubes of its hub) to rows."""
+        rows = self._make_rows(len(scans.cubes), self.cubes.n_pads)
         rows.cube[:] = scans.cubes
         rows.status[:] = 0
         _place(rows, scans.raws, scans.stamps_ns)
@@ -298,10 +300,8 @@ class ScanBuilder:
 
     def rows_waiting(self) -> int:
         """Return how many rows (samples of cubes) were added, but not yet built or left out."""
-        parts = [*self._deferred]
-        for scan in self._pending:
-            parts += scan.values()
-        return sum(len(part.cubes) for part in parts)
+        waiting = self._deferred + [part for scan in self._pending for part in scan.values()]
+        return sum(len(part.cubes) for part in waiting)
 
     def _take_scans(self, max_scans: int | None) -> list[_SampleRows]:
         """Remove the oldest scans (one sample of each link); return their samples that have rows.
@@ -312,7 +312,12 @@ class ScanBuilder:
         if len(self._pending) - self._n_reached() > 1:
             self._align_by_order()
             self._holds_back = True
-        n_scans = self._n_scans_to_build()
+        n_scans = len(self._pending)
+        n_reached = self._n_reached()
+        # The scans that a delivering link has not reached wait for its samples, unless it has given
+        # none at all, or another link is too far ahead.
+        if n_reached and n_scans - n_reached <= MAX_SCANS_AHEAD:
+            n_scans = n_reached
         if max_scans is not None and n_scans > max_scans:
             n_scans = max_scans
             self._holds_back = False
@@ -348,29 +353,17 @@ class ScanBuilder:
         Args:
             missing: Links that deliver but have no sample in the pending scan.
         """
-        limits_ns: list[float] = []
-        for link, stamped in self._pending[0].items():
-            last_ns, stamp_ns = self._built_ns[link], stamped.stamp_ns
-            if stamp_ns > last_ns:
-                limits_ns.append((stamp_ns + last_ns) / 2)
-            else:
+        first_missing_ns = min(self._built_ns[link] for link in missing)
+        for link, part in self._pending[0].items():
+            last_ns = self._built_ns[link]
+            limit_ns = (part.stamp_ns + last_ns) / 2
+            if part.stamp_ns <= last_ns:
                 # A hub with many cubes sends a sample in several frames. This frame belongs to the
                 # same sample as one that was built before, so it is late.
-                limits_ns.append(0.0)
-        built_ns = [self._built_ns[link] for link in missing]
-        return min(built_ns) > min(limits_ns)
-
-    def _n_scans_to_build(self) -> int:
-        """Return how many of the oldest pending scans are to be built now.
-
-        Usually these are the scans that every delivering link has reached; the later ones wait for
-        the missing samples. All scans are built if a delivering link has no sample in them, or if
-        one link is more than `MAX_SCANS_AHEAD` scans ahead of another.
-        """
-        reached = self._n_reached()
-        if not reached or len(self._pending) - reached > MAX_SCANS_AHEAD:
-            return len(self._pending)
-        return reached
+                limit_ns = 0
+            if first_missing_ns > limit_ns:
+                return True
+        return False
 
     def _n_reached(self) -> int:
         """Return the number of pending scans that every delivering link has reached.
@@ -387,21 +380,16 @@ class ScanBuilder:
         more messages, which cost even more time. With this step the process keeps up with 1260
         cubes at 1 kHz; without it, a third of their rows were lost.
         """
-        queues: dict[int, list[_SampleRows]] = {}
-        for scan in self._pending:
-            for link, stamped in scan.items():
-                queues.setdefault(link, []).append(stamped)
-
-        n_scans = max(map(len, queues.values()))
-        self._pending = [{} for _ in range(n_scans)]
-        for link, queue in queues.items():
-            for scan, stamped in zip(self._pending, queue, strict=False):
-                scan[link] = stamped
-        self._pending_ns = [
-            min(stamped.stamp_ns for stamped in scan.values()) for scan in self._pending
+        scans = self._pending
+        queues = [
+            [scan[link] for scan in scans if link in scan] for link in range(len(self._n_pending))
         ]
-        n_links = len(self._n_pending)
-        self._n_pending = [len(queues.get(link, ())) for link in range(n_links)]
+        self._n_pending = [len(queue) for queue in queues]
+        self._pending = [
+            {link: queue[k] for link, queue in enumerate(queues) if k < len(queue)}
+            for k in range(max(self._n_pending))
+        ]
+        self._pending_ns = [min(part.stamp_ns for part in scan.values()) for scan in self._pending]
 
     def _first_scan_at(self, stamp_ns: int) -> int:
         """Return the index of the first pending scan that is not too early for a sample.
@@ -417,28 +405,6 @@ class ScanBuilder:
         period = (times[-1] - times[0]) / n_periods
         tolerance = MAX_PERIODS_EARLIER * period
         return bisect_left(times, stamp_ns - tolerance)
-
-
-def _split_by_span(
-    parts: list[_SampleRows],
-) -> tuple[list[_SampleRows], list[_SampleRows]]:
-    """Split samples into those at most `MAX_SPAN_NS` later than the earliest, and the others.
-
-    Args:
-        parts: Samples with the cubes of their rows, in any order.
-
-    Returns:
-        The samples for this message, and those left for the next one.
-    """
-    if not parts:
-        return [], []
-    stamps_ns = [part.stamp_ns for part in parts]
-    end_ns = min(stamps_ns) + MAX_SPAN_NS
-    if max(stamps_ns) <= end_ns:
-        return parts, []
-    within = [part for part in parts if part.stamp_ns <= end_ns]
-    beyond = [part for part in parts if part.stamp_ns > end_ns]
-    return within, beyond
 
 
 def _place(
@@ -465,12 +431,10 @@ def _place(
 
 
 def _fill(rows: FrequencyRows, part: _SampleRows) -> None:
-    """Write one sample into rows, for installations without the wire module in C."""
+    """Write the values and the stamp of one sample into rows, without the wire module in C."""
     sample = part.sample
-    rows.cube[:] = part.cubes
     rows.sequence[:] = sample.sequence
     rows.stamp_ns[:] = part.stamp_ns
-    rows.status[:] = part.status
     rows.pad_fault[:] = sample.pad_fault
     rows.temperature[:] = _CELSIUS[sample.temperature.view(np.uint16)]
 

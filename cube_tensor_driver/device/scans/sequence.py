@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from enum import Enum
 
 from ..track import MAX_DEVICE_US, MAX_DISORDER, NEVER, LinkTrack
@@ -70,10 +70,6 @@ class SequenceCounters:
     duplicate: int = 0
     out_of_order: int = 0
     resets: int = 0
-
-    def as_dict(self) -> dict[str, int]:
-        """Return the counters by name."""
-        return {name: getattr(self, name) for name in self.__slots__}
 
     def add(self, other: SequenceCounters) -> None:
         """Increase each of these counters by the one of the same name in `other`."""
@@ -389,11 +385,6 @@ class SampleAccount:
             self._ended.add(self._trackers.pop(first).counters)
 
     @property
-    def received(self) -> int:
-        """Number of SAMPLE frames received."""
-        return self._received + self._track.usual
-
-    @property
     def is_usual(self) -> bool:
         """Whether each sample comes in one frame, which holds all cubes of the hub."""
         tracker = self._trackers.get(0)
@@ -415,8 +406,9 @@ class SampleAccount:
         Two sums hold: taken = delivered + dropped_in_hub + lost_on_the_way, and received =
         delivered + duplicate.
         """
-        total = self._total().as_dict()
+        total = asdict(self._total())
         missing = total.pop("missing")
+        total["delivered"] += self._track.usual
         # The hub reports the number of samples that it has dropped only in STATS frames. Until then
         # they count as lost on the way; a sample that was lost on the way never counts as dropped.
         dropped = min(self._dropped, missing)
@@ -428,24 +420,25 @@ class SampleAccount:
         }
 
     def _total(self) -> SequenceCounters:
-        """Return the sums of the counters of all parts of the samples, also of ended ones."""
-        total = SequenceCounters()
-        total.add(self._ended)
-        total.delivered += self._track.usual
+        """Return the sums of the counters of all parts of the samples, also of ended ones.
+
+        Samples that the module in C has counted are not included.
+        """
+        total = replace(self._ended)
         for tracker in self._trackers.values():
             total.add(tracker.counters)
         return total
 
     def contradictions(self) -> list[str]:
-        """Return one text if received differs from delivered + duplicate.
+        """Return one text if received differs from delivered + duplicate; otherwise none.
 
-        Otherwise the list is empty; the text shows a defect of the driver.
+        The text shows a defect of the driver. Samples that the module in C has counted are left
+        out, because it may count more meanwhile.
         """
-        counters = self.counters()
-        delivered, duplicate = counters["delivered"], counters["duplicate"]
-        if self.received == delivered + duplicate:
+        total = self._total()
+        if self._received == total.delivered + total.duplicate:
             return []
         return [
-            f"{self.received} samples received, {delivered} delivered and {duplicate} duplicate: "
-            "the driver lost count, please report it",
+            f"{self._received} samples received in Python, {total.delivered} delivered and "
+            f"{total.duplicate} duplicate: the driver lost count, please report it",
         ]

@@ -8,7 +8,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 
 from ...device.chain import LinkReport, LiveLinks
 from ...device.links.link import LinkState
-from ...device.scans.row_account import RowCounts
+from ...device.scans.row_counts import RowCounts
 from .updater import make_status
 
 LEVELS = {
