@@ -35,7 +35,6 @@ ROS = (
     "ament_index_python",
     "builtin_interfaces",
     "diagnostic_msgs",
-    "diagnostic_updater",
     "geometry_msgs",
     "launch",
     "launch_ros",

@@ -87,20 +87,10 @@ def show_bag(path: Path) -> None:
             console.print(f"{path}: no messages")
 
         console.print(topic_table(bag, duration_s))
-        skins = bag.topics(FREQUENCIES)
-        for topic in skins:
+        for topic in bag.topics(FREQUENCIES):
             show_skin(bag, topic, console)
-        # All nodes of a robot share one topic of diagnostics, so those of skins that are not in the
-        # bag are recorded, too. The name of a status begins with that of its node, as in
-        # "/left/driver: link hub0".
-        namespaces = {topic.rpartition("/")[:2] for topic in skins}
-        statuses = last_diagnostics(bag)
-        nodes = [status.name.partition(":")[0].rpartition("/")[:2] for status in statuses]
-        own = [status for status, node in zip(statuses, nodes, strict=True) if node in namespaces]
-        for status in own:
+        for status in last_diagnostics(bag):
             console.print(diagnostics_line(status), markup=False)
-        if len(own) < len(statuses):
-            console.print(f"{len(statuses) - len(own)} diagnostics of other nodes")
 
 
 def topic_table(bag: Bag, duration_s: float) -> Table:

@@ -13,11 +13,11 @@ from pathlib import Path
 Value = str | float | bool
 """Type of the value of a ROS parameter."""
 
-RECORDED = ("frequencies", "stress", "compensation", "info", "driver/info", "/diagnostics")
+RECORDED = ("frequencies", "stress", "compensation", "info", "driver/info", "diagnostics")
 """Topics of a skin that `./cube record` records by default.
 
 From `frequencies` and `info` the stress can be computed again; `driver/info` replaces `info` while
-no reconstruction runs. `stress` is recorded to keep the published results, and `/diagnostics` to
+no reconstruction runs. `stress` is recorded to keep the published results, and `diagnostics` to
 keep the reports about links and cubes.
 """
 

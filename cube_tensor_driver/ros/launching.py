@@ -219,7 +219,7 @@ def _recorded_topics(surroundings: dict[str, Any], namespace: str) -> dict[str, 
 
     qualities = {}
     for topic, quality in read_yaml(RECORD_QOS).items():
-        name = topic if topic == "/diagnostics" else topic.removeprefix("/")
+        name = topic.removeprefix("/")
         name = remaps.get(name, name)
         prefix = f"/{namespace}" if namespace else ""
         full_name = name if name.startswith("/") else f"{prefix}/{name}"

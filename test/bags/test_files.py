@@ -680,14 +680,18 @@ def test_a_bag_that_cannot_be_reprocessed_leaves_no_full_bar(tmp_path, capsys):
     assert "nope: no such file or folder" in error and "100%" not in error
 
 
-def test_info_shows_the_diagnostics_of_the_skins_in_the_bag(bag, capsys, monkeypatch):
-    """All nodes of a robot publish on /diagnostics, also those of another skin."""
-    names = ["/driver: link hub0", "/right/driver: link hub0", "motor: 3"]
-    statuses = [SimpleNamespace(name=name, message="", values=[]) for name in names]
+def test_info_shows_the_diagnostics_in_the_bag(bag, capsys, monkeypatch):
+    values = [SimpleNamespace(key="crc", value="3"), SimpleNamespace(key="framing", value="0")]
+    statuses = [
+        SimpleNamespace(name="/left/driver: link hub0", message="", values=values),
+        SimpleNamespace(name="/left/driver: rows", message="too slow", values=[]),
+    ]
     monkeypatch.setattr(summary, "last_diagnostics", lambda _: statuses)
     assert main(["bag", "info", str(bag)]) == 0
-    shown = capsys.readouterr().out.splitlines()[-2:]
-    assert shown == ["/driver: link hub0: nothing wrong; ", "2 diagnostics of other nodes"]
+    assert capsys.readouterr().out.splitlines()[-2:] == [
+        "/left/driver: link hub0: nothing wrong; crc 3",
+        "/left/driver: rows: too slow; ",
+    ]
 
 
 def test_plot_and_info(bag, tmp_path, capsys):

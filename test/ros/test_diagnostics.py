@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -15,9 +16,14 @@ pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 
 import numpy as np
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from played_hub import SINGLE
 from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import UInt32
 
+from cube_tensor_driver.bags.read import Bag
+from cube_tensor_driver.bags.summary import last_diagnostics
+from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.browser import markup
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import read_skin
@@ -26,6 +32,10 @@ from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.device.chain import LinkReport
 from cube_tensor_driver.device.links.link import LinkState
 from cube_tensor_driver.device.scans.row_counts import RowCounts
+from cube_tensor_driver.processes.children import Children
+from cube_tensor_driver.processes.skin_processes import RECORDED, skin_processes
+from cube_tensor_driver.ros.commands import record
+from cube_tensor_driver.ros.commands.echo import resolve_topics
 from cube_tensor_driver.ros.compat import make_executor, with_number
 from cube_tensor_driver.ros.diagnostics.links import LinkDiagnostics
 from cube_tensor_driver.ros.diagnostics.reconstruction import (
@@ -141,3 +151,32 @@ def test_losses_of_a_link_are_a_warning_and_coloured_on_the_page(state, notes, l
     html = markup.conditions(["c"], scan)
     colour = {b"\0": "inherit", b"\1": markup.AMBER}.get(level, markup.RED)
     assert f"color:{colour}'>{link.message}<" in html
+
+
+def test_a_recording_of_a_namespace_has_no_diagnostics_of_another(ros, tmp_path, monkeypatch):
+    """Though tools of ROS find those of all nodes in /diagnostics."""
+    monkeypatch.setattr(record, "MAX_CONNECT_S", 0.0)  # a driver alone has not all topics
+    heard = ros.listen(DiagnosticArray, "/diagnostics")
+    recorder_node = rclpy.create_node("recorder", namespace="left")
+    names = resolve_topics(recorder_node, RECORDED)
+    recorder_node.destroy_node()
+    (driver,) = skin_processes(SINGLE)[1:]
+    with Children(tmp_path) as children:
+        for namespace in ("left", "right"):
+            arguments = ("--ros-args", "-r", f"__ns:=/{namespace}")
+            children.start(replace(driver, executable=namespace, arguments=arguments))
+        recorder = record.Recorder(ros.node, names, BagWriter(tmp_path / "bag"))
+
+        def is_recorded():
+            recorder.find_topics()
+            statuses = {status.name for array in heard for status in array.status}
+            if not recorder.has_begun:
+                heard.clear()
+            has_come = any(recorder.counts.get(name) for name in names if "diagnostics" in name)
+            return has_come and {"/left/driver: rows", "/right/driver: rows"} <= statuses
+
+        ros.wait(is_recorded)
+        recorder.close()
+    with Bag(tmp_path / "bag") as bag:
+        recorded = {status.name for status in last_diagnostics(bag)}
+    assert recorded == {"/left/driver: rows", "/left/driver: link hub0"}

@@ -216,12 +216,13 @@ def test_the_recording_follows_namespace_and_remaps():
     )
     (action,) = record_skin(context)
     command = [words[0].perform(context) for words in action.cmd]
-    names = ["frequencies", "touch", "info", "driver/info"]
-    whole = [*(f"/robot1/hand/{name}" for name in names), "/diagnostics"]
+    names = ["frequencies", "touch", "compensation", "info", "driver/info", "diagnostics"]
+    whole = [f"/robot1/hand/{name}" for name in names]
     regex = command[command.index("--regex") + 1]
-    assert [name for name in [*whole, "/frequencies"] if re.search(regex, name)] == whole
+    others = ["/frequencies", "/diagnostics"]
+    assert [name for name in [*whole, *others] if re.search(regex, name)] == whole
     qualities = read_yaml(Path(command[command.index("--qos-profile-overrides-path") + 1]))
-    assert list(qualities) == ["/robot1/hand/frequencies", "/robot1/hand/touch", *whole[2:]]
+    assert list(qualities) == whole
     assert qualities["/robot1/hand/touch"]["reliability"] == "best_effort"
     assert qualities["/robot1/hand/info"]["durability"] == "transient_local"
     folder = Path(command[command.index("--output") + 1])
@@ -458,10 +459,8 @@ def test_a_robot_includes_a_simulated_skin(ros, tmp_path):
         assert source.skin.frame(source.skin.cubes[0]) == "robot1_skin_c00"
     with Bag(folder) as bag:
         recorded = {connection.topic for connection in bag.connections}
-    assert recorded == {
-        *(f"/robot1/hand/{topic}" for topic in ("frequencies", "touch", "info", "driver/info")),
-        "/diagnostics",
-    }
+    names = ("frequencies", "touch", "compensation", "info", "driver/info", "diagnostics")
+    assert recorded == {f"/robot1/hand/{name}" for name in names}
     assert not [path for path in temporary.iterdir() if path.name.startswith("cube_")]
 
 

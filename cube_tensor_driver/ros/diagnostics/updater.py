@@ -1,14 +1,13 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Publishes diagnostics of a node at 1 Hz.
+"""Publishes diagnostics of a node once a second.
 
-The package diagnostic_updater of ROS is used if it is installed, otherwise a replacement.
+The package diagnostic_updater of ROS is not used: it publishes on /diagnostics only.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
 
 from diagnostic_msgs.msg import (
     DiagnosticArray,
@@ -17,31 +16,21 @@ from diagnostic_msgs.msg import (
 )
 from rclpy.node import Node
 
-try:
-    from diagnostic_updater import Updater
-except ModuleNotFoundError:
+TOPICS = ("/diagnostics", "diagnostics")
+"""Topics on which each node publishes its diagnostics.
 
-    class Updater:  # type: ignore[no-redef]
-        """Replacement of diagnostic_updater's class, with the methods that are used here."""
+All nodes of a robot share the first one, which tools of ROS read. The second one lies in the
+namespace of the node, so that the recording of a skin contains only what concerns this skin.
+"""
 
-        def __init__(self, node: Node, period: float = 1.0) -> None:
-            self.node, self.node_name = node, node.get_name()
-            self.publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-            self.timer = node.create_timer(period, self.update)
+PERIOD_S = 1.0
+"""Time, in seconds, between two messages of diagnostics of a node."""
 
-        def update(self) -> None:
-            """Publish the statuses of the node; subclasses override it. The timer calls it."""
-
-        def publish(self, statuses: list[DiagnosticStatus]) -> None:
-            """Publish statuses, with the name of the node in front of their names."""
-            message = DiagnosticArray(status=statuses)
-            message.header.stamp = self.node.get_clock().now().to_msg()
-            for status in statuses:
-                status.name = f"{self.node_name}: {status.name}"
-            self.publisher.publish(message)
+QUEUE_DEPTH = 10
+"""Depth of the queue of each topic, in messages. The nodes of a robot publish at the same time."""
 
 
-class Diagnostics(Updater):  # type: ignore[misc]
+class Diagnostics:
     """Publishes the diagnostic statuses of a node once a second, until the node is destroyed."""
 
     def __init__(
@@ -58,19 +47,28 @@ class Diagnostics(Updater):  # type: ignore[misc]
             count_errors: Returns the number of calls of the node's callbacks that have raised an
                 exception so far. It is added to the first status.
         """
-        super().__init__(node)
-        self._statuses, self._count_errors = statuses, count_errors
+        self._node, self._statuses, self._count_errors = node, statuses, count_errors
         self._errors_before = 0
-        # The name contains the namespace, because several skins may run in different namespaces.
-        # By itself diagnostic_updater uses the name without namespace, or writes two slashes.
-        self.node_name = node.get_fully_qualified_name()
+        # Without a namespace both names are those of one topic.
+        topics = {node.resolve_topic_name(topic) for topic in TOPICS}
+        self._publishers = [
+            node.create_publisher(DiagnosticArray, topic, QUEUE_DEPTH) for topic in topics
+        ]
+        node.create_timer(PERIOD_S, self._publish)
 
-    def update(self) -> None:
-        """Publish the statuses of the node. A timer of the base class calls this once a second."""
+    def _publish(self) -> None:
         statuses = self._statuses()
-        if statuses:
-            self._add_errors(statuses[0])
-            self.publish(statuses)
+        if not statuses:
+            return
+        self._add_errors(statuses[0])
+        # The name contains the namespace, because several skins may run in different namespaces.
+        node_name = self._node.get_fully_qualified_name()
+        for status in statuses:
+            status.name = f"{node_name}: {status.name}"
+        message = DiagnosticArray(status=statuses)
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        for publisher in self._publishers:
+            publisher.publish(message)
 
     def _add_errors(self, status: DiagnosticStatus) -> None:
         errors = self._count_errors()
@@ -87,7 +85,7 @@ def make_status(
     hardware_id: str,
     level: bytes,
     text: str,
-    values: Mapping[str, Any],
+    values: Mapping[str, object],
 ) -> DiagnosticStatus:
     """Return the diagnostic status of one part of a node.
 
