@@ -86,15 +86,15 @@ def link_configs(
             f"port is {port!r}, but the skin {skin.name} has {len(skin.links)} links; "
             "write the ports into the skin file"
         )
+    is_simulated = bool(port_directory) and not port
     configs = []
     for link in skin.links:
         path = port or link.port
-        if port_directory and not port:
+        if is_simulated:
             path = str(Path(port_directory) / link.name)
         problem = port_problem(path)
         if problem:
             raise ConfigError(f"link {link.name}: port: {problem}")
-        is_simulated = bool(port_directory) and not port
         configs.append(LinkConfig(link.name, path, link.baud, link.hub_uid, is_simulated))
     return configs
 
@@ -129,9 +129,15 @@ class LinkSource:
         links: Port, baud rate and expected hub of each link.
         rate: Sample rate to request from the hubs, in Hz; with None they keep their own.
 
+    Attributes:
+        skin: The skin whose rows this source yields.
+        is_live: True, because the rows are measured now, not read from a recording.
+
     Raises:
         LinkError: With the kind `bad_port`: a port is neither a device path nor a TCP address.
     """
+
+    is_live = True
 
     def __init__(
         self,
@@ -139,28 +145,18 @@ class LinkSource:
         links: Sequence[LinkConfig],
         rate: float | None,
     ) -> None:
-        self._skin = skin
+        self.skin = skin
         # Each entry holds the monotonic time, in s, at which its rows were queued.
         self._queue: deque[tuple[float, FrequencyRows]] = deque()
         self._changed = threading.Condition()
         self._closed = False
-        self._ended = False
+        self._failure: Exception | None = None
         self._given = 0
         self._dropped = 0
         self._links = LiveLinks(
             links, cube_addresses(skin), self._put, rate=rate, on_end=self._on_end
         )
         self._links.start()
-
-    @property
-    def skin(self) -> Skin:
-        """The skin (cubes and links) whose rows this source yields."""
-        return self._skin
-
-    @property
-    def is_live(self) -> bool:
-        """True, because the rows of this source are measured now, not read from a recording."""
-        return True
 
     def statistics(self) -> dict[str, object]:
         """Return the numbers of rows, and the state, notes and counters of each link.
@@ -186,12 +182,7 @@ class LinkSource:
                 "rows given": self._given,
                 "rows waiting": waiting,
                 "rows dropped": self._dropped,
-                "rows of unknown cubes": counts.unknown_cube,
-                "rows with another number of pads": counts.wrong_pads,
-                "rows that came twice": counts.duplicate,
-                "rows dropped by a slow host": counts.overload,
-                "rows lost by errors": counts.lost,
-                "rows unaccounted": counts.unaccounted,
+                **counts.not_delivered(),
                 "links": links,
             }
 
@@ -211,11 +202,7 @@ class LinkSource:
         If an error has ended the reader's thread, the rows that wait are yielded first, then the
         error is raised.
         """
-        while True:
-            rows = self._get()
-            if rows is None:
-                return
-            yield rows
+        return iter(self._get, None)
 
     def __enter__(self) -> LinkSource:
         return self
@@ -237,20 +224,19 @@ class LinkSource:
             self._changed.notify()
 
     def _on_end(self) -> None:
-        """Wake up a consumer that waits for rows, because the reader's thread has ended."""
+        """Wake up a consumer that waits for rows, if an error has ended the reader's thread."""
         with self._changed:
-            self._ended = True
+            self._failure = self._links.failure
             self._changed.notify_all()
 
     def _get(self) -> FrequencyRows | None:
         """Wait for the next rows (samples of cubes); return None once the source is closed."""
         with self._changed:
-            while not self._closed:
-                if self._queue:
-                    _, rows = self._queue.popleft()
-                    self._given += len(rows)
-                    return rows
-                if self._ended and self._links.failure is not None:
-                    raise self._links.failure
-                self._changed.wait()
-        return None
+            self._changed.wait_for(lambda: self._closed or self._queue or self._failure)
+            if self._closed:
+                return None
+            if not self._queue and self._failure is not None:
+                raise self._failure
+            _, rows = self._queue.popleft()
+            self._given += len(rows)
+            return rows

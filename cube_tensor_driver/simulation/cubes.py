@@ -158,15 +158,10 @@ class HubCubes:
             Frequencies (cubes of the hub, pads) in mHz; `NOT_MEASURED` for the pads of cubes that
             are not in the skin.
         """
-        shape = (len(self.members), self.cubes.n_pads)
-        frequency = np.full(shape, NOT_MEASURED, "<u4")
+        frequency = np.full((len(self.members), self.cubes.n_pads), NOT_MEASURED, "<u4")
         cubes = self.skin_cubes
         in_skin = self.members != ABSENT
-        frequency[in_skin] = self.cubes.frequency(
-            stress[cubes],
-            gradient[cubes],
-            seconds,
-        )
+        frequency[in_skin] = self.cubes.frequency(stress[cubes], gradient[cubes], seconds)
         return frequency
 
 
@@ -237,17 +232,15 @@ def hub_members(skin: Skin, link: str) -> Index:
     Returns:
         Index in the skin for each index on the hub; `ABSENT` where no cube of the skin has it.
     """
-    by_index = {
-        cube.index: number
-        for number, cube in enumerate(skin.cubes)
-        if cube.link == link and cube.index is not None
-    }
-    first_link = skin.links[0].name
-    by_uid = [
-        number
-        for number, cube in enumerate(skin.cubes)
-        if cube.index is None and (cube.link or first_link) == link
-    ]
+    by_index: dict[int, int] = {}
+    by_uid: list[int] = []
+    for number, cube in enumerate(skin.cubes):
+        if (cube.link or skin.links[0].name) != link:
+            continue
+        if cube.index is None:
+            by_uid.append(number)
+        else:
+            by_index[cube.index] = number
 
     # A hub may have cubes that are not in the skin, whose indices then stay free.
     highest = max(by_index, default=-1)
@@ -273,11 +266,7 @@ def calibration_groups(
     cubes_by_id: dict[str, list[int]] = {}
     for number, calibration in enumerate(calibrations):
         cubes_by_id.setdefault(calibration.id, []).append(number)
-    groups = []
-    for cubes in cubes_by_id.values():
-        calibration = calibrations[cubes[0]]
-        groups.append((calibration, np.array(cubes)))
-    return groups
+    return [(calibrations[cubes[0]], np.array(cubes)) for cubes in cubes_by_id.values()]
 
 
 def true_state(

@@ -8,7 +8,7 @@ Like the protocol code, this code reads no port and no clock: its caller passes 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -72,6 +72,7 @@ class SimulatedHub:
         extra_pads: Number of pads that HELLO contains in addition to `n_pads`.
         celsius: Temperature in 0.01 °C in the SAMPLE frames.
         pad_fault: Bit masks (cubes,) of the pads that the hub reports as failed; None for no pads.
+        runs: All samples taken so far, as runs (samples at equal intervals) in the order of time.
     """
 
     uid: int
@@ -92,12 +93,7 @@ class SimulatedHub:
     celsius: int = TEMPERATURE_UNKNOWN
     pad_fault: PadMasks | None = None
     _drift_since_us: int = 0
-    _ended_runs: list[SampleRun] = field(default_factory=list)
-    # The newest run (samples at equal intervals) as it began, the number of its last sample, and
-    # time, period and restarts of the hub that the next sample must have to continue the run.
-    _run: SampleRun | None = None
-    _last: int = 0
-    _expected: tuple[int, int, int] | None = None
+    runs: list[SampleRun] = field(default_factory=list)
 
     def hello(self) -> bytes:
         """Return the HELLO frame, the description of the hub and its cubes."""
@@ -189,48 +185,20 @@ class SimulatedHub:
         self.next_us += self.period_us
 
         n = len(frequency)
-        pad_fault = self.pad_fault
-        if pad_fault is None:
-            pad_fault = np.zeros(n, "<u4")
+        pad_fault = np.zeros(n, "<u4") if self.pad_fault is None else self.pad_fault
         temperature = np.full(n, self.celsius, "<i2")
-        sample = Sample(
-            sequence,
-            0,
-            device_us,
-            frequency,
-            pad_fault,
-            temperature,
-        )
+        sample = Sample(sequence, 0, device_us, frequency, pad_fault, temperature)
         return encode(sample, self.version)
-
-    @property
-    def runs(self) -> list[SampleRun]:
-        """All samples taken so far, as runs (samples at equal intervals) in the order of time."""
-        if self._run is None:
-            return []
-        newest = replace(self._run, last=self._last)
-        return [*self._ended_runs, newest]
 
     def _log_sample(self) -> None:
         """Add the sample that is due at `next_us` to the log of all samples."""
-        # The log consists of runs (samples at equal intervals). A run ends when samples are
-        # skipped, the period changes or the hub restarts.
-        now = (self.next_us, self.period_us, self.boots)
-        if now != self._expected:
-            self._ended_runs = self.runs
-            self._run = SampleRun(
-                first=self.sequence,
-                last=self.sequence,
-                start_us=self.next_us,
-                period_us=self.period_us,
-                boot=self.boots,
-            )
-        self._last = self.sequence
-        self._expected = (
-            self.next_us + self.period_us,
-            self.period_us,
-            self.boots,
-        )
+        due = (self.next_us, self.period_us, self.boots)
+        run = self.runs[-1] if self.runs else None
+        # A run ends when samples are skipped, the period changes or the hub restarts.
+        if run is None or due != (run.end_us, run.period_us, run.boot):
+            run = SampleRun(self.sequence, self.sequence, *due)
+            self.runs.append(run)
+        run.last = self.sequence
 
     def skip(self, now_us: int) -> None:
         """Schedule the next sample after simulated time `now_us`; earlier samples are left out.

@@ -35,7 +35,7 @@ SEQUENCE_RANGE = 1 << 32
 bits. The sample numbers in this log do not wrap."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class SampleRun:
     """Samples of one hub at equal intervals.
 
@@ -156,12 +156,7 @@ class SampleLog:
             for link in data["links"]
         )
         faults = tuple(
-            FaultRecord(
-                record["start_us"],
-                record["end_us"],
-                Fault(**record["fault"]),
-            )
-            for record in data["faults"]
+            FaultRecord(**record | {"fault": Fault(**record["fault"])}) for record in data["faults"]
         )
         return cls(data["start_time_ns"], links, faults)
 
@@ -240,16 +235,8 @@ class SampleTable:
             among = np.arange(len(self))
         # A sample contains all cubes of a hub, so it is identified by the link instead of the cube.
         number = self.number[among] % SEQUENCE_RANGE
-        known = SampleKeys(
-            self.link[among],
-            number,
-            self.time_ns[among],
-        )
-        wanted = SampleKeys(
-            self.link_of_cube[rows.cube],
-            rows.sequence,
-            rows.stamp_ns,
-        )
+        known = SampleKeys(self.link[among], number, self.time_ns[among])
+        wanted = SampleKeys(self.link_of_cube[rows.cube], rows.sequence, rows.stamp_ns)
         found = match_rows(known, wanted)
         # A row without a match has the index `NO_MATCH`, which is -1 and selects the last element.
         return np.append(among, NO_MATCH)[found]

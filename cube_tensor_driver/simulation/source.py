@@ -4,11 +4,11 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
@@ -115,11 +115,7 @@ class SimulatedSource:
     drift: float = 0.0
     imperfections: Imperfections | None = None
     scans: int = 0
-
-    @property
-    def is_live(self) -> bool:
-        """Whether the source has to be read in real time; always False."""
-        return False
+    is_live: ClassVar[bool] = False  # the rows are there at once
 
     def statistics(self) -> dict[str, object]:
         """Return how much the latest iteration over this source has simulated.
@@ -135,22 +131,14 @@ class SimulatedSource:
         }
 
     def __iter__(self) -> Iterator[FrequencyRows]:
-        pads = SkinPads(
-            self.skin,
-            self.noise,
-            self.drift,
-            self.imperfections,
-        )
+        pads = SkinPads(self.skin, self.noise, self.drift, self.imperfections)
         fields = LoadMemory(self.load)
-        end_us = None if self.duration is None else round(1e6 * self.duration)
+        end_us = math.inf if self.duration is None else round(1e6 * self.duration)
         self.scans = 0
-        for number in itertools.count():
-            time_us = number * self.period_us
-            if end_us is not None and time_us >= end_us:
-                return
+        while (time_us := self.scans * self.period_us) < end_us:
             self.scans += 1
             stress, gradient = fields.at(time_us)
-            yield pads.rows(stress, gradient, number, time_us)
+            yield pads.rows(stress, gradient, self.scans - 1, time_us)
 
     def __enter__(self) -> SimulatedSource:
         return self
@@ -207,22 +195,16 @@ class SkinPads:
             time_us: Simulated time in µs.
         """
         count = len(self._cube)
-        shape = (count, self._n_pads)
-        millihertz = np.full(shape, NOT_MEASURED, np.uint32)
+        seconds = 1e-6 * time_us
+        millihertz = np.full((count, self._n_pads), NOT_MEASURED, np.uint32)
         temperature = np.empty(count, np.float32)
-        # The rows are sorted link by link, as the driver delivers them.
-        start = 0
         for hub in self._hubs:
             cubes = hub.skin_cubes
-            end = start + len(cubes)
-            own = hub.cubes.frequency(
-                stress[cubes],
-                gradient[cubes],
-                1e-6 * time_us,
-            )
-            millihertz[start:end, : hub.cubes.n_pads] = own
-            temperature[start:end] = hub.cubes.temperature(1e-6 * time_us)
-            start = end
+            own = hub.cubes.frequency(stress[cubes], gradient[cubes], seconds)
+            millihertz[cubes, : hub.cubes.n_pads] = own
+            temperature[cubes] = hub.cubes.temperature(seconds)
+        # The rows are sorted link by link, as the driver delivers them.
+        millihertz, temperature = millihertz[self._cube], temperature[self._cube]
 
         # Frequencies from a real hub are also whole mHz, which the driver converts to float32 Hz.
         frequency = (millihertz * 1e-3).astype(np.float32)

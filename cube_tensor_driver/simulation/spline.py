@@ -9,6 +9,7 @@ simulator needs to start.
 from __future__ import annotations
 
 import numpy as np
+from numpy.polynomial.polynomial import polyder, polyval
 
 from ..core.arrays import Array
 
@@ -32,58 +33,43 @@ class CubicSpline:
             closed: Whether the last point is the first one and the curve passes it smoothly.
                 Otherwise the velocity is 0 at both ends.
         """
-        self._points = np.asarray(points, float)
-        n = len(points)
+        points = np.asarray(points, float)
+        # The last point of a closed curve is the first one.
+        knots = points[:-1] if closed else points
+        identity = np.eye(len(knots))
+        before, after = np.roll(identity, 1, axis=0), np.roll(identity, -1, axis=0)
+        matrix = 4 * identity + before + after
+        right = 3 * (np.roll(knots, -1, axis=0) - np.roll(knots, 1, axis=0))
+        if not closed:
+            ends = [0, -1]
+            matrix[ends] = identity[ends]
+            right[ends] = 0.0
+        slopes = np.linalg.solve(matrix, right)
         if closed:
-            # There is one equation for each point except the last, which is equal to the first.
-            ring = self._points[:-1]
-            identity = np.eye(n - 1)
-            before = np.roll(identity, 1, axis=1)
-            after = np.roll(identity, -1, axis=1)
-            matrix = 4 * identity + before + after
-            next_point = np.roll(ring, -1, axis=0)
-            last_point = np.roll(ring, 1, axis=0)
-            right = 3 * (next_point - last_point)
-            slopes = np.linalg.solve(matrix, right)
-            self._slopes = np.concatenate([slopes, slopes[:1]])
-        else:
-            size = n - 2
-            identity = np.eye(size)
-            before = np.eye(size, k=1)
-            after = np.eye(size, k=-1)
-            matrix = 4 * identity + before + after
-            right = 3 * (points[2:] - points[:-2])
-            self._slopes = np.zeros_like(self._points)
-            self._slopes[1:-1] = np.linalg.solve(matrix, right)
+            slopes = np.append(slopes, slopes[:1], axis=0)
+
+        p, q = points[:-1], points[1:]
+        m, n = slopes[:-1], slopes[1:]
+        # Coefficients (4, K - 1, D) of the powers of t (0 to 1 from a point to the next).
+        self._coefficients = np.stack([p, m, 3 * (q - p) - 2 * m - n, 2 * (p - q) + m + n])
 
     def position(self, time: float) -> Array:
         """Return the position (D,) at a time from 0 to 1."""
-        # Cubic Hermite polynomial of t (0 to 1 from one point to the next) between the points p and
-        # q, with the slopes m and n there.
-        t, p, q, m, n = self._interval(time)
-        left = 1 - t
-        value = (1 + 2 * t) * left**2 * p
-        value = value + t**2 * (3 - 2 * t) * q
-        value = value + t * left**2 * m
-        return value - t**2 * left * n
+        t, coefficients = self._interval(time)
+        return np.asarray(polyval(t, coefficients))
 
     def velocity(self, time: float) -> Array:
         """Return the derivative (D,) of the position by the time, at a time from 0 to 1."""
-        t, p, q, m, n = self._interval(time)
-        per_interval = 6 * t * (1 - t) * (q - p)
-        per_interval = per_interval + (1 - t) * (1 - 3 * t) * m
-        per_interval = per_interval + t * (3 * t - 2) * n
-        return per_interval * (len(self._points) - 1)
+        t, coefficients = self._interval(time)
+        n_intervals = self._coefficients.shape[1]
+        return np.asarray(n_intervals * polyval(t, polyder(coefficients)))
 
-    def _interval(self, time: float) -> tuple[float, Array, Array, Array, Array]:
+    def _interval(self, time: float) -> tuple[float, Array]:
         """Return the interval between two points in which a time from 0 to 1 lies.
 
         Returns:
-            Elapsed fraction t of the interval, the points p and q (D,) at its start and end, and
-            the slopes m and n (D,) there.
+            Elapsed fraction of the interval, and the coefficients (4, D) of its polynomial.
         """
-        scaled = time * (len(self._points) - 1)
-        i = min(int(scaled), len(self._points) - 2)
-        points = self._points[i : i + 2]
-        slopes = self._slopes[i : i + 2]
-        return scaled - i, *points, *slopes
+        n_intervals = self._coefficients.shape[1]
+        i = min(int(time * n_intervals), n_intervals - 1)
+        return time * n_intervals - i, self._coefficients[:, i]

@@ -12,10 +12,11 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 
 from ..track import MAX_DEVICE_US, NEVER, LinkTrack
 from .line import ClockLine, ClockRoundTrip
-from .steps import MAX_DECISION_NS, SampleTiming, StepDecision
+from .steps import MAX_DECISION_NS, StepDecision, find_step
 
 MAX_DELAY_NS = 60_000_000_000
 """Longest credible delay, in ns, between the sampling of a sample and its arrival. If the estimated
@@ -76,7 +77,6 @@ class HubClock:
         self.in_doubt = False
         self.problems: set[str] = set()
         self._line = ClockLine(self._track)
-        self._timing = SampleTiming(self._track)
         self._is_late = False  # whether the samples of the last update were read late
         self._last_us = -1  # newest device time, in µs, in the last read
         self._moved_ns = 0  # arrival time at which _last_us changed last
@@ -221,17 +221,15 @@ class HubClock:
         stamps: list[int] = []
         start = 0
         for k, number in enumerate(numbers):
-            step_us = self._timing.find_step(number, device_us[k])
+            step_us = find_step(self._track, number, device_us[k])
             if not step_us:
                 continue
             # Samples before a step of the hub's clock are converted by the line before the step.
-            if k > start:
-                stamps += self._convert(device_us[start:k], arrival_ns)
-                start = k
-            if self._track.newest_ns != NEVER:
+            stamps += self._convert(device_us[start:k], arrival_ns)
+            start = k
+            if not self._is_fresh:
                 self._begin_decision(step_us, arrival_ns)
-        remaining = device_us[start:] if start else device_us
-        return stamps + self._convert(remaining, arrival_ns)
+        return stamps + self._convert(device_us[start:], arrival_ns)
 
     @property
     def _is_fresh(self) -> bool:
@@ -242,8 +240,9 @@ class HubClock:
         """Discard the clock line and all samples; keep the drift and the last stamp (host time)."""
         self._track.first_us = self._track.first_ns = 0
         self._track.newest_ns = NEVER
+        self._track.reference = -1
+        self._track.period_us = 0.0
         self._line.restart()
-        self._timing.restart()
         self._decision: StepDecision | None = None
 
     def _count_reset(self) -> None:
@@ -350,12 +349,14 @@ class HubClock:
             device_us: Device time of the newest sample, in µs.
             arrival_ns: Host time at which it arrived, in ns.
         """
-        if device_us == self._last_us:
-            self._n_still += 1
-            if self._stands_still(arrival_ns):
-                return CLOCK_STANDS_STILL
-        else:
-            if self._n_still and self._stands_still(arrival_ns):
+        is_same = device_us == self._last_us
+        self._n_still += is_same
+        still_ns = arrival_ns - self._moved_ns
+        stood_still = self._n_still >= MIN_STILL_READS and still_ns > MIN_STILL_NS
+        if is_same and stood_still:
+            return CLOCK_STANDS_STILL
+        if not is_same:
+            if stood_still:
                 # The clock runs again, but it is unknown for how long it stood still.
                 self.reset()
             self._last_us, self._moved_ns, self._n_still = device_us, arrival_ns, 0
@@ -363,18 +364,6 @@ class HubClock:
         if steps_ns and arrival_ns - steps_ns[0] > STEPS_NS:
             steps_ns.popleft()
         return CLOCK_KEEPS_JUMPING if len(steps_ns) == MAX_STEPS else ""
-
-    def _stands_still(self, arrival_ns: int) -> bool:
-        """Return whether the hub's clock stands still, so that device times cannot be used.
-
-        It stands still if the device time of the samples did not change for `MIN_STILL_NS` and in
-        `MIN_STILL_READS` successive reads.
-
-        Args:
-            arrival_ns: Host time of the newest read, in ns.
-        """
-        still_ns = arrival_ns - self._moved_ns
-        return self._n_still >= MIN_STILL_READS and still_ns > MIN_STILL_NS
 
     def _begin_decision(self, step_us: int, arrival_ns: int) -> None:
         """Begin to decide whether the hub's clock was set, or the hub sampled late or early.
@@ -386,25 +375,19 @@ class HubClock:
                 µs.
             arrival_ns: Host time at which the sample after the step arrived, in ns.
         """
-        newest_ns = self._track.newest_ns
-        before_ns = self._track.last_arrival_ns - self._track.first_ns
-        since_ns = arrival_ns - self._track.first_ns
-        if self._decision is not None:
-            step_us += self._decision.step_us
-            newest_ns = self._decision.newest_ns
-            before_ns = self._decision.before_ns
-            since_ns = self._decision.since_ns
-        if not step_us:
-            # This step of the hub's clock has undone the one before, so nothing is left to decide.
-            self._decision = None
+        track = self._track
+        if self._decision is None:
+            self._decision = StepDecision(
+                step_us,
+                newest_ns=track.newest_ns,
+                before_ns=track.last_arrival_ns - track.first_ns,
+                since_ns=arrival_ns - track.first_ns,
+                usual_delay_ns=self._line.recent_min_height,
+            )
             return
-        self._decision = StepDecision(
-            step_us=step_us,
-            newest_ns=newest_ns,
-            before_ns=before_ns,
-            since_ns=since_ns,
-            usual_delay_ns=self._line.recent_min_height,
-        )
+        step_us += self._decision.step_us
+        # If this step of the hub's clock has undone the one before, nothing is left to decide.
+        self._decision = replace(self._decision, step_us=step_us) if step_us else None
 
     def _decide(self, decision: StepDecision, newest_us: int, arrival_ns: int) -> None:
         """Decide whether the hub's clock was set or the hub sampled late, if that is possible now.
@@ -416,19 +399,18 @@ class HubClock:
         """
         device_ns = 1000 * (newest_us - self._track.first_us)
         arrival = arrival_ns - self._track.first_ns
-        delay = self._line.height(device_ns, arrival)
-        was_set = None
         if not self._is_late:
+            delay = self._line.height(device_ns, arrival)
             was_set = decision.was_set(device_ns, delay, arrival, self._track.jitter_ns)
-        elif arrival - decision.since_ns > MAX_DECISION_NS:
+        else:
             # Delays of samples that this host reads late do not tell whether the hub's clock was
             # set. If it was, the clock line shows that once they are read in time again.
-            was_set = False
+            was_set = None if arrival - decision.since_ns <= MAX_DECISION_NS else False
         if was_set is None:
             return
         self._decision = None
         if not was_set:
-            self._timing.forget_period()
+            self._track.period_us = 0.0
             return
         # The origin of device times is moved by the step, so that device times relative to it
         # continue as before the step, and the line and its points stay valid.

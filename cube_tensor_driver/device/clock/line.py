@@ -23,9 +23,11 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from itertools import pairwise
 from typing import NamedTuple
 
+import numpy as np
+
+from ...core.arrays import Array
 from ..track import LinkTrack
 
 BUCKET_NS = 1_000_000_000
@@ -266,13 +268,13 @@ class ClockLine:
             self._points.clear()
         self._points.append((device_ns, delay))
 
-        points = sorted(self._points)
-        if len(points) >= MIN_BUCKETS_FOR_DRIFT:
-            slope = _slope_at_centre(points)
+        devices_ns, delays = np.array(self._points).T
+        if len(devices_ns) >= MIN_BUCKETS_FOR_DRIFT:
+            slope = _slope_at_centre(devices_ns, delays)
             track.drift = min(max(slope, -MAX_DRIFT), MAX_DRIFT)
         # The line must not lie above any point, because no delay is negative. With a limited slope
         # it need not touch two points, so the offset is computed from all of them.
-        track.offset = min(delay - track.drift * device_ns for device_ns, delay in points)
+        track.offset = float((delays - track.drift * devices_ns).min())
         return was_set
 
     def _drift_error(self) -> float:
@@ -324,25 +326,19 @@ class ClockLine:
         self._track.bounded_offset = min(self._track.offset, self._trip_offset)
 
 
-def _slope_at_centre(points: list[tuple[float, float]]) -> float:
-    """Return the slope of the lower convex hull of points at their mean x.
+def _slope_at_centre(x: Array, y: Array) -> float:
+    """Return the slope of the lower convex hull of points at their mean x; 0 if all x are equal.
 
     Args:
-        points: At least two points (x, y), sorted by x.
+        x: First coordinates (K,) of the points.
+        y: Second coordinates (K,) of the points.
     """
-    hull: list[tuple[float, float]] = []
-    for x, y in points:
-        while len(hull) > 1:
-            (x0, y0), (x1, y1) = hull[-2:]
-            turns_left = (x1 - x0) * (y - y0) > (x - x0) * (y1 - y0)
-            if turns_left:
-                # The last point of the hull lies below the straight line between its predecessor
-                # and the new point, so it remains on the hull.
-                break
-            hull.pop()
-        hull.append((x, y))
-    centre = sum(x for x, _ in points) / len(points)
-    for (x0, y0), (x1, y1) in pairwise(hull):
-        if x1 >= centre and x1 > x0:
-            return (y1 - y0) / (x1 - x0)
-    return 0.0
+    is_left = x < x.mean()
+    if not is_left.any():
+        return 0.0
+    # Of all segments from a point left of the centre to one right of it, the one that passes the
+    # centre lowest is the edge of the hull. Rows are left ends, columns right ends.
+    left_x, left_y = x[is_left, np.newaxis], y[is_left, np.newaxis]
+    slopes = (y[~is_left] - left_y) / (x[~is_left] - left_x)
+    heights = left_y + slopes * (x.mean() - left_x)
+    return float(slopes.flat[heights.argmin()])

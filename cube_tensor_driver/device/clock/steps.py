@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, field
 
 from ..track import LinkTrack
 
@@ -97,70 +98,50 @@ class HostClockWatch:
         return now, step
 
 
-class SampleTiming:
-    """Finds samples whose device times are not as expected from their numbers.
+def find_step(track: LinkTrack, number: int, device_us: int) -> int:
+    """Compare the device time (hub's clock) of a sample with the time expected from its number.
 
-    The expected device time (hub's clock) grows by the estimated sample period with each number.
+    The expected time grows by the estimated sample period with each number.
+
+    Args:
+        track: Sample period and reference sample of the link, which are updated.
+        number: Number of the sample, 32 bits, which wraps to 0.
+        device_us: Device time of the sample, in µs.
+
+    Returns:
+        Device time minus expected device time, in µs, if the difference is large enough for a step
+        of the hub's clock; else 0.
     """
-
-    def __init__(self, track: LinkTrack) -> None:
-        self._track = track
-        self.restart()
-
-    def restart(self) -> None:
-        """Discard the sample period and the last sample, because the hub restarted."""
-        self._track.reference = -1
-        self._track.period_us = 0.0
-
-    def forget_period(self) -> None:
-        """Discard the estimated sample period; the next sample gives a new estimate."""
-        self._track.period_us = 0.0
-
-    def find_step(self, number: int, device_us: int) -> int:
-        """Compare the device time of a sample with the time expected from its number.
-
-        Args:
-            number: Number of the sample, 32 bits, which wraps to 0.
-            device_us: Device time of the sample, in µs.
-
-        Returns:
-            Device time minus expected device time, in µs, if the difference is large enough for a
-            step of the hub's clock; else 0.
-        """
-        track = self._track
-        if track.reference < 0:
-            track.reference, track.reference_us = number, device_us
-            return 0
-        # The expected time is counted from a reference: the newest earlier sample whose device time
-        # differed from that of the sample before it. A number that is not ahead of it belongs to a
-        # late sample or to a further frame of one sample.
-        n_periods = (number - track.reference) % _WRAP
-        if not 0 < n_periods < _WRAP // 2:
-            return 0
-        interval = device_us - track.reference_us
-        period = track.period_us
-        error = interval - n_periods * period
-        is_step = False
-        if period <= 0.0:
-            track.period_us = interval / n_periods
-        elif abs(error) > MIN_STEP_US + PERIOD_TOLERANCE * n_periods * period:
-            is_step = True
-        else:
-            # The change of the period is limited, because otherwise a clock that stands still would
-            # look like a shorter and shorter period.
-            bound = period / PERIOD_SAMPLES
-            if error > bound:
-                error = bound
-            elif error < -bound:
-                error = -bound
-            track.period_us = period + error / PERIOD_SAMPLES
-        # While the hub's clock stands still, the reference sample stays the same, so that the
-        # deviation grows with each sample until it counts as a step.
-        if interval or is_step or period <= 0.0:
-            track.reference, track.reference_us = number, device_us
-        return round(error) if is_step else 0
+    if track.reference < 0:
+        track.reference, track.reference_us = number, device_us
+        return 0
+    # The expected time is counted from a reference: the newest earlier sample whose device time
+    # differed from that of the sample before it. A number that is not ahead of it belongs to a
+    # late sample or to a further frame of one sample.
+    n_periods = (number - track.reference) % _WRAP
+    if not 0 < n_periods < _WRAP // 2:
+        return 0
+    interval = device_us - track.reference_us
+    period = track.period_us
+    error = interval - n_periods * period
+    is_step = False
+    if period <= 0.0:
+        track.period_us = interval / n_periods
+    elif abs(error) > MIN_STEP_US + PERIOD_TOLERANCE * n_periods * period:
+        is_step = True
+    else:
+        # The change of the period is limited, because otherwise a clock that stands still would
+        # look like a shorter and shorter period.
+        bound = period / PERIOD_SAMPLES
+        track.period_us = period + min(max(error, -bound), bound) / PERIOD_SAMPLES
+    # While the hub's clock stands still, the reference sample stays the same, so that the
+    # deviation grows with each sample until it counts as a step.
+    if interval or is_step or period <= 0.0:
+        track.reference, track.reference_us = number, device_us
+    return round(error) if is_step else 0
 
 
+@dataclass
 class StepDecision:
     """Decides from the delays of samples whether a hub's clock was set or the hub sampled late.
 
@@ -168,34 +149,24 @@ class StepDecision:
     as before. If its clock was set, they seem to be shorter by the step. All times but `step_us`
     are in ns, relative to the origins of the hub's clock line.
 
-    Args:
+    Attributes:
         step_us: Device time of the first sample after the step minus the device time expected from
             its number, in µs.
         newest_ns: Device time of the newest sample before the step.
         before_ns: Arrival time of the newest sample before the step.
         since_ns: Arrival time of the first sample after the step.
         usual_delay_ns: Smallest delay of the samples just before the step, above the clock line.
-
-    Attributes:
-        step_us, newest_ns, before_ns, since_ns: The arguments of the same names.
+        min_delay_ns: Smallest delay of the samples since the step, above the clock line.
+        n_reads: Number of reads of the link since the step.
     """
 
-    def __init__(
-        self,
-        *,
-        step_us: int,
-        newest_ns: int,
-        before_ns: int,
-        since_ns: int,
-        usual_delay_ns: float,
-    ) -> None:
-        self.step_us = step_us
-        self.newest_ns = newest_ns
-        self.before_ns = before_ns
-        self.since_ns = since_ns
-        self._usual_delay_ns = usual_delay_ns
-        self._min_delay_ns = math.inf
-        self._n_reads = 0
+    step_us: int
+    newest_ns: int
+    before_ns: int
+    since_ns: int
+    usual_delay_ns: float
+    min_delay_ns: float = field(default=math.inf, init=False)
+    n_reads: int = field(default=0, init=False)
 
     def was_set(
         self,
@@ -219,14 +190,14 @@ class StepDecision:
         if step_ns < 0 and device_ns < self.newest_ns:
             # Device times never decrease unless the hub's clock is set back.
             return True
-        self._n_reads += 1
-        self._min_delay_ns = min(self._min_delay_ns, delay_ns)
+        self.n_reads += 1
+        self.min_delay_ns = min(self.min_delay_ns, delay_ns)
         # The shift is the change of the delay in units of the step: 0 if the hub sampled late or
         # early, 1 if its clock was set. After a step forward, the delay is compared with 0, the
         # smallest possible one, because the next sample may have a smaller delay than the usual.
-        reference_ns = self._usual_delay_ns if step_ns < 0 else 0.0
+        reference_ns = self.usual_delay_ns if step_ns < 0 else 0.0
         shift = (reference_ns - delay_ns) / step_ns
-        max_shift = (reference_ns - self._min_delay_ns) / step_ns
+        max_shift = (reference_ns - self.min_delay_ns) / step_ns
         if (step_ns > 0) == (max_shift > 0.5):
             # With the other explanation, the delay of a sample would be negative.
             return step_ns > 0
@@ -240,8 +211,8 @@ class StepDecision:
                 return True
 
         age_ns = arrival_ns - self.since_ns
-        shift = (self._usual_delay_ns - self._min_delay_ns) / step_ns
+        shift = (self.usual_delay_ns - self.min_delay_ns) / step_ns
         is_unclear = abs(shift - 0.5) < 0.25 and age_ns < MAX_DECISION_NS
-        if age_ns < DECISION_NS or self._n_reads < MIN_DECISION_READS or is_unclear:
+        if age_ns < DECISION_NS or self.n_reads < MIN_DECISION_READS or is_unclear:
             return None
         return shift > 0.5

@@ -119,7 +119,12 @@ class CubeTable:
             nothing has changed since the last HELLO.
         """
         hub = self._hubs[link]
-        is_same = hub.hello is not None and _has_same_cubes(hub.hello, hello)
+        before = hub.hello
+        is_same = (
+            before is not None
+            and before.n_pads == hello.n_pads
+            and np.array_equal(before.cube_uids, hello.cube_uids)
+        )
         if is_same and hub.is_present and not hub.waits_for_cube:
             return None
         hub.hello = hello
@@ -134,13 +139,10 @@ class CubeTable:
         fits = self._pads[cubes] == hello.n_pads
         shape = hello.n_cubes, hello.n_pads
         hub.complete = (cubes.astype(np.uint16), shape) if (is_known & fits).all() else None
-
         known_uids = hello.cube_uids[is_known].tolist()
-        uids = dict(self.uids)
-        uids.update(zip(cubes[is_known].tolist(), known_uids, strict=True))
         # Other threads read this dictionary at any time, so it is replaced in one step and never
         # changed in place.
-        self.uids = uids
+        self.uids = self.uids | dict(zip(cubes[is_known].tolist(), known_uids, strict=True))
         return problems
 
     def forget(self, link: int) -> None:
@@ -222,56 +224,30 @@ class CubeTable:
         index_of_uid: dict[int, int] = {}
         for index, uid in enumerate(uids):
             index_of_uid.setdefault(uid, index)
-
-        claimed = self._claimed_by_others(link)
-        cubes = np.full(hello.n_cubes, ABSENT, np.int32)
-        # The keys are the texts of problems, the values the names of the cubes that have them.
-        names: dict[str, list[str]] = {}
-        for number, address in enumerate(self._addresses):
-            is_claimed = number in claimed
-            found, problem = _locate(address, link, hello, index_of_uid, is_claimed)
-            if found is not None:
-                cubes[found] = number
-            if problem:
-                names.setdefault(problem, []).append(str(address))
-        self._hubs[link].waits_for_cube = _OTHER_LINK_HAS_IT in names
-        problems = [
-            # All cubes with the same problem share one line of the log.
-            _join_names("cube", group, text)
-            for text, group in names.items()
-        ]
-
-        # The hub's cubes without an index in the skin are not in the skin file, or repeat the uid
-        # of an earlier cube of the hub.
-        repeated: list[str] = []
-        unknown: list[str] = []
-        for index in np.flatnonzero(cubes == ABSENT).tolist():
-            uid = uids[index]
-            is_first_of_uid = index_of_uid[uid] == index
-            group = unknown if is_first_of_uid else repeated
-            group.append(f"{index} (uid {uid:#x})")
-        if repeated:
-            text = "left out: an earlier one has the same uid"
-            problems.append(_join_names("the hub's cube", repeated, text))
-        if unknown:
-            text = "not in the skin file: add it there"
-            problems.append(_join_names("the hub's cube", unknown, text))
-        return cubes, problems
-
-    def _claimed_by_others(self, link: int) -> set[int]:
-        """Return the indices in the skin of the cubes on the present hubs of all other links."""
         claimed: set[int] = set()
         for other, hub in enumerate(self._hubs):
             if other != link and hub.is_present:
-                claimed |= set(hub.cubes.tolist())
-        return claimed
+                claimed.update(hub.cubes.tolist())
 
+        cubes = np.full(hello.n_cubes, ABSENT, np.int32)
+        # All cubes with the same problem share one line of the log. The keys are the noun of the
+        # cubes and the text of the problem, the values the names of the cubes.
+        names: dict[tuple[str, str], list[str]] = {}
+        for number, address in enumerate(self._addresses):
+            found, problem = _locate(address, link, hello, index_of_uid, number in claimed)
+            if found is not None:
+                cubes[found] = number
+            if problem:
+                names.setdefault(("cube", problem), []).append(str(address))
+        self._hubs[link].waits_for_cube = ("cube", _OTHER_LINK_HAS_IT) in names
 
-def _has_same_cubes(one: Hello, other: Hello) -> bool:
-    """Return whether two HELLO frames list the same cube uids and the same number of pads."""
-    if one.n_pads != other.n_pads:
-        return False
-    return np.array_equal(one.cube_uids, other.cube_uids)
+        for index in np.flatnonzero(cubes == ABSENT).tolist():
+            uid = uids[index]
+            problem = "not in the skin file: add it there"
+            if index_of_uid[uid] != index:
+                problem = "left out: an earlier one has the same uid"
+            names.setdefault(("the hub's cube", problem), []).append(f"{index} (uid {uid:#x})")
+        return cubes, [_join_names(noun, group, text) for (noun, text), group in names.items()]
 
 
 def _locate(

@@ -39,6 +39,17 @@ class RowCounts:
     lost_reason: str = ""
     received: int = field(default=0, compare=False)
 
+    def not_delivered(self) -> dict[str, int]:
+        """Return the numbers of rows that were not delivered, by a description for people."""
+        return {
+            "rows of unknown cubes": self.unknown_cube,
+            "rows with another number of pads": self.wrong_pads,
+            "rows that came twice": self.duplicate,
+            "rows dropped by a slow host": self.overload,
+            "rows lost by errors": self.lost,
+            "rows unaccounted": self.unaccounted,
+        }
+
     def count_lost(self, n_waiting: int, error: Exception) -> int:
         """Count all rows that have gone missing since the last `check` as lost.
 

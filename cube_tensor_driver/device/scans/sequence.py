@@ -84,6 +84,7 @@ class SequenceTracker:
         counters: Numbers of delivered, missing and duplicate samples.
         n_cubes: Number of cubes in each frame whose samples are tracked. A hub with many cubes
             divides each sample into several frames, which have a tracker each.
+        first: Number of the first counted sample since the start or the last restart of the hub.
     """
 
     # The 32-bit numbers of samples wrap to 0. In the attributes below they are unwrapped, so that
@@ -94,7 +95,7 @@ class SequenceTracker:
         self.n_cubes = -1
         self._track = LinkTrack() if track is None else track
         self._is_begun = False
-        self._first = 0
+        self.first = 0
         self._first_us = 0
         self._restart_at = -1  # number of the next sample when a restart was last expected
 
@@ -126,11 +127,11 @@ class SequenceTracker:
         if ahead < -MAX_DISORDER or not self._fits_run(number, device_us):
             return self._restart(sequence, device_us)
 
-        if number < self._first:
+        if number < self.first:
             # This late sample is older than the first one that was counted. It becomes the first,
             # and the samples between the two count as missing.
-            self.counters.missing += self._first - number - 1
-            self._first, self._first_us = number, device_us
+            self.counters.missing += self.first - number - 1
+            self.first, self._first_us = number, device_us
         else:
             self.counters.missing -= 1
         self.counters.out_of_order += 1
@@ -151,11 +152,6 @@ class SequenceTracker:
         if self._is_begun and 0 < ahead <= MAX_GAP:
             self.counters.missing += ahead
             self._track.next += ahead
-
-    @property
-    def first(self) -> int:
-        """Number of the first counted sample since the start or the last restart of the hub."""
-        return self._first
 
     def _ahead(self, sequence: int) -> int:
         """Return by how many samples a 32-bit number is ahead of the next expected number.
@@ -193,7 +189,7 @@ class SequenceTracker:
             number: Unwrapped number of the sample.
             device_us: Device time of the sample, in µs.
         """
-        if not self._first <= number < self._track.next - MAX_DISORDER:
+        if not self.first <= number < self._track.next - MAX_DISORDER:
             return False
         age_us = self._track.newest_us - device_us
         return self._first_us <= device_us and 0 < age_us <= MAX_REPEAT_US
@@ -209,7 +205,7 @@ class SequenceTracker:
             number: Unwrapped number of the sample.
             device_us: Device time of the sample, in µs.
         """
-        if number < self._first:
+        if number < self.first:
             return abs(self._track.newest_us - device_us) < RESTART_US
         seen = self._seen()
         if any(other == number for other, _ in seen):
@@ -236,7 +232,7 @@ class SequenceTracker:
         if sequence <= MAX_GAP:
             # Numbers begin at 0 with power-up, so all samples before this one are missing.
             self.counters.missing += sequence
-            self._first = 0
+            self.first = 0
         return arrival
 
     def _begin(self, sequence: int, device_us: int, arrival: Arrival) -> Arrival:
@@ -250,7 +246,7 @@ class SequenceTracker:
         self._is_begun = True
         for entry in self._track.seen:
             entry[0] = NEVER
-        self._first = sequence
+        self.first = sequence
         self._first_us = device_us
         self._track.next = sequence + 1
         self._track.newest_us = device_us
@@ -393,12 +389,7 @@ class SampleAccount:
     @property
     def missing(self) -> int:
         """Number of samples that the hub has taken, by their numbers, but that have not come."""
-        return sum(tracker.counters.missing for tracker in self._trackers.values())
-
-    @property
-    def resets(self) -> int:
-        """Number of restarts of the hub plus number of times its clock was set back."""
-        return self._total().resets
+        return self._total().missing
 
     def counters(self) -> dict[str, int]:
         """Return the numbers of samples by name.

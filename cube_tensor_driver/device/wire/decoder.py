@@ -10,7 +10,7 @@ counter of `Counters`. `PythonDecoder` is easy to read and is used where no C co
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 from . import cobs
 from .native import NOT_COMPILED, wire
@@ -55,7 +55,7 @@ class Counters:
 
     def as_dict(self) -> dict[str, int]:
         """Return the counters by name."""
-        return {name: getattr(self, name) for name in self.__slots__}
+        return asdict(self)
 
 
 class PythonDecoder:

@@ -72,12 +72,7 @@ def _rows_status(
     values = {
         "rows published": counts.delivered,
         "rows per second": counts.delivered - before.delivered,
-        "rows of unknown cubes": counts.unknown_cube,
-        "rows with another number of pads": counts.wrong_pads,
-        "rows that came twice": counts.duplicate,
-        "rows dropped by a slow host": counts.overload,
-        "rows lost by errors": counts.lost,
-        "rows unaccounted": counts.unaccounted,
+        **counts.not_delivered(),
     }
     return make_status("rows", skin_name, level, text, values)
 
