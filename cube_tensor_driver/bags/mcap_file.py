@@ -29,8 +29,8 @@ from mcap.stream_reader import get_chunk_data_stream
 from mcap.summary import Summary
 from mcap.writer import CompressionType, Writer
 
-from ..config.yaml import parse_yaml, to_yaml
-from .metadata import Connection, FileSummary, QosProfile, bag_information
+from ..config.yaml import to_yaml
+from .metadata import Connection, FileSummary, QosProfile, bag_information, parse_profiles
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 """The bytes with which every complete MCAP file begins and ends."""
@@ -39,9 +39,10 @@ RECORD_HEAD = struct.Struct("<BQ")
 """Layout of the 9 bytes in front of each record of an MCAP file: the opcode, which is the record's
 type, and the length of the record's content in bytes."""
 
-_MESSAGE_HEAD = struct.Struct("<HIQQ")
-"""Layout of the bytes in front of the serialised message in a message record: channel (number of
-the topic in the file), sequence number, and the times of recording and of publication, in ns."""
+MESSAGE_HEAD = struct.Struct("<BQHIQQ")
+"""Layout of the 31 bytes in front of the serialised message in a message record: those of
+`RECORD_HEAD`, channel (number of the topic in the file), sequence number, and the times of
+recording and of publication, in ns."""
 
 CHUNK_BYTES = 1 << 18
 """Size, in bytes, at which the writer completes a chunk (block of messages) of an MCAP file.
@@ -57,11 +58,12 @@ rosbag2 completes a chunk at 0.8 MB, so only a single large message can make a c
 file that states a size beyond this limit is treated as damaged, before memory is allocated.
 """
 
-CACHED_CHUNKS = 4
+CACHED_CHUNKS = 8
 """Number of chunks (blocks of messages) of a file that stay in memory after they were read.
 
 The topics of frequencies and of stress are read in turn by two iterators, whose messages lie in
-the same chunks. Without this cache each chunk would be read and decompressed twice.
+the same chunks. Without this cache each chunk would be read and decompressed twice. What is decoded
+together (`read.MAX_BATCH_ROWS`) takes up to five chunks of `CHUNK_BYTES`.
 """
 
 ROSBAG2_RECORD = "rosbag2"
@@ -117,7 +119,7 @@ class McapReader:
             self._stream.close()
             raise
         self._index = index
-        self._connections = _connections(index)
+        self._connections = read_connections(index)
         # One cache per open file, so that its chunks are freed together with this object.
         self._load_chunk = lru_cache(CACHED_CHUNKS)(self._read_chunk)
         self.summary = summarise(path.name, index)
@@ -151,18 +153,18 @@ class McapReader:
         if not self._index.chunk_indexes:
             yield from self._unindexed_messages(channels, start_ns, stop_ns)
             return
-        stored = self._in_order(channels, start_ns, stop_ns)
-        for time_ns, _, channel, data in stored:
-            # A chunk also contains messages of other topics and of times outside the wanted span.
-            if channel in channels and start_ns <= time_ns < stop_ns:
-                yield channels[channel], time_ns, data
+        for stored in self._in_order(channels, start_ns, stop_ns):
+            for time_ns, _, channel, data in stored:
+                # A chunk also contains messages of other topics, and of times outside the span.
+                if channel in channels and start_ns <= time_ns < stop_ns:
+                    yield channels[channel], time_ns, data
 
     def _in_order(
         self,
         channels: Collection[int],
         start_ns: int,
         stop_ns: int,
-    ) -> Iterator[StoredMessage]:
+    ) -> Iterator[Sequence[StoredMessage]]:
         """Read the chunks (blocks of messages) that can contain wanted messages, in order of time.
 
         Messages of chunks whose times overlap are merged.
@@ -173,7 +175,8 @@ class McapReader:
             stop_ns: End of the wanted span of time, in ns since the Unix epoch.
 
         Yields:
-            All messages of these chunks in the order of time, including unwanted ones.
+            All messages of these chunks, including unwanted ones, in groups that follow each other
+            in the order of time.
         """
         chunks = [
             chunk
@@ -192,7 +195,7 @@ class McapReader:
             # The chunks are sorted by their first times, so messages before that of this chunk can
             # be delivered: no later chunk has an earlier message.
             ready = bisect_left(pending, chunk.message_start_time, key=itemgetter(0))
-            yield from pending[:ready]
+            yield pending[:ready]
             loaded = self._load_chunk(chunk.chunk_start_offset, chunk.chunk_length)
             waiting = pending[ready:]
             if not waiting:
@@ -200,7 +203,7 @@ class McapReader:
                 continue
             # Messages with equal times stay in the order in which they were written to the file.
             pending = sorted([*waiting, *loaded], key=itemgetter(0, 1))
-        yield from pending
+        yield pending
 
     def _read_chunk(self, offset: int, length: int) -> Sequence[StoredMessage]:
         """Read one chunk (block of messages) of the file.
@@ -216,11 +219,19 @@ class McapReader:
         # Parsing a copy of the record limits what a damaged length inside it can request: reading
         # stops at the end of the record instead of allocating any amount of memory.
         record = BytesIO(self._stream.read(length - RECORD_HEAD.size))
-        chunk = Chunk.read(ReadDataStream(record))
-        messages = [
-            (time_ns, offset, channel, data)
-            for channel, time_ns, data in _chunk_messages(unpack_chunk(chunk))
-        ]
+        data = unpack_chunk(Chunk.read(ReadDataStream(record)))
+        # The reader of the library mcap takes several times as long, because it reads field by
+        # field. The zeros at the end let each record be read as if it were a message.
+        padded = data + bytes(MESSAGE_HEAD.size)
+        messages = []
+        begin = 0
+        while begin < len(data):
+            opcode, size, channel, _, time_ns, _ = MESSAGE_HEAD.unpack_from(padded, begin)
+            end = begin + RECORD_HEAD.size + size
+            if opcode == Opcode.MESSAGE:
+                content = data[begin + MESSAGE_HEAD.size : end]
+                messages.append((time_ns, offset, channel, content))
+            begin = end
         # Recorders write messages of several topics slightly out of the order of their times.
         messages.sort(key=itemgetter(0))
         return messages
@@ -351,31 +362,6 @@ def unpack_chunk(chunk: Chunk) -> bytes:
         raise McapError(str(error)) from None
 
 
-def chunk_records(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Yield each record of an unpacked chunk: its opcode, and where its content begins and ends.
-
-    Args:
-        data: Result of `unpack_chunk`. Begin and end are indices of this byte string.
-    """
-    begin = 0
-    while begin < len(data):
-        opcode, length = RECORD_HEAD.unpack_from(data, begin)
-        begin += RECORD_HEAD.size
-        yield opcode, begin, begin + length
-        begin += length
-
-
-def _chunk_messages(data: bytes) -> Iterator[tuple[int, int, bytes]]:
-    """Yield each message of an unpacked chunk: channel, time of recording in ns, serialised bytes.
-
-    The reader of the library mcap takes several times as long, because it reads field by field.
-    """
-    for opcode, begin, end in chunk_records(data):
-        if opcode == Opcode.MESSAGE:
-            channel, _, time_ns, _ = _MESSAGE_HEAD.unpack_from(data, begin)
-            yield channel, time_ns, data[begin + _MESSAGE_HEAD.size : end]
-
-
 def rosbag2_metadata(file: FileSummary) -> dict[str, str]:
     """Return the content of the metadata record that rosbag2 reads if metadata.yaml is missing."""
     return {"serialized_metadata": to_yaml(bag_information("mcap", [file]))}
@@ -391,13 +377,13 @@ def summarise(name: str, index: Summary) -> FileSummary:
     times = index.statistics
     return FileSummary(
         name,
-        list(_connections(index).values()),
+        list(read_connections(index).values()),
         times.message_start_time if times else 0,
         times.message_end_time if times else 0,
     )
 
 
-def _connections(index: Summary) -> dict[int, Connection]:
+def read_connections(index: Summary) -> dict[int, Connection]:
     """Return the topics of an MCAP file by their channels (numbers of the topics in the file)."""
     counts = index.statistics.channel_message_counts if index.statistics else {}
     found = {}
@@ -409,7 +395,7 @@ def _connections(index: Summary) -> dict[int, Connection]:
             channel.topic,
             schema.name if schema else "",
             schema.data.decode() if schema and has_text else "",
-            parse_yaml(channel.metadata.get("offered_qos_profiles") or "[]", channel.topic),
+            parse_profiles(channel.metadata.get("offered_qos_profiles", ""), channel.topic),
             counts.get(number, 0),
         )
     return found

@@ -19,7 +19,7 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
 from ..config.package_data import package_data
-from ..config.yaml import read_yaml, write_yaml
+from ..config.yaml import parse_yaml, read_yaml, write_yaml
 from ..core.errors import BagError, ConfigError
 from ..messages.types import PACKAGE
 
@@ -139,6 +139,23 @@ def quality(
         "liveliness_lease_duration": dict(_UNLIMITED_DURATION),
         "avoid_ros_namespace_conventions": False,
     }
+
+
+@lru_cache
+def parse_profiles(text: str, topic: str) -> Sequence[QosProfile]:
+    """Return the quality of service profiles that a storage file states for a topic.
+
+    The result is cached, because bags of one robot have the same text for the same topic.
+
+    Args:
+        text: List of profiles as YAML; "" if the file states none.
+        topic: Name of the topic, for error messages.
+
+    Raises:
+        ConfigError: The text is not YAML.
+    """
+    profiles: list[QosProfile] = parse_yaml(text or "[]", topic)
+    return profiles
 
 
 @lru_cache

@@ -14,7 +14,7 @@ import struct
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -37,7 +37,7 @@ from .sqlite_file import SqliteReader
 VERSION = 3
 """Version of this package's message definitions that can be read: ``SkinInfo.VERSION``."""
 
-MAX_BATCH_MESSAGES = 64
+MAX_BATCH_MESSAGES = 128
 """Largest number of messages decoded by one call of numpy. With more messages, the fixed cost of
 the call is already negligible."""
 
@@ -288,6 +288,16 @@ class Bag:
             BagError: A file of the bag is damaged, or has another number of messages than its
                 summary states.
         """
+        for connection, time_ns, data in self._stored(topics, start_ns, stop_ns):
+            yield Entry(connection.topic, connection.msgtype, time_ns, data)
+
+    def _stored(
+        self,
+        topics: set[str] | None = None,
+        start_ns: int = 0,
+        stop_ns: int = MAX_TIME_NS,
+    ) -> Iterator[tuple[Connection, int, bytes]]:
+        """Read messages as `entries` does; yield topic, time of recording in ns, and bytes."""
         wanted = {one.topic for one in self.connections}
         if topics is not None:
             wanted &= topics
@@ -305,7 +315,7 @@ class Bag:
                         except READ_ERRORS as error:
                             self.skip(connection.topic, time_ns, error)
                             continue
-                    yield Entry(connection.topic, connection.msgtype, time_ns, data)
+                    yield connection, time_ns, data
 
         # If the name of a topic or the number of a channel is damaged, no library raises an error:
         # messages are only missing. Therefore their number is compared with the one stated.
@@ -364,8 +374,7 @@ class Bag:
 
         The list is empty if the type is unknown.
         """
-        constants_and_fields = typestore().fielddefs.get(msgtype, ((), ()))
-        return list(constants_and_fields[1])
+        return message_fields(msgtype)
 
     def infos(self, topic: str) -> list[Any]:
         """Return the SkinInfo messages (cubes, calibrations, rest frequencies) of a topic.
@@ -464,7 +473,7 @@ class Bag:
                     except MessageError as error:
                         self.skip(topic, time_ns, error)
 
-        for _, _, time_ns, data in self.entries({topic}):
+        for _, time_ns, data in self._stored({topic}):
             has_same_shape = len(data) == size and data.startswith(shape, SHAPE_AT)
             if len(waiting) >= limit or not has_same_shape:
                 if waiting:
@@ -512,13 +521,9 @@ class Bag:
             if not one.msgtype.startswith(PACKAGE) or not one.definition:
                 continue
             with report_damage(self.path):
-                definitions = get_types_from_msg(one.definition, one.msgtype)
-            # Only fields are compared; constants of a definition do not change a message's bytes.
-            for name, (_, fields) in definitions.items():
-                if not name.startswith(PACKAGE):
-                    continue
-                if list(fields) != self.fields(name):
-                    self._refuse_version(f"{one.topic} has another definition of {name}")
+                different = _differing_type(one.msgtype, one.definition)
+            if different:
+                self._refuse_version(f"{one.topic} has another definition of {different}")
 
     def _refuse_version(self, difference: str) -> None:
         """Raise a BagError that states which message of the bag has another version, and how."""
@@ -526,6 +531,33 @@ class Bag:
             f"{self.path}: {difference}; this package reads version {VERSION} of its messages: "
             "use the version of the package that recorded the bag"
         )
+
+
+def message_fields(msgtype: str) -> list[tuple[str, Any]]:
+    """Return name and kind of each field of a message type, as the library rosbags states them.
+
+    The list is empty if the type is unknown.
+    """
+    constants_and_fields = typestore().fielddefs.get(msgtype, ((), ()))
+    return list(constants_and_fields[1])
+
+
+@lru_cache
+def _differing_type(msgtype: str, definition: str) -> str:
+    """Return the first type of this package that a bag defines with other fields; "" if none is.
+
+    Parsing a definition takes longer than reading a bag of a few seconds, and all bags of one
+    version have the same, so the result is cached.
+
+    Args:
+        msgtype: Type of the messages of a topic.
+        definition: Text of its definition in the bag, with those of the types in it.
+    """
+    # Only fields are compared; constants of a definition do not change a message's bytes.
+    for name, (_, fields) in get_types_from_msg(definition, msgtype).items():
+        if name.startswith(PACKAGE) and list(fields) != message_fields(name):
+            return name
+    return ""
 
 
 def _decompress(data: bytes) -> bytes:

@@ -53,7 +53,6 @@ from .mcap_file import (
     RECORD_HEAD,
     ROSBAG2_RECORD,
     McapReader,
-    chunk_records,
     rosbag2_metadata,
     summarise,
     unpack_chunk,
@@ -357,9 +356,7 @@ class _Salvaged:
         self._open_chunk = None
         chunk: Chunk = _parse(Chunk.read, content)
         counts: Counter[int] = Counter()
-        data = unpack_chunk(chunk)
-        for opcode, begin, end in chunk_records(data):
-            record = data[begin:end]
+        for opcode, _, record in _records(BytesIO(unpack_chunk(chunk))):
             if opcode == Opcode.MESSAGE:
                 counts[int.from_bytes(record[:2], "little")] += 1
             else:

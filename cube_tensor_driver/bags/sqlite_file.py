@@ -10,13 +10,14 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from ..config.yaml import parse_yaml, to_yaml
+from ..config.yaml import to_yaml
 from .metadata import (
     METADATA_VERSION,
     Connection,
     FileSummary,
     QosProfile,
     bag_information,
+    parse_profiles,
     type_hash,
 )
 
@@ -150,7 +151,7 @@ class SqliteReader:
                 topic,
                 msgtype,
                 definitions.get(msgtype, ""),
-                parse_yaml(qos or "[]", topic),
+                parse_profiles(qos, topic),
                 counts.get(number, 0),
             )
             for number, topic, msgtype, qos in topics

@@ -96,6 +96,27 @@ class Watch(Protocol):
         """
 
 
+@lru_cache(maxsize=MAX_CACHED_ESTIMATORS)
+def _find_estimator(calibration: Calibration, mask: int) -> Estimator:
+    """Return the estimator (map from pad stresses to components) of a calibration.
+
+    It is cached for all pipelines of the process, because making it takes longer than computing the
+    stress of a recording of a second.
+
+    Args:
+        calibration: The calibration.
+        mask: Bit mask of the pads that are not used.
+    """
+    missing = [pad for pad in range(calibration.layout.n_pads) if mask >> pad & 1]
+    return make_estimator(
+        calibration.response,
+        calibration.noise,
+        calibration.modes,
+        missing,
+        calibration.neglect,
+    )
+
+
 class Pipeline:
     """Computes the stress of the cubes of one skin.
 
@@ -143,8 +164,7 @@ class Pipeline:
         modulus = pad_table([c.modulus for c in self._groups], self.n_pads, fill=0)
         self._beta = np.maximum(beta, MIN_BETA)
         self._stiffness = modulus * (1 + self._beta) / self._beta
-        self._estimator = lru_cache(maxsize=MAX_CACHED_ESTIMATORS)(self._make_estimator)
-        whole = [self._make_estimator(number, 0) for number in range(len(self._groups))]
+        whole = [self._estimator(number, 0) for number in range(len(self._groups))]
         # Calibrations with no more pads than modes have no residual. Even if this holds for all,
         # the matrices have one column for the residual, which is NaN.
         self._n_residuals = max(estimator.dof for estimator in whole) or 1
@@ -485,22 +505,14 @@ class Pipeline:
         is_stress = np.arange(N_COMPONENTS) < len(STRESS)
         return np.where(is_stress, 1, 1 / self._groups[group].half_side)
 
-    def _make_estimator(self, group: int, mask: int) -> Estimator:
-        """Construct the estimator (map from pad stresses to components) of a calibration.
+    def _estimator(self, group: int, mask: int) -> Estimator:
+        """Return the estimator (map from pad stresses to components) of a calibration.
 
         Args:
             group: Number of the calibration.
             mask: Bit mask of the pads that are not used.
         """
-        calibration = self._groups[group]
-        missing = [pad for pad in range(calibration.layout.n_pads) if mask >> pad & 1]
-        return make_estimator(
-            calibration.response,
-            calibration.noise,
-            calibration.modes,
-            missing,
-            calibration.neglect,
-        )
+        return _find_estimator(self._groups[group], mask)
 
     def _allocate_tables(self, group: AnyArray) -> Tables:
         """Return the tables of the skin, with room for `MAX_CACHED_ESTIMATORS` sets of bad pads.

@@ -428,8 +428,15 @@ class MessageCodec(Generic[AnyRows]):
                 raise MessageError(
                     f"{self._name}: {count} messages of different lengths; decode them one by one"
                 )
-        stamp_ns = np.array([self._read_stamp(layout, message) for message in messages])
         record: AnyArray = np.frombuffer(data, layout.record, count)
+        # The lengths of many messages are compared by numpy. Only if some differ, or for a single
+        # message, each is checked by `_read_stamp`.
+        lengths = record[[f"length of {name}" for name in layout.sequences]]
+        checked = messages if (lengths != lengths[0]).any() else messages[:1]
+        stamps = [self._read_stamp(layout, message) for message in checked]
+        if len(stamps) == count:
+            return layout, record, np.array(stamps)
+        stamp_ns = record["sec"].astype(np.int64) * SECOND + record["nanosec"]
         return layout, record, stamp_ns
 
     def _read_shape(self, data: bytes) -> _Shape:

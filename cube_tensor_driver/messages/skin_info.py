@@ -7,6 +7,7 @@ The message may be an object of rclpy or of the bag library.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -70,8 +71,7 @@ def cube_calibrations(info: Any) -> tuple[Calibration, ...]:
     try:
         # Most skins have one calibration for all cubes, so each text is parsed only once.
         for used_id in set(used_ids):
-            data = parse_yaml(texts[used_id], f"calibration {used_id}")
-            calibrations[used_id] = Calibration.from_dict(data)
+            calibrations[used_id] = _parse_calibration(used_id, texts[used_id])
     except (CalibrationError, ConfigError) as error:
         raise MessageError(f"info of the skin {info.name}: {error}") from None
     except KeyError as error:
@@ -79,6 +79,20 @@ def cube_calibrations(info: Any) -> tuple[Calibration, ...]:
             f"info of the skin {info.name}: no calibration {error}, which a cube uses"
         ) from None
     return tuple(calibrations[used_id] for used_id in used_ids)
+
+
+@lru_cache
+def _parse_calibration(name: str, text: str) -> Calibration:
+    """Return a calibration, which is cached because many recordings of one skin have the same.
+
+    Args:
+        name: Id of the calibration, for error messages.
+        text: The calibration as YAML.
+
+    Raises:
+        CalibrationError, ConfigError: The text is no valid calibration.
+    """
+    return Calibration.from_dict(parse_yaml(text, f"calibration {name}"))
 
 
 def geometry(info: Any) -> list[object]:
