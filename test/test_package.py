@@ -58,7 +58,6 @@ HOMES = {
     "pyarrow": {"bags", "lerobot"},
     "PIL": {"lerobot"},
     "zarr": {"bags"},
-    "distributed": {"bags"},
     "skfem": {"cube_tensor_design"},
     "transforms3d": {"core"},
     "launch": {"ros"},

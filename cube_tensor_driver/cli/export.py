@@ -64,7 +64,7 @@ def arguments(parser: Parser) -> None:
         _add_common(table)
         # The command `reprocess` makes the tables. Its options that these subcommands do not have
         # are set to their defaults.
-        table.set_defaults(format=name, contacts=None, scheduler=None)
+        table.set_defaults(format=name, contacts=None)
         table.add_jobs()
 
 

@@ -1,6 +1,6 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""./cube reprocess: compute the stress of bags again, in parallel, here or on a Dask cluster.
+"""./cube reprocess: compute the stress of bags again, in parallel.
 
 It needs no ROS. From the same frequencies and calibrations, it computes exactly the same numbers
 (bit by bit) as the reconstruction node.
@@ -45,11 +45,6 @@ def arguments(parser: Parser) -> None:
         "its other parameters: depth:=0.005 thickness:=0.011 rate:=20",
     )
     parser.add_jobs()
-    parser.add_argument(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="scheduler of a Dask cluster to run on, as in tcp://host:8786",
-    )
 
 
 def add_overrides(parser: Parser) -> None:
@@ -93,7 +88,6 @@ def run(options: argparse.Namespace) -> int:
         make_jobs,
         remove_without_results,
         reprocess_all,
-        useful_workers,
         workers,
         write_recipe,
     )
@@ -110,11 +104,9 @@ def run(options: argparse.Namespace) -> int:
         done = len(jobs) - len(waiting)
         console.print(f"{done} of {len(jobs)} bags are there already in {options.output}")
 
-    # Each bag is one job, so more processes than bags would be useless.
-    processes = useful_workers(options.jobs, len(waiting))
     failed = 0
     try:
-        with workers(processes, options.scheduler) as executor, progress_bar() as report:
+        with workers(options.jobs, len(waiting)) as executor, progress_bar() as report:
             results = reprocess_all(waiting, executor)
             for done, (job, result) in enumerate(results, 1):
                 report(done, len(waiting), "reprocessing")

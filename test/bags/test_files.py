@@ -382,19 +382,6 @@ def test_reprocess_goes_on_where_it_ended(bag, tmp_path, capsys):
     assert "other options" in capsys.readouterr().err
 
 
-def test_reprocess_on_a_dask_cluster(bag, tmp_path):
-    from distributed import LocalCluster
-
-    with LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
-    ) as cluster:
-        address = cluster.scheduler_address
-        assert (
-            main(["reprocess", str(bag), "-o", str(tmp_path / "out"), "--scheduler", address]) == 0
-        )
-    assert all_differing_bits(stress(bag), stress(tmp_path / "out" / "bag")) == 0
-
-
 def test_cut_off_anywhere_is_repaired(bag, tmp_path):
     """What stood in complete chunks is there after the repair, the rest is kept, whatever byte the
     end fell on."""

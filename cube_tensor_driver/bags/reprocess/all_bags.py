@@ -1,6 +1,6 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Reprocessing of many bags into one folder, in parallel processes or on a Dask cluster."""
+"""Reprocessing of many bags into one folder, in parallel processes."""
 
 from __future__ import annotations
 
@@ -9,13 +9,12 @@ import os
 import shutil
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from ...config.yaml import read_yaml, write_yaml
-from ...core.errors import BagError, ConfigError, CubeError
+from ...core.errors import BagError, CubeError
 from .contacts import ContactsOverTime
 from .job import PARTIAL_FOLDER, Overrides, ReprocessJob, ReprocessResult, reprocess
 
@@ -145,45 +144,16 @@ def reprocess_all(
             yield futures[future], error
 
 
-@contextmanager
-def workers(count: int, scheduler: str | None = None) -> Iterator[Executor]:
-    """Provide worker processes for the duration of a `with` block.
+def workers(wanted: int | None, jobs: int) -> Executor:
+    """Return worker processes, a context manager.
 
     Args:
-        count: Number of processes on this machine; a Dask cluster has its own number.
-        scheduler: Address of the scheduler of a Dask cluster, such as tcp://host:8786; None: the
-            processes run on this machine.
-
-    Raises:
-        ConfigError: No scheduler answers at the address within 5 s.
-        ModuleNotFoundError: The package `distributed`, which Dask requires, is not installed.
-    """
-    if scheduler is None:
-        # With one process per core, further threads of numpy (OpenBLAS) would only compete for the
-        # cores. The worker processes inherit this environment variable.
-        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-        # The processes are spawned, not forked, because numpy's threads do not survive a fork.
-        with ProcessPoolExecutor(count, multiprocessing.get_context("spawn")) as executor:
-            yield executor
-        return
-    from distributed import Client
-
-    try:
-        client = Client(scheduler, timeout="5s")  # type: ignore[no-untyped-call]
-    except (OSError, ValueError) as error:
-        raise ConfigError(
-            f"--scheduler {scheduler}: {error}; name a running scheduler, tcp://host:8786"
-        ) from None
-    with client:
-        yield client.get_executor()  # type: ignore[no-untyped-call]
-
-
-def useful_workers(wanted: int | None, jobs: int) -> int:
-    """Return the number of worker processes to start.
-
-    Args:
-        wanted: Number that the user gave; None: one per core of this machine.
+        wanted: Number of processes that the user gave; None: one per core of this machine.
         jobs: Number of jobs, which is the largest useful number of processes.
     """
-    cores = os.cpu_count() or 1
-    return max(1, min(wanted or cores, jobs))
+    # With one process per core, further threads of numpy (OpenBLAS) would only compete for the
+    # cores. The worker processes inherit this environment variable.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    count = max(1, min(wanted or os.cpu_count() or 1, jobs))
+    # The processes are spawned, not forked, because numpy's threads do not survive a fork.
+    return ProcessPoolExecutor(count, multiprocessing.get_context("spawn"))
