@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import pyarrow
 import pyarrow.dataset
+import pyarrow.parquet
 import pytest
 
 pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
@@ -45,14 +46,29 @@ def assert_reprocessed(folder) -> None:
     """Every bag has a file in the partition with the bytes of `./cube reprocess`."""
     for name in BAGS:
         reprocess(ReprocessJob(folder / name, folder / f"{name}.parquet", "parquet"))
-        expected = pyarrow.dataset.dataset(folder / f"{name}.parquet").to_table()
-        path = folder / "stress" / PARTITION / f"{name}-0.parquet"
-        found = pyarrow.dataset.dataset(path).to_table()
+        expected = pyarrow.parquet.read_table(folder / f"{name}.parquet", partitioning=None)
+        found = pyarrow.parquet.read_table(folder / "stress" / PARTITION / f"{name}.parquet")
         assert found.column_names == expected.column_names
         for column in set(expected.column_names) - {"cube"}:
             one, other = (table[column].to_numpy().tobytes() for table in (found, expected))
             assert one == other, column
         assert found["cube"].to_pylist() == expected["cube"].to_pylist()
+
+
+def test_program_goes_on_where_it_was_interrupted(page, tmp_path, monkeypatch):
+    """A bag whose file is complete is skipped, and half a file is never taken for a whole one."""
+    assert page["write_stress"](BAGS[0]) == {"rows": 320}
+
+    def fail(table, file):
+        file.write(b"PAR1")
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as interrupted, pytest.raises(KeyboardInterrupt):
+        interrupted.setattr(pyarrow.parquet, "write_table", fail)
+        page["write_stress"](BAGS[1])
+    assert [path.stem for path in (tmp_path / "stress").rglob("*.parquet")] == [BAGS[0]]
+    assert [page["write_stress"](name)["rows"] for name in BAGS] == [0, 320]
+    assert_reprocessed(tmp_path)
 
 
 def test_program_runs_on_dask(page, tmp_path):
@@ -113,7 +129,7 @@ def test_program_writes_to_an_object_store(page, monkeypatch):
         for name in BAGS:
             assert page["write_stress"](name, folder="s3://fleet/stress") == {"rows": 320}
         found = sorted(files.find("fleet/stress"))
-        assert found == [f"fleet/stress/{PARTITION}/{name}-0.parquet" for name in BAGS]
+        assert found == [f"fleet/stress/{PARTITION}/{name}.parquet" for name in BAGS]
         data = pyarrow.dataset.dataset("fleet/stress", filesystem=files, partitioning="hive")
         assert data.to_table(filter=pyarrow.dataset.field("robot") == "arm1").num_rows == 640
     finally:
