@@ -13,9 +13,10 @@ import numpy as np
 import viser
 from viser import uplot
 
+from ..core.arrays import Array
 from ..core.modes import COMPONENTS, STRESS
-from ..views.figures.panels import Panel, draw_panels
-from ..views.figures.style import png, symbol
+from ..views.figures.panels import draw_panels
+from ..views.figures.style import png
 from ..views.round_numbers import round_range
 from . import markup
 from .history import History
@@ -59,6 +60,9 @@ AXIS_SIZES = (44, 56)
 The first entry is the height below the time axis, the second the width beside the value axis.
 """
 
+TIME_LABEL = "time before now / s"
+"""Label of the time axis of the plots."""
+
 CHART_HEIGHT = 250
 """Height of a chart, in pixels."""
 
@@ -86,18 +90,30 @@ class ChartLine(NamedTuple):
     Attributes:
         cube: Index of the cube in the skin.
         column: Index of the value in `History.COLUMNS`.
-        label: Name of the line in the legend on the page, such as "c05 σzz".
-        printed: Name of the line in a PNG file, with the symbol set as mathematics.
-        axis: Label of the value axis of its chart, with the unit.
-        size: Size of this unit, in SI units.
+        label: Name of the line in the legend, such as "c05 σzz".
     """
 
     cube: int
     column: int
     label: str
-    printed: str
+
+
+class Chart(NamedTuple):
+    """What one chart shows.
+
+    Attributes:
+        axis: Label of the value axis, with the unit.
+        unit: Size of this unit, in SI units.
+        lines: The lines of the chart.
+    """
+
     axis: str
-    size: float
+    unit: float
+    lines: tuple[ChartLine, ...]
+
+    def values(self, history: History) -> dict[str, Array]:
+        """Return the values (M,) of each line at the M instants of a history, by its label."""
+        return {line.label: history.of(line.cube, line.column) / self.unit for line in self.lines}
 
 
 class Charts:
@@ -119,7 +135,7 @@ class Charts:
         self._gui, self._tab, self._names = gui, tab, list(names)
         self._history: History | None = None
         self._cubes = [0]
-        self._lines: list[tuple[ChartLine, ...]] = [()] * len(FIRST_GROUPS)
+        self._charts = [Chart("", 1.0, ())] * len(FIRST_GROUPS)
         with tab:
             self._text = gui.add_text(
                 "more cubes",
@@ -150,8 +166,8 @@ class Charts:
         def _(event: viser.GuiEvent[Any]) -> None:
             self._save(event.client, str(files.value))
 
-    def choose(self, history: History, chosen: int) -> tuple[tuple[ChartLine, ...], ...]:
-        """Return the lines of each chart that the user has chosen.
+    def choose(self, history: History, chosen: int) -> tuple[Chart, ...]:
+        """Return the charts that the user has chosen.
 
         Args:
             history: Values of all cubes in the last seconds, which tell what the cubes observe.
@@ -166,34 +182,36 @@ class Charts:
         for number, one in enumerate(self.lists):
             # A browser may send any text, so the value is checked.
             group = one.value if one.value in GROUPS else FIRST_GROUPS[0]
-            lines = chart_lines(history, self._names, self._cubes, group)
-            # A chart without lines would have no axes; it keeps those that it has.
-            self._lines[number] = lines or self._lines[number]
-        return tuple(self._lines)
+            chart = make_chart(history, self._names, self._cubes, group)
+            # A chart without lines would have no axes; the one before stays.
+            if chart.lines:
+                self._charts[number] = chart
+        return tuple(self._charts)
 
-    def replace_plots(self, charts: Sequence[Sequence[ChartLine]]) -> dict[str, Any]:
+    def replace_plots(self, charts: Sequence[Chart]) -> dict[str, Any]:
         """Replace the plots whose lines have changed, as uPlot cannot add a line to a plot.
 
         Args:
-            charts: Lines of each chart.
+            charts: What the charts show.
 
         Returns:
             Name of each new plot -> the plot.
         """
         new: dict[str, Any] = {}
-        for number, lines in enumerate(charts):
+        for number, chart in enumerate(charts):
             plot = self._plots[number]
             labels = [one["label"] for one in plot.series[1:]] if plot is not None else []
-            if not lines or labels == [line.label for line in lines]:
+            # A chart without lines is not plotted yet, so it is equal to one without labels.
+            if labels == [line.label for line in chart.lines]:
                 continue
             if plot is not None:
                 plot.remove()
-            new[f"chart {number}"] = self._plots[number] = self._add_plot(lines, 2 + 2 * number)
+            new[f"chart {number}"] = self._plots[number] = self._add_plot(chart, 2 + 2 * number)
         return new
 
-    def _add_plot(self, lines: Sequence[ChartLine], order: float) -> viser.GuiUplotHandle:
+    def _add_plot(self, chart: Chart, order: float) -> viser.GuiUplotHandle:
         grid: uplot.Axis_Grid = {"stroke": "#dee2e6", "width": 1}
-        labels = ("time before now / s", lines[0].axis)
+        labels = (TIME_LABEL, chart.axis)
         axes = tuple(
             uplot.Axis(
                 stroke="#343a40",
@@ -211,11 +229,11 @@ class Charts:
                 width=1.8,
                 dash=DASHES[number // len(COLOURS) % len(DASHES)],
             )
-            for number, line in enumerate(lines)
+            for number, line in enumerate(chart.lines)
         ]
         with self._tab:
             return self._gui.add_uplot(
-                (np.array([0.0]),) * (1 + len(lines)),
+                (np.array([0.0]),) * (1 + len(series)),
                 (uplot.Series(label="s"), *series),
                 height=CHART_HEIGHT,
                 axes=axes,
@@ -238,18 +256,17 @@ class Charts:
                 save_immediately=True,
             )
         elif kind == "PNG":
-            panels = [chart_panel(history, lines) for lines in self._lines if lines]
+            panels = [(chart.axis, chart.values(history)) for chart in self._charts]
+            figure = draw_panels(history.times, TIME_LABEL, panels)
             client.send_file_download(
                 "skin.png",
-                png(draw_panels(panels)),
+                png(figure),
                 save_immediately=True,
             )
 
 
-def chart_lines(
-    history: History, names: Sequence[str], cubes: Sequence[int], group: str
-) -> tuple[ChartLine, ...]:
-    """Return the lines of a chart: the observed values of a group, of some cubes.
+def make_chart(history: History, names: Sequence[str], cubes: Sequence[int], group: str) -> Chart:
+    """Return a chart of the observed values of a group, of some cubes.
 
     Args:
         history: Values of all cubes in the last seconds.
@@ -257,34 +274,26 @@ def chart_lines(
         cubes: Indices of the cubes, in the order of their lines.
         group: Name of the values in `GROUPS`.
     """
-    observed = history.observed_names
     size, unit = markup.unit(GROUPS[group][0])
+    observed = [name for name in GROUPS[group] if name in history.observed_names]
     lines = [
-        ChartLine(
-            cube=cube,
-            column=History.COLUMNS.index(name),
-            label=f"{names[cube]} {markup.label(name)}",
-            printed=f"{names[cube]} {name if name == 'residual' else symbol(name)}",
-            axis=f"{group} / {unit}",
-            size=size,
-        )
+        ChartLine(cube, History.COLUMNS.index(name), f"{names[cube]} {markup.label(name)}")
         for cube in cubes
-        for name in GROUPS[group]
-        if name in observed
+        for name in observed
     ]
-    return tuple(lines[:MAX_LINES])
+    return Chart(f"{group} / {unit}", size, tuple(lines[:MAX_LINES]))
 
 
-def chart_properties(history: History, lines: Sequence[ChartLine]) -> dict[str, Any]:
-    """Return the values of a plot and the ranges of its axes.
+def chart_properties(history: History, chart: Chart) -> dict[str, Any]:
+    """Return the values of a plot and the ranges of its axes; nothing if it has no lines.
 
     Args:
         history: Values of all cubes in the last seconds.
-        lines: The lines of the plot; if there are none, nothing is returned.
+        chart: What the plot shows.
     """
-    if not lines:
+    values = list(chart.values(history).values())
+    if not values:
         return {}
-    values = [history.of(line.cube, line.column) / line.size for line in lines]
     # The range is computed here, because uPlot cannot compute it from values with NaN.
     finite = np.concatenate(values)
     finite = finite[np.isfinite(finite)]
@@ -292,14 +301,6 @@ def chart_properties(history: History, lines: Sequence[ChartLine]) -> dict[str, 
     if history.count // NUDGE_PERIOD % 2:
         high += 1e-9 * (high - low)
     return {"data": (history.times, *values), "scales": _scales(low, high)}
-
-
-def chart_panel(history: History, lines: Sequence[ChartLine]) -> Panel:
-    """Return what `draw_panels` needs to draw a chart into a picture."""
-    # matplotlib sets the symbol of a component as mathematics; the page shows plain text.
-    label = lines[0].axis.replace("σzz", symbol("zz"))
-    values = {line.printed: history.of(line.cube, line.column) / line.size for line in lines}
-    return label, history.times, values
 
 
 def _scales(low: float, high: float) -> dict[str, uplot.Scale]:

@@ -15,7 +15,7 @@ import numpy as np
 from ..core.arrays import Array
 from ..core.latest_stress import FAULTY, HEALTH_WORDS
 from ..core.modes import COMPONENTS
-from ..core.status import STATUS
+from ..core.status import describe_status
 from ..touch.surface import Contact
 from ..views import scene
 from .scan import Scan
@@ -316,18 +316,15 @@ def numbers(scan: Scan, cube: int) -> str:
             rows.append((label(name), f"{si_value / size:+.3f}", unit_name))
     rows.append(("residual", f"{scan.residual[cube]:.2f}", "× noise"))
     rows.append(("rate", f"{scan.rate[cube]:.0f}", "Hz"))
-    rows.append(("state", _state(scan.status[cube], scan.health[cube]), ""))
+    rows.append(
+        ("state", describe_status(scan.status[cube]) or HEALTH_WORDS[scan.health[cube]], "")
+    )
     return box(_table(rows))
 
 
 def _hundredths(number: float) -> str:
     text = f"{number:.2f}"
     return "0.00" if text == "-0.00" else text
-
-
-def _state(status: int, health: int) -> str:
-    words = [name.lower().replace("_", " ") for name, bit in STATUS.items() if status & bit]
-    return ", ".join(words) or HEALTH_WORDS[health]
 
 
 def conditions(names: list[str], scan: Scan) -> str:

@@ -16,14 +16,14 @@ from typing import Any
 import numpy as np
 import viser
 
-from ..views.scene import Quantity
+from ..views.scene import Quantity, Ranges
 from . import markup
 from .charts import Charts
 from .controls import ColourControls, ReplayControls, add_part_controls
 from .history import History
 from .markup import PageStatus
 from .scan import Scan
-from .scene_3d import SPAN, Ranges, Update
+from .scene_3d import SPAN, Update
 from .update import Choices, ShownSkin, build_update
 
 BRAND_COLOUR = (24, 100, 171)
@@ -205,7 +205,7 @@ class Page:
         if quantity is not self._quantity:
             # The automatic range of the colours belongs to another quantity.
             self._quantity = quantity
-            self._ranges_before = self._ranges_before._replace(colour=0.0)
+            self._ranges_before = self._ranges_before._replace(colours=0.0)
         return Choices(
             quantity=quantity,
             fixed_top=self._colours.fixed_top,

@@ -3,21 +3,20 @@
 """The skin in 3-D on the page: cubes, field, arrows, crosses, contact.
 
 A computer without a graphics card draws each instance of a batched mesh separately, and a thousand
-cubes twenty times a second are too many for it. Parts whose number grows with the skin are
-therefore joined to one object: all arrows of one kind are one mesh, and the cubes of a large skin
-are squares.
+cubes twenty times a second are too many for it. The cubes of a large skin are therefore squares,
+which are joined to one mesh for each colour, and arrows, crosses and rings consist of lines.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import viser
 
-from ..core.arrays import AnyArray, Array
+from ..core.arrays import Array
 from ..core.latest_stress import DOUBTFUL, FAULTY, STALE
 from ..core.poses import CubePoses, quaternions
 from ..touch.surface import Contact, Surface
@@ -27,17 +26,12 @@ from ..views.meshes import (
     CUBE,
     CUBE_EDGES,
     NO_MESH,
-    Mesh,
     SquareLayer,
-    arrows,
     corner_lines,
     hit,
-    ring_lines,
-    rods,
     step_colours,
 )
 from ..views.round_numbers import round_down
-from ..views.scene import QUANTITIES
 from .colouring import Colouring
 from .scan import Scan
 
@@ -74,8 +68,8 @@ The unit length is the pitch (distance of neighbouring cubes) if that is larger.
 thousand cubes the pitch is so small that the directions of such arrows could not be seen.
 """
 
-MIN_THICKNESS = SPAN / 1000
-"""Minimum radius of a line, in units of the scene, that is visible on every screen."""
+MIN_THICKNESS = SPAN / 500
+"""Minimum thickness of a line, in units of the scene, that is visible on every screen."""
 
 AMBIENT_LIGHT = 2.4
 """Intensity of the ambient light, in units of viser.
@@ -99,16 +93,33 @@ FAULT_COLOURS = {DOUBTFUL: (230, 130, 0), FAULTY: (215, 25, 25), STALE: DARK}
 A cube whose health is `FINE` has no cross.
 """
 
-MESH_COLOURS: dict[str, Colour] = {
-    "traction": DARK,
-    "gradient": BLUE,
-    "tension": (210, 40, 40),
-    "compression": (40, 80, 220),
-    "chosen": DARK,
-    "contacts": (200, 40, 160),
-    **{f"fault {state}": colour for state, colour in FAULT_COLOURS.items()},
+LINES: dict[str, tuple[Colour, float]] = {
+    "traction": (DARK, 0.05),
+    "gradient": (BLUE, 0.05),
+    "tension": ((210, 40, 40), 0.04),
+    "compression": ((40, 80, 220), 0.04),
+    "chosen": (DARK, 0.014),
+    "contacts": ((200, 40, 160), 0.02),
+    **{f"fault {state}": (colour, 0.06) for state, colour in FAULT_COLOURS.items()},
 }
-"""Name of a mesh whose shape depends on the measured values -> its colour."""
+"""Name of an object of lines that depend on the measured values -> its colour, and the thickness
+of its lines relative to the unit length of arrows (about the pitch, which is the distance of
+neighbouring cubes)."""
+
+NO_LINES = np.zeros((1, 2, 3))
+"""An invisible line without length, because the browser cannot draw an object without lines."""
+
+MIN_ARROW = 0.15
+"""Minimum length of an arrow that is drawn, relative to the unit length of arrows (about the pitch,
+which is the distance of neighbouring cubes)."""
+
+VIEW_DIRECTION = np.array([0.1, -0.7, 0.7])
+"""(3,) unit vector from the skin to the camera as it stands at first (`CAMERA_POSITION` in
+page.py), in the scene. The heads of the arrows are perpendicular to it, so that they are visible.
+"""
+
+RING_CORNERS = 48
+"""Number of corners of the polygon that is drawn as the ring around a contact."""
 
 ArrowLines = Callable[[CubePoses, Array, float], Array]
 """Function that returns tails and tips (N, 2, 3) of one arrow per cube.
@@ -182,22 +193,6 @@ class Placement:
         return (position - self.centre) * self.unit
 
 
-class Ranges(NamedTuple):
-    """Values, in SI units, at the upper ends of the automatic ranges of one picture.
-
-    Each range follows a rise of the values at once and a fall slowly, from picture to picture.
-
-    Attributes:
-        colour: Value at the upper end of the colour scale.
-        traction: Traction of the longest arrow, in Pa.
-        gradient: Gradient of the pressure of the longest arrow, in Pa/m.
-    """
-
-    colour: float = 0.0
-    traction: float = 0.0
-    gradient: float = 0.0
-
-
 class Scene:
     """The skin in 3-D: its fixed geometry, which all browsers share, and what a scan changes.
 
@@ -252,15 +247,19 @@ class Scene:
         self._add_scale_bar(api)
         if self._is_solid:
             self._add_edges(api)
-        meshes = {f"field/{step}": DARK for step in range(COLOUR_STEPS + 1)} | MESH_COLOURS
         objects: dict[str, Any] = {
-            name: _add_mesh(
-                api,
-                name,
-                colour,
+            f"field/{step}": api.add_mesh_simple(
+                f"/field/{step}", *NO_MESH, flat_shading=True, side="double", **NO_SHADOWS
             )
-            for name, colour in meshes.items()
+            for step in range(COLOUR_STEPS + 1)
         }
+        for name, (colour, thickness) in LINES.items():
+            objects[name] = api.add_line_segments(
+                f"/{name}",
+                NO_LINES,
+                colour,
+                thickness=max(MIN_THICKNESS, thickness * self._placement.arrow),
+            )
         if self._is_solid:
             objects["cubes"] = self._add_cubes(api)
         objects["names"] = self._add_names(api)
@@ -270,45 +269,11 @@ class Scene:
             start, direction = np.array(event.ray_origin), np.array(event.ray_direction)
             # viser reports a click as a ray from the camera through the point that was clicked.
             placement = self._placement
-            cube = hit(
-                placement.poses.position,
-                placement.pitch,
-                start,
-                direction,
-            )
+            cube = hit(placement.poses.position, placement.pitch, start, direction)
             if cube is not None:
                 pick(cube)
 
         return objects
-
-    def ranges(
-        self,
-        scan: Scan,
-        colour: float,
-        before: Ranges,
-    ) -> Ranges:
-        """Return the automatic ranges of a picture.
-
-        Args:
-            scan: The instant that is drawn.
-            colour: Value at the upper end of the colour scale, in SI units.
-            before: Ranges of the picture of the scan before.
-        """
-        traction = scan.values[:, 2:5]
-        gradient = QUANTITIES["gradient"].of(scan.values, scan.residual)
-        return Ranges(
-            colour=colour,
-            traction=scene.automatic(
-                QUANTITIES["shear"],
-                traction,
-                before.traction,
-            ),
-            gradient=scene.automatic(
-                QUANTITIES["gradient"],
-                gradient,
-                before.gradient,
-            ),
-        )
 
     def draw(
         self,
@@ -316,7 +281,7 @@ class Scene:
         colouring: Colouring,
         parts: set[str],
         chosen: int,
-        ranges: Ranges,
+        ranges: scene.Ranges,
     ) -> Update:
         """Return the properties of all objects for one instant.
 
@@ -329,23 +294,26 @@ class Scene:
         """
         update = self._colours(colouring, "field" in parts)
         update["names"] = {"visible": "names" in parts}
-        meshes = dict.fromkeys(("traction", "gradient", "tension", "compression"), NO_MESH)
+        lines = dict.fromkeys(LINES, NO_LINES)
         if "traction" in parts:
             length = self._traction(ranges)
-            meshes["traction"] = self._arrows(scene.traction_arrows, scan.values, length)
+            lines["traction"] = self._arrows(scene.traction_arrows, scan.values, length)
         if "gradient" in parts:
             length = self._gradient(ranges)
-            meshes["gradient"] = self._arrows(scene.gradient_arrows, scan.values, length)
+            lines["gradient"] = self._arrows(scene.gradient_arrows, scan.values, length)
         if "principal" in parts:
-            meshes |= self._crosses(scan.values, ranges.traction)
-        update |= {name: _properties(mesh) for name, mesh in meshes.items()}
+            lines |= self._crosses(scan.values, ranges.traction)
+        crosses = scene.fault_crosses(self._placement.poses, scan.health)
         for state in FAULT_COLOURS:
-            update[f"fault {state}"] = self._fault_crosses(scan.health, state)
-        update["chosen"] = self._chosen_cube(chosen)
-        update["contacts"] = self._contacts(scan.contacts)
+            lines[f"fault {state}"] = crosses[scan.health == state]
+        lines["chosen"] = self._chosen_cube(chosen)
+        lines["contacts"] = self._contacts(scan.contacts)
+        for name, ends in lines.items():
+            points = ends.reshape(-1, 2, 3) if len(ends) else NO_LINES
+            update[name] = {"points": points.astype(np.float32)}
         return update
 
-    def per_bar(self, ranges: Ranges) -> tuple[float, float]:
+    def per_bar(self, ranges: scene.Ranges) -> tuple[float, float]:
         """Return the values whose arrows are as long as the scale bar.
 
         Args:
@@ -358,11 +326,11 @@ class Scene:
         bar = self.bar * self._placement.unit
         return bar / self._traction(ranges), bar / self._gradient(ranges)
 
-    def _traction(self, ranges: Ranges) -> float:
+    def _traction(self, ranges: scene.Ranges) -> float:
         """Return the length of the arrows of traction, in units of the scene per Pa."""
         return TRACTION_LENGTH * self._placement.arrow / ranges.traction
 
-    def _gradient(self, ranges: Ranges) -> float:
+    def _gradient(self, ranges: scene.Ranges) -> float:
         """Return the length of the arrows of the gradient, in units of the scene per Pa/m."""
         return GRADIENT_LENGTH * self._placement.arrow / ranges.gradient
 
@@ -382,7 +350,8 @@ class Scene:
         colours_of_steps = step_colours(quantity).tolist()
         for step, mesh in enumerate(meshes):
             colour = tuple(colours_of_steps[step])
-            update[f"field/{step}"] = _properties(mesh) | {"color": colour}
+            vertices, faces = mesh
+            update[f"field/{step}"] = {"vertices": vertices, "faces": faces, "color": colour}
         return update
 
     def _arrows(
@@ -390,8 +359,8 @@ class Scene:
         lines: ArrowLines,
         values: Array,
         length: float,
-    ) -> Mesh:
-        """Return the mesh of an arrow on the upper face of each cube.
+    ) -> Array:
+        """Return the lines of an arrow on the upper face of each cube.
 
         Args:
             lines: Function that returns tails and tips of the arrows.
@@ -399,12 +368,15 @@ class Scene:
                 cubes.
             length: Length of the arrows, in units of the scene per SI unit of the values.
         """
-        placement = self._placement
-        tails_and_tips = lines(placement.poses, values, length)
-        return arrows(tails_and_tips, placement.arrow)
+        poses = self._placement.poses
+        arrows = lines(poses, values, length)
+        # A shorter arrow would be hardly more than a dot.
+        size = np.linalg.norm(arrows[:, 1] - arrows[:, 0], axis=1)
+        arrows = arrows[size > MIN_ARROW * self._placement.arrow]
+        return scene.heads(arrows, np.broadcast_to(VIEW_DIRECTION, (len(arrows), 3)))
 
-    def _crosses(self, values: Array, longest: float) -> dict[str, Mesh]:
-        """Return the meshes of the principal stresses: a cross of three lines above each cube.
+    def _crosses(self, values: Array, longest: float) -> dict[str, Array]:
+        """Return the lines of the principal stresses: a cross of three lines above each cube.
 
         Each line lies along a principal direction; its colour tells tension from compression.
 
@@ -415,48 +387,31 @@ class Scene:
                 cubes).
         """
         placement, pitch = self._placement, self._placement.pitch
-        lines, is_tension = scene.principal_crosses(
-            placement.poses,
-            values,
-            pitch / longest,
-        )
+        poses = placement.poses
+        lines, is_tension = scene.principal_crosses(poses, values, pitch / longest)
         # `scene.principal_crosses` returns crosses centred on the upper faces; this lifts them.
-        faces = _above(placement, 1.0)
-        lift = _above(placement, CROSS_HEIGHT, pitch) - faces
+        lift = (CROSS_HEIGHT * pitch - poses.half_side)[:, None] * poses.rotation[:, :, 2]
         lines = lines + lift[:, None, None]
-        return {
-            "tension": rods(lines[is_tension], 0.02 * pitch),
-            "compression": rods(lines[~is_tension], 0.02 * pitch),
-        }
+        return {"tension": lines[is_tension], "compression": lines[~is_tension]}
 
-    def _fault_crosses(self, health: AnyArray, state: int) -> Properties:
-        """Return the mesh of a cross over each cube that has this health."""
-        chosen = np.flatnonzero(health == state)
-        poses = CubePoses(*(column[chosen] for column in self._placement.poses))
-        crosses = scene.fault_crosses(poses, health[chosen])
-        thickness = 0.03 * self._placement.pitch
-        return _properties(rods(crosses.reshape(-1, 2, 3), thickness))
-
-    def _chosen_cube(self, cube: int) -> Properties:
-        """Return the mesh of the marks at the corners of the chosen cube."""
+    def _chosen_cube(self, cube: int) -> Array:
+        """Return the lines of the marks at the corners of the chosen cube."""
         placement = self._placement
         # The marks stand a little outside of the face; on a large skin they have a minimum size.
         side = max(2.6 * float(placement.poses.half_side[cube]), 0.2 * placement.arrow)
         lines = corner_lines(placement.poses.rotation[cube], side)
-        thickness = MIN_THICKNESS + 0.003 * placement.arrow
-        return _properties(rods(lines + _above(placement, 1.1)[cube], thickness))
+        return np.asarray(lines + scene.above(placement.poses, 1.1)[cube])
 
-    def _contacts(self, contacts: Sequence[Contact]) -> Properties:
-        """Return the mesh of a ring around each contact, which has the area of the contact."""
+    def _contacts(self, contacts: Sequence[Contact]) -> Array:
+        """Return the lines of a ring around each contact, which has the area of the contact."""
         placement = self._placement
         rings = [np.zeros((0, 2, 3))]
         for contact in contacts:
             radius = max(float(np.sqrt(contact.area / np.pi)) * placement.unit, MIN_RING)
             # The ring lies in the plane of the drawn field, so that it encloses the load there.
             centre = placement.point(contact.position) - self._contact_depth * contact.normal
-            rings.append(ring_lines(centre, contact.normal, radius))
-        thickness = MIN_THICKNESS + 0.006 * placement.arrow
-        return _properties(rods(np.concatenate(rings), thickness))
+            rings.append(scene.ring(centre, contact.normal, radius, RING_CORNERS))
+        return np.concatenate(rings)
 
     def _add_scale_bar(self, api: viser.SceneApi) -> None:
         """Add a scale bar in front of the skin, and the axes of its parent frame beside it."""
@@ -466,9 +421,7 @@ class Scene:
 
         start = np.array([low[0], y, z])
         end = start + np.array([self.bar * placement.unit, 0, 0])
-        vertices, faces = rods(np.array([[start, end]]), 0.006 * SPAN)
-        bar = _add_mesh(api, "bar", DARK)
-        bar.vertices, bar.faces = vertices, faces
+        api.add_line_segments("/bar", np.array([[start, end]]), DARK, thickness=0.012 * SPAN)
         middle = tuple((start + end) / 2 - np.array([0, 0.03 * SPAN, 0]))
         text = f"{1e3 * self.bar:g} mm"
         api.add_label(
@@ -563,32 +516,10 @@ def _make_squares(
     rotation = poses.rotation[of_cube]
     side = np.full(len(points), surface.spacing * placement.unit)
     if with_cubes:
-        points = np.concatenate([points, _above(placement, 1.0)])
+        points = np.concatenate([points, scene.above(poses, 1.0)])
         rotation = np.concatenate([rotation, poses.rotation])
         side = np.append(side, 2 * poses.half_side)
     return SquareLayer(points, rotation, side)
-
-
-def _properties(mesh: Mesh) -> Properties:
-    vertices, faces = mesh
-    return {"vertices": vertices, "faces": faces}
-
-
-def _above(
-    placement: Placement,
-    factor: float,
-    unit: float | None = None,
-) -> Array:
-    """Return one point above the centre of each cube (N, 3), in units of the scene.
-
-    Args:
-        placement: Poses of the cubes in the scene.
-        factor: Height of the points above the centres, as a multiple of `unit`.
-        unit: Unit of the height, in units of the scene; None: half the side of each cube.
-    """
-    poses = placement.poses
-    height = poses.half_side[:, None] if unit is None else unit
-    return poses.position + factor * height * poses.rotation[:, :, 2]
 
 
 def _set_up_lights(api: viser.SceneApi) -> None:
@@ -603,14 +534,4 @@ def _set_up_lights(api: viser.SceneApi) -> None:
         "/light/above",
         intensity=DIRECT_LIGHT,
         position=(-0.4, -0.6, 1.0),
-    )
-
-
-def _add_mesh(
-    api: viser.SceneApi,
-    name: str,
-    colour: Colour,
-) -> viser.MeshHandle:
-    return api.add_mesh_simple(
-        f"/{name}", *NO_MESH, color=colour, flat_shading=True, side="double", **NO_SHADOWS
     )

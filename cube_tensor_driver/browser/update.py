@@ -11,13 +11,13 @@ from ..core.calibration import Calibration
 from ..core.modes import COMPONENTS
 from ..core.poses import CubePoses
 from ..touch.surface import Surface
-from ..views.scene import QUANTITIES, Quantity
+from ..views.scene import QUANTITIES, Quantity, Ranges
 from . import markup
-from .charts import GROUPS, ChartLine, chart_properties
+from .charts import GROUPS, Chart, chart_properties
 from .colouring import Colouring
 from .history import History
 from .scan import Scan
-from .scene_3d import Ranges, Scene, Update
+from .scene_3d import Scene, Update
 from .surface_field import DEVIATION, FieldModel
 from .top_view import TopView
 
@@ -76,7 +76,7 @@ class Choices(NamedTuple):
         fixed_top: Upper end of the colour scale, in SI units; 0: it follows the values.
         cube: Index of the chosen cube.
         parts: Those of `PARTS` (of the 3-D view) that are drawn.
-        charts: Lines of each chart.
+        charts: What the charts show.
         is_paused: Whether the page or the replay is stopped.
         is_recording: Whether a bag is being recorded.
     """
@@ -85,7 +85,7 @@ class Choices(NamedTuple):
     fixed_top: float
     cube: int
     parts: set[str]
-    charts: tuple[tuple[ChartLine, ...], ...]
+    charts: tuple[Chart, ...]
     is_paused: bool
     is_recording: bool
 
@@ -112,9 +112,9 @@ def build_update(
         skin.surface,
         choices.quantity,
         choices.fixed_top,
-        before.colour,
+        before.colours,
     )
-    ranges = skin.scene.ranges(scan, colouring.top, before)
+    ranges = before.follow(scan.values, scan.residual, colouring.top)
     update = skin.scene.draw(scan, colouring, choices.parts, cube, ranges)
 
     # A tool tip cannot be read while the page changes ten times a second.
@@ -129,8 +129,8 @@ def build_update(
         "from above": above,
     }
     update |= {name: {"content": text} for name, text in texts.items()}
-    for number, lines in enumerate(choices.charts):
-        update[f"chart {number}"] = chart_properties(history, lines)
+    for number, chart in enumerate(choices.charts):
+        update[f"chart {number}"] = chart_properties(history, chart)
     return update | _options(history, scan, choices), ranges
 
 

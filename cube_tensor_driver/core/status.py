@@ -99,3 +99,9 @@ LEFT_OUT = OPEN | SHORT | RANGE | STUCK | NOISY | REPORTED
 A drifting pad is still used, because its error is small and a tare (taking the present frequencies
 as those without load) corrects it.
 """
+
+
+def describe_status(status: int) -> str:
+    """Return the names of the status bits of a row in words, such as "pad fault, residual"."""
+    names = (name for name, bit in STATUS.items() if status & bit)
+    return ", ".join(names).lower().replace("_", " ")

@@ -151,13 +151,14 @@ def choose_skin_file(settings: DemoSettings, folder: Path) -> Path:
     return package_data() / "config" / "skin_demo.yaml"
 
 
-def write_grid(path: Path, cubes: int, rate: float) -> Path:
+def write_grid(path: Path, cubes: int, rate: float, cubes_per_hub: int = CUBES_PER_HUB) -> Path:
     """Write the skin file of a grid that is as nearly square as possible, and return its path.
 
     Args:
         path: The file to write.
         cubes: Number of cubes; the last row of the grid may be incomplete.
         rate: Samples per second of each cube.
+        cubes_per_hub: Maximum number of cubes on each hub.
 
     Raises:
         ConfigError: The number of cubes is not from 1 to `MAX_CUBES`.
@@ -166,14 +167,8 @@ def write_grid(path: Path, cubes: int, rate: float) -> Path:
         raise ConfigError(f"--cubes is {cubes}, allowed: 1 to {MAX_CUBES}")
     nx = math.ceil(math.sqrt(cubes))
     ny = math.ceil(cubes / nx)
-    links = math.ceil(cubes / CUBES_PER_HUB)
-    skin = grid(
-        nx=nx,
-        ny=ny,
-        pitch=PITCH,
-        links=links,
-        rate=rate,
-    )
+    links = math.ceil(cubes / cubes_per_hub)
+    skin = grid(nx=nx, ny=ny, pitch=PITCH, links=links, rate=rate)
     # Surplus cubes of the last row are removed, and with them links (hubs) without any cube.
     skin["cubes"] = skin["cubes"][:cubes]
     used = {cube["link"] for cube in skin["cubes"]}

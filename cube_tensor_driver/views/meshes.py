@@ -1,10 +1,10 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Triangle meshes of the 3-D view as arrays: prisms, arrows, marks and coloured squares."""
+"""Shapes of the 3-D view as arrays: cubes, marks and coloured squares."""
 
 from __future__ import annotations
 
-from itertools import product
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
@@ -19,9 +19,6 @@ Mesh = tuple[NDArray[Any], NDArray[Any]]
 
 NO_MESH: Mesh = (np.zeros((3, 3)), np.array([[0, 1, 2]]))
 """An invisible mesh: one triangle without area, because viser refuses a mesh without triangles."""
-
-PRISM_SIDES = 6
-"""Number of sides of the prisms that approximate the cylinders of arrows, crosses and rings."""
 
 CUBE: Mesh = (
     np.array(list(product((-1.0, 1.0), repeat=3))),
@@ -39,35 +36,9 @@ CUBE: Mesh = (
 """Triangle mesh of a cube with its centre at the origin and half a side of 1."""
 
 CUBE_EDGES = np.array(
-    [
-        [one, other]
-        for number, one in enumerate(CUBE[0])
-        for other in CUBE[0][number + 1 :]
-        if np.count_nonzero(one != other) == 1
-    ]
+    [ends for ends in combinations(CUBE[0], 2) if np.count_nonzero(ends[0] != ends[1]) == 1]
 )
 """Edges (12, 2, 3) of `CUBE`: the positions of both ends of each edge."""
-
-MIN_ARROW = 0.15
-"""Minimum length of an arrow that is drawn, relative to the unit length of arrows.
-
-The unit length is the pitch (distance of neighbouring cubes) or, on a large skin, a little more.
-"""
-
-HEAD_LENGTH = 0.2
-"""Length of the head of an arrow, relative to the unit length of arrows (about the pitch, which is
-the distance of neighbouring cubes)."""
-
-SHAFT_RADIUS = 0.025
-"""Radius of the shaft of an arrow, relative to the unit length of arrows (about the pitch, which is
-the distance of neighbouring cubes)."""
-
-HEAD_RADIUS = 0.075
-"""Radius of the base of an arrow's head, relative to the unit length of arrows (about the pitch,
-which is the distance of neighbouring cubes)."""
-
-RING_POINTS = 49
-"""Number of points that approximate the circle of a ring; the last is equal to the first."""
 
 COLOUR_STEPS = 32
 """Number of colours in which a `SquareLayer` (coloured squares of a skin) is drawn.
@@ -78,98 +49,6 @@ The squares of each colour are a mesh of their own, so more colours take the bro
 # Corners of a square with sides of 1 around the origin, and its two triangles.
 _SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
 _SQUARE_FACES = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
-
-
-def rods(
-    lines: Array,
-    start_radius: float,
-    end_radius: float | None = None,
-) -> Mesh:
-    """Return one mesh of prisms along lines, without the faces at their ends.
-
-    Args:
-        lines: (N, 2, 3) start and end of each line.
-        start_radius: Radius of each prism at its start, in the unit of the lines.
-        end_radius: Radius at its end; 0 makes pyramids, None a constant radius.
-    """
-    if not len(lines):
-        return NO_MESH
-    first, second = _perpendicular(lines[:, 1] - lines[:, 0])
-    angle = 2 * np.pi * np.arange(PRISM_SIDES)[:, None, None] / PRISM_SIDES
-    circle = (np.cos(angle) * first + np.sin(angle) * second).swapaxes(0, 1)
-    radii = np.array([start_radius, start_radius if end_radius is None else end_radius])
-    vertices = lines[:, :, None] + circle[:, None] * radii[:, None, None]
-
-    # Each side of a prism is a quadrilateral, which is divided into two triangles.
-    corner = np.arange(PRISM_SIDES)
-    following = (corner + 1) % PRISM_SIDES
-    triangles = [
-        [corner, following, following + PRISM_SIDES],
-        [corner, following + PRISM_SIDES, corner + PRISM_SIDES],
-    ]
-    prism = np.array(triangles).transpose(0, 2, 1).reshape(-1, 3)
-    faces = prism + 2 * PRISM_SIDES * np.arange(len(lines))[:, None, None]
-    return vertices.reshape(-1, 3), faces.reshape(-1, 3)
-
-
-def _perpendicular(along: Array) -> tuple[Array, Array]:
-    """Return two unit vectors (N, 3), perpendicular to each vector (N, 3) and to each other."""
-    # The cross product with the coordinate axis that is least parallel to the vector is never close
-    # to zero, so the perpendicular direction is accurate.
-    axis = np.eye(3)[np.abs(along).argmin(axis=1)]
-    first = _normalised(np.cross(along, axis))
-    return first, _normalised(np.cross(along, first))
-
-
-def _normalised(vectors: Array) -> Array:
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return np.asarray(vectors / np.maximum(length, 1e-12))
-
-
-def arrows(lines: Array, unit: float) -> Mesh:
-    """Return one mesh of arrows.
-
-    All heads have the same size. Arrows shorter than `MIN_ARROW` times the unit length, which would
-    be hardly more than a head, are left out.
-
-    Args:
-        lines: (N, 2, 3) tail and tip of each arrow.
-        unit: Unit length, to which the sizes of heads and shafts are relative.
-    """
-    along = lines[:, 1] - lines[:, 0]
-    length = np.linalg.norm(along, axis=1, keepdims=True)
-    is_drawn = length[:, 0] > MIN_ARROW * unit
-    lines, length = lines[is_drawn], length[is_drawn]
-    tail, tip = lines[:, 0], lines[:, 1]
-    neck = tip - (tip - tail) * np.minimum(HEAD_LENGTH * unit / length, 1)
-    shafts = rods(np.stack([tail, neck], axis=1), SHAFT_RADIUS * unit)
-    heads = rods(
-        np.stack([neck, tip], axis=1),
-        HEAD_RADIUS * unit,
-        0.0,
-    )
-    vertices = np.concatenate([shafts[0], heads[0]])
-    faces = np.concatenate([shafts[1], heads[1] + len(shafts[0])])
-    return vertices, faces
-
-
-def ring_lines(
-    centre: Array,
-    normal: Array,
-    radius: float,
-) -> Array:
-    """Return the lines (48, 2, 3) of a ring, each with its start and its end.
-
-    Args:
-        centre: (3,) centre of the ring.
-        normal: (3,) unit vector perpendicular to the plane of the ring.
-        radius: Radius of the ring, in the unit of the centre.
-    """
-    # Two directions in the plane of the ring.
-    first, second = _perpendicular(normal[np.newaxis])
-    angle = np.linspace(0, 2 * np.pi, RING_POINTS)[:, None]
-    points = centre + radius * (np.cos(angle) * first + np.sin(angle) * second)
-    return np.stack([points[:-1], points[1:]], axis=1)
 
 
 def corner_lines(rotation: Array, side: float) -> Array:
@@ -239,11 +118,7 @@ class SquareLayer:
         """
         # The corners never move, so only the choice of squares has to be made for each picture.
         offset = side[:, None, None] * _SQUARE
-        corners = points[:, None] + np.einsum(
-            "mij,mqj->mqi",
-            rotation[:, :, :2],
-            offset,
-        )
+        corners = points[:, None] + np.einsum("mij,mqj->mqi", rotation[:, :, :2], offset)
         self._corners = corners.astype(np.float32)
 
     def paint(
@@ -261,15 +136,7 @@ class SquareLayer:
             top: Value at the upper end of the colour scale, in SI units.
             visible: (M,) whether each square is drawn.
         """
-        steps = np.where(
-            visible,
-            colour_steps(
-                quantity,
-                values,
-                top,
-            ),
-            -1,
-        )
+        steps = np.where(visible, colour_steps(quantity, values, top), -1)
         return [self._mesh(np.flatnonzero(steps == step)) for step in range(COLOUR_STEPS + 1)]
 
     def _mesh(self, chosen: Index) -> Mesh:
@@ -294,11 +161,7 @@ def colour_steps(
     """
     bottom = -top if quantity.signed else 0.0
     share = (np.nan_to_num(values) - bottom) / (top - bottom)
-    step = np.clip(
-        share * COLOUR_STEPS,
-        0,
-        COLOUR_STEPS - 1,
-    ).astype(int)
+    step = np.clip(share * COLOUR_STEPS, 0, COLOUR_STEPS - 1).astype(int)
     return np.where(np.isfinite(values), step, COLOUR_STEPS)
 
 
@@ -306,11 +169,4 @@ def step_colours(quantity: Quantity) -> NDArray[np.uint8]:
     """Return the colours of a `SquareLayer` (COLOUR_STEPS + 1, 3) in sRGB; the last is for NaN."""
     middle = (np.arange(COLOUR_STEPS) + 0.5) / COLOUR_STEPS
     values = np.append(2 * middle - 1 if quantity.signed else middle, np.nan)
-    return np.round(
-        255
-        * scene.colours(
-            quantity,
-            values,
-            1.0,
-        )
-    ).astype(np.uint8)
+    return np.round(255 * scene.colours(quantity, values, 1.0)).astype(np.uint8)

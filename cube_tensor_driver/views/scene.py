@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,14 +111,7 @@ def _length(*names: str) -> Callable[[Array, Array], Array]:
         parts = values[:, columns]
         is_observed = np.isfinite(parts)
         # An unobserved component counts as 0; if all are unobserved, the magnitude is NaN.
-        length = np.linalg.norm(
-            np.where(
-                is_observed,
-                parts,
-                0,
-            ),
-            axis=1,
-        )
+        length = np.linalg.norm(np.where(is_observed, parts, 0), axis=1)
         return np.where(is_observed.any(axis=1), length, np.nan)
 
     return of
@@ -197,6 +191,35 @@ def automatic(
     )
 
 
+class Ranges(NamedTuple):
+    """Values, in SI units, at the upper ends of the automatic ranges of one picture.
+
+    Attributes:
+        colours: Value at the upper end of the colour scale.
+        traction: Traction (force per area on the upper face) of the longest arrow, in Pa.
+        gradient: Gradient of the pressure of the longest arrow, in Pa/m.
+    """
+
+    colours: float = 0.0
+    traction: float = 0.0
+    gradient: float = 0.0
+
+    def follow(self, values: Array, residual: Array, colours: float) -> Ranges:
+        """Return the ranges of the next picture.
+
+        Args:
+            values: (N, 15) 6 stress components in Pa and 9 gradients in Pa/m, in the frames of the
+                cubes.
+            residual: (N,) residuals of the cubes.
+            colours: Upper end of its colour scale, in SI units.
+        """
+        # Columns 2 to 4 are the stress components zz, yz and zx, which act on the upper face.
+        traction = automatic(QUANTITIES["shear"], values[:, 2:5], self.traction)
+        gradient = QUANTITIES["gradient"]
+        longest_gradient = automatic(gradient, gradient.of(values, residual), self.gradient)
+        return Ranges(colours, traction, longest_gradient)
+
+
 def colours(
     quantity: Quantity,
     values: Array,
@@ -214,11 +237,8 @@ def colours(
     if quantity.signed:
         share = share / 2 + 0.5
     table = _colour_table(DIVERGING if quantity.signed else SEQUENTIAL)
-    # `place` is the position in the table; its fraction interpolates between two entries.
-    place = np.clip(share, 0, 1) * (len(table) - 1)
-    low = np.minimum(place.astype(int), len(table) - 2)
-    part = (place - low)[:, None]
-    mixed = (1 - part) * table[low] + part * table[low + 1]
+    entries = np.linspace(0, 1, len(table))
+    mixed = np.stack([np.interp(share, entries, channel) for channel in table.T], axis=1)
     return np.where(np.isfinite(values)[:, None], mixed, GREY)
 
 
@@ -228,16 +248,24 @@ def linear_light(colours: Array) -> NDArray[np.uint8]:
     The browser interprets the colours of batched meshes as linear intensities of light. The
     conversion is the transfer function of sRGB (IEC 61966-2-1).
     """
-    linear = np.where(
-        colours <= 0.04045,
-        colours / 12.92,
-        ((colours + 0.055) / 1.055) ** 2.4,
-    )
+    curved = ((colours + 0.055) / 1.055) ** 2.4
+    linear = np.where(colours <= 0.04045, colours / 12.92, curved)
     return (255 * linear).astype(np.uint8)
 
 
 def _colour_table(hexes: str) -> Array:
     return np.array([tuple(bytes.fromhex(text)) for text in hexes.split()]) / 255
+
+
+def above(poses: CubePoses, factor: float) -> Array:
+    """Return one point above the centre of each cube (N, 3), along its z axis.
+
+    Args:
+        poses: Poses of the N cubes.
+        factor: Height of the points, relative to half the side of the cube; 1 is the upper face.
+    """
+    height = factor * poses.half_side[:, None]
+    return np.asarray(poses.position + height * poses.rotation[:, :, 2])
 
 
 def traction_arrows(
@@ -262,7 +290,7 @@ def traction_arrows(
     """
     traction = np.nan_to_num(values[:, [4, 3, 2]]) * length
     arrow = np.einsum("nij,nj->ni", poses.rotation, traction)
-    face = poses.position + poses.rotation[:, :, 2] * poses.half_side[:, None]
+    face = above(poses, 1.0)
     presses = traction[:, 2:] < 0
     tail = np.where(presses, face - arrow, face)
     return np.stack([tail, tail + arrow], axis=1)
@@ -288,12 +316,9 @@ def gradient_arrows(
     # Pressure is −σzz, so it grows in the direction opposite to the gradient of σzz.
     columns = [COMPONENTS.index("zz_x"), COMPONENTS.index("zz_y")]
     gradient = -np.nan_to_num(values[:, columns]) * length
-    arrow = np.einsum(
-        "nij,nj->ni",
-        poses.rotation[:, :, :2],
-        gradient,
-    )
-    tail = poses.position + poses.rotation[:, :, 2] * (1.15 * poses.half_side[:, None])
+    arrow = np.einsum("nij,nj->ni", poses.rotation[:, :, :2], gradient)
+    # The arrows lie a little above the upper faces, so that these do not hide them.
+    tail = above(poses, 1.15)
     return np.stack([tail, tail + arrow], axis=1)
 
 
@@ -321,8 +346,7 @@ def principal_crosses(
     principal, directions = principal_stresses(np.nan_to_num(values[:, : len(STRESS)]))
     in_parent = np.einsum("nij,nkj->nki", poses.rotation, directions)
     half = in_parent * (0.5 * length * np.abs(principal))[..., None]
-    up = poses.rotation[:, None, :, 2] * poses.half_side[:, None, None]
-    centre = poses.position[:, None] + up
+    centre = above(poses, 1.0)[:, None]
     return np.stack([centre - half, centre + half], axis=2), np.asarray(principal > 0)
 
 
@@ -341,15 +365,10 @@ def fault_crosses(poses: CubePoses, health: AnyArray) -> Array:
     diagonals = [[[-1, -1, 0], [1, 1, 0]], [[-1, 1, 0], [1, -1, 0]]]
     has_fault = (health != FINE)[:, None, None, None]
     # The crosses lie a little above the upper face, so that the face does not hide them.
-    corner = np.where(
-        has_fault,
-        CROSS_SIZE * np.array(diagonals),
-        0.0,
-    )
-    corner += np.array([0, 0, CROSS_HEIGHT])
+    corner = np.where(has_fault, CROSS_SIZE * np.array(diagonals), 0.0)
     scaled = corner * poses.half_side[:, None, None, None]
     in_parent = np.einsum("nij,nabj->nabi", poses.rotation, scaled)
-    return np.asarray(poses.position[:, None, None] + in_parent)
+    return np.asarray(above(poses, CROSS_HEIGHT)[:, None, None] + in_parent)
 
 
 def heads(arrows: Array, normal: Array) -> Array:
@@ -366,18 +385,28 @@ def heads(arrows: Array, normal: Array) -> Array:
     back = BARB_LENGTH * (tail - tip)
     # For an arrow along the normal the cross product would be 0. A small vector in another
     # direction, added to the normal, prevents that.
-    across = np.cross(
-        back,
-        normal
-        + 1e-3
-        * np.roll(
-            normal,
-            1,
-            axis=1,
-        ),
-    )
+    across = np.cross(back, normal + 1e-3 * np.roll(normal, 1, axis=1))
     size = np.linalg.norm(across, axis=1, keepdims=True)
     half_width = 0.5 * np.linalg.norm(back, axis=1, keepdims=True)
     across *= half_width / np.where(size > 0, size, 1)
     barbs = [np.stack([tip, tip + back + side], axis=1) for side in (across, -across)]
     return np.stack([arrows, *barbs], axis=1)
+
+
+def ring(centre: Array, normal: Array, radius: float, corners: int) -> Array:
+    """Return the sides (corners, 2, 3) of a polygon that approximates a circle.
+
+    Args:
+        centre: (3,) centre of the circle.
+        normal: (3,) unit vector perpendicular to the plane of the circle.
+        radius: Radius of the circle, in the unit of the centre.
+        corners: Number of corners of the polygon.
+    """
+    # The cross product with the coordinate axis that is least parallel to the normal is the most
+    # accurate.
+    first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    first /= np.linalg.norm(first)
+    second = np.cross(normal, first)
+    angle = 2 * np.pi * np.arange(corners) / corners
+    points = centre + radius * (np.outer(np.cos(angle), first) + np.outer(np.sin(angle), second))
+    return np.stack([points, np.roll(points, -1, axis=0)], axis=1)

@@ -279,26 +279,23 @@ def test_arrays_of_serialised_markers_are_where_other_nodes_read_them(name):
     assert read[f"{name}'s legend"].text == "7 bytes" and "nobody" not in made
 
 
-def test_rods_lie_around_their_lines_with_the_radii_asked_for():
-    from cube_tensor_driver.views.meshes import PRISM_SIDES, rods
-
-    lines = np.random.default_rng(3).normal(size=(7, 2, 3))
-    lines[0, 1] = lines[0, 0] + [0, 0, 2.0]  # along an axis
-    vertices, faces = rods(lines, 0.2, 0.05)
-    rings = vertices.reshape(7, 2, PRISM_SIDES, 3)
-    np.testing.assert_allclose(rings.mean(axis=2), lines, atol=1e-12)
-    way = lines[:, 1] - lines[:, 0]
-    from_axis = rings - lines[:, :, None]
-    np.testing.assert_allclose(np.einsum("nask,nk->nas", from_axis, way), 0, atol=1e-12)
-    radii = np.linalg.norm(from_axis, axis=3)
-    np.testing.assert_allclose(radii, np.broadcast_to([[[0.2], [0.05]]], radii.shape))
-    # every face lies on one rod and touches both of its ends; every vertex has three
-    assert (faces // (2 * PRISM_SIDES) == np.repeat(np.arange(7), 2 * PRISM_SIDES)[:, None]).all()
-    assert {len(set(end)) for end in (faces // PRISM_SIDES % 2).tolist()} == {2}
-    assert (np.bincount(faces.ravel()) == 3).all()
-    # nothing to draw is a shape that is not seen
-    vertices, faces = rods(np.zeros((0, 2, 3)), 0.2)
-    assert np.ptp(vertices, axis=0).max() == 0 and faces.max() < len(vertices)
+def test_the_head_of_an_arrow_is_at_its_tip_and_flat_to_the_viewer():
+    """Also for an arrow that points to the viewer, whose plane is not determined."""
+    arrows = np.random.default_rng(3).normal(size=(7, 2, 3))
+    normal = np.array([0.6, 0.0, 0.8])
+    arrows[0, 1] = arrows[0, 0] + 2 * normal
+    lines = scene.heads(arrows, np.broadcast_to(normal, (7, 3)))
+    np.testing.assert_array_equal(lines[:, 0], arrows)
+    tip, along = arrows[:, 1], arrows[:, 1] - arrows[:, 0]
+    np.testing.assert_array_equal(lines[:, 1:, 0], np.stack([tip, tip], axis=1))
+    one, other = lines[:, 1, 1] - tip, lines[:, 2, 1] - tip
+    np.testing.assert_allclose(one + other, -2 * scene.BARB_LENGTH * along)
+    across = one - other
+    length = np.linalg.norm(along, axis=1)
+    np.testing.assert_allclose(np.linalg.norm(across, axis=1), scene.BARB_LENGTH * length)
+    np.testing.assert_allclose(np.einsum("nk,nk->n", across, along), 0, atol=1e-12)
+    # The plane is turned by a thousandth, so that it is determined for every arrow.
+    assert (np.abs(across[1:] @ normal) < 0.01 * length[1:]).all()
 
 
 def test_a_click_finds_the_cube_in_front():

@@ -9,7 +9,6 @@ figures. A client that draws nothing reads the page of the browser view.
 from __future__ import annotations
 
 import contextlib
-import math
 import sys
 import tempfile
 import threading
@@ -23,8 +22,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
-from cube_tensor_driver.config.grid import grid
-from cube_tensor_driver.config.yaml import write_yaml
+from cube_tensor_driver.demo.demo import write_grid
 from cube_tensor_driver.demo.running import observing
 from cube_tensor_driver.demo.usage import Usage
 from cube_tensor_driver.processes.children import Children
@@ -101,7 +99,7 @@ def measure(cubes: int) -> dict[str, float]:
         children = stack.enter_context(Children(folder))
         observer = stack.enter_context(observing("measure", children))
         hubs = SimulatedHubs(folder / "ports", instants=INSTANTS)
-        skin = write_skin(folder, cubes)
+        skin = write_grid(folder / "skin.yaml", cubes, RATE, CUBES_PER_HUB)
         for process in skin_processes(skin, markers=True, contacts=True, simulated=hubs):
             children.start(process)
         children.start(VIEW)
@@ -116,18 +114,6 @@ def measure(cubes: int) -> dict[str, float]:
         figures = {f"cpu_{name}_percent": value for name, value in usage.cpu_percent().items()}
         figures |= {"view_hz": pictures / seconds, "rss_view_mb": usage.memory_mb()["view"]}
         return {name: round(value, 1) for name, value in figures.items()}
-
-
-def write_skin(folder: Path, cubes: int) -> Path:
-    """Write the file of a grid that is as nearly square as the number of cubes allows."""
-    nx = math.ceil(math.sqrt(cubes))
-    # The next larger divisor, so that all rows are full.
-    while cubes % nx:
-        nx += 1
-    path = folder / "skin.yaml"
-    links = math.ceil(cubes / CUBES_PER_HUB)
-    write_yaml(path, grid(nx=nx, ny=cubes // nx, pitch=0.012, links=links, rate=RATE))
-    return path
 
 
 if __name__ == "__main__":

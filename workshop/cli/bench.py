@@ -16,43 +16,45 @@ DEFAULT_COUNTS = [1, 4, 16, 64, 256, 1024, 4096]
 
 def arguments(parser: Parser) -> None:
     """Add a subcommand for each benchmark."""
-    pipeline = parser.add_subcommand(
-        "pipeline", "the core against the same equations and matrix product in bare numpy"
+    _add(
+        parser,
+        "pipeline",
+        "the core against the same equations and matrix product in bare numpy",
+        cubes=1260,
     )
-    _add_cubes(pipeline, 1260)
-
-    decode = parser.add_subcommand(
-        "decode", "the decoder on clean frames and all kinds of noise, GB/s"
+    _add(parser, "decode", "the decoder on clean frames and all kinds of noise, GB/s")
+    _add(
+        parser,
+        "links",
+        "from the bytes of hubs in C to arrays, without DDS and reconstruction",
+        cubes=1280,
+        timed=True,
     )
-
-    links = parser.add_subcommand(
-        "links", "from the bytes of hubs in C to arrays, without DDS and reconstruction"
+    _add(
+        parser,
+        "echo",
+        "bare rclpy: publish, echo and receive messages of a skin's sizes",
+        cubes=64,
+        timed=True,
     )
-    _add_cubes(links, 1280)
-    _add_time(links)
-
-    echo = parser.add_subcommand(
-        "echo", "bare rclpy: publish, echo and receive messages of a skin's sizes"
+    skin = _add(
+        parser,
+        "skin",
+        "from simulated hubs to received tensors, against the echo",
+        cubes=64,
+        timed=True,
     )
-    _add_cubes(echo, 64)
-    _add_time(echo)
-
-    skin = parser.add_subcommand(
-        "skin", "from simulated hubs to received tensors, against the echo"
+    touch = _add(
+        parser,
+        "touch",
+        "latency from hubs to received touch, and the processor time that it adds",
+        cubes=256,
+        timed=True,
     )
-    _add_cubes(skin, 64)
-    _add_time(skin)
-
-    touch = parser.add_subcommand(
-        "touch", "latency from hubs to received touch, and the processor time that it adds"
-    )
-    _add_cubes(touch, 256)
-    _add_time(touch)
-
     for chain in (skin, touch):
         _add_chain(chain)
 
-    scale = parser.add_subcommand("scale", "skin for growing numbers of cubes, with a picture")
+    scale = _add(parser, "scale", "skin for growing numbers of cubes, with a picture", timed=True)
     scale.add_argument(
         "--counts",
         type=count,
@@ -61,11 +63,14 @@ def arguments(parser: Parser) -> None:
         metavar="N",
         help=f"numbers of cubes (default: {' '.join(map(str, DEFAULT_COUNTS))})",
     )
-    _add_time(scale)
-
-    contacts = parser.add_subcommand(
-        "contacts", "errors and CPU time of contacts by the shape of the load"
+    scale.add_output(
+        "--figure",
+        kind="picture",
+        default=Path("scale.png"),
+        help="picture to write (default: %(default)s)",
     )
+
+    contacts = _add(parser, "contacts", "errors and CPU time of contacts by the shape of the load")
     contacts.add_argument(
         "--loads",
         type=count,
@@ -74,41 +79,45 @@ def arguments(parser: Parser) -> None:
         help="number of loads of each shape (default: %(default)s)",
     )
 
-    for benchmark in (pipeline, decode, links, echo, skin, touch, scale, contacts):
-        benchmark.add_json()
-    scale.add_output(
-        "--figure",
-        kind="picture",
-        default=Path("scale.png"),
-        help="picture to write (default: %(default)s)",
-    )
 
+def _add(
+    parser: Parser, name: str, text: str, cubes: int | None = None, timed: bool = False
+) -> Parser:
+    """Add the subcommand of a benchmark, and return it.
 
-def _add_cubes(parser: Parser, default: int) -> None:
-    parser.add_argument(
-        "--cubes",
-        type=count,
-        default=default,
-        metavar="N",
-        help="number of cubes (default: %(default)s)",
-    )
-
-
-def _add_time(parser: Parser) -> None:
-    parser.add_argument(
-        "--rate",
-        type=sample_rate,
-        default=1000.0,
-        metavar="HZ",
-        help="scans per second (default: %(default)g)",
-    )
-    parser.add_argument(
-        "--duration",
-        type=positive,
-        default=10.0,
-        metavar="S",
-        help="how long to measure, s (default: %(default)g)",
-    )
+    Args:
+        parser: Parser of `./cube bench`.
+        name: Name of the benchmark.
+        text: What it measures, for the help.
+        cubes: Default number of cubes; None: it has no such option.
+        timed: Whether it has options for a sampling rate and a duration.
+    """
+    benchmark = parser.add_subcommand(name, text)
+    if cubes is not None:
+        benchmark.add_argument(
+            "--cubes",
+            type=count,
+            default=cubes,
+            metavar="N",
+            help="number of cubes (default: %(default)s)",
+        )
+    if timed:
+        benchmark.add_argument(
+            "--rate",
+            type=sample_rate,
+            default=1000.0,
+            metavar="HZ",
+            help="scans per second (default: %(default)g)",
+        )
+        benchmark.add_argument(
+            "--duration",
+            type=positive,
+            default=10.0,
+            metavar="S",
+            help="how long to measure, s (default: %(default)g)",
+        )
+    benchmark.add_json()
+    return benchmark
 
 
 def _add_chain(parser: Parser) -> None:

@@ -7,7 +7,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -19,31 +18,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cube_tensor_design.figures.experiments import draw_prototype
-from cube_tensor_design.figures.field import (
-    draw_field_study,
-    draw_methods,
-    draw_traction,
-)
+from cube_tensor_design.figures.field import draw_field_study, draw_methods, draw_traction
 from cube_tensor_design.figures.pads_example import draw_pads, draw_sweep
 from cube_tensor_design.paper.experiments import experiments
 from cube_tensor_design.studies.field_study import field_example, field_study
 from cube_tensor_design.studies.pads_example import planar_calibration, sweep
-from cube_tensor_design.studies.pads_study import (
-    coarse_influence,
-    layer_example,
-)
+from cube_tensor_design.studies.pads_study import coarse_influence, layer_example
 from cube_tensor_design.studies.traction_study import traction_example
-from cube_tensor_driver.cli import ROOT
 from cube_tensor_driver.config.output_files import atomic_write, write_json
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import read_skin
-from cube_tensor_driver.core.errors import ConfigError, CubeError
+from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.processes.children import Children
-from cube_tensor_driver.processes.skin_processes import (
-    Process,
-    SimulatedHubs,
-    skin_processes,
-)
+from cube_tensor_driver.processes.skin_processes import VIEW, SimulatedHubs, skin_processes
 from cube_tensor_driver.simulation.mujoco.scene import MujocoLoad, scene_skin
 from cube_tensor_driver.simulation.mujoco.source import load_mujoco
 from cube_tensor_driver.views.figures.style import save
@@ -77,8 +64,6 @@ SHAKEN_S = 2.62
 """Time at which the acceleration of the gripper's box is largest, in s."""
 CAMERA_TARGET = (0.0, 0.0, 0.1)
 """Position, in m in the world of the gripper's scene, at the centre of its picture."""
-PHOTOGRAPH_S = 120.0
-"""Longest time for the browser to make its picture, in s."""
 COUNTS = [1, 4, 16, 64, 256, 1024, 4096]
 """Numbers of cubes in the scale plot."""
 RATE = 100.0
@@ -197,7 +182,7 @@ def _demo_skin() -> Iterator[Children]:
         hubs = SimulatedHubs(Path(name) / "ports", load=load, noise=None)
         for process in skin_processes(skin, contacts=True, simulated=hubs):
             children.start(process)
-        children.start(Process("view", "cube_tensor_driver.cli", False, arguments=("view",)))
+        children.start(VIEW)
         yield children
 
 
@@ -205,24 +190,9 @@ def _photograph(children: Children, path: Path) -> None:
     """Save a picture of the browser view.
 
     Raises:
-        CubeError: The browser made no picture.
+        WebDriverException: The browser made no picture.
     """
-    url = children.wait_for_line("view", "http://", START_S).split()[0]
-    # In a process of its own, so that only a machine with Chromium needs selenium.
-    command = [
-        sys.executable,
-        "-m",
-        "workshop.pictures.photograph",
-        url,
-        str(path.resolve()),
-    ]
-    done = subprocess.run(
-        command,
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=PHOTOGRAPH_S,
-        check=False,
-    )
-    if done.returncode:
-        raise CubeError(f"no picture of {url}:\n{done.stderr[-500:]}")
+    # Only a machine with Chromium needs selenium, which this module imports.
+    from .photograph import photograph
+
+    photograph(children.wait_for_line("view", "http://", START_S).split()[0], path)

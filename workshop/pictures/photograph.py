@@ -1,17 +1,14 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""A picture of the running browser view in headless Chromium, while a load presses the chosen cube.
-
-Use: python -m workshop.pictures.photograph URL FILE.png
-"""
+"""A picture of the running browser view in headless Chromium, while a load presses the chosen cube."""
 
 from __future__ import annotations
 
 import shutil
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from selenium import webdriver
 from selenium.webdriver.chrome.service import Service
@@ -84,8 +81,8 @@ def chromium(url: str) -> Iterator[webdriver.Chrome]:
         browser.quit()
 
 
-def photograph(url: str, path: str) -> None:
-    """Write a picture of the page at `url` to the PNG file `path`."""
+def photograph(url: str, path: Path) -> None:
+    """Write a picture of the page at a URL to a PNG file."""
     with chromium(url) as browser:
         wait = WebDriverWait(browser, MAX_WAIT_S, poll_frequency=POLL_S)
         wait.until(lambda _: browser.execute_script(READY))
@@ -95,7 +92,7 @@ def photograph(url: str, path: str) -> None:
             wait.until(lambda _: browser.execute_script(PRESSURE) < MIN_PRESSURE_KPA / 2)
         wait.until(lambda _: is_pressed_steadily(browser))
         browser.execute_script(CLOSE_NOTES)
-        browser.save_screenshot(path)
+        browser.save_screenshot(str(path))
 
 
 def is_pressed_steadily(browser: webdriver.Chrome) -> bool:
@@ -104,7 +101,3 @@ def is_pressed_steadily(browser: webdriver.Chrome) -> bool:
     time.sleep(STEADY_S)
     change = abs(browser.execute_script(PRESSURE) - before)
     return bool(before > MIN_PRESSURE_KPA and change < MAX_CHANGE_KPA)
-
-
-if __name__ == "__main__":
-    photograph(*sys.argv[1:])

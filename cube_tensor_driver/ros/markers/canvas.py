@@ -7,8 +7,6 @@ The pitch, in multiples of which many lengths are stated, is the distance of nei
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from geometry_msgs.msg import Point, Quaternion, Vector3
 from visualization_msgs.msg import Marker
@@ -89,20 +87,6 @@ HIDDEN_OPACITY = 0.001
 warning for a colour with opacity 0."""
 
 
-class Ranges(NamedTuple):
-    """Upper ends of the scales of a picture.
-
-    Attributes:
-        colours: Value at the upper end of the colour scale, in SI units of the quantity shown.
-        traction: Traction (force per area on the upper face) of the longest arrow, in Pa.
-        gradient: Gradient of stress of the longest arrow, in Pa/m.
-    """
-
-    colours: float = 0.0
-    traction: float = 0.0
-    gradient: float = 0.0
-
-
 class Canvas:
     """The picture of a skin. The namespace of each marker is its name, such as "faults".
 
@@ -139,8 +123,7 @@ class Canvas:
             *legend_markers(frame_id, place, signed),
         ]
         self._markers = SerialisedMarkers(markers)
-        heights = PLATE_HEIGHT * poses.half_side[:, None]
-        plates = poses.position + heights * poses.rotation[:, :, 2]
+        plates = scene.above(poses, PLATE_HEIGHT)
         oriented = enumerate(zip(self._groups, rotations, strict=True))
         for group, (members, rotation) in oriented:
             # Points of a marker are given in the frame of the marker's pose, so they are rotated
@@ -167,7 +150,7 @@ class Canvas:
         for group, members in enumerate(self._groups):
             self._markers[f"cubes {group}"].colours[:, :3] = colours[members]
 
-    def draw_arrows(self, values: Array, ranges: Ranges) -> None:
+    def draw_arrows(self, values: Array, ranges: scene.Ranges) -> None:
         """Draw the arrows of traction and gradient of each cube.
 
         Args:
@@ -247,7 +230,7 @@ class Canvas:
             # A circle with the area of the contact is drawn, although contacts have other shapes.
             area = max(0.0, contacts.area[number])
             radius = float(np.sqrt(area / np.pi))
-            rings[number] = _make_ring(position, normal, radius)
+            rings[number] = scene.ring(position, normal, radius, RING_CORNERS)
             slips = number < len(contacts.slip) and contacts.slip[number] == SkinContacts.SLIP
             label.colour[:] = *(SLIP_COLOUR if slips else CONTACT_COLOUR), 1.0
             label.position[:] = position + max(radius, MIN_TEXT_DISTANCE_M) * normal
@@ -371,23 +354,3 @@ def _force_text(normal_n: float, shear_n: float) -> str:
         shear_n: Tangential force of a contact, in N; NaN if it is not observed.
     """
     return f"{four_characters(normal_n)} N, shear {four_characters(shear_n)} N"
-
-
-def _make_ring(centre: Array, normal: Array, radius: float) -> Array:
-    """Return the lines of a ring as pairs of end points, (RING_CORNERS, 2, 3), in m.
-
-    Args:
-        centre: Centre of the ring, (3,), in m.
-        normal: Unit vector perpendicular to the plane of the ring, (3,).
-        radius: Radius of the ring, in m.
-    """
-    # Of the three coordinate axes, the one closest to perpendicular to the normal gives the most
-    # accurate cross product.
-    aside = np.eye(3)[np.abs(normal).argmin()]
-    first = np.cross(normal, aside)
-    first /= np.linalg.norm(first)
-    second = np.cross(normal, first)
-    angle = 2 * np.pi * np.arange(RING_CORNERS) / RING_CORNERS
-    direction = np.outer(np.cos(angle), first) + np.outer(np.sin(angle), second)
-    corners = centre + radius * direction
-    return np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)

@@ -7,10 +7,10 @@ from __future__ import annotations
 from visualization_msgs.msg import MarkerArray
 
 from ...config.parameters import MARKERS
-from ...core.arrays import Array, Index
+from ...core.arrays import Index
 from ...msg import SkinContacts
 from ...views import scene
-from ..markers.canvas import Canvas, Ranges
+from ..markers.canvas import Canvas
 from ..messages import CheckedSubscription, to_ns
 from ..node import run
 from ..skin_subscriber import FollowedSkin, SkinSubscriberNode
@@ -47,12 +47,14 @@ class Markers(SkinSubscriberNode):
             crosses=self.value("crosses"),
             signed=signed,
         )
-        self._ranges = Ranges()
+        self._ranges = scene.Ranges()
 
     def compute_message(self, skin: FollowedSkin, health: Index) -> bytes:
         values, residual = skin.newest.usable_values(health), skin.newest.residual
         shown = self._quantity.of(values, residual)
-        ranges = self._ranges = self._follow_ranges(values, residual, shown)
+        fixed, last = float(self.value("range")), self._ranges.colours
+        top = fixed or scene.automatic(self._quantity, shown, last)
+        ranges = self._ranges = self._ranges.follow(values, residual, top)
         canvas = self._canvas
         canvas.draw_cubes(scene.colours(self._quantity, shown, ranges.colours))
         canvas.draw_arrows(values, ranges)
@@ -79,30 +81,6 @@ class Markers(SkinSubscriberNode):
 
     def _on_contacts(self, message: SkinContacts) -> None:
         self._contacts = message
-
-    def _follow_ranges(
-        self,
-        values: Array,
-        residual: Array,
-        shown: Array,
-    ) -> Ranges:
-        """Return the ranges of colours and arrows, which adapt to the values step by step.
-
-        Args:
-            values: 6 stress components (Pa) and 9 gradients (Pa/m) of each cube in its own frame,
-                (cubes, 15).
-            residual: Residual of each cube, (cubes,).
-            shown: The quantity that the colours show, (cubes,), in SI units.
-        """
-        shear, gradient = scene.QUANTITIES["shear"], scene.QUANTITIES["gradient"]
-        last, fixed = self._ranges, float(self.value("range"))
-        # Columns 2 to 4 are the stress components zz, yz and zx, which act on the upper face.
-        traction = values[:, 2:5]
-        return Ranges(
-            colours=fixed or scene.automatic(self._quantity, shown, last.colours),
-            traction=scene.automatic(shear, traction, last.traction),
-            gradient=scene.automatic(gradient, gradient.of(values, residual), last.gradient),
-        )
 
 
 def main() -> None:

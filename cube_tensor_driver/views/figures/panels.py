@@ -1,48 +1,71 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Curves over time in panels one below the other, as the page saves its plots."""
+"""Curves over time in panels one below the other: of `./cube plot`, and as the page saves them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from ...core.arrays import Array
 from .style import curve_style, print_style
 
-Panel = tuple[str, Array, dict[str, Array]]
-"""A chart for a picture: label of its value axis; times (M,) in s before now; name of a line -> its
-values (M,), in the unit of the label."""
+Panel = tuple[str, Mapping[str, Array]]
+"""A panel: label of its value axis; name of each line -> its values (M,), in the unit of the label.
+"""
+
+MIN_GAP_STEPS = 3.0
+"""Minimum time between two samples, relative to the median of this time, that counts as a gap.
+
+No line connects the two samples at a gap.
+"""
+
+MARKERS_PER_LINE = 12
+"""Approximate number of markers on a line; they show which line it is, not single samples."""
+
+
+MAX_LEGEND_LINES = 12
+"""Maximum number of lines in a panel whose legend has one column; for more it has two."""
 
 
 @print_style()
-def draw_panels(panels: Sequence[Panel]) -> Figure:
+def draw_panels(times: Array, time_label: str, panels: Sequence[Panel]) -> Figure:
     """Draw panels one below the other over a common time axis.
 
     Args:
-        panels: Label, times and values of each panel, in the order from top to bottom.
+        times: (M,) times of all values, in s.
+        time_label: Label of the time axis.
+        panels: The panels, from top to bottom; a line that is NaN everywhere is left out.
     """
-    figure = Figure(figsize=(8, 3 * len(panels)))
-    axes = figure.subplots(
-        len(panels),
-        1,
-        sharex=True,
-        squeeze=False,
-    )[:, 0]
-    for axis, (label, times, lines) in zip(
-        axes,
-        panels,
-        strict=True,
-    ):
-        for number, (name, values) in enumerate(lines.items()):
-            axis.plot(times, values, label=name, **curve_style(number) | {"marker": ""})
+    figure = Figure(figsize=(8, 2.5 * len(panels)))
+    axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+    steps = np.diff(times)
+    usual_step = float(np.median(steps)) if len(steps) else 0.0
+    gaps = 1 + np.flatnonzero(steps > MIN_GAP_STEPS * usual_step)
+    # matplotlib interrupts a line at NaN.
+    broken_times = np.insert(times, gaps, np.nan)
+    spacing = max(1, len(times) // MARKERS_PER_LINE)
+    for axis, (label, lines) in zip(axes, panels, strict=True):
+        shown = {name: values for name, values in lines.items() if np.isfinite(values).any()}
+        for number, (name, values) in enumerate(shown.items()):
+            # The first marker of each line is at another sample, so that markers do not overlap.
+            first_marker = number * spacing // len(shown)
+            axis.plot(
+                broken_times,
+                np.insert(values, gaps, np.nan),
+                label=name,
+                markevery=(first_marker, spacing),
+                **curve_style(number),
+            )
         axis.set_ylabel(label)
         axis.legend(
             loc="center left",
             bbox_to_anchor=(1.0, 0.5),
-            fontsize=8,
+            fontsize=7,
             handlelength=3,
+            ncol=1 if len(shown) <= MAX_LEGEND_LINES else 2,
         )
-    axes[-1].set_xlabel("time before now / s")
+    axes[-1].set_xlabel(time_label)
     return figure

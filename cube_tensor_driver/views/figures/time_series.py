@@ -5,8 +5,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -17,19 +16,8 @@ from ...core.arrays import AnyArray
 from ...core.errors import BagError
 from ...core.modes import COMPONENTS, STRESS
 from ...core.status import INVALID, RESIDUAL
-from .style import MARKERS, print_style, symbol
-
-DASHES = ("-", "--", "-.", ":")
-"""Line styles of matplotlib, in the order in which the lines of a panel use them."""
-
-MIN_GAP_STEPS = 3.0
-"""Minimum time between two samples, relative to the median of this time, that counts as a gap.
-
-No line connects the two samples at a gap.
-"""
-
-MARKERS_PER_LINE = 12
-"""Approximate number of markers on a line; they show which line it is, not single samples."""
+from .panels import draw_panels
+from .style import print_style, symbol
 
 MAX_POINTS = 20_000
 """Maximum number of samples of a line that are drawn; more cannot be distinguished on paper."""
@@ -133,119 +121,36 @@ def draw_series(series: TimeSeries, title: str) -> Figure:
         series: The samples of the cube.
         title: First part of the title, such as the name of the bag.
     """
-    series = _with_breaks(series)
-    figure = Figure(figsize=(8, 9))
-    top, stress_axes, gradient_axes, bottom = figure.subplots(
-        4,
-        1,
-        sharex=True,
-    )
-    seconds, n_stress = series.seconds, len(STRESS)
-
     change_percent = 100 * (series.frequency / series.rest - 1)
-    _draw_columns(top, seconds, change_percent, series.pads)
-    top.set(ylabel="frequency above rest / %", title=f"{title}: cube {series.name}")
-
     symbols = [symbol(name) for name in COMPONENTS]
-    stress_kpa = series.values[:, :n_stress] * 1e-3
-    _draw_columns(
-        stress_axes,
-        seconds,
-        stress_kpa,
-        symbols[:n_stress],
+    lines = dict(zip(symbols, series.values.T, strict=True))
+    figure = draw_panels(
+        series.seconds,
+        "time after the start of the bag / s",
+        [
+            (
+                "frequency above rest / %",
+                dict(zip(series.pads, change_percent.T, strict=True)),
+            ),
+            (
+                "stress / kPa (tension: +)",
+                {name: 1e-3 * lines[name] for name in symbols[: len(STRESS)]},
+            ),
+            (
+                "gradient / (kPa/mm)",
+                {name: 1e-6 * lines[name] for name in symbols[len(STRESS) :]},
+            ),
+            ("residual / expected noise", {"residual": series.residual}),
+        ],
     )
-    stress_axes.set(ylabel="stress / kPa (tension: +)")
-    gradient_kpa_per_mm = series.values[:, n_stress:] * 1e-6
-    _draw_columns(
-        gradient_axes,
-        seconds,
-        gradient_kpa_per_mm,
-        symbols[n_stress:],
-    )
-    gradient_axes.set(ylabel="gradient / (kPa/mm)")
-
-    bottom.plot(
-        seconds,
-        series.residual,
-        color="0.3",
-        lw=0.8,
-        label="residual",
-    )
+    top, *_, bottom = figure.axes
+    top.set_title(f"{title}: cube {series.name}")
     for bit, label, marker in ((RESIDUAL, "residual too large", "x"), (INVALID, "invalid", "v")):
         is_marked = series.status & bit > 0
         if is_marked.any():
             # The residual of an invalid row is NaN; its mark is drawn at zero.
             residual = np.nan_to_num(series.residual[is_marked])
-            bottom.plot(
-                seconds[is_marked],
-                residual,
-                marker,
-                color="C3",
-                ms=4,
-                label=label,
-            )
-    bottom.set(ylabel="residual / expected noise", xlabel="time after the start of the bag / s")
+            seconds = series.seconds[is_marked]
+            bottom.plot(seconds, residual, marker, color="C3", ms=4, label=label)
     bottom.legend(loc="upper right", fontsize=7)
     return figure
-
-
-def _with_breaks(series: TimeSeries) -> TimeSeries:
-    """Insert a sample of NaN into each gap (see `MIN_GAP_STEPS`) of a series of samples.
-
-    matplotlib interrupts a line at NaN, so that no line connects the samples beside a gap.
-    """
-    step = np.diff(series.seconds)
-    if not len(step):
-        return series
-    gaps = np.flatnonzero(step > MIN_GAP_STEPS * np.median(step)) + 1
-    return replace(
-        series,
-        seconds=np.insert(series.seconds, gaps, np.nan),
-        frequency=np.insert(series.frequency, gaps, np.nan, axis=0),
-        values=np.insert(series.values, gaps, np.nan, axis=0),
-        residual=np.insert(series.residual, gaps, np.nan),
-        status=np.insert(series.status, gaps, 0),
-    )
-
-
-def _draw_columns(
-    axes: Any,
-    seconds: AnyArray,
-    columns: AnyArray,
-    names: list[str],
-) -> None:
-    """Draw lines that differ in dashes, markers and lightness, so that no colour is needed.
-
-    Args:
-        axes: The axes of matplotlib to draw into.
-        seconds: (N,) times, in s.
-        columns: (N, K) values of K lines; a line that is NaN everywhere is left out.
-        names: K labels of the lines.
-    """
-    shown = [
-        (values, name)
-        for values, name in zip(columns.T, names, strict=True)
-        if np.isfinite(values).any()
-    ]
-    step = max(1, len(seconds) // MARKERS_PER_LINE)
-    for number, (values, name) in enumerate(shown):
-        axes.plot(
-            seconds,
-            values,
-            DASHES[number % len(DASHES)],
-            lw=0.9,
-            color=str(0.6 * number / len(shown)),
-            ms=4,
-            marker=MARKERS[number % len(MARKERS)],
-            mfc="white",
-            # The first marker of each line is at another sample, so that markers do not overlap.
-            markevery=(number * step // len(shown), step),
-            label=name,
-        )
-    columns_of_legend = 1 if len(names) <= 12 else 2
-    axes.legend(
-        loc="center left",
-        bbox_to_anchor=(1.0, 0.5),
-        fontsize=7,
-        ncol=columns_of_legend,
-    )

@@ -5,8 +5,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from rich.box import SIMPLE_HEAD
@@ -17,10 +16,11 @@ from rich.table import Table
 from rich.text import Text
 
 from ...config.skin import Skin
-from ...core.arrays import Array, Index
-from ...core.modes import COMPONENTS, STRESS
+from ...core.arrays import Array
+from ...core.latest_stress import LatestStress
+from ...core.modes import COMPONENTS
 from ...core.rows import StressRows
-from ...core.status import STATUS
+from ...core.status import describe_status
 from .output import counted
 
 DRAW_PERIOD_S = 0.1
@@ -37,6 +37,9 @@ They are normal stresses, the shear stresses at the surface of the skin, and the
 
 UNOBSERVED = "·"
 """Character that the table shows instead of a value that is not observed (NaN)."""
+
+PRESSURE = "pressure"
+"""Heading of the column with the bars."""
 
 BAR_WIDTH = 12
 """Width, in characters, of the longest bar in the column for the pressure."""
@@ -62,38 +65,8 @@ It is larger than any table, so that it does not limit the result.
 """
 
 
-@dataclass(frozen=True)
-class _Form:
-    """A layout of the table: its optional columns, and whether it has lines.
-
-    The columns for names, rates and states are in every layout.
-    """
-
-    components: tuple[str, ...]
-    has_bar: bool = True
-    has_residual: bool = True
-    has_lines: bool = True
-
-
-def _forms(components: Sequence[str]) -> Iterator[_Form]:
-    """Yield the possible layouts of the table, from the widest to the narrowest.
-
-    Args:
-        components: Names of the components that have a column in the widest layout.
-    """
-    names = tuple(components)
-    yield _Form(names)
-    # Without lines, the table of a skin of planar cubes is not wider than 80 characters.
-    yield _Form(names, has_lines=False)
-    for n in range(len(names), 0, -1):
-        yield _Form(names[:n], has_bar=False, has_lines=False)
-    yield _Form((), has_bar=False, has_lines=False)
-    yield _Form(
-        (),
-        has_bar=False,
-        has_residual=False,
-        has_lines=False,
-    )
+Cells = list[str | Text]
+"""Content of one column of the table, one entry for each row."""
 
 
 class LiveTable:
@@ -112,15 +85,11 @@ class LiveTable:
             skin: The skin whose cubes are shown.
             show: Whether to draw the table; otherwise it only counts rows.
         """
-        n = len(skin.cubes)
         self.note = ""
         self._skin = skin
-        self._values = np.full((n, len(COMPONENTS)), np.nan)
-        self._residual = np.full(n, np.nan)
-        self._status = np.zeros(n, np.uint16)
-        self._count = np.zeros(n, int)
-        self._rate = np.full(n, np.nan)
-        self._rate_count = self._count.copy()
+        self._latest = LatestStress(len(skin.cubes))
+        self._rate = np.full(len(skin.cubes), np.nan)
+        self._rate_count = self._latest.count.copy()
         self._rate_s = time.monotonic()
         self._peak = 0.0
         self._drawn_s = 0.0
@@ -147,34 +116,30 @@ class LiveTable:
     @property
     def seen(self) -> int:
         """Number of cubes from which at least one tensor has arrived."""
-        return int(np.count_nonzero(self._count))
+        return int(np.count_nonzero(self._latest.count))
 
     @property
     def seen_all(self) -> bool:
         """Whether at least one tensor has arrived from every cube."""
-        return self.seen == len(self._count)
+        return bool(self._latest.count.all())
 
     def update(self, rows: StressRows) -> None:
         """Store the rows of a stress message, which the next `refresh` shows.
 
         Of several rows of one cube, the last one is shown.
         """
-        if not self._count.any():
+        if not self._latest.count.any():
             # The next `refresh` draws the first tensors without waiting for `DRAW_PERIOD_S`.
             self._drawn_s = 0.0
-        cube = rows.cube
-        self._values[cube, : len(STRESS)] = rows.stress
-        self._values[cube, len(STRESS) :] = rows.gradient
-        self._residual[cube], self._status[cube] = rows.residual, rows.status
-        # If a cube occurs several times in a message, `+=` would count it only once.
-        np.add.at(self._count, cube, 1)
+        self._latest.update(rows, time.monotonic())
 
     def refresh(self) -> None:
         """Compute the rates and draw the table, each if its period is over."""
         now_s = time.monotonic()
         if now_s - self._rate_s >= RATE_PERIOD_S:
-            self._rate = (self._count - self._rate_count) / (now_s - self._rate_s)
-            self._rate_count, self._rate_s = self._count.copy(), now_s
+            count = self._latest.count.copy()
+            self._rate = (count - self._rate_count) / (now_s - self._rate_s)
+            self._rate_count, self._rate_s = count, now_s
         if self._live and now_s - self._drawn_s >= DRAW_PERIOD_S:
             self._drawn_s = now_s
             max_rows = max(MIN_ROWS, self._console.height - OTHER_LINES)
@@ -184,20 +149,16 @@ class LiveTable:
         """Make the table for a terminal.
 
         In a skin of more than `max_rows` cubes, those with the largest absolute σzz are shown. If
-        the table is too wide, the lines, then the bars, then components from the last one on are
-        left out.
+        the table is too wide, the lines, then the bars, then components from the last one on, and
+        at last the residual are left out.
 
         Args:
             max_rows: Maximum number of cubes in the table.
             width: Width of the terminal, in characters.
         """
         # Tension is positive in the stress tensor, so the pressure is −σzz.
-        pressure = np.nan_to_num(-self._values[:, COMPONENTS.index("zz")])
-        self._peak = max(
-            self._peak * PEAK_DECAY,
-            float(pressure.max()),
-            MIN_PEAK,
-        )
+        pressure = np.nan_to_num(-self._component("zz"))
+        self._peak = max(self._peak * PEAK_DECAY, float(pressure.max()), MIN_PEAK)
         shown = np.arange(len(pressure))
         notes = []
         if len(shown) > max_rows:
@@ -208,82 +169,73 @@ class LiveTable:
                 f"the {max_rows} cubes under the greatest normal stress of {len(pressure)}"
             )
 
-        components = [name for name in SHOWN if np.isfinite(self._component(name)).any()]
+        columns = self._columns(shown.tolist(), pressure)
+        # The first and the last two columns (name, rate and state) are always shown.
+        bar, *components, residual = list(columns)[1:-2]
+        omissible = ["lines", bar, *reversed(components), residual]
         options = self._console.options.update(max_width=UNLIMITED_WIDTH)
         table = Table()
-        for form in _forms(components):
-            # The width of the table depends on its content, so it is made in each layout and
-            # measured until it fits.
-            table = self._table(form, shown, pressure)
-            left_out = [] if form.has_bar else ["pressure"]
-            left_out += map(_label, components[len(form.components) :])
-            left_out += [] if form.has_residual else ["residual"]
+        # The width of the table depends on its content, so it is made and measured until it fits.
+        for n_omitted in range(len(omissible) + 1):
+            omitted = omissible[:n_omitted]
+            shown_columns = {
+                heading: column for heading, column in columns.items() if heading not in omitted
+            }
+            table = self._table(shown_columns, has_lines=not omitted)
+            # The first line of a heading is a name, the second one a unit.
+            left_out = [heading.split("\n")[0] for heading in columns if heading in omitted]
             too_narrow = [f"too narrow for {', '.join(left_out)}"] if left_out else []
             table.caption = "; ".join([*notes, *too_narrow])
-            if (
-                Measurement.get(
-                    self._console,
-                    options,
-                    table,
-                ).maximum
-                <= width
-            ):
+            if Measurement.get(self._console, options, table).maximum <= width:
                 break
         return table
 
-    def _table(
-        self,
-        form: _Form,
-        shown: Index,
-        pressure: Array,
-    ) -> Table:
-        """Make the table in one layout.
+    def _columns(self, shown: Sequence[int], pressure: Array) -> dict[str, Cells]:
+        """Return all columns by their headings.
 
         Args:
-            form: The layout.
-            shown: (K,) indices of the cubes that have a row.
+            shown: Indices of the cubes that have a row.
             pressure: (N,) pressure −σzz at all cubes, in Pa.
         """
-        table = self._empty_table(form)
-        for number in shown.tolist():
-            cells: list[str | Text] = [self._skin.cubes[number].name]
-            if form.has_bar:
-                share = min(1.0, max(0.0, pressure[number] / self._peak))
-                cells.append(Text("█" * int(BAR_WIDTH * share), "blue"))
-            for name in form.components:
-                cells.append(_in_kpa(name, self._component(name)[number]))
-            if form.has_residual:
-                cells.append(_number(self._residual[number], ".2f"))
-            cells += [_number(self._rate[number], ".0f"), self._state(number)]
-            table.add_row(*cells)
-        return table
+        bar_lengths = BAR_WIDTH * np.clip(pressure / self._peak, 0.0, 1.0)
+        columns: dict[str, Cells] = {
+            "cube": [self._skin.cubes[cube].name for cube in shown],
+            PRESSURE: [Text("█" * int(bar_lengths[cube]), "blue") for cube in shown],
+        }
+        for name in SHOWN:
+            values = self._component(name)
+            if np.isfinite(values).any():
+                is_gradient = "_" in name
+                label = f"∂{name[:2]}/∂{name[3]}" if is_gradient else name
+                scale, unit = (1e-6, "kPa/mm") if is_gradient else (1e-3, "kPa")
+                columns[f"{label}\n{unit}"] = _numbers(scale * values, shown, "+7.2f")
+        columns["residual"] = _numbers(self._latest.residual, shown, ".2f")
+        columns["Hz"] = _numbers(self._rate, shown, "4.0f")
+        columns["state"] = [self._state(cube) for cube in shown]
+        return columns
 
-    def _empty_table(self, form: _Form) -> Table:
-        count = counted(len(self._count), "cube")
+    def _table(self, columns: Mapping[str, Cells], has_lines: bool) -> Table:
+        """Make the table with these columns, which have lines between them or not."""
+        count = counted(len(self._skin.cubes), "cube")
         title = f"skin {self._skin.name!r}: {count}. Tension is positive; "
         table = Table(title=f"{title}{UNOBSERVED} is not observed{self.note}")
-        if not form.has_lines:
+        # Without lines, the table of a skin of planar cubes is not wider than 80 characters.
+        if not has_lines:
             table.box, table.padding, table.show_edge = SIMPLE_HEAD, (0, 0), False
-
-        table.add_column("cube")
-        if form.has_bar:
-            table.add_column("pressure", width=BAR_WIDTH)
-        for name in form.components:
-            unit = "kPa/mm" if is_gradient(name) else "kPa"
+        for heading in columns:
             table.add_column(
-                f"{_label(name)}\n{unit}",
-                justify="right",
-                min_width=7,
+                heading,
+                justify="left" if heading in ("cube", PRESSURE, "state") else "right",
+                # The bars have different lengths in each drawing, the column always the same.
+                width=BAR_WIDTH if heading == PRESSURE else None,
             )
-        if form.has_residual:
-            table.add_column("residual", justify="right")
-        table.add_column("Hz", justify="right", min_width=4)
-        table.add_column("state")
+        for cells in zip(*columns.values(), strict=True):
+            table.add_row(*cells)
         return table
 
     def _component(self, name: str) -> Array:
         """Return the values (N,) of one component of all cubes, in Pa or Pa/m."""
-        return self._values[:, COMPONENTS.index(name)]
+        return self._latest.values[:, COMPONENTS.index(name)]
 
     def _state(self, number: int) -> Text:
         """Return the names of the status bits that are set in the latest row of a cube.
@@ -293,33 +245,12 @@ class LiveTable:
         Args:
             number: Index of the cube in the skin.
         """
-        bits = self._status[number]
-        words = [word.lower().replace("_", " ") for word, bit in STATUS.items() if bits & bit]
+        words = describe_status(self._latest.status[number])
         if words:
-            return Text(", ".join(words), "red")
-        return Text("ok" if self._count[number] else "waiting", "green")
+            return Text(words, "red")
+        return Text("ok" if self._latest.count[number] else "waiting", "green")
 
 
-def is_gradient(component: str) -> bool:
-    """Return whether a component is a gradient, such as zz_x, the derivative of zz along x."""
-    return "_" in component
-
-
-def _label(component: str) -> str:
-    """Return the heading of the column of a component, such as zz or ∂zz/∂x."""
-    return f"∂{component[:2]}/∂{component[3]}" if is_gradient(component) else component
-
-
-def _in_kpa(component: str, value: float) -> str:
-    """Return a stress as text in kPa, or a gradient as text in kPa/mm.
-
-    Args:
-        component: Name of the component, such as zz (stress) or zz_x (gradient).
-        value: Its value, in Pa or Pa/m.
-    """
-    scale = 1e-6 if is_gradient(component) else 1e-3
-    return _number(value * scale, "+.2f")
-
-
-def _number(value: float, form: str) -> str:
-    return UNOBSERVED if np.isnan(value) else f"{value:{form}}"
+def _numbers(values: Array, shown: Sequence[int], form: str) -> Cells:
+    """Return the cells of some cubes: numbers in a format of Python, `UNOBSERVED` for NaN."""
+    return [UNOBSERVED if np.isnan(values[cube]) else f"{values[cube]:{form}}" for cube in shown]
