@@ -1,6 +1,6 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""A picture of the running browser view in headless Chromium, while a load presses the chosen cube."""
+"""A picture of the running page in headless Chromium, while a load presses the chosen cube."""
 
 from __future__ import annotations
 
