@@ -472,7 +472,6 @@ def test_samples_that_are_handled_in_c_are_no_silence(hub: PtyHub) -> None:
     session = session_module.Session(link, None, time.time_ns, lambda *_: None)
     now = time.monotonic()
     assert session.open(now)
-    session.begin()
     for second in (0.5, 1.0, 1.5):
         link.track.usual += 1
         session.check_timers(now + second)

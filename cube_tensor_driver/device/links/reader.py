@@ -262,7 +262,6 @@ class Reader:
                             session.check_timers(now)
                         elif session.open(now):
                             self._intake.update()
-                            session.begin()
                 self._plan_gathering()
 
     def _handle_reads(

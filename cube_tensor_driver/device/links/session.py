@@ -96,6 +96,8 @@ class Session:
     def open(self, now: float) -> bool:
         """Open the link if the pause after the last attempt is over or its device file changed.
 
+        Then the state becomes OPEN, and the hub is asked for HELLO.
+
         Args:
             now: Monotonic time, in s.
 
@@ -103,7 +105,7 @@ class Session:
             Whether the link is open.
 
         Raises:
-            LinkError: The attempt to open the link failed.
+            LinkError: The attempt to open the link failed, or sending.
         """
         link = self.link
         if now >= self._check_port_at:
@@ -123,16 +125,9 @@ class Session:
         self._has_hello = False
         self._answered_us = self.asked_ns = None
         link.period_problem = ""
-        return True
-
-    def begin(self) -> None:
-        """Set the state OPEN and ask the hub for HELLO, because the link was opened.
-
-        Raises:
-            LinkError: Sending failed.
-        """
         self.set_state(LinkState.OPEN)
-        self._ask_hello(time.monotonic())
+        self._ask_hello(now)
+        return True
 
     def close(self, error: LinkError) -> None:
         """Close the link because of an error, and set the state WAITING.

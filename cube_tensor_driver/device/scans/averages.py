@@ -54,19 +54,12 @@ def average_over_time(
         in the interval.
     """
     parts: list[Array] = []
-    begin_s: float | None = None
+    end_s = np.inf
     for rows in source:
         frequency, seconds = split_into_scans(rows, n_cubes)
+        end_s = min(end_s, seconds[0] + duration_s)
         parts.append(frequency)
-        if begin_s is None:
-            begin_s = float(seconds[0])
-        if seconds[-1] - begin_s < duration_s:
-            continue
-
-        values = np.concatenate(parts)
-        is_measured = np.isfinite(values)
-        total = np.where(is_measured, values, 0).sum(axis=0)
-        count = is_measured.sum(axis=0)
-        mean = np.full(total.shape, np.nan)
-        yield np.divide(total, count, out=mean, where=count > 0)
-        parts, begin_s = [], None
+        if seconds[-1] >= end_s:
+            values = np.ma.masked_invalid(np.concatenate(parts))
+            yield values.mean(axis=0).filled(np.nan)
+            parts, end_s = [], np.inf

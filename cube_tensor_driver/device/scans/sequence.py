@@ -27,6 +27,8 @@ MAX_REPEAT_US = 60_000_000
 than the newest one. No line holds samples for longer, so an older sample shows that the hub has
 restarted and its device time has begun again near zero."""
 _WRAP = 1 << 32
+_MAX_CUBES = 1 << 16
+"""Number of indices of a cube on a hub, which have 16 bits."""
 
 
 class Arrival(str, Enum):
@@ -38,15 +40,12 @@ class Arrival(str, Enum):
         DUPLICATE: A sample that has come before and must not be delivered again, or one so old that
             this cannot be excluded.
         RESET: The first sample after a restart of the hub.
-        SET_BACK: The next sample, or the first after a gap, with an earlier device time than the
-            sample before, because the hub's clock was set back.
     """
 
     NEW = "new"
     LATE = "late"
     DUPLICATE = "duplicate"
     RESET = "reset"
-    SET_BACK = "set_back"
 
 
 @dataclass(slots=True)
@@ -116,7 +115,13 @@ class SequenceTracker:
         if ahead >= 0:
             if ahead > MAX_GAP and device_us - track.newest_us < MIN_PERIOD_US * ahead:
                 return self._restart(sequence, device_us)
-            return self._skip(number, device_us)
+            # An earlier device time than that of the sample before shows that the hub's clock was
+            # set back.
+            self.counters.resets += device_us < track.newest_us
+            self.counters.missing += ahead
+            track.next = number + 1
+            track.newest_us = device_us
+            return self._deliver(number, device_us, Arrival.NEW)
 
         # The number is smaller than that of the next sample.
         if self._restart_at == track.next and device_us < track.newest_us:
@@ -161,24 +166,6 @@ class SequenceTracker:
         half = _WRAP // 2
         distance = (sequence - self._track.next) % _WRAP
         return distance if distance < half else distance - _WRAP
-
-    def _skip(self, number: int, device_us: int) -> Arrival:
-        """Deliver the next sample, the first one after lost samples, or one after a step of time.
-
-        A device time (hub's clock) earlier than that of the newest sample shows such a step back.
-
-        Args:
-            number: Unwrapped number of the sample.
-            device_us: Device time of the sample, in µs.
-        """
-        self.counters.missing += number - self._track.next
-        arrival = Arrival.NEW
-        if device_us < self._track.newest_us:
-            arrival = Arrival.SET_BACK
-            self.counters.resets += 1
-        self._track.next = number + 1
-        self._track.newest_us = device_us
-        return self._deliver(number, device_us, arrival)
 
     def _is_old_repeat(self, number: int, device_us: int) -> bool:
         """Return whether a sample older than the kept ones lies in the past of the hub's run.
@@ -282,6 +269,7 @@ class SampleAccount:
 
     def __init__(self, track: LinkTrack | None = None) -> None:
         self._track = LinkTrack() if track is None else track
+        self._track.n_cubes = _MAX_CUBES  # until HELLO states the number
         self._received = 0
         self.stats_frame: Stats | None = None
         # A sample of many cubes comes in several frames (parts). There is one tracker for each
@@ -289,7 +277,6 @@ class SampleAccount:
         # longer sends are added to _ended.
         self._trackers: dict[int, SequenceTracker] = {}
         self._ended = SequenceCounters()
-        self._n_cubes = 1 << 16  # number of cubes in HELLO; indices have 16 bits
         self._dropped = 0
         self._dropped_before = 0
 
@@ -298,7 +285,7 @@ class SampleAccount:
         self._received += 1
         tracker = self._trackers.get(frame.first_cube)
         if tracker is None or tracker.n_cubes != frame.n_cubes:
-            if frame.first_cube >= self._n_cubes:
+            if frame.first_cube >= self._track.n_cubes:
                 # HELLO has not reported such cubes, so their rows are left out (`CubeTable`).
                 self._ended.delivered += 1
                 return Arrival.NEW
@@ -315,9 +302,7 @@ class SampleAccount:
             n_pads: Number of pads of each cube.
         """
         self._track.n_cubes, self._track.n_pads = n_cubes, n_pads
-        if n_cubes != self._n_cubes:
-            self._n_cubes = n_cubes
-            self._end_parts(n_cubes, 1 << 16)
+        self._end_parts(n_cubes, _MAX_CUBES)
 
     def expect_restart(self) -> None:
         """Note that the hub may have restarted, because it was started, silent or not connected.
@@ -383,8 +368,8 @@ class SampleAccount:
     @property
     def is_usual(self) -> bool:
         """Whether each sample comes in one frame, which holds all cubes of the hub."""
-        tracker = self._trackers.get(0)
-        return tracker is not None and len(self._trackers) == 1 and tracker.n_cubes == self._n_cubes
+        sizes = {first: tracker.n_cubes for first, tracker in self._trackers.items()}
+        return sizes == {0: self._track.n_cubes}
 
     @property
     def missing(self) -> int:
