@@ -23,9 +23,13 @@
 #endif
 
 /* Bits of core/status.py, and limits of core/health/statistics.py. */
-enum { PAD_FAULT = 1, RESIDUAL = 2, INVALID = 4, TEMPERATURE = 8, STAMP = 2048 };
+enum { PAD_FAULT = 1, RESIDUAL = 2, INVALID = 4, TEMPERATURE = 8, STAMP = 2048, COMPENSATION = 4096 };
 static const int64_t GAP_NS = 50000000;
 static const double MAX_JITTER_RATIO = 1.5;
+
+/* Limits of core/kernel/contract.py. */
+static const int64_t MAX_GAP_NS = 5000000000;
+static const float MAX_SPECIFIC_FORCE = 1000;
 
 /* Quantities of each pad: PAD_QUANTITIES in core/kernel/contract.py. */
 enum { LAST, DIFFERENCE, FIRST_SQUARES, SECOND_SQUARES, BOUNDED_SQUARES, SUM, LOWEST, HIGHEST };
@@ -69,13 +73,21 @@ static int32_t find_table(const cube_scan_call *call, int64_t key) {
     return low < call->length[E] && call->keys[low] == key ? call->numbers[low] : -1;
 }
 
-/* Returns whether the newest stamp of the scan that begins here lies in the window. */
-static bool is_in_window(const cube_scan_call *call, int64_t row) {
+/* Returns what is due before the scan that begins here: the next window of health, if its newest
+ * stamp lies outside the present one, or the next step of compensation likewise. */
+static int64_t find_due(const cube_scan_call *call, int64_t row) {
+    const int64_t *window_ns = call->window_ns, *step_ns = call->step_ns;
     int64_t newest_ns = call->stamp_ns[row];
     for (row++; row < call->length[N] && call->cube[row] > call->cube[row - 1]; row++)
         newest_ns = call->stamp_ns[row] > newest_ns ? call->stamp_ns[row] : newest_ns;
-    call->window_ns[2] = newest_ns;
-    return call->window_ns[0] <= newest_ns && newest_ns < call->window_ns[1];
+    if (window_ns != NULL) {
+        call->window_ns[2] = newest_ns;
+        if (newest_ns < window_ns[0] || newest_ns >= window_ns[1])
+            return CUBE_SCAN_WINDOW;
+    }
+    if (step_ns != NULL && (newest_ns < step_ns[0] || newest_ns >= step_ns[1]))
+        return CUBE_SCAN_STEP;
+    return CUBE_SCAN_DONE;
 }
 
 /* f0 and f_highest at the temperature T of a row: both times
@@ -98,8 +110,7 @@ static void warm_row(const cube_scan_call *call, block *b, int64_t i) {
 }
 
 /* Pad law (Kiyota & Shinoda, eq. 6): v = (f - f0) / (f_highest - f), the stress on a pad divided by
- * its stiffness; 0 without 0 < f < f_highest. NaN fails all comparisons. An offset (weight, creep,
- * thermal stress) is subtracted from it; v of the call keeps it as it was measured.
+ * its stiffness; 0 without 0 < f < f_highest. NaN fails all comparisons.
  *
  * Returns the number of pads with such a frequency and, with health, one in their possible range. */
 INLINE int64_t apply_law(const cube_scan_call *call, block *b, const float *rest, const float *highest) {
@@ -112,19 +123,53 @@ INLINE int64_t apply_law(const cube_scan_call *call, block *b, const float *rest
         b->v[l] = is_good ? quotient : 0;
         n_good += is_good;
     }
-    if (call->v != NULL)
-        memcpy(call->v + b->row * call->length[P], b->v, (size_t)n_lanes * sizeof *b->v);
-    if (call->offset != NULL) {
-        const float *offset = call->offset + b->row * call->length[P];
-        LANES for (int64_t l = 0; l < n_lanes; l++)
-            b->v[l] -= offset[l];
-    }
     if (call->words == NULL)
         return n_good;
     const float *low = quantity(call, LOW, b->cube), *high = quantity(call, HIGH, b->cube);
     LANES for (int64_t l = 0; l < n_lanes; l++)
         n_possible += (f[l] > low[l]) & (f[l] < high[l]);
     return n_good < n_possible ? n_good : n_possible;
+}
+
+/* Subtracts from v of a row what is no load: offset + (slope + gain * v) * (time since since_ns) for
+ * creep and temperature, and response * force for weight. Sets the bits of what is subtracted. */
+INLINE void subtract_offsets(const cube_scan_call *call, block *b, int64_t i) {
+    const int64_t n = call->length[P], row = b->row + i, cube = b->cube + i;
+    const float *offset = call->offset + cube * n, *slope = call->slope + cube * n;
+    const float *gain = call->gain + cube * n;
+    float *v = b->v + i * n, *reading = call->reading + cube * n, *sum = call->subtracted + cube * n;
+    const int64_t stamp_ns = call->stamp_ns[row];
+    const int64_t elapsed_ns = (int64_t)((uint64_t)stamp_ns - (uint64_t)call->since_ns[cube]);
+    const float elapsed = elapsed_ns > 0 ? (float)((double)elapsed_ns * 1e-9) : 0;
+    const bool is_near = elapsed_ns >= 0 && elapsed_ns <= MAX_GAP_NS;
+    const uint16_t lasting = call->lasting[cube];
+    call->status[row] |= is_near || lasting == 0 ? lasting : COMPENSATION;
+    call->newest_ns[cube] = stamp_ns;
+    LANES for (int64_t p = 0; p < n; p++) {
+        reading[p] = v[p];
+        sum[p] = offset[p] + (slope[p] + gain[p] * v[p]) * elapsed;
+    }
+    if (call->force != NULL) {
+        const float *force = call->force + row * 3, *response = call->response + cube * 3 * n;
+        float used[3];
+        bool is_known = true;
+        for (int axis = 0; axis < 3; axis++)
+            is_known &= fabsf(force[axis]) < MAX_SPECIFIC_FORCE; /* false for NaN */
+        for (int axis = 0; axis < 3; axis++) {
+            used[axis] = is_known ? force[axis] : 0;
+            call->newest_force[cube * 3 + axis] = is_known ? force[axis] : NAN;
+        }
+        call->status[row] |= is_known ? call->weighing[cube] : COMPENSATION;
+        LANES for (int64_t p = 0; p < n; p++) {
+            sum[p] += response[p] * used[0];
+            sum[p] += response[n + p] * used[1];
+            sum[p] += response[2 * n + p] * used[2];
+        }
+    }
+    LANES for (int64_t p = 0; p < n; p++)
+        v[p] -= sum[p];
+    if (call->row_offset != NULL)
+        memcpy(call->row_offset + row * n, sum, (size_t)n * sizeof *sum);
 }
 
 /* Gets mask and conditions of a row. Returns whether a pad may be bad. */
@@ -160,7 +205,11 @@ static int64_t leave_out(const cube_scan_call *call, block *b, int64_t i, const 
     if (bad == 0)
         return CUBE_SCAN_DONE;
     for (int64_t p = 0; p < n; p++)
-        b->v[i * n + p] = bad >> p & 1 ? 0 : b->v[i * n + p];
+        if (bad >> p & 1) {
+            b->v[i * n + p] = 0;
+            if (call->since_ns != NULL)
+                call->reading[cube * n + p] = NAN;
+        }
     const int64_t key = (int64_t)calibration << 32 | bad;
     b->table[i] = find_table(call, key);
     if (b->table[i] < 0)
@@ -296,7 +345,10 @@ INLINE int64_t process_block(const cube_scan_call *call, block *b) {
         rest = b->rest;
         highest = b->highest;
     }
-    if (apply_law(call, b, rest, highest) != n_pads || is_doubtful)
+    const int64_t n_good = apply_law(call, b, rest, highest);
+    for (int64_t i = 0; i < b->n_rows && call->since_ns != NULL; i++)
+        subtract_offsets(call, b, i);
+    if (n_good != n_pads || is_doubtful)
         for (int64_t i = 0; i < b->n_rows; i++) {
             request = leave_out(call, b, i, highest);
             if (request != CUBE_SCAN_DONE)
@@ -324,10 +376,8 @@ CLONES static int64_t process(const cube_scan_call *call, int64_t start, int64_t
         }
         /* A scan begins where the cube number does not rise. */
         const bool is_begin = b.row == 0 || cube[b.row] <= cube[b.row - 1];
-        if (call->words != NULL && is_begin && !is_in_window(call, b.row)) {
-            *request = CUBE_SCAN_WINDOW;
+        if (is_begin && (*request = find_due(call, b.row)) != CUBE_SCAN_DONE)
             return b.row;
-        }
         while (b.n_rows < ROWS && b.row + b.n_rows < call->length[N] &&
                cube[b.row + b.n_rows] == b.cube + b.n_rows && b.cube + b.n_rows < call->length[C])
             b.n_rows++;
@@ -338,7 +388,13 @@ CLONES static int64_t process(const cube_scan_call *call, int64_t start, int64_t
 
 int64_t cube_scan(const cube_scan_call *call, int64_t start, int64_t *request) {
     const int64_t n_outputs = call->length[K];
-    const bool has_health = call->words != NULL;
+    const bool has_health = call->words != NULL, has_offsets = call->since_ns != NULL;
+    const void *offsets[] = {call->step_ns, call->offset, call->slope, call->gain, call->lasting,
+                             call->response, call->weighing, call->newest_ns, call->reading, call->subtracted,
+                             call->newest_force};
+    for (size_t i = 0; i < sizeof offsets / sizeof *offsets; i++)
+        if ((offsets[i] != NULL) != has_offsets)
+            return -1;
     if (start < 0 || call->length[P] > CUBE_SCAN_MAX_PADS || n_outputs % CUBE_SCAN_BLOCK != 0 ||
         n_outputs > CUBE_SCAN_MAX_OUTPUTS || call->n_residuals > n_outputs - CUBE_SCAN_COMPONENTS ||
         (call->quantities != NULL) != has_health || (call->window_ns != NULL) != has_health)

@@ -35,6 +35,7 @@
 #define CUBE_SCAN_WINDOW (-2)       /* the next scan lies outside the window of health */
 #define CUBE_SCAN_CONDITION (-3)    /* a pad of this row has a condition that is not found yet */
 #define CUBE_SCAN_UNKNOWN_CUBE (-4) /* the row is of no cube of the skin */
+#define CUBE_SCAN_STEP (-5)         /* the next scan lies outside the step of compensation */
 
 /* State of the health of one cube: CUBE_STATE in core/kernel/contract.py. */
 typedef struct {
@@ -64,6 +65,18 @@ typedef struct {
     X(int64_t, words, 'i', "C8", STATE)               \
     X(float, quantities, 'f', "QCP", STATE)           \
     X(int64_t, window_ns, 'i', "3", STATE)            \
+    X(const int64_t, step_ns, 'i', "2", OPTION)       \
+    X(const int64_t, since_ns, 'i', "C", OPTION)      \
+    X(const float, offset, 'f', "CP", OPTION)         \
+    X(const float, slope, 'f', "CP", OPTION)          \
+    X(const float, gain, 'f', "CP", OPTION)           \
+    X(const uint16_t, lasting, 'u', "C", OPTION)      \
+    X(const float, response, 'f', "C3P", OPTION)      \
+    X(const uint16_t, weighing, 'u', "C", OPTION)     \
+    X(int64_t, newest_ns, 'i', "C", STATE)            \
+    X(float, reading, 'f', "CP", STATE)               \
+    X(float, subtracted, 'f', "CP", STATE)            \
+    X(float, newest_force, 'f', "C3", STATE)          \
     X(const uint16_t, cube, 'u', "N", INPUT)          \
     X(const float, frequency, 'f', "NP", INPUT)       \
     X(const float, temperature, 'f', "N", INPUT)      \
@@ -71,14 +84,14 @@ typedef struct {
     X(const int64_t, stamp_ns, 'i', "N", INPUT)       \
     X(const uint16_t, doubt, 'u', "N", INPUT)         \
     X(const bool, known, 'b', "N", OPTION)            \
-    X(const float, offset, 'f', "NP", OPTION)         \
+    X(const float, force, 'f', "N3", OPTION)          \
     X(float, stress, 'f', "N6", RESULT)               \
     X(float, gradient, 'f', "N9", RESULT)             \
     X(float, residual, 'f', "N", RESULT)              \
     X(uint16_t, status, 'u', "N", RESULT)             \
     X(uint16_t, row_observed, 'u', "N", RESULT)       \
     X(uint32_t, left_out, 'u', "N", RESULT)          \
-    X(float, v, 'f', "NP", STATE)
+    X(float, row_offset, 'f', "NP", STATE)
 
 /* OPTION and STATE may be absent; STATE and RESULT are written. */
 enum cube_scan_use { CUBE_SCAN_INPUT, CUBE_SCAN_OPTION, CUBE_SCAN_STATE, CUBE_SCAN_RESULT };
@@ -98,7 +111,7 @@ typedef struct {
     enum cube_scan_use use;
 } cube_scan_array;
 
-#define CUBE_SCAN_N_ARRAYS 29
+#define CUBE_SCAN_N_ARRAYS 41
 extern const cube_scan_array cube_scan_arrays[CUBE_SCAN_N_ARRAYS];
 
 /* Makes a call without arrays; the caller sets them and n_residuals. */

@@ -29,7 +29,7 @@ import numpy as np
 from ..bags.source import open_bag
 from ..core.arrays import Array, Index
 from ..core.calibration import Calibration
-from ..core.compensation.creep import relaxed_share
+from ..core.compensation.low_pass import relaxed_share
 from ..core.compensation.models import CreepModel
 from ..core.errors import FitError
 from ..messages.codec import SECOND

@@ -28,11 +28,13 @@ from .kernel.contract import (
     BLOCK,
     DONE,
     NEEDS_CONDITION,
+    NEEDS_STEP,
     NEEDS_WINDOW,
     UNKNOWN_CUBE,
     Columns,
     HealthState,
     Numbers,
+    Offsets,
     Results,
     Tables,
 )
@@ -117,6 +119,17 @@ def _find_estimator(calibration: Calibration, mask: int) -> Estimator:
     )
 
 
+class Effects(Protocol):
+    """Effects on the pads that are no load (weight, creep, temperature), which are subtracted."""
+
+    @property
+    def offsets(self) -> Offsets:
+        """What is subtracted, with the state that the kernel changes."""
+
+    def step(self, columns: Columns, row: int) -> None:
+        """Advance the effects to a scan, which begins with a row, and open the next step."""
+
+
 class Pipeline:
     """Computes the stress of the cubes of one skin.
 
@@ -127,8 +140,8 @@ class Pipeline:
         calibrations: Calibration of each cube.
         n_pads: Largest number of pads of a cube, P.
         dtype: Precision of the computation.
-        newest_offset: Offsets of the newest rows (cubes, P), stress / stiffness, that compensation
-            (of weight, creep or temperature) subtracts; None: nothing is compensated.
+        newest_offset: What was subtracted from the newest rows (cubes, P), stress / stiffness, as
+            weight, creep or temperature; None: nothing is compensated.
         rest_version: Number of times that the rest frequencies were set.
     """
 
@@ -172,7 +185,7 @@ class Pipeline:
         for number, estimator in enumerate(whole):
             self._store_table(number, number, estimator)
         self._n_extra = 0
-        self.newest_offset: Array | None = None
+        self.newest_offset: Real | None = None
         rest = [c.rest_frequency for c in self.calibrations]
         self.rest_frequency = pad_table(rest, self.n_pads, fill=np.nan)
 
@@ -240,19 +253,19 @@ class Pipeline:
         """Return the ratio of the frequencies without load to the rest frequencies (N, P).
 
         The ratio is the product of two factors. One is that of temperature. The other is the ratio
-        f / f0 at which the stress of a pad, divided by its stiffness, is the offset o that
-        compensation subtracts. It follows from the pad law
+        f / f0 at which the stress of a pad, divided by its stiffness, is the offset o that is
+        subtracted as no load. It follows from the pad law
         o = (f - f0) / (f0 (1 + beta) / beta - f), where beta is the ratio of the parasitic to the
         active capacitance of a pad without load.
 
         Args:
             cube: Numbers of the cubes (N,).
             temperature: Temperatures (N,), in °C; NaN where they are unknown.
-            offset: Offsets o (N, P), stress / stiffness; None: those of the newest rows (samples).
+            offset: Offsets o (N, P), stress / stiffness; None: those of the newest rows.
         """
         factor = self.temperature_factor(cube, temperature)
         if offset is None and self.newest_offset is not None:
-            offset = self.newest_offset[cube]
+            offset = self.newest_offset[cube].astype(float)
         if offset is None:
             return factor
         beta = self._beta[self._tables.calibration[cube]]
@@ -279,8 +292,8 @@ class Pipeline:
         watch: Watch | None = None,
         known: Mask | None = None,
         out: StressRows | None = None,
+        effects: Effects | None = None,
         offset: Real | None = None,
-        v: Real | None = None,
     ) -> StressRows:
         """Compute the stress of N rows.
 
@@ -295,26 +308,29 @@ class Pipeline:
             known: Whether the health of a row is not found but given, by `left_out` and the
                 `status` of `out` (N,).
             out: Rows to write into; None makes new ones.
-            offset, v: Values to subtract from the pads' stresses, and array for these stresses
-                before that (N, P), both divided by `stiffness`; see `Columns` and `Results`.
+            effects: Effects that are subtracted; None: none are, whatever columns the rows have.
+            offset: Array for what is subtracted (N, P), stress / stiffness; None: not wanted.
 
         Raises:
             LayoutError: Arrays have the wrong shape, or `watch` is given and a row is of a cube
                 that the skin does not have. Every other problem of a row becomes a bit of its
                 status.
         """
-        columns = self._read_columns(rows, known)._replace(offset=offset)
+        columns = self._read_columns(rows, known)
         if out is None:
             out = self.make_rows(rows)
         if watch is None or known is not None:
             out.left_out[:] = rows.pad_fault if left_out is None else left_out
         results = Results(
-            out.stress, out.gradient, out.residual, out.status, out.observed, out.left_out, v
+            out.stress, out.gradient, out.residual, out.status, out.observed, out.left_out, offset
         )
         sums = watch.sums if watch else None
+        offsets = effects.offsets if effects else None
         row, request = 0, DONE
         while row < len(rows):
-            row, request = run(row, self._n_residuals, self._tables, sums, columns, results)
+            row, request = run(
+                row, self._n_residuals, self._tables, sums, offsets, columns, results
+            )
             if request == UNKNOWN_CUBE:
                 if watch:
                     raise self._misfit(rows)
@@ -322,6 +338,8 @@ class Pipeline:
                 row += 1
             elif request == NEEDS_WINDOW and watch:
                 watch.advance()
+            elif request == NEEDS_STEP and effects:
+                effects.step(columns, row)
             elif request == NEEDS_CONDITION and watch:
                 watch.find_conditions(self._tables, columns, row)
             elif request != DONE:
@@ -447,6 +465,7 @@ class Pipeline:
         frequency = np.ascontiguousarray(frequency)
         if frequency.shape != (len(rows), self.n_pads):
             raise self._misfit(rows)
+        force = rows.specific_force
         cube = rows.cube
         if cube.dtype != np.uint16:
             is_possible = (cube >= 0) & (cube < UNKNOWN)
@@ -459,6 +478,7 @@ class Pipeline:
             np.ascontiguousarray(rows.stamp_ns, np.int64),
             np.ascontiguousarray(rows.status, np.uint16),
             known,
+            None if force is None else np.ascontiguousarray(force, self.dtype),
         )
 
     def _misfit(self, rows: FrequencyRows) -> LayoutError:

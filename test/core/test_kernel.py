@@ -24,12 +24,12 @@ from hypothesis import strategies as st
 from conftest import ROOT
 from cube_tensor_driver.core import pipeline
 from cube_tensor_driver.core.calibration import Calibration, illustrative
-from cube_tensor_driver.core.compensation.models import WeightModel
+from cube_tensor_driver.core.compensation.models import CreepModel, ThermalModel, WeightModel
 from cube_tensor_driver.core.kernel import run
 from cube_tensor_driver.core.oscillator import TemperatureModel
 from cube_tensor_driver.core.reconstructor import Reconstructor, RecordedHealth
 from cube_tensor_driver.core.rows import FrequencyRows, StressRows
-from cube_tensor_driver.core.status import CREEP, STAMP
+from cube_tensor_driver.core.status import STAMP
 
 NATIVE = ROOT / "native"
 SOURCES = [NATIVE / "cube_scan.c", ROOT / "test" / "scan_process.c"]
@@ -48,6 +48,8 @@ N_TABLES = 11
 """Number of arrays with tables of the skin that a call of the kernel takes."""
 N_HEALTH = 3
 """Number of arrays with the state of health that a call of the kernel takes."""
+N_OFFSETS, N_CUBE_STATE = 12, 4
+"""Number of arrays with what is subtracted, and of those of them that the kernel writes."""
 N_COLUMNS = 8
 """Number of arrays with columns of frequencies that a call of the kernel takes."""
 
@@ -67,7 +69,9 @@ class ScanProcess:
             shape = () if array is None else array.shape
             call.append(np.array([size, len(shape), *shape], np.int64).tobytes())
             call.append(b"" if array is None else array.tobytes())
-        written = [*arrays[N_TABLES:][:N_HEALTH], *arrays[N_TABLES + N_HEALTH + N_COLUMNS :]]
+        health, rest = arrays[N_TABLES:][:N_HEALTH], arrays[N_TABLES + N_HEALTH :]
+        offsets, results = rest[N_OFFSETS - N_CUBE_STATE : N_OFFSETS], rest[N_OFFSETS + N_COLUMNS :]
+        written = [*health, *offsets, *results]
         try:
             self._process.stdin.write(b"".join(call))
             self._process.stdin.flush()
@@ -143,41 +147,30 @@ def heavy(calibration: Calibration, seed: int) -> Calibration:
     return replace(calibration, weight=WeightModel(response))
 
 
-class Sluggish:
-    """A recursive effect: half of what the pads measured before."""
-
-    key, bit, is_recursive = "creep", CREEP, True
-
-    def __init__(self, pipeline) -> None:
-        self._half = np.zeros((len(pipeline.calibrations), pipeline.n_pads), pipeline.dtype)
-        self.seen: list[np.ndarray] = []
-
-    def applies(self, rows) -> bool:
-        return True
-
-    def add_offset(self, rows, cube, offset):
-        offset += self._half[cube]
-        return rows.temperature > 25
-
-    def update(self, rows, cube, v, bad):
-        self._half[cube] = v / 2
-        self.seen.append(v)
+def lasting(calibration: Calibration, seed: int) -> Calibration:
+    """The calibration with creep and an effect of temperature that differ between pads."""
+    rng = np.random.default_rng(seed)
+    n_pads = calibration.layout.n_pads
+    creep = CreepModel(np.array([0.1, 2.0]), 0.1 * rng.random((n_pads, 2)))
+    model = ThermalModel(np.array(25.0), np.array([1.0, 0.2]), rng.normal(size=(n_pads, 2)))
+    return replace(calibration, creep=creep, thermal=model)
 
 
 SKINS = {
     "planar": [illustrative("planar")] * 9,
     "mixed": [
         heavy(individual("cube", 8), 9),
-        thermal("cube", 1, 2),
+        lasting(thermal("cube", 1, 2), 3),
+        lasting(heavy(individual("planar", 12), 4), 5),
         *(individual("planar", seed) for seed in range(4)),
         individual("quad", 6),
         replace(illustrative("planar"), beta=np.array(0.0)),
         thermal("planar", 7, 1),
     ],
-    "quad": [heavy(illustrative("quad"), 2)] * 3,
+    "quad": [lasting(heavy(illustrative("quad"), 2), 3)] * 3,
 }
-"""Skins of all layouts: of one calibration, of many, with temperature, with weight, and without a
-residual."""
+"""Skins of all layouts: of one calibration, of many, with temperature, weight and creep, and
+without a residual."""
 
 WILD = [np.nan, np.inf, -np.inf, 0.0, -1e5, 1e-300, 1e300, 2e4, 1.8e5, 3.5e5, 1e5 * 1.3 / 0.3]
 
@@ -236,19 +229,18 @@ def played(kernel, calibrations, seed: int, dtype=np.float32) -> list[object]:
         patch.setattr(pipeline, "MAX_CACHED_ESTIMATORS", 24)
         reconstructor = Reconstructor(calibrations, dtype)
         health = reconstructor.health
-        sluggish = Sluggish(reconstructor.pipeline)
-        if seed % 2:
-            reconstructor.compensation.effects.insert(0, sluggish)
         for number, (rows, recorded) in enumerate(played_rows(calibrations, seed, dtype)):
             if number % 10 == 7:
                 reconstructor.rest_frequency = reconstructor.rest_frequency * (1 + 1e-4)
             given = recorded if number % 3 == 2 else None
             found.append(reconstructor.process(rows, given))
             found.append(reconstructor.process_known(rows, recorded))
+            found += reconstructor.compensation.states().values()
+            found += [array.copy() for array in reconstructor.compensation.offsets]
             found += [health.state, health.mask.copy(), *health.collect(), *health.window()]
         found += [column for window in health.history for column in window]
         found += [health.sums.cubes[name] for name in health.sums.cubes.dtype.names]
-        found += [health.sums.quantities, health.sums.window_ns, health.closed, *sluggish.seen]
+        found += [health.sums.quantities, health.sums.window_ns, health.closed]
     return found
 
 
@@ -341,7 +333,7 @@ def test_arrays_that_do_not_fit_are_refused():
         patch.setattr(run, "native", SimpleNamespace(run=record))
         Reconstructor(SKINS["planar"]).process(rows)
     call = calls[-1]
-    with pytest.raises(TypeError, match="takes 31 arguments"):
+    with pytest.raises(TypeError, match="takes 43 arguments"):
         module.run(*call[:-1])
     for number in range(2, len(call)):
         for wrong in (

@@ -100,7 +100,7 @@ def test_parts_and_a_restored_state_give_the_same_bits():
     )
     together = Reconstructor(two).process(both)
     assert together.stress[::2].tobytes() == expected.stress.tobytes()
-    with pytest.raises(LayoutError, match="a state of 3 numbers for 1 cubes"):
+    with pytest.raises(LayoutError, match="a state of thermal has 3 numbers"):
         parts.compensation.restore({"thermal": np.zeros(3)})
 
 

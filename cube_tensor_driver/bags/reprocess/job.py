@@ -412,21 +412,20 @@ def _measure_rest(
         BagError: A pad has no valid frequency in the span.
     """
     bag = source.bag
-    pipeline = Pipeline(settings.calibrations)
+    pipeline = Pipeline([replace(one, creep=None) for one in settings.calibrations])
     exists = np.isfinite(settings.rest_frequency)
     total = np.zeros(exists.shape)
     count = np.zeros(exists.shape)
     begin_ns = bag.start_ns + round(begin_s * 1e9)
     end_ns = bag.start_ns + round(end_s * 1e9)
     # Weight is no load: a tare holds in every pose. Creep follows loads, of which there are none.
-    effects = [effect for effect in Compensation(pipeline).effects if not effect.is_recursive]
+    compensation = Compensation(pipeline)
     for rows in BagSource(bag, source.topic):
         rows = rows.select(rows.cube < len(exists))
         cube = rows.cube.astype(np.intp)
         offset = np.zeros(rows.frequency.shape)
-        for effect in effects:
-            if effect.applies(rows):
-                effect.add_offset(rows, cube, offset)
+        out = pipeline.make_rows(rows)
+        compensation.process(rows, None, watch=None, known=None, out=out, offset=offset)
         inside = (rows.stamp_ns >= begin_ns) & (rows.stamp_ns < end_ns)
         rows, cube, offset = rows.select(inside), cube[inside], offset[inside]
         if not len(rows):

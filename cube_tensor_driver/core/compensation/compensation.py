@@ -1,29 +1,42 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""The sum of all effects that are subtracted from the stresses on the pads.
+"""The effects on the pads that are subtracted, because they are no load: the sum of all of them.
 
     v = (f - f0) / (f_highest - f)        pad law: stress on a pad / its stiffness
     v - offset,  offset = sum of effects  what the load contributes
 
-A row is one sample of one cube, P the largest number of pads of a cube. Without effects, nothing is
-computed here.
+The kernel subtracts the offsets from each row (`kernel.contract.Offsets`). What creep and
+temperature contribute to them is computed here in steps that are longer than the interval between
+rows. Creep comes after temperature, whose effect was measured in place and contains the creep of
+the foam under thermal stress, and before weight, which strains the foam.
+
+A row is one sample of one cube, C the number of cubes of the skin, P the largest number of pads of
+a cube. Without effects, nothing is computed here.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from itertools import pairwise
 
 import numpy as np
 
-from ..arrays import Array, Mask, PadMasks, index_cubes
+from ..arrays import Array, Mask, PadMasks, Real
+from ..errors import LayoutError
+from ..kernel.contract import Columns, Offsets
 from ..pipeline import Pipeline, Watch
 from ..rows import FrequencyRows, StressRows
-from ..status import COMPENSATION
+from ..status import COMPENSATION, WEIGHT
 from .creep import Creep
-from .effect import Effect
 from .thermal import Thermal
 from .weight import Weight
+
+STEP_NS = 100_000_000
+"""Duration of a step, in ns, within which temperature counts as constant, and the readings of the
+pads as straight lines for creep.
+
+With a lag of 100 s and 150 Pa/K, the effect of temperature changes by 2 Pa within a step after the
+skin warmed by 15 K at once, less than the noise of one sample (3 Pa).
+"""
 
 
 class Compensation:
@@ -31,16 +44,36 @@ class Compensation:
 
     Attributes:
         creep: The compensation of creep, which a tare needs.
-        effects: The effects, in the order in which they are subtracted. Creep comes after the
-            effect of temperature, whose model was measured in place and contains the creep of the
-            foam under thermal stress, and before weight, which strains the foam.
+        offsets: What is subtracted, and the newest row of each cube.
     """
 
     def __init__(self, pipeline: Pipeline) -> None:
         self._pipeline = pipeline
-        self.creep = Creep(pipeline)
-        self.effects: list[Effect] = [Thermal(pipeline), self.creep, Weight(pipeline)]
-        self._active: list[Effect] = []
+        n_cubes = len(pipeline.calibrations)
+        shape, real = (n_cubes, pipeline.n_pads), pipeline.dtype
+        self._weight = Weight(pipeline)
+        stiffness = np.where(pipeline.stiffness > 0, pipeline.stiffness, np.inf)
+        response = self._weight.response / stiffness[:, None]
+        weighing = np.where(self._weight.has_model, WEIGHT, COMPENSATION)
+        self.offsets = Offsets(
+            step_ns=np.zeros(2, np.int64),
+            since_ns=np.zeros(n_cubes, np.int64),
+            offset=np.zeros(shape, real),
+            slope=np.zeros(shape, real),
+            gain=np.zeros(shape, real),
+            lasting=np.zeros(n_cubes, np.uint16),
+            response=response.astype(real),
+            weighing=weighing.astype(np.uint16),
+            newest_ns=np.zeros(n_cubes, np.int64),
+            reading=np.zeros(shape, real),
+            subtracted=np.zeros(shape, real),
+            newest_force=np.full((n_cubes, 3), np.nan, real),
+        )
+        self._thermal = Thermal(pipeline)
+        self.creep = Creep(pipeline, self.offsets)
+        both = self._thermal, self.creep
+        self._lasting = [effect for effect in both if effect.has_model.any()]
+        self._has_forces = False
 
     def process(
         self,
@@ -50,29 +83,55 @@ class Compensation:
         watch: Watch | None,
         known: Mask | None,
         out: StressRows,
+        offset: Real | None = None,
     ) -> StressRows:
         """Compute the stress of rows without the effects; arguments as `Pipeline.process`."""
-        self._active = [effect for effect in self.effects if effect.applies(rows)]
-        if not self._active:
-            self._pipeline.newest_offset = None
-            return self._pipeline.process(rows, left_out, watch=watch, known=known, out=out)
-        parts = self._split(rows)
-        if len(parts) == 1:
-            # Selecting takes 18 us.
-            self._process_part(rows, left_out, watch, known, out)
-            return out
-        for part in parts:
-            self._process_part(
-                rows.select(part),
-                None if left_out is None else left_out[part],
-                watch,
-                None if known is None else known[part],
-                out.select(part),
-            )
-        return out
+        self._has_forces = rows.specific_force is not None
+        is_active = self._has_forces or bool(self._lasting)
+        if is_active and self.creep.follow_rest():
+            self.offsets.step_ns[:] = 0
+        self._pipeline.newest_offset = self.offsets.subtracted if is_active else None
+        effects = self if is_active else None
+        return self._pipeline.process(
+            rows,
+            left_out,
+            watch=watch,
+            known=known,
+            out=out,
+            effects=effects,
+            offset=offset,
+        )
+
+    def step(self, columns: Columns, row: int) -> None:
+        """Advance creep and temperature to the scan that begins with a row; see `STEP_NS`."""
+        scan = columns.select(columns.find_scan(row))
+        newest_ns = int(scan.stamp_ns.max())
+        self.offsets.step_ns[:] = newest_ns - STEP_NS, newest_ns + STEP_NS
+        if not self._lasting:
+            return
+        self.offsets.since_ns[:] = self.offsets.newest_ns
+        if self.creep in self._lasting:
+            self.creep.advance(self._thermal.offset, newest_ns, STEP_NS)
+        if self._thermal in self._lasting:
+            self._thermal.advance(scan)
+        self._fill_offsets()
+
+    def _fill_offsets(self) -> None:
+        """Write the sums of the effects for the kernel."""
+        self.offsets.offset[:] = self._thermal.offset + self.creep.offset
+        # The gain applies to v with the effect of temperature, which is no reading of creep.
+        self.offsets.slope[:] = self.creep.slope - self.creep.gain * self._thermal.offset
+        self.offsets.gain[:] = self.creep.gain
+        self.offsets.lasting[:] = 0
+        for effect in self._lasting:
+            bits = np.where(effect.is_known, effect.bit, COMPENSATION)
+            self.offsets.lasting[:] |= bits.astype(np.uint16)
 
     def growth(self, cube: int, left_out: int = 0) -> Array | None:
         """Return what the effects add to the covariance (15, 15) of a cube's newest row.
+
+        An effect states patterns (P, k) of one standard deviation each of the stresses on the pads,
+        in Pa; the k patterns are independent of each other.
 
         Args:
             cube: Number of the cube.
@@ -81,23 +140,25 @@ class Compensation:
         Returns:
             Covariance in the units of `Pipeline.covariance`; None: nothing.
         """
-        patterns = [effect.deviation(cube) for effect in self._active]
+        patterns = [effect.deviation(cube) for effect in self._lasting]
+        if self._has_forces:
+            patterns.append(self._weight.deviation(cube, self.offsets.newest_force[cube]))
         if not any(pattern.any() for pattern in patterns):
             return None
         matrix = self._pipeline.matrix(cube, left_out)
-        n_pads = matrix.shape[1]
-        components = matrix @ np.hstack(patterns)[:n_pads]
+        components = matrix @ np.hstack(patterns)[: matrix.shape[1]]
         growth: Array = components @ components.T
         return growth
 
     def states(self) -> dict[str, Array]:
-        """Return the states that earlier rows left, by the names of the effects that have one."""
-        states = {}
-        for effect in self.effects:
-            state = effect.state()
-            if len(state):
-                states[effect.key] = state
-        return states
+        """Return the states that earlier rows left, as flat numbers, by the names of effects.
+
+        From them, later rows give the same bits; effects without a state have none.
+        """
+        return {
+            effect.key: np.concatenate([part.ravel() for part in self._parts(effect)])
+            for effect in self._lasting
+        }
 
     def restore(self, states: Mapping[str, Array]) -> None:
         """Continue from recorded states, so that the next rows give the bits of the recording.
@@ -108,63 +169,26 @@ class Compensation:
         Raises:
             LayoutError: A state is that of another skin.
         """
-        for effect in self.effects:
-            if effect.key in states:
-                effect.restore(states[effect.key])
+        restored = [effect for effect in self._lasting if effect.key in states]
+        for effect in restored:
+            state, parts = states[effect.key], self._parts(effect)
+            ends = np.cumsum([part.size for part in parts])
+            if len(state) != ends[-1]:
+                raise LayoutError(
+                    f"a state of {effect.key} has {len(state)} numbers; it must have {ends[-1]}: "
+                    "use the skin of the recording"
+                )
+            for part, values in zip(parts, np.split(state, ends[:-1]), strict=True):
+                part[:] = values.reshape(part.shape)
+            effect.resume()
+        if restored:
+            self._fill_offsets()
 
-    def _split(self, rows: FrequencyRows) -> list[slice]:
-        """Return the parts of rows that are processed at once: all, or single scans."""
-        if not any(effect.is_recursive for effect in self._active):
-            return [slice(None)]
-        # A scan begins where the cube number does not rise.
-        begins = np.flatnonzero(rows.cube[1:] <= rows.cube[:-1]) + 1
-        bounds = [0, *begins.tolist(), len(rows)]
-        return [slice(*ends) for ends in pairwise(bounds)]
+    def _parts(self, effect: Thermal | Creep) -> list[Array]:
+        """Return the arrays of the state of an effect, which are changed in place.
 
-    def _process_part(
-        self,
-        rows: FrequencyRows,
-        left_out: PadMasks | None,
-        watch: Watch | None,
-        known: Mask | None,
-        out: StressRows,
-    ) -> None:
-        """Compute the stress of rows without the effects.
-
-        Args:
-            rows: Rows of frequencies, of one scan if an effect is recursive.
-            left_out, watch, known, out: As for `Pipeline.process`.
+        Times stand there with their bits, because a float would round them.
         """
-        pipeline = self._pipeline
-        # Cube numbers that the skin does not have are refused or marked by the pipeline.
-        n_cubes = len(pipeline.calibrations)
-        cube = np.clip(rows.cube, 0, n_cubes - 1).astype(np.intp)
-        shape = len(rows), pipeline.n_pads
-        offset = np.zeros(shape, pipeline.dtype)
-        # Sum of the effects that come before each recursive one.
-        before = {}
-        bits = np.zeros(len(rows), np.uint16)
-        for effect in self._active:
-            if effect.is_recursive:
-                before[effect] = offset.copy()
-            is_known = effect.add_offset(rows, cube, offset)
-            bit = np.where(is_known, effect.bit, COMPENSATION)
-            bits |= bit.astype(np.uint16)
-
-        v = np.empty_like(offset) if before else None
-        pipeline.process(
-            rows,
-            left_out,
-            watch=watch,
-            known=known,
-            out=out,
-            offset=offset,
-            v=v,
-        )
-        out.status[:] |= bits
-        for effect, earlier in before.items():
-            effect.update(rows, cube, v - earlier, out.left_out)
-
-        if pipeline.newest_offset is None:
-            pipeline.newest_offset = np.zeros((n_cubes, pipeline.n_pads))
-        pipeline.newest_offset[index_cubes(cube, n_cubes)] = offset
+        offsets = self.offsets
+        times = [offsets.step_ns, offsets.since_ns, offsets.newest_ns]
+        return [*(time.view(float) for time in times), *effect.parts()]

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array, Index, Single, Times, index_cubes
+from ..arrays import Array, Single, Times, index_cubes
 from ..poses import CubePoses
 from ..rows import FrequencyRows
 
@@ -28,9 +28,6 @@ An arm that is shaken with 2 g at 5 Hz is then wrong by less than 4 m/s².
 
 MAX_INTERVAL_NS = 200_000_000
 """Longest interval between two instants, in ns, over which the motion is interpolated."""
-
-MAX_KNOWN = 16
-"""Maximum number of instants whose specific forces at the cubes are kept to be used again."""
 
 
 class Motion(NamedTuple):
@@ -62,9 +59,10 @@ class ForcesAtCubes:
             poses: Poses in the parent frame of the skin. For the same bits as a recording, they
                 must be those of its SkinInfo message.
         """
-        self._position = np.ascontiguousarray(poses.position.T)
-        self._rotation = np.ascontiguousarray(poses.rotation.transpose(1, 2, 0))
-        self._known: dict[bytes, Array] = {}
+        # With the axes first, numpy computes all rows in one loop.
+        self._position = np.ascontiguousarray(poses.position.T, np.float32)
+        # The components in the frame of a cube are along the columns of its rotation.
+        self._axes = np.ascontiguousarray(poses.rotation.transpose(2, 1, 0), np.float32)
 
     def add_to(self, rows: FrequencyRows, motion: Motion) -> FrequencyRows:
         """Return rows with a column of specific forces.
@@ -74,89 +72,56 @@ class ForcesAtCubes:
             motion: Motion of the skin, at instants near the times of the rows.
         """
         columns = rows.columns()
-        columns["specific_force"] = self._interpolate(rows, motion)
+        columns["specific_force"] = self._find_forces(rows, motion)
         return FrequencyRows(**columns)
 
-    def _interpolate(self, rows: FrequencyRows, motion: Motion) -> Single:
+    def _find_forces(self, rows: FrequencyRows, motion: Motion) -> Single:
         """Return the specific forces (N, 3) of rows in the frames of their cubes; NaN: unknown."""
-        # With the axis first, numpy computes all rows in one loop.
-        force = np.full((3, len(rows)), np.nan, np.float32)
-        n_instants = len(motion.time_ns)
         n_cubes = self._position.shape[1]
         cube = index_cubes(rows.cube, n_cubes)
-        if n_instants == 1:
-            force[:] = self._at_cubes(motion, 0)[:, cube]
-        elif n_instants:
-            inner_ns = motion.time_ns[1:-1]
-            number = np.searchsorted(inner_ns, rows.stamp_ns, side="right")
-            # Few instants lie within the rows of a message, usually none.
-            for k in range(n_instants - 1):
-                between = self._interpolate_between(motion, k, rows.stamp_ns, cube)
-                np.copyto(force, between, where=number == k, casting="same_kind")
-        force[:, rows.cube >= n_cubes] = np.nan
-        column: Single = force.T
-        return column
-
-    def _interpolate_between(
-        self,
-        motion: Motion,
-        k: int,
-        stamp_ns: Times,
-        cube: Index | slice,
-    ) -> Array:
-        """Return the specific forces (3, N) by the instants k and k + 1; NaN: unknown.
-
-        Args:
-            motion: Motion of the skin.
-            k: Number of the first instant.
-            stamp_ns: Time stamps of the rows (N,), in ns.
-            cube: Index of their cubes.
-        """
-        begin_ns, end_ns = motion.time_ns[k : k + 2].tolist()
-        interval_ns = end_ns - begin_ns
-        # A damaged recording may state equal instants.
-        if not 0 < interval_ns <= MAX_INTERVAL_NS:
-            return np.full((3, len(stamp_ns)), np.nan)
-        elapsed_ns = stamp_ns - begin_ns
-        beyond_ns = np.maximum(-elapsed_ns, elapsed_ns - interval_ns)
-        max_beyond_ns = max(MAX_EXTRAPOLATION_NS, 2 * interval_ns)
-        share = elapsed_ns / interval_ns
-        share[beyond_ns > max_beyond_ns] = np.nan
-        before = self._at_cubes(motion, k)[:, cube]
-        after = self._at_cubes(motion, k + 1)[:, cube]
-        force: Array = before + share * (after - before)
-        return force
-
-    def _at_cubes(self, motion: Motion, k: int) -> Array:
-        """Return the specific force at each cube in its frame (3, cubes) at one instant.
-
-        The results of the newest instants are kept, because successive
-        messages use them again.
-
-        Args:
-            motion: Motion of the skin.
-            k: Number of the instant.
-        """
-        force = motion.specific_force[k]
-        gradient = motion.gradient[k]
-        key = force.tobytes() + gradient.tobytes()
-        if key in self._known:
-            return self._known[key]
-        if len(self._known) > MAX_KNOWN:
-            self._known.clear()
-
-        in_parent = force[:, None] + _multiply(gradient, self._position)
-        # The components in the frame of a cube are along the columns of its rotation.
-        axes = self._rotation.transpose(1, 0, 2)
-        in_cube = _multiply(axes, in_parent)
-        self._known[key] = in_cube
-        return in_cube
+        origin, gradient = _interpolate(motion, rows.stamp_ns)
+        in_parent = _multiply(gradient, self._position[:, cube])
+        in_parent += origin
+        in_cube = _multiply(self._axes[:, :, cube], in_parent)
+        in_cube[:, rows.cube >= n_cubes] = np.nan
+        return np.ascontiguousarray(in_cube.T)
 
 
-def _multiply(matrix: Array, vector: Array) -> Array:
-    """Return products of matrices (3, 3) or (3, 3, n) and vectors (3, n), summed in fixed order."""
-    columns = matrix.reshape(3, 3, -1)
-    product: Array = columns[:, 0] * vector[0]
-    product += columns[:, 1] * vector[1]
-    product += columns[:, 2] * vector[2]
+def _interpolate(motion: Motion, stamp_ns: Times) -> tuple[Single, Single]:
+    """Return the motion of a skin at N times, interpolated linearly between instants.
+
+    Args:
+        motion: The motion; if it is known at one instant only, it is the same at all times.
+        stamp_ns: The times (N,), in ns.
+
+    Returns:
+        Specific forces at the origin (3, N), in m/s², and their gradients (3, 3, N), in 1/s²; NaN
+        where they are unknown.
+    """
+    columns = motion.specific_force, motion.gradient.reshape(-1, 9)
+    known = np.concatenate(columns, axis=1).T.astype(np.float32)
+    n_instants = len(motion.time_ns)
+    if n_instants < 2:
+        state = np.full((12, len(stamp_ns)), known if n_instants else np.nan, np.float32)
+        return state[:3], state[3:].reshape(3, 3, -1)
+    # Few instants lie within the rows of a message, usually none.
+    inner_ns = motion.time_ns[1:-1]
+    first = np.searchsorted(inner_ns, stamp_ns, "right") if len(inner_ns) else np.zeros(1, int)
+    length_ns = np.diff(motion.time_ns)[first]
+    elapsed_ns = stamp_ns - motion.time_ns[first]
+    beyond_ns = np.maximum(-elapsed_ns, elapsed_ns - length_ns)
+    is_near = beyond_ns <= np.maximum(MAX_EXTRAPOLATION_NS, 2 * length_ns)
+    # A damaged recording may state equal instants.
+    is_known = is_near & (length_ns > 0) & (length_ns <= MAX_INTERVAL_NS)
+    share = np.where(is_known, elapsed_ns / np.maximum(length_ns, 1), np.nan)
+    state = np.diff(known)[:, first] * share.astype(np.float32)
+    state += known[:, first]
+    return state[:3], state[3:].reshape(3, 3, -1)
+
+
+def _multiply(matrix: Single, vector: Single) -> Single:
+    """Return products of matrices (3, 3, N) and vectors (3, N), summed in a fixed order."""
+    product: Single = matrix[:, 0] * vector[0]
+    product += matrix[:, 1] * vector[1]
+    product += matrix[:, 2] * vector[2]
     return product

@@ -180,9 +180,7 @@ class Health:
             columns: Rows of frequencies.
             row: Number of the first row to check; all rows of its scan after it are checked, too.
         """
-        is_end = columns.cube[row + 1 :] <= columns.cube[row:-1]
-        count = int(np.argmax(is_end)) if is_end.any() else len(is_end)
-        rows = columns.select(slice(row, row + 1 + count))
+        rows = columns.select(columns.find_scan(row))
         cube, f = rows.cube.astype(np.intp), rows.frequency.astype(np.float32)
         reported = mask_bits(tables, tables.calibration[cube], rows.pad_fault)
         bits = np.where(f >= self._open[cube], OPEN, RANGE)

@@ -56,6 +56,21 @@ of a cube that the skin does not have.
 If the health of pads is updated, the kernel stops before the first row, and no row is processed.
 """
 
+NEEDS_STEP = -5
+"""Result of the kernel (the loop over rows of frequencies) that stops before a scan whose newest
+time stamp lies outside the present step of the compensation, `Offsets.step_ns`.
+
+The caller advances creep and temperature, and calls the kernel again from that scan on.
+"""
+
+MAX_GAP_NS = 5_000_000_000
+"""Longest interval between two rows of a cube, in ns, in which load and temperature of the cube
+count as known."""
+
+MAX_SPECIFIC_FORCE = 1000.0
+"""Upper limit of a credible specific force along one axis, in m/s² (about 100 g). A force that is
+not below it counts as missing, because it is an error of the source and would look like a load."""
+
 CUBE_STATE = np.dtype(
     {
         "names": [
@@ -172,6 +187,46 @@ class HealthState(NamedTuple):
         return view
 
 
+class Offsets(NamedTuple):
+    """What is subtracted from v (pad stress / stiffness), because it is no load.
+
+    For a row of cube c at the time t with the specific force s it is
+
+        offset[c] + (slope[c] + gain[c] * v) * (t - since_ns[c]) + sum_i response[c, i] * s_i
+
+    The last term is weight; all others are creep and temperature. Values for pads that a cube does
+    not have are 0. The kernel changes the last four arrays.
+
+    Attributes:
+        step_ns: Begin and end of the time in which these values hold (2,), in ns.
+        since_ns: Times from which the slopes count (C,), in ns.
+        offset: Offsets (C, P).
+        slope: Their changes per second (C, P), for v = 0.
+        gain: Change of the slopes with v (C, P), per second.
+        lasting: Status bits of rows at most `MAX_GAP_NS` later than `since_ns` (C,). If it has any,
+            other rows get COMPENSATION.
+        response: Response of the pads to specific force (C, 3, P), per m/s².
+        weighing: Status bits of rows with a known specific force (C,); others get COMPENSATION.
+        newest_ns: Time stamp of the newest row of each cube (C,), in ns; 0: none.
+        reading: v of this row before the subtraction (C, P); NaN where a pad was not used.
+        subtracted: What was subtracted from it (C, P).
+        newest_force: Specific force of the newest row that has this column (C, 3); NaN: unknown.
+    """
+
+    step_ns: Times
+    since_ns: Times
+    offset: Real
+    slope: Real
+    gain: Real
+    lasting: StatusBits
+    response: Real
+    weighing: StatusBits
+    newest_ns: Times
+    reading: Real
+    subtracted: Real
+    newest_force: Real
+
+
 class Columns(NamedTuple):
     """Columns of N rows (samples of one cube) to process.
 
@@ -184,9 +239,7 @@ class Columns(NamedTuple):
         doubt: Status bits (N,) of which STAMP (doubtful time stamp) is used.
         known: Whether `left_out` and `status` of `Results` hold the health of a row before the call
             (N,); None stands for False in all rows.
-        offset: Values (N, P) to subtract from v (pad stress / stiffness) before the product with
-            the matrix: effects that are no load, such as weight, creep and thermal stress. They
-            are finite, and 0 for pads that a cube does not have. None: nothing is subtracted.
+        force: Specific force (N, 3), in m/s²; None: weight is not compensated.
     """
 
     cube: NDArray[np.uint16]
@@ -196,7 +249,13 @@ class Columns(NamedTuple):
     stamp_ns: Times
     doubt: StatusBits
     known: Mask | None
-    offset: Real | None = None
+    force: Real | None
+
+    def find_scan(self, row: int) -> slice:
+        """Return the rows from one on up to the end of its scan, where the cube number falls."""
+        is_end = self.cube[row + 1 :] <= self.cube[row:-1]
+        count = int(np.argmax(is_end)) if is_end.any() else len(is_end)
+        return slice(row, row + 1 + count)
 
     def select(self, rows: slice) -> Columns:
         """Return the columns of some successive rows, as views."""
@@ -211,8 +270,7 @@ class Results(NamedTuple):
     conditions of the pads, for all rows whose health is not judged in this call.
 
     Attributes:
-        v: Pad stress / stiffness (N, P) by the pad law, before an offset is subtracted; 0 where a
-            frequency lies outside the range of the law. None: not wanted.
+        offset: What is subtracted (N, P), see `Offsets`; None: not wanted.
     """
 
     stress: Real
@@ -221,7 +279,7 @@ class Results(NamedTuple):
     status: StatusBits
     observed: NDArray[np.uint16]
     left_out: PadMasks
-    v: Real | None = None
+    offset: Real | None = None
 
     def select(self, rows: slice) -> Results:
         """Return the columns of some successive rows, as views."""

@@ -12,20 +12,24 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..arrays import Array, Index, Mask, PadMasks, Real, Single, Times, multiply
+from ..arrays import Array, Index, Mask, PadMasks, Real, Single, StatusBits, Times, multiply
 from ..health.statistics import GAP_NS, MAX_JITTER_RATIO
 from ..modes import COMPONENTS, STRESS
 from ..oscillator import rest_ratio
-from ..status import INVALID, PAD_FAULT, RESIDUAL, STAMP, TEMPERATURE
+from ..status import COMPENSATION, INVALID, PAD_FAULT, RESIDUAL, STAMP, TEMPERATURE
 from .contract import (
     DONE,
+    MAX_GAP_NS,
+    MAX_SPECIFIC_FORCE,
     NEEDS_CONDITION,
+    NEEDS_STEP,
     NEEDS_WINDOW,
     PAD_QUANTITIES,
     UNKNOWN_CUBE,
     Columns,
     HealthState,
     Numbers,
+    Offsets,
     Results,
     Tables,
 )
@@ -46,6 +50,7 @@ def run(
     n_residuals: int,
     tables: Tables,
     health: HealthState | None,
+    offsets: Offsets | None,
     columns: Columns,
     results: Results,
 ) -> tuple[int, int]:
@@ -62,13 +67,14 @@ def run(
     begins_scan[1:-1] = columns.cube[1:] <= columns.cube[:-1]
     while start < n_rows:
         end = start + MAX_ROWS
-        if health is not None:
+        if health is not None or offsets is not None:
             end = start + 1 + int(np.argmax(begins_scan[start + 1 :]))
         scan = slice(start, min(end, n_rows))
-        if health is not None and begins_scan[start] and not _is_in_window(health, columns, scan):
-            return start, NEEDS_WINDOW
+        due = _find_due(health, offsets, columns, scan) if begins_scan[start] else DONE
+        if due != DONE:
+            return start, due
         with np.errstate(all="ignore"):
-            start, request = _process(scan, n_residuals, tables, health, columns, results)
+            start, request = _process(scan, n_residuals, tables, health, offsets, columns, results)
         if request != DONE:
             return start, request
     if len(unknown):
@@ -144,20 +150,31 @@ def pack_bits(bits: Mask) -> PadMasks:
     return masks
 
 
-def _is_in_window(health: HealthState, columns: Columns, scan: slice) -> bool:
-    """Return whether the newest time stamp of a scan lies in the present window of 0.5 s.
-
-    The newest time stamp is also stored in the state.
+def _find_due(
+    health: HealthState | None,
+    offsets: Offsets | None,
+    columns: Columns,
+    scan: slice,
+) -> int:
+    """Return what is due before a scan, because of its newest time stamp.
 
     Args:
-        health: State of the health, with begin and end of the window.
+        health: State of the health, in which the newest time stamp is also stored.
+        offsets: What is subtracted.
         columns: Rows of frequencies.
         scan: The rows of the scan.
+
+    Returns:
+        `NEEDS_WINDOW`, `NEEDS_STEP`, or `DONE` if nothing is due.
     """
-    begin_ns, end_ns, _ = health.window_ns.tolist()
     newest_ns = int(columns.stamp_ns[scan].max())
-    health.window_ns[2] = newest_ns
-    return bool(begin_ns <= newest_ns < end_ns)
+    if health is not None:
+        health.window_ns[2] = newest_ns
+        if not health.window_ns[0] <= newest_ns < health.window_ns[1]:
+            return NEEDS_WINDOW
+    if offsets is not None and not offsets.step_ns[0] <= newest_ns < offsets.step_ns[1]:
+        return NEEDS_STEP
+    return DONE
 
 
 def _process(
@@ -165,6 +182,7 @@ def _process(
     n_residuals: int,
     tables: Tables,
     health: HealthState | None,
+    offsets: Offsets | None,
     columns: Columns,
     results: Results,
 ) -> tuple[int, int]:
@@ -175,6 +193,7 @@ def _process(
         n_residuals: Number of outputs of a matrix that are residuals.
         tables: Tables of the skin.
         health: State of the health, which is changed; None: health is not judged.
+        offsets: What is subtracted and its state, which is changed; None: nothing is.
         columns: All rows of frequencies.
         results: All rows of stress to write.
 
@@ -198,10 +217,11 @@ def _process(
     is_lacking = find_existing(tables, calibration) & ~is_good
     is_bad = is_lacking | mask_bits(tables, calibration, out.left_out)
     bad = pack_bits(is_bad)
-    if out.v is not None:
-        out.v[:] = v
-    if rows.offset is not None:
-        v = v - rows.offset
+    if offsets is not None:
+        offset = _find_offsets(offsets, rows, cube, v, is_bad, out.status)
+        v -= offset
+        if out.offset is not None:
+            out.offset[:] = offset
     v[is_bad] = 0
     table, key = _find_tables(tables, calibration, bad)
     stops = np.flatnonzero(has_new_condition | (key != DONE))
@@ -237,6 +257,45 @@ def _process(
     if health is not None:
         _add_to_window(health, rows, cube[:end], is_over_limit)
     return scan.start + end, request
+
+
+def _find_offsets(
+    offsets: Offsets,
+    rows: Columns,
+    cube: Index,
+    v: Real,
+    is_bad: Mask,
+    status: StatusBits,
+) -> Real:
+    """Return what is subtracted from rows of one scan (N, P), by the equation of `Offsets`.
+
+    Args:
+        offsets: What is subtracted; the state of the cubes is changed.
+        rows: Rows of one scan.
+        cube: Numbers of their cubes, to index with.
+        v: Pad stress / stiffness by the pad law (N, P).
+        is_bad: Whether a pad is not used (N, P).
+        status: Status bits of the rows (N,), to which those of the compensation are added.
+    """
+    elapsed_ns = rows.stamp_ns - offsets.since_ns[cube]
+    elapsed_s = (np.maximum(elapsed_ns, 0) * 1e-9).astype(v.dtype)
+    slope = offsets.slope[cube] + offsets.gain[cube] * v
+    total: Real = offsets.offset[cube] + slope * elapsed_s[:, None]
+    lasting = offsets.lasting[cube]
+    is_near = (elapsed_ns >= 0) & (elapsed_ns <= MAX_GAP_NS)
+    status |= np.where(is_near | (lasting == 0), lasting, np.uint16(COMPENSATION))
+    if rows.force is not None:
+        # NaN, which stands for an unknown force, fails the comparison.
+        is_known: Mask = np.abs(rows.force).max(axis=1) < MAX_SPECIFIC_FORCE
+        force = np.where(is_known[:, None], rows.force, 0)
+        for axis in range(3):
+            total += offsets.response[cube, axis] * force[:, axis, None]
+        status |= np.where(is_known, offsets.weighing[cube], np.uint16(COMPENSATION))
+        offsets.newest_force[cube] = np.where(is_known[:, None], force, np.nan)
+    offsets.newest_ns[cube] = rows.stamp_ns
+    offsets.reading[cube] = np.where(is_bad, np.nan, v)
+    offsets.subtracted[cube] = total
+    return total
 
 
 def _find_tables(tables: Tables, calibration: Numbers, bad: PadMasks) -> tuple[Numbers, Times]:

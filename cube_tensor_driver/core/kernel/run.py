@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 
 from . import rows
-from .contract import Columns, HealthState, Results, Tables
+from .contract import Columns, HealthState, Offsets, Results, Tables
 
 try:
     from ... import _scan as native
@@ -17,12 +17,16 @@ except ImportError:
 _NO_HEALTH = (None,) * len(HealthState._fields)
 """Arguments of the kernel in C instead of a `HealthState`, where health is not judged."""
 
+_NO_OFFSETS = (None,) * len(Offsets._fields)
+"""Arguments of the kernel in C instead of `Offsets`, where nothing is compensated."""
+
 
 def run(
     start: int,
     n_residuals: int,
     tables: Tables,
     health: HealthState | None,
+    offsets: Offsets | None,
     columns: Columns,
     results: Results,
 ) -> tuple[int, int]:
@@ -38,11 +42,11 @@ def run(
 
     Returns:
         Number of the first row that is not processed, and what the caller has to do: `DONE`,
-        `NEEDS_WINDOW`, `NEEDS_CONDITION`, `UNKNOWN_CUBE`, or the key (see `Tables.keys`) of a
-        matrix that must be added.
+        `NEEDS_WINDOW`, `NEEDS_STEP`, `NEEDS_CONDITION`, `UNKNOWN_CUBE`, or the key (see
+        `Tables.keys`) of a matrix that must be added.
     """
     # The kernel in C computes in float32, the precision of messages.
     if native is None or columns.frequency.dtype != np.float32:
-        return rows.run(start, n_residuals, tables, health, columns, results)
-    state = health or _NO_HEALTH
-    return native.run(start, n_residuals, *tables, *state, *columns, *results)
+        return rows.run(start, n_residuals, tables, health, offsets, columns, results)
+    state, subtracted = health or _NO_HEALTH, offsets or _NO_OFFSETS
+    return native.run(start, n_residuals, *tables, *state, *subtracted, *columns, *results)
