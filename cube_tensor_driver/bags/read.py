@@ -369,13 +369,6 @@ class Bag:
             )
         self.skipped[topic] += count
 
-    def fields(self, msgtype: str) -> list[tuple[str, Any]]:
-        """Return name and kind of each field of a message type, as the library rosbags states them.
-
-        The list is empty if the type is unknown.
-        """
-        return message_fields(msgtype)
-
     def infos(self, topic: str) -> list[Any]:
         """Return the SkinInfo messages (cubes, calibrations, rest frequencies) of a topic.
 

@@ -10,10 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow
+import pyarrow.compute
 import pyarrow.csv
 import pyarrow.parquet
 
-from ..core.errors import BagError
+from ..core.arrays import AnyArray
+from ..core.errors import BagError, LayoutError
 from ..core.modes import GRADIENT, STRESS
 from ..core.rows import StressRows, concatenate
 
@@ -40,6 +42,39 @@ STRESS_SCHEMA = pyarrow.schema(
     ]
 )
 """Names and types of the columns of a table of stress; `StressRows` states what they contain."""
+
+
+def as_column(values: AnyArray) -> pyarrow.Array:
+    """Return an array (N, …) as an Arrow column of N numbers, or of N nested lists of numbers."""
+    column = pyarrow.array(np.ascontiguousarray(values).reshape(-1))
+    # Lists are nested from the last dimension to the first: each step joins `size` successive
+    # numbers or lists to one list.
+    for size in reversed(values.shape[1:]):
+        ends = size * np.arange(len(column) // size + 1, dtype=np.int32)
+        column = pyarrow.ListArray.from_arrays(ends, column)
+    return column
+
+
+def as_array(column: pyarrow.Array) -> AnyArray:
+    """Return an Arrow column of N numbers, or of N nested lists of numbers, as an array (N, …).
+
+    Numbers that are null become NaN; lists that are null are left out.
+
+    Raises:
+        LayoutError: The lists have different lengths.
+    """
+    shape: list[int] = []
+    while pyarrow.types.is_nested(column.type):
+        column = column.drop_null()
+        lengths = pyarrow.compute.list_value_length(column).unique().to_pylist()
+        if len(lengths) > 1:
+            raise LayoutError(
+                f"lists of {lengths} numbers in one column; they must be equally long"
+            )
+        shape += lengths
+        column = column.flatten()
+    values: AnyArray = column.to_numpy(zero_copy_only=False).reshape(-1, *shape)
+    return values
 
 
 def stress_batch(rows: StressRows, cubes: pyarrow.Array) -> pyarrow.RecordBatch:

@@ -15,10 +15,10 @@ import numpy as np
 import pyarrow
 import pyarrow.parquet
 
+from ..bags.tables import as_column
 from ..config.skin import Skin
 from ..core.arrays import AnyArray
 from ..core.modes import COMPONENTS, STRESS
-from .columns import as_column
 from .plan import Episode
 from .statistics import Statistics
 from .topics import Topic
@@ -50,6 +50,10 @@ COUNTER_FEATURES = {
 }
 """Features that state the time and the numbers of each frame, its episode and its task, with their
 types. LeRobot requires them in every data set."""
+
+
+_IMAGE = pyarrow.struct([("bytes", pyarrow.binary()), ("path", pyarrow.string())])
+"""Parquet type of an image as LeRobot stores it: the bytes of the image file, or its path."""
 
 
 class DataSet:
@@ -131,10 +135,7 @@ class DataSet:
             columns: By the names of the features (columns of the data set): arrays whose first
                 dimension is the frames, or a list of image files with one per frame.
         """
-        arrays = {}
-        for name, values in columns.items():
-            arrays[name] = as_column(values)
-        table = pyarrow.table(arrays)
+        table = pyarrow.table({name: _as_column(values) for name, values in columns.items()})
         if self._writer is None:
             name = FILE_NAME.format(**self._place())
             path = self._folder / "data" / name
@@ -265,6 +266,19 @@ class DataSet:
         for key, dtype in COUNTER_FEATURES.items():
             features[key] = _feature(dtype, (1,), None)
         return features
+
+
+def _as_column(values: AnyArray | list[bytes]) -> pyarrow.Array:
+    """Return the values of a feature in n frames as a column of the Parquet file.
+
+    Args:
+        values: Contents of n image files, or an array (n, …).
+    """
+    if isinstance(values, list):
+        # LeRobot reads an image from the bytes if it has no path to an image file.
+        return pyarrow.array([{"bytes": image, "path": None} for image in values], _IMAGE)
+    # LeRobot stores a feature of one number as this number, and not as a list of it.
+    return as_column(values[:, 0] if values.shape[1:] == (1,) else values)
 
 
 def describe_skin(skin: Skin) -> dict[str, Any]:

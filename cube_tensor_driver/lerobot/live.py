@@ -19,13 +19,13 @@ import numpy as np
 import pyarrow
 import pyarrow.ipc
 
+from ..bags.tables import as_array, as_column
 from ..config.skin import Skin
 from ..core.arrays import AnyArray
 from ..core.errors import BagError, ConfigError, CubeError
 from ..core.reconstructor import Reconstructor
 from ..core.rows import StressRows, concatenate
 from ..device.live import LinkSource
-from .columns import as_column
 from .windows import Windows
 
 NUMBER = "frame_number"
@@ -169,10 +169,8 @@ class LiveWindows:
         windows = Windows(counts, depth=int(counts.max()))
         windows.add(np.zeros(len(rows), np.intp), rows)
         (columns,) = windows.complete()
-        arrays = {NUMBER: pyarrow.array([self._number])}
-        for name, values in columns.items():
-            arrays[name] = as_column(values)
-        batch = pyarrow.record_batch(arrays)
+        arrays = {name: as_column(values) for name, values in columns.items()}
+        batch = pyarrow.record_batch({NUMBER: pyarrow.array([self._number])} | arrays)
         if self._writer is None:
             path = self._folder / f"{self._number}.arrow"
             self._file = pyarrow.OSFile(str(path), "wb")
@@ -241,7 +239,7 @@ class RecordedWindows:
             raise BagError(f"no window has the number {number}; name the folder of this data set")
         batch = self._frames[number]
         names = batch.schema.names
-        return {name: _as_array(batch[name]) for name in names if name != NUMBER}
+        return {name: as_array(batch[name])[0] for name in names if name != NUMBER}
 
 
 def frame_number(picture: AnyArray) -> int:
@@ -289,13 +287,3 @@ def nearest_cubes(skin: Skin, width: int, height: int) -> AnyArray:
         distance = np.subtract.outer(columns, across) ** 2 + (y - up) ** 2
         nearest[row] = distance.argmin(axis=1)
     return nearest
-
-
-def _as_array(column: pyarrow.Array) -> AnyArray:
-    """Return the only entry of a column, nested lists of numbers, as an array."""
-    shape = []
-    while pyarrow.types.is_list(column.type):
-        shape.append(column.value_lengths()[0].as_py())
-        column = column.flatten()
-    values: AnyArray = column.to_numpy(zero_copy_only=False).reshape(shape or -1)
-    return values

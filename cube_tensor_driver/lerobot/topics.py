@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from rosbags.interfaces import Nodetype
 
-from ..bags.read import Bag
+from ..bags.read import Bag, message_fields
 from ..bags.recording import stamp_ns
 from ..core.arrays import Single, Times
 from ..core.errors import BagError
@@ -214,7 +214,7 @@ def _read_numbers(
     Raises:
         BagError: The bag is damaged, or a JointState has more or fewer values than joint names.
     """
-    paths = _number_paths(bag, topic.msgtype)
+    paths = _number_paths(topic.msgtype)
     for _, message in bag.decoded({topic.name}):
         if topic.msgtype == JOINT_STATE_TYPE:
             numbers = _joint_numbers(message, f"{bag.path}: {topic.name}")
@@ -247,38 +247,36 @@ def _stamped_topics(
     for one in bag.connections:
         is_of_cube = one.topic.startswith(f"{skin}cubes/")
         is_known = one.msgtype in (JOINT_STATE_TYPE, *IMAGE_TYPES)
-        is_usable = is_known or _number_paths(bag, one.msgtype)
+        is_usable = is_known or _number_paths(one.msgtype)
         if one.msgcount and is_usable and not is_of_cube:
             found.append((one.topic, one.msgtype))
     return sorted(found)
 
 
-def _number_paths(bag: Bag, msgtype: str) -> list[str]:
+def _number_paths(msgtype: str) -> list[str]:
     """Return the paths of the numbers in messages of a type, such as ``wrench.force.x``.
 
     The list is empty if the type has no header (and therefore no stamp), contains a list of
     variable length, or belongs to this package.
     """
-    fields = bag.fields(msgtype)
+    fields = message_fields(msgtype)
     if not fields or msgtype.startswith(PACKAGE):
         return []
     _, first = fields[0]
     if first != (Nodetype.NAME, HEADER_TYPE):
         return []
-    paths = list(_nested_paths(bag, fields[1:], ""))
+    paths = list(_nested_paths(fields[1:], ""))
     return [] if None in paths else [path for path in paths if path]
 
 
 def _nested_paths(
-    bag: Bag,
     fields: list[tuple[str, Any]],
     prefix: str,
 ) -> Iterator[str | None]:
     """Yield the paths of the numbers in a message type, including those in nested messages.
 
     Args:
-        bag: Open bag, which knows the fields of nested types.
-        fields: Name and kind of each field, as `Bag.fields` returns them.
+        fields: Name and kind of each field, as `message_fields` returns them.
         prefix: Path of the fields within the outermost message, ending in "."; "" for its own.
 
     Yields:
@@ -287,7 +285,7 @@ def _nested_paths(
     """
     for name, (node, kind) in fields:
         if node == Nodetype.NAME:
-            yield from _nested_paths(bag, bag.fields(kind), f"{prefix}{name}.")
+            yield from _nested_paths(message_fields(kind), f"{prefix}{name}.")
             continue
         # For a list of fixed length, `kind` consists of the node and kind of its elements, and the
         # length.

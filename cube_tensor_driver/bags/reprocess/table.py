@@ -14,12 +14,12 @@ import numpy as np
 import pyarrow
 import pyarrow.compute
 
-from ...core.arrays import AnyArray, Array
+from ...core.arrays import Array
 from ...core.errors import BagError, LayoutError
 from ...core.reconstructor import CalibratedSkin, Reconstructor, RecordedHealth
 from ...core.rows import FrequencyRows
 from ..source import BagSource
-from ..tables import STRESS_SCHEMA, stress_batch
+from ..tables import STRESS_SCHEMA, as_array, as_column, stress_batch
 
 COLUMNS = {
     "cube": "cube",
@@ -80,7 +80,7 @@ def frequency_table(source: BagSource) -> pyarrow.Table:
             "recorded_status": pyarrow.array(health.status, mask=unknown),
         }
         values = rows.columns()
-        columns |= {name: _column(values[key]) for name, key in COLUMNS.items() if key in values}
+        columns |= {name: as_column(values[key]) for name, key in COLUMNS.items() if key in values}
         numbers = np.minimum(rows.cube, len(cubes) - 1).astype(np.int32)
         columns["cube"] = pyarrow.DictionaryArray.from_arrays(numbers, cubes)
         for name, change in changes.items():
@@ -145,7 +145,7 @@ def reprocess_table(frequencies: pyarrow.Table, skin: CalibratedSkin) -> pyarrow
         columns["cube"] = number.fill_null(len(names)).cast(pyarrow.uint16())
         _restore(reconstructor, columns)
         rows = FrequencyRows.of(
-            **{key: _numbers(columns[name]) for name, key in COLUMNS.items() if name in columns}
+            **{key: as_array(columns[name]) for name, key in COLUMNS.items() if name in columns}
         )
         health = _recorded_health(columns)
         # As for a bag, pads are not examined where the health of all rows is recorded.
@@ -157,35 +157,12 @@ def reprocess_table(frequencies: pyarrow.Table, skin: CalibratedSkin) -> pyarrow
     return pyarrow.Table.from_batches(batches, STRESS_SCHEMA)
 
 
-def _column(values: AnyArray) -> pyarrow.Array:
-    """Return an array (N,) as a column of numbers, or (N, K) as a column of lists."""
-    if values.ndim == 1:
-        return pyarrow.array(values)
-    ends = np.arange(len(values) + 1, dtype=np.int32) * values.shape[1]
-    return pyarrow.ListArray.from_arrays(ends, values.ravel())
-
-
-def _numbers(column: pyarrow.Array) -> AnyArray:
-    """Return a column as an array (N,), or the lists of a column, of equal length K, as (N, K).
-
-    Raises:
-        LayoutError: The lists have different lengths.
-    """
-    if not pyarrow.types.is_nested(column.type):
-        return np.asarray(column.to_numpy(zero_copy_only=False))
-    lists = column.drop_null()
-    lengths = pyarrow.compute.list_value_length(lists).unique().to_pylist()
-    if len(lengths) > 1:
-        raise LayoutError(f"lists of {lengths} numbers in one column; they must be equally long")
-    return np.asarray(lists.flatten().to_numpy(zero_copy_only=False).reshape(len(lists), -1))
-
-
 def _recorded_health(columns: dict[str, Any]) -> RecordedHealth | None:
     """Return the health of the pads that Arrow columns state; None: they state none."""
     names = "recorded_left_out", "recorded_status"
     if not columns.keys() >= {*names}:
         return None
-    left_out, status = (_numbers(columns[name]).astype(float) for name in names)
+    left_out, status = (as_array(columns[name]).astype(float) for name in names)
     known = ~np.isnan(left_out)
     left_out, status = np.nan_to_num(left_out), np.nan_to_num(status)
     return RecordedHealth(known, left_out.astype(np.uint32), status.astype(np.uint16))
@@ -203,7 +180,7 @@ def _restore(reconstructor: Reconstructor, columns: dict[str, Any]) -> None:
             continue
         if column[1:].null_count < len(column) - 1:
             raise LayoutError(f"{name} changes within a part; keep the column part of its table")
-        value = _numbers(column)[0]
+        value = as_array(column)[0]
         if key != "rest_frequency":
             reconstructor.compensation.restore({key: value})
         elif value.size == reconstructor.rest_frequency.size:
