@@ -12,9 +12,6 @@ from typing import TYPE_CHECKING, Any
 from .parser import Parser
 
 if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.table import Table
-
     from ..bags.read import Bag
 
 
@@ -68,13 +65,12 @@ def show_bag(path: Path) -> None:
         BagError: The bag cannot be read.
     """
     import numpy as np
-    from rich.console import Console
 
     from ..bags.read import Bag
     from ..bags.summary import last_diagnostics
     from ..messages.types import FREQUENCIES
+    from ..views.terminal.output import say
 
-    console = Console(highlight=False)
     with Bag(path) as bag:
         duration_s = 0.0
         # A bag without messages has no start and end time.
@@ -82,78 +78,71 @@ def show_bag(path: Path) -> None:
             duration_s = (bag.end_ns - bag.start_ns) * 1e-9
             # The start is printed in ms, because its nanoseconds are of no interest to a reader.
             start = np.datetime64(bag.start_ns, "ns").astype("datetime64[ms]")
-            console.print(f"{path}: {duration_s:.3f} s from {start} UTC")
+            say(f"{path}: {duration_s:.3f} s from {start} UTC")
         else:
-            console.print(f"{path}: no messages")
+            say(f"{path}: no messages")
 
-        console.print(topic_table(bag, duration_s))
+        show_topics(bag, duration_s)
         for topic in bag.topics(FREQUENCIES):
-            show_skin(bag, topic, console)
+            show_skin(bag, topic)
         for status in last_diagnostics(bag):
-            console.print(diagnostics_line(status), markup=False)
+            say(diagnostics_line(status))
 
 
-def topic_table(bag: Bag, duration_s: float) -> Table:
-    """Return a table of the topics of a bag with their types, message counts and mean rates.
+def show_topics(bag: Bag, duration_s: float) -> None:
+    """Print a table of the topics of a bag with their types, message counts and mean rates.
 
     Args:
         bag: The bag.
         duration_s: Time from the first to the last message, in s.
     """
-    from rich.table import Table
+    from ..views.terminal.output import print_table
 
-    table = Table("topic")
-    table.add_column("type", overflow="fold")
-    for heading in ("messages", "Hz"):
-        table.add_column(heading, justify="right")
+    rows = []
     for connection in sorted(bag.connections, key=lambda connection: connection.topic):
         count = connection.msgcount
         # A rate needs at least two messages.
         rate = f"{count / duration_s:.1f}" if duration_s and count > 1 else ""
-        table.add_row(connection.topic, connection.msgtype, str(count), rate)
-    return table
+        rows.append((connection.topic, connection.msgtype, str(count), rate))
+    print_table(("topic", "type"), ("messages", "Hz"), rows)
 
 
-def show_skin(bag: Bag, topic: str, console: Console) -> None:
+def show_skin(bag: Bag, topic: str) -> None:
     """Print a recorded skin with its calibrations, and for each cube its rate, losses and gaps.
 
     Args:
         bag: The bag.
         topic: Topic with the frequencies of the skin's pads.
-        console: Console to print to.
     """
     from ..bags.recording import skin_infos
     from ..bags.summary import cube_summaries
     from ..core.errors import BagError
-    from ..views.terminal.output import counted, make_table
+    from ..views.terminal.output import counted, print_table, say
 
     try:
         info = skin_infos(bag, topic)[-1]
     except BagError as error:
         # A skin that cannot be shown must not keep the other skins of the bag from being shown.
-        console.print(str(error), style="red", markup=False)
+        say(str(error), "red")
         return
     frame, version = info.header.frame_id, info.version
-    console.print(
-        f"skin {info.name!r}: {counted(len(info.cubes), 'cube')} in {frame}, "
-        f"info version {version}",
-        markup=False,
-    )
+    cubes = counted(len(info.cubes), "cube")
+    say(f"skin {info.name!r}: {cubes} in {frame}, info version {version}")
     for name, count in Counter(cube.calibration_id for cube in info.cubes).items():
         # All cubes with the same calibration have the same layout, unless a file was edited.
         layouts = sorted({cube.layout for cube in info.cubes if cube.calibration_id == name})
         cubes = counted(count, "cube")
-        console.print(f"  calibration {name}, layout {', '.join(layouts)}: {cubes}")
+        say(f"  calibration {name}, layout {', '.join(layouts)}: {cubes}")
 
-    table = make_table(("cube", "uid"), ("samples", "Hz", "lost", "gaps", "longest gap / ms"))
+    rows = []
     for cube in cube_summaries(bag, topic, info):
         # Rate, losses and gaps are unknown for a cube with fewer than two samples.
         cells = ["", "", "", ""]
         if cube.rate is not None and cube.longest_gap is not None:
             gap_ms = f"{1e3 * cube.longest_gap:.1f}"
             cells = [f"{cube.rate:.1f}", str(cube.lost), str(cube.gaps), gap_ms]
-        table.add_row(cube.name, f"{cube.uid:#x}", str(cube.samples), *cells)
-    console.print(table)
+        rows.append((cube.name, f"{cube.uid:#x}", str(cube.samples), *cells))
+    print_table(("cube", "uid"), ("samples", "Hz", "lost", "gaps", "longest gap / ms"), rows)
 
 
 def diagnostics_line(status: Any) -> str:

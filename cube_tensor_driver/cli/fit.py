@@ -98,7 +98,7 @@ def run(options: argparse.Namespace) -> int:
         return run_rest(options)
 
     from ..calibrate.fit import fit, measured_stress
-    from ..config.calibration import named_layout, write_calibration
+    from ..config.calibration import named_layout
     from ..config.output_files import write_json
     from ..core.errors import ConfigError
     from ..core.symmetry import find_structure
@@ -131,90 +131,91 @@ def run(options: argparse.Namespace) -> int:
     created = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
     table = options.loads.name
     calibration = result.calibration(base, created, f"fit of {table}, {len(measured)} loads")
-    header = f"./cube fit {table} --layout {options.layout} --symmetry {options.symmetry}"
-    write_calibration(options.output, calibration, header)
-    print(f"wrote {options.output}: calibration {calibration.id}")
+    words = f"{table} --layout {options.layout} --symmetry {options.symmetry}"
+    write_result(options.output, calibration, words)
     return 0
+
+
+def write_result(path: Path, calibration: Calibration, words: str) -> None:
+    """Write a calibration file and print its path.
+
+    Args:
+        path: The file.
+        calibration: The result of a fit.
+        words: The words behind ./cube fit, which the header of the file states.
+    """
+    from ..config.calibration import write_calibration
+
+    write_calibration(path, calibration, f"./cube fit {words}")
+    print(f"wrote {path}: calibration {calibration.id}")
 
 
 def run_rest(options: argparse.Namespace) -> int:
     """Fit the effect of temperature to bags, print and draw it, and write the calibrations."""
-    from rich.console import Console
-
     from ..calibrate.thermal import fit_thermal, read_warming
-    from ..config.calibration import write_calibration
     from ..views.figures.calibration import draw_thermal_fit
     from ..views.figures.style import save
-    from ..views.terminal.output import make_table
+    from ..views.terminal.output import print_table
 
     warming = read_warming(options.rest, options.cube)
     fits = {name: fit_thermal(data) for name, (_, data) in warming.items()}
     bags = " ".join(path.name for path in options.rest)
     columns = ("lag, s", "degree", "before, Pa", "after, Pa", "deviation, Pa/K")
-    table = make_table(("cube",), columns)
+    rows = []
     for name, result in fits.items():
         lags = " + ".join(f"{lag:.0f}" for lag in result.model.lag.tolist())
         degree = str(result.model.coefficient.shape[1])
-        table.add_row(name, lags, degree, *(f"{size:.2f}" for size in result.sizes()))
-    Console(highlight=False).print(table)
+        rows.append((name, lags, degree, *(f"{size:.2f}" for size in result.sizes())))
+    print_table(("cube",), columns, rows)
     for name, result in fits.items():
         path, picture = options.output, options.figure
         if len(fits) > 1:
             path, picture = (one.with_stem(f"{one.stem}_{name}") for one in (path, picture))
         base = warming[name][0]
         calibration = result.calibration(base, f"{base.source}; temperature fitted to {bags}")
-        write_calibration(path, calibration, f"./cube fit --rest {bags}")
         save(draw_thermal_fit(result), picture)
-        print(f"wrote {path}: calibration {calibration.id}")
+        write_result(path, calibration, f"--rest {bags}")
     return 0
 
 
 def run_weight(options: argparse.Namespace) -> int:
     """Fit the response to weight and inertia to a bag, print it and write the calibration."""
-    from rich.console import Console
-
     from ..calibrate.weight import fit_weight
-    from ..config.calibration import write_calibration
-    from ..views.terminal.output import make_table
+    from ..views.terminal.output import print_table
 
     calibration = fit_weight(options.weight, options.cube)
     model = calibration.weight
     if model is not None and model.deviation is not None:
-        table = make_table(("pad",), [f"{axis}, Pa per m/s²" for axis in "xyz"])
-        rows = zip(calibration.layout.pads, model.response, model.deviation, strict=True)
-        for pad, values, deviations in rows:
+        rows = []
+        for pad, values, deviations in zip(
+            calibration.layout.pads, model.response, model.deviation, strict=True
+        ):
             pairs = zip(values, deviations, strict=True)
-            table.add_row(pad, *(f"{value:+.3f} ± {sd:.2g}" for value, sd in pairs))
-        Console(highlight=False).print(table)
-    write_calibration(options.output, calibration, f"./cube fit --weight {options.weight.name}")
-    print(f"wrote {options.output}: calibration {calibration.id}")
+            rows.append((pad, *(f"{value:+.3f} ± {sd:.2g}" for value, sd in pairs)))
+        print_table(("pad",), [f"{axis}, Pa per m/s²" for axis in "xyz"], rows)
+    write_result(options.output, calibration, f"--weight {options.weight.name}")
     return 0
 
 
 def run_creep(options: argparse.Namespace) -> int:
     """Fit the creep of the foam to a bag with one press, print it and write the calibration."""
-    from rich.console import Console
-
     from ..calibrate.creep import fit_recorded_creep, reading_after_step
-    from ..config.calibration import write_calibration
-    from ..views.terminal.output import make_table
+    from ..views.terminal.output import print_table, say
 
     result, calibration = fit_recorded_creep(options.creep, options.cube)
-    table = make_table(("pad",), ("load, Pa", "creep from 1 s to 10 min, %", "to 1 h, %"))
+    rows = []
     at_once, *later = (reading_after_step(result.model, time) for time in (1.0, 600.0, 3600.0))
     for pad, load, *readings in zip(
         calibration.layout.pads, result.load, at_once, *later, strict=True
     ):
         growth = [f"{100 * (reading / readings[0] - 1):.2f}" for reading in readings[1:]]
-        table.add_row(pad, f"{load:.0f}", *growth)
-    console = Console(highlight=False)
-    console.print(table)
-    console.print(
+        rows.append((pad, f"{load:.0f}", *growth))
+    print_table(("pad",), ("load, Pa", "creep from 1 s to 10 min, %", "to 1 h, %"), rows)
+    say(
         f"{len(result.model.time)} relaxation times explain a hold of {result.hold_s:.0f} s to "
         f"{100 * result.misfit:.2g} % of the load"
     )
-    write_calibration(options.output, calibration, f"./cube fit --creep {options.creep.name}")
-    print(f"wrote {options.output}: calibration {calibration.id}")
+    write_result(options.output, calibration, f"--creep {options.creep.name}")
     return 0
 
 
@@ -282,36 +283,34 @@ def show_fit(result: Fit, remark: str) -> None:
         result: Result of the fit.
         remark: Origin of the rest frequencies, in words.
     """
-    from rich.console import Console
+    from ..views.terminal.output import print_table, say
 
-    from ..views.terminal.output import make_table
-
-    console = Console(highlight=False)
-    console.print(f"coefficients, {result.structure.symmetry} symmetry, Pa per Pa; {remark}")
-    table = make_table(("coefficient",), ("value", "standard deviation"))
+    say(f"coefficients, {result.structure.symmetry} symmetry, Pa per Pa; {remark}")
+    coefficients = []
     for name, value in result.coefficients.items():
         # A coefficient that the loads do not determine is NaN.
+        cells = ("open", "not determined")
         if math.isfinite(value):
-            table.add_row(name, f"{value:+.5f}", f"{result.deviations[name]:.2g}")
-        else:
-            table.add_row(name, "open", "not determined")
-    console.print(table)
+            cells = (f"{value:+.5f}", f"{result.deviations[name]:.2g}")
+        coefficients.append((name, *cells))
+    print_table(("coefficient",), ("value", "standard deviation"), coefficients)
 
-    console.print("gains (average 1 over pads that the symmetry carries onto each other)")
-    gains = make_table(("pad",), ("gain", "standard deviation"))
+    say("gains (average 1 over pads that the symmetry carries onto each other)")
     pads = result.structure.layout.pads
-    for pad, gain, deviation in zip(pads, result.gain, result.gain_deviation, strict=True):
-        gains.add_row(pad, f"{gain:.5f}", f"{deviation:.2g}")
-    console.print(gains)
+    gains = [
+        (pad, f"{gain:.5f}", f"{deviation:.2g}")
+        for pad, gain, deviation in zip(pads, result.gain, result.gain_deviation, strict=True)
+    ]
+    print_table(("pad",), ("gain", "standard deviation"), gains)
 
-    console.print(
+    say(
         f"scatter {result.scale:.3g} × the stated noise; "
         f"chi-square {result.chi2:.4g} for {result.dof} degrees of freedom; "
         f"held-out error {100 * result.held_out:.3g} % of the readings; "
         f"{int(result.outliers.sum())} outliers"
     )
     for sentence in result.advice:
-        console.print(sentence, style="red")
+        say(sentence, "red")
 
 
 def figures(result: Fit) -> dict[str, object]:

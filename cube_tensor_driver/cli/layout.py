@@ -93,31 +93,26 @@ def show_layout(layout: Layout, symmetry: str, result: dict[str, Any], source: s
         result: Result of `core.estimator.summarize_response`; unknown values are None.
         source: Origin of the response matrix, in words.
     """
-    from rich.console import Console
-
     from ..core.symmetry import coefficient_counts
-    from ..views.terminal.output import make_table
+    from ..views.terminal.output import print_table, say
 
-    console = Console(highlight=False)
     pads = " ".join(layout.pads)
-    console.print(f"layout {layout.name}: {layout.n_pads} pads   {pads}", markup=False)
+    say(f"layout {layout.name}: {layout.n_pads} pads   {pads}")
     counts = [
         f"{name} {'not possible' if count is None else count}"
         for name, count in coefficient_counts(layout).items()
     ]
-    console.print(f"coefficients by symmetry: {', '.join(counts)}")
-    console.print(f"symmetry {symmetry}; {source}", markup=False)
+    say(f"coefficients by symmetry: {', '.join(counts)}")
+    say(f"symmetry {symmetry}; {source}")
 
     for part in ("uniform", "gradient"):
         condition = result[f"condition_{part}"]
         text = "unknown" if condition is None else f"{condition:.3g}"
-        console.print(f"{part + ':':10} rank {result[f'rank_{part}']}, condition {text}")
-    console.print(f"unobservable: {', '.join(result['unobservable']) or 'nothing'}")
-    console.print("noise of each mode per unit of pad noise (gradients times the half side):")
-    table = make_table(("mode",), ("noise",))
-    for name in result["modes"]:
-        table.add_row(name, noise_text(result, name))
-    console.print(table)
+        say(f"{part + ':':10} rank {result[f'rank_{part}']}, condition {text}")
+    say(f"unobservable: {', '.join(result['unobservable']) or 'nothing'}")
+    say("noise of each mode per unit of pad noise (gradients times the half side):")
+    rows = [(name, noise_text(result, name)) for name in result["modes"]]
+    print_table(("mode",), ("noise",), rows)
 
 
 def noise_text(result: dict[str, Any], mode: str) -> str:

@@ -48,10 +48,28 @@ def make_table(names: Iterable[str], numbers: Iterable[str]) -> Table:
         names: Headings of the left-justified columns, which are for names.
         numbers: Headings of the right-justified columns, which are for numbers.
     """
-    table = Table(*names)
+    table = Table()
+    for heading in names:
+        table.add_column(heading, overflow="fold")
     for heading in numbers:
         table.add_column(heading, justify="right")
     return table
+
+
+def print_table(
+    names: Iterable[str], numbers: Iterable[str], rows: Iterable[Iterable[str]]
+) -> None:
+    """Print a table with left-justified columns and then right-justified columns.
+
+    Args:
+        names: Headings of the left-justified columns, which are for names.
+        numbers: Headings of the right-justified columns, which are for numbers.
+        rows: Cells of each row.
+    """
+    table = make_table(names, numbers)
+    for cells in rows:
+        table.add_row(*cells)
+    Console(highlight=False).print(table)
 
 
 @contextmanager
