@@ -5,6 +5,7 @@ own state."""
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import time
 from dataclasses import replace
@@ -154,29 +155,37 @@ def test_losses_of_a_link_are_a_warning_and_coloured_on_the_page(state, notes, l
 
 
 def test_a_recording_of_a_namespace_has_no_diagnostics_of_another(ros, tmp_path, monkeypatch):
-    """Though tools of ROS find those of all nodes in /diagnostics."""
+    """Though tools of ROS find those of all nodes in /diagnostics. The rate is an integer, as in a
+    parameter file in which somebody has written `rate: 250`."""
     monkeypatch.setattr(record, "MAX_CONNECT_S", 0.0)  # a driver alone has not all topics
     heard = ros.listen(DiagnosticArray, "/diagnostics")
     recorder_node = rclpy.create_node("recorder", namespace="left")
     names = resolve_topics(recorder_node, RECORDED)
     recorder_node.destroy_node()
     (driver,) = skin_processes(SINGLE)[1:]
-    with Children(tmp_path) as children:
-        for namespace in ("left", "right"):
-            arguments = ("--ros-args", "-r", f"__ns:=/{namespace}")
-            children.start(replace(driver, executable=namespace, arguments=arguments))
-        recorder = record.Recorder(ros.node, names, BagWriter(tmp_path / "bag"))
+    parameters = driver.parameters | {"rate": 250}
+    with (
+        Children(tmp_path) as children,
+        contextlib.closing(
+            record.Recorder(ros.node, names, BagWriter(tmp_path / "bag"))
+        ) as recorder,
+    ):
+        for name in ("left", "right"):
+            arguments = ("--ros-args", "-r", f"__ns:=/{name}")
+            children.start(
+                replace(driver, executable=name, arguments=arguments, parameters=parameters)
+            )
 
         def is_recorded():
+            children.check()
             recorder.find_topics()
-            statuses = {status.name for array in heard for status in array.status}
             if not recorder.has_begun:
                 heard.clear()
+            statuses = {status.name for array in heard for status in array.status}
             has_come = any(recorder.counts.get(name) for name in names if "diagnostics" in name)
             return has_come and {"/left/driver: rows", "/right/driver: rows"} <= statuses
 
         ros.wait(is_recorded)
-        recorder.close()
     with Bag(tmp_path / "bag") as bag:
         recorded = {status.name for status in last_diagnostics(bag)}
     assert recorded == {"/left/driver: rows", "/left/driver: link hub0"}
