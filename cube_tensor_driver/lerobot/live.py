@@ -50,6 +50,14 @@ MIN_WIDTH = MIN_SQUARE * NUMBER_GRID[1]
 MIN_HEIGHT = 4 * MIN_SQUARE
 """Smallest height of a picture, in pixels. The frame number takes two squares of it."""
 
+HANDOVER_S = 1e-3
+"""Time, in s, for which the caller of `next_picture` sleeps before it takes the samples.
+
+Only one thread of Python runs at a time. While the recorder computes, the threads that read the
+links get their turn only every 5 ms (`sys.getswitchinterval`), one after the other. Asleep, it lets
+them finish what has arrived, which would otherwise be missing in its frame.
+"""
+
 UNKNOWN_GREY = 90
 """Brightness (0 to 255) of the cubes whose stress along z is unknown."""
 
@@ -122,6 +130,7 @@ class LiveWindows:
             TimeoutError: No sample arrived.
             CubeError: The thread that reads the links has failed.
         """
+        time.sleep(HANDOVER_S)
         with self._changed:
             self._changed.wait_for(lambda: self._rows or self._failure, timeout_s)
             parts, self._rows = self._rows, []

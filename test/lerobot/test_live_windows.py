@@ -9,18 +9,24 @@ import json
 import os
 import shutil
 import subprocess
+import sys
 import threading
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet
 import pytest
+from bag_maker import make_bag
 
 import cube_tensor_driver as ctd
 from conftest import ROOT
+from cube_tensor_driver.bags.tables import as_array
 from cube_tensor_driver.cli.main import main
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import Skin, read_skin
 from cube_tensor_driver.core.rows import FrequencyRows, StressRows, concatenate
+from cube_tensor_driver.lerobot import live as live_module
 from cube_tensor_driver.lerobot.live import LiveWindows, RecordedWindows, frame_number
 from cube_tensor_driver.lerobot.windows import TACTILE, WINDOW_COLUMNS
 from cube_tensor_driver.simulation.background import BackgroundHubs
@@ -111,6 +117,68 @@ def test_windows_hold_the_bits_of_the_stress_and_a_pause_lengthens_one(tmp_path)
     shown = pictures[2].transpose(2, 0, 1) / np.float32(255)
     assert frame_number(shown) == frame_number(pictures[2])
     assert_picture_shows(pictures[-1], expected.select(slice(-cubes, None)))
+
+
+def test_live_windows_have_the_bits_of_the_export_of_the_same_run(tmp_path):
+    """The samples of all frames, one after the other; both divide them into other frames."""
+    path = package_data() / "config" / "skin_demo.yaml"
+    bag = make_bag(tmp_path / "bag", path, 60)
+    with ctd.open_bag(bag) as recorded:
+        rows = concatenate(list(recorded))
+    source = HeldSource(read_skin(path))
+    live = LiveWindows(source, tmp_path / "touch", **SIZE)
+    cubes = len(source.skin.cubes)
+    windows = []
+    for begin, end in pairwise((0, 5, 30, 60)):
+        source.give(rows.select(slice(begin * cubes, end * cubes)))
+        picture = live.next_picture(10.0)
+        windows.append(frame_number(picture))
+    live.close()
+    touch = RecordedWindows(tmp_path / "touch")
+
+    assert main(["export", "lerobot", str(bag), "-o", str(tmp_path / "set"), "--fps", "30"]) == 0
+    table = pyarrow.parquet.read_table(tmp_path / "set" / "data" / "chunk-000" / "file-000.parquet")
+    count = as_array(table[f"{TACTILE}.count"].combine_chunks())
+    depth = as_array(table[TACTILE].combine_chunks()).shape[1]
+    # A window has its samples at its end, as many of each cube.
+    is_sample = np.arange(depth) >= depth - count[:, :1]
+    for name in touch.at(windows[0]).keys() - {f"{TACTILE}.count"}:
+        exported = as_array(table[name].combine_chunks())[is_sample]
+        joined = np.concatenate([touch.at(number)[name] for number in windows])
+        assert joined.dtype == exported.dtype and len(joined) == 60
+        np.testing.assert_array_equal(joined, exported, name)
+
+
+def test_a_frame_has_what_arrived_while_the_recorder_computed(tmp_path, monkeypatch):
+    """No other thread runs between the arrival of a scan and the reading of the frame."""
+    monkeypatch.setattr(live_module, "HANDOVER_S", 0.3)
+    skin = read_skin(package_data() / "config" / "skin_demo.yaml")
+    cubes = len(skin.cubes)
+    with ctd.simulate(skin, duration=0.02, rate=RATE) as simulated:
+        rows = concatenate(list(simulated))
+    source = HeldSource(skin)
+    live = LiveWindows(source, tmp_path / "touch", **SIZE)
+    source.give(rows.select(slice(0, cubes)))
+    arrival = threading.Lock()
+    arrival.acquire()
+
+    def receive() -> None:
+        arrival.acquire()
+        source.give(rows.select(slice(cubes, 2 * cubes)))
+
+    thread = threading.Thread(target=receive)
+    thread.start()
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(100)
+    try:
+        arrival.release()
+        picture = live.next_picture(10.0)
+    finally:
+        sys.setswitchinterval(interval)
+    thread.join(10)
+    live.close()
+    window = RecordedWindows(tmp_path / "touch").of(picture)
+    np.testing.assert_array_equal(window[f"{TACTILE}.count"], [2] * cubes)
 
 
 def assert_picture_shows(picture: np.ndarray, last: StressRows) -> None:
