@@ -9,7 +9,7 @@ them. `injector.py` carries faults out.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 from ..config.schema import Schema, integer, mapping, real
@@ -68,10 +68,7 @@ _SCHEMA = Schema(
     mapping(
         ["kind"],
         {
-            "kind": {
-                "enum": list(KINDS),
-                "description": ", ".join(KINDS),
-            },
+            "kind": {"enum": list(KINDS), "description": ", ".join(KINDS)},
             "at": _AMOUNT,
             "link": {"type": "string", "description": "the name of a link"},
             "seconds": _AMOUNT,
@@ -124,11 +121,8 @@ class Fault:
             raise ConfigError(f"{place}: {mistake}")
         # The values are converted to the types of the attributes, because YAML may contain 2 where
         # a float is needed, and 2.0 where an integer is needed.
-        types: dict[str, Any] = {"kind": str}
-        for field in fields(cls)[1:]:
-            types[field.name] = type(field.default)
-        values = {key: types[key](value) for key, value in data.items()}
-        return cls(**values)
+        defaults: dict[str, Any] = {"kind": "", **vars(cls)}
+        return cls(**{key: type(defaults[key])(value) for key, value in data.items()})
 
 
 def parse_faults(data: Any, place: str) -> list[Fault]:
@@ -143,11 +137,7 @@ def parse_faults(data: Any, place: str) -> list[Fault]:
     """
     if not isinstance(data, list):
         raise ConfigError(f"{place}: found {str(data)[:60]!r}, allowed: a list of faults")
-    faults = []
-    for number, item in enumerate(data):
-        fault = Fault.parse(item, f"{place}: [{number}]")
-        faults.append(fault)
-    return faults
+    return [Fault.parse(item, f"{place}: [{number}]") for number, item in enumerate(data)]
 
 
 @dataclass(frozen=True)

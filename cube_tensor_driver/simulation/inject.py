@@ -49,9 +49,7 @@ def inject(ports: Path | None, words: Sequence[str]) -> str:
         # The simulator writes the file with the sizes of its hubs before it creates the pipe, so
         # the file exists.
         sizes = read_yaml(folder / HUBS_FILE)
-        hubs = {}
-        for name, size in sizes.items():
-            hubs[name] = HubSize(**size)
+        hubs = {name: HubSize(**size) for name, size in sizes.items()}
         links = check_target(parsed, hubs)
         stream.write(fault_line(fault))
     return f"{', '.join(links)}: {_describe(parsed)}"
@@ -84,15 +82,9 @@ def _open_pipe(pipe: Path) -> int:
 
 def _describe(fault: Fault) -> str:
     """Return the effect of a fault in words, with its values."""
-    text = KINDS[fault.kind]
-    units = {
-        "seconds": " s",
-        "count": "",
-        "value": "",
-    }
-    for name, unit in units.items():
-        value = getattr(fault, name)
-        text = text.replace(f"`{name}`", f"{value:g}{unit}")
+    text = KINDS[fault.kind].replace("`seconds`", f"{fault.seconds:g} s")
+    for name in ("count", "value"):
+        text = text.replace(f"`{name}`", f"{getattr(fault, name):g}")
     if fault.kind in PAD_FAULTS:
         text = text.replace("a pad", f"pad {fault.pad} of cube {fault.cube}")
     return text

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import heapq
+import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -50,37 +51,6 @@ their times by itself; a changed temperature stays until the next fault of the k
 
 
 @dataclass
-class SimulatedLink:
-    """A link of the skin: a simulated hub and its line to the host.
-
-    Attributes:
-        name: Name of the link.
-        hub: Simulated hub.
-        line: Line between hub and host.
-        damaged: Samples whose frame was altered or not sent: for each, the number of the hub's
-            restarts before, and the number of the sample.
-    """
-
-    name: str
-    hub: SimulatedHub
-    line: SimulatedLine
-    damaged: list[tuple[int, int]] = field(
-        default_factory=list,
-        kw_only=True,
-    )
-
-    @property
-    def size(self) -> HubSize:
-        """Number of cubes and pads of the hub."""
-        return HubSize(len(self.hub.cube_uids), self.hub.n_pads)
-
-    def mark_damaged(self) -> None:
-        """Record that the frame of the hub's newest sample is altered or not sent."""
-        newest = self.hub.sequence - 1
-        self.damaged.append((self.hub.boots, newest))
-
-
-@dataclass
 class _BrokenPad:
     """A pad under a fault, and its frequency in mHz at the first sample after the fault began."""
 
@@ -89,8 +59,8 @@ class _BrokenPad:
 
 
 @dataclass
-class _LinkState:
-    """Faults that affect one link now.
+class LinkFaults:
+    """Faults that affect one link now; only `Injector` uses it.
 
     Attributes:
         frames: Kinds of faults for the next SAMPLE frames (messages with a sample), one for each.
@@ -106,6 +76,36 @@ class _LinkState:
     pads: list[_BrokenPad] = field(default_factory=list)
     warming: tuple[int, Fault] | None = None
     hold: tuple[int, Fault] | None = None
+
+
+@dataclass
+class SimulatedLink:
+    """A link of the skin: a simulated hub and its line to the host.
+
+    Attributes:
+        name: Name of the link.
+        hub: Simulated hub.
+        line: Line between hub and host.
+        damaged: Samples whose frame was altered or not sent: for each, the number of the hub's
+            restarts before, and the number of the sample.
+        faults: Faults that affect the link now.
+    """
+
+    name: str
+    hub: SimulatedHub
+    line: SimulatedLine
+    damaged: list[tuple[int, int]] = field(default_factory=list, kw_only=True)
+    faults: LinkFaults = field(default_factory=LinkFaults, kw_only=True)
+
+    @property
+    def size(self) -> HubSize:
+        """Number of cubes and pads of the hub."""
+        return HubSize(len(self.hub.cube_uids), self.hub.n_pads)
+
+    def mark_damaged(self) -> None:
+        """Record that the frame of the hub's newest sample is altered or not sent."""
+        newest = self.hub.sequence - 1
+        self.damaged.append((self.hub.boots, newest))
 
 
 class Injector:
@@ -133,13 +133,12 @@ class Injector:
         """
         self.records: list[FaultRecord] = []
         self._links = {link.name: link for link in links}
-        self._states = {name: _LinkState() for name in self._links}
         self._random = np.random.default_rng(seed)
         # Heap of begins and ends of faults: simulated time in µs, whether the fault begins, serial
         # number, fault. At the same time, faults end before others begin, because a fault may begin
         # when another one on the same pad ends.
         self._schedule: list[tuple[int, bool, int, Fault]] = []
-        self._number = 0
+        self._numbers = itertools.count()
         for fault in faults:
             self.add(fault, round(1e6 * fault.at))
 
@@ -156,8 +155,7 @@ class Injector:
         sizes = {name: link.size for name, link in self._links.items()}
         # A fault without a link becomes one fault per link.
         for name in check_target(fault, sizes):
-            on_link = replace(fault, link=name)
-            self._push(at_us, True, on_link)
+            self._push(at_us, True, replace(fault, link=name))
 
     def due_us(self) -> int | None:
         """Return the simulated time in µs at which the next fault begins or ends.
@@ -186,7 +184,7 @@ class Injector:
             frequency: Frequencies (cubes, pads) in mHz of pads without faults.
             now_us: Simulated time of the sample in µs.
         """
-        state = self._states[link.name]
+        state = link.faults
         hub = link.hub
         # The array is copied, because it may be used again for a later sample.
         frequency = frequency.copy()
@@ -200,16 +198,8 @@ class Injector:
             sound = int(frequency[pad])
             if broken.reading is None:
                 broken.reading = sound
-            frequency[pad] = broken_reading(
-                broken.fault,
-                sound,
-                broken.reading,
-                now_us,
-            )
-        if hub.extra_pads:
-            widths = ((0, 0), (0, hub.extra_pads))
-            frequency = np.pad(frequency, widths)
-        return frequency
+            frequency[pad] = broken_reading(broken.fault, sound, broken.reading, now_us)
+        return np.pad(frequency, ((0, 0), (0, hub.extra_pads)))
 
     def load_us(self, link: SimulatedLink, now_us: int) -> int:
         """Return the simulated time, in µs, whose load acts on the cubes of a hub.
@@ -220,7 +210,7 @@ class Injector:
             link: Link of the hub.
             now_us: Present simulated time in µs.
         """
-        hold = self._states[link.name].hold
+        hold = link.faults.hold
         return now_us if hold is None else hold[0]
 
     def transmitted(self, link: SimulatedLink, data: bytes) -> bytes:
@@ -234,10 +224,9 @@ class Injector:
             The frame, altered if a fault acts on it; empty if the frame is lost or held back. A
             frame that was held back before (fault `reorder`) follows at the end.
         """
-        state = self._states[link.name]
+        state = link.faults
         kind = state.frames.pop(0) if state.frames else ""
-        held_back = state.held_back
-        state.held_back = b""
+        held_back, state.held_back = state.held_back, b""
         if kind in DAMAGING_FAULTS:
             link.mark_damaged()
         if kind == "reorder" and not held_back:
@@ -269,8 +258,7 @@ class Injector:
                 noise = random.bytes(int(random.integers(1, _MAX_INSERTED_BYTES)))
                 return data[:at] + noise + data[at:]
             case "truncate":
-                end = int(random.integers(1, len(data) - 1))
-                return data[:end]
+                return data[: int(random.integers(1, len(data) - 1))]
         return data
 
     def _begin(self, fault: Fault, now_us: int) -> None:
@@ -281,7 +269,7 @@ class Injector:
             now_us: Simulated time in µs.
         """
         link = self._links[fault.link]
-        state = self._states[fault.link]
+        state = link.faults
         hub = link.hub
         line = link.line
         is_momentary = fault.kind in MOMENTARY_FAULTS
@@ -291,7 +279,7 @@ class Injector:
                 state.frames += [kind] * fault.count
             case kind if kind in PAD_FAULTS:
                 state.pads.append(_BrokenPad(fault))
-                _report_pads(hub, state)
+                _report_pads(link)
             case "stall":
                 line.held_until_us = end_us
             case "burst":
@@ -337,7 +325,7 @@ class Injector:
             now_us: Simulated time in µs.
             sequence: Number of the next sample of the hub.
         """
-        self._states[link.name].held_back = b""
+        link.faults.held_back = b""
         link.hub.reset(now_us, sequence)
         link.line.send(link.hub.hello(), now_us)
 
@@ -349,14 +337,13 @@ class Injector:
             now_us: Simulated time in µs.
         """
         link = self._links[fault.link]
-        state = self._states[fault.link]
+        state = link.faults
         hub = link.hub
         line = link.line
         match fault.kind:
             case kind if kind in PAD_FAULTS:
-                pads = state.pads
-                state.pads = [broken for broken in pads if broken.fault is not fault]
-                _report_pads(hub, state)
+                state.pads = [broken for broken in state.pads if broken.fault is not fault]
+                _report_pads(link)
             case "hold":
                 # A fault `hold` that began later has replaced this one, and does not end now.
                 if state.hold is not None and state.hold[1] is fault:
@@ -389,9 +376,7 @@ class Injector:
             begins: Whether the fault begins at this time; otherwise it ends.
             fault: Fault with the name of a single link.
         """
-        self._number += 1
-        entry = (at_us, begins, self._number, fault)
-        heapq.heappush(self._schedule, entry)
+        heapq.heappush(self._schedule, (at_us, begins, next(self._numbers), fault))
 
 
 def broken_reading(
@@ -470,16 +455,10 @@ def centi_celsius(warmer: Any) -> Any:
     return np.where(warmer != 0, known, TEMPERATURE_UNKNOWN)
 
 
-def _report_pads(hub: SimulatedHub, state: _LinkState) -> None:
-    """Set the pads that a hub reports as failed in its frames: those under the fault `report`.
-
-    Args:
-        hub: The hub, which is changed.
-        state: Faults that affect its link now.
-    """
-    bits = np.zeros(len(hub.cube_uids), "<u4")
-    for broken in state.pads:
+def _report_pads(link: SimulatedLink) -> None:
+    """Set the pads that a hub reports as failed in its frames: those under the fault `report`."""
+    bits = np.zeros(len(link.hub.cube_uids), "<u4")
+    for broken in link.faults.pads:
         if broken.fault.kind == "report":
-            bit = np.uint32(1 << broken.fault.pad)
-            bits[broken.fault.cube] |= bit
-    hub.pad_fault = bits if bits.any() else None
+            bits[broken.fault.cube] |= np.uint32(1 << broken.fault.pad)
+    link.hub.pad_fault = bits

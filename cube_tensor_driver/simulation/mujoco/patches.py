@@ -136,7 +136,7 @@ def _edge_distances(corners: Array, place: Array) -> Array:
     Returns:
         Distance (K,) from the line of each edge, positive inside, multiplied by the edge's length.
     """
-    edge_x, edge_y = (_next_corners(corners) - corners).T
+    edge_x, edge_y = (next_corners(corners) - corners).T
     x, y = (place - corners).T
     return np.asarray(edge_x * y - edge_y * x)
 
@@ -150,7 +150,7 @@ def _area_moments(corners: Array) -> tuple[float, Array, float]:
         corners: Corners (K, 2) in m, counterclockwise.
     """
     x, y = corners.T
-    next_x, next_y = _next_corners(corners).T
+    next_x, next_y = next_corners(corners).T
     double_area = x * next_y - next_x * y
     area = float(double_area.sum() / 2)
     if not area > 0:
@@ -171,7 +171,7 @@ def _area_moments(corners: Array) -> tuple[float, Array, float]:
     return area, centroid, float(polar_about_origin - area * centroid @ centroid)
 
 
-def _next_corners(corners: Array) -> Array:
+def next_corners(corners: Array) -> Array:
     """Return, for each corner (K, 2) of a polygon, the corner that follows it.
 
     np.roll would take five times as long.

@@ -46,7 +46,7 @@ from ...mechanics.layer import Layer
 from ..imperfections import Imperfections
 from ..load import ContactLoad, StressField, surface_normal
 from ..source import SkinPads
-from .patches import Polygon, flat_contact, hertz_radius
+from .patches import Polygon, flat_contact, hertz_radius, next_corners
 
 if TYPE_CHECKING:
     from mujoco import MjData, MjModel
@@ -263,8 +263,7 @@ class MujocoSkin:
         if not is_felt.any():
             return None
 
-        place = place[is_felt]
-        force = force[is_felt]
+        place, force = place[is_felt], force[is_felt]
         total = force.sum(axis=0)
         if len(place) > 1:
             # The round contact with the same area is used where a single position is needed.
@@ -515,17 +514,13 @@ def _field_of_polygons(
     in_plane = rotation[..., :2]
     polygons = [touch.polygon for touch in touches if touch.polygon is not None]
     normals = np.stack([touch.press.normal for touch in touches], axis=1)
-    next_corner: list[int] = []  # the corner where each edge ends
-    number: list[int] = []  # the polygon of each edge
-    for index, polygon in enumerate(polygons):
-        first = len(number)
-        size = len(polygon.corners)
-        next_corner += [*range(first + 1, first + size), first]
-        number += [index] * size
+    # Each corner is the start of one edge, the next corner its end.
+    starts = np.concatenate([polygon.corners for polygon in polygons])
+    ends = np.concatenate([next_corners(polygon.corners) for polygon in polygons])
+    sizes = [len(polygon.corners) for polygon in polygons]
+    number = np.repeat(np.arange(len(polygons)), sizes)  # the polygon of each edge
 
     origin = position[:, None]
-    places = np.concatenate([polygon.corners for polygon in polygons])
-    corners = (places - origin) @ in_plane
     centres = np.stack([polygon.centre for polygon in polygons])
     centre = (centres - origin) @ in_plane
 
@@ -540,8 +535,8 @@ def _field_of_polygons(
     traction[..., 0] += twist * centre[..., 1]
     traction[..., 1] -= twist * centre[..., 0]
     return tables.field(
-        corners,
-        corners[:, next_corner],
+        (starts - origin) @ in_plane,
+        (ends - origin) @ in_plane,
         traction[:, number],
         twist[:, number],
     )
@@ -556,7 +551,7 @@ def _curvatures(model: MjModel, mujoco: Any) -> Array:
     kinds = mujoco.mjtGeom
     round_kinds = (kinds.mjGEOM_SPHERE, kinds.mjGEOM_CAPSULE, kinds.mjGEOM_CYLINDER)
     numbers = [int(kind) for kind in round_kinds]
-    is_round = np.isin(model.geom_type, numbers)
-    radius = np.where(is_round, model.geom_size[:, 0], 1.0)
-    curvature = np.where(is_round, 1 / radius, 0.0)
-    return np.append(curvature, 0.0)
+    rows = np.flatnonzero(np.isin(model.geom_type, numbers))
+    curvature = np.zeros(model.ngeom + 1)
+    curvature[rows] = 1 / model.geom_size[rows, 0]
+    return curvature
