@@ -15,7 +15,7 @@
 #define MAX_DELAY_NS 60000000000
 #define MAX_PAUSE_NS 60000000000
 
-/* Follows the sample period, as `SampleTiming.find_step`. false: the device time deviates. */
+/* Follows the sample period, as `find_step` of steps.py. false: the device time deviates. */
 static bool follow_period(cube_track_head *track, const cube_sample *sample) {
     uint32_t n_periods = sample->sequence - (uint32_t)track->reference;
     double interval = (double)((int64_t)sample->device_us - track->reference_us);

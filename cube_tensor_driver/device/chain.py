@@ -489,7 +489,7 @@ class LiveLinks:
             # which is no event to report.
             if error is not None or state is LinkState.CLOSED:
                 record.events.append((state, str(error or state.value)))
-            self._scans.set_live(link, False)
+            self._scans.forget(link)
             self._deliver()
 
         # A simulator may make the port after the driver was started. So until the link has been

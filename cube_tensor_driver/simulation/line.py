@@ -45,7 +45,7 @@ class SimulatedLine:
         self.burst_until_us = 0
         self._far_end = -1
         self._queue = bytearray()
-        self._newest_burst = 0
+        self._next_burst_us = 0
         self.plug()
 
     @property
@@ -106,15 +106,10 @@ class SimulatedLine:
 
     def flush(self, now_us: int) -> None:
         """Write as many waiting bytes as the line takes at simulated time `now_us`."""
-        if not self.plugged or now_us < self.held_until_us:
+        if not self.plugged or now_us < self._blocked_until_us(now_us):
             return
-        if now_us < self.burst_until_us:
-            # During the fault `burst`, waiting bytes are written at most once per
-            # `BURST_PERIOD_US`.
-            burst = now_us // BURST_PERIOD_US
-            if burst == self._newest_burst:
-                return
-            self._newest_burst = burst
+        # During the fault `burst`, waiting bytes are written once per period.
+        self._next_burst_us = (now_us // BURST_PERIOD_US + 1) * BURST_PERIOD_US
         # If the line takes no more bytes, the rest stays in the queue until the host reads.
         with contextlib.suppress(BlockingIOError):
             while self._queue:
@@ -134,13 +129,13 @@ class SimulatedLine:
         Returns:
             Time at which `flush` has to be called; None if no bytes wait or they can be sent now.
         """
-        if not self._queue:
-            return None
-        if now_us < self.held_until_us:
-            return self.held_until_us
-        if now_us < self.burst_until_us:
-            return (now_us // BURST_PERIOD_US + 1) * BURST_PERIOD_US
-        return None
+        blocked_us = self._blocked_until_us(now_us)
+        return blocked_us if self._queue and now_us < blocked_us else None
+
+    def _blocked_until_us(self, now_us: int) -> int:
+        """Return the simulated time in µs before which a stall or burst lets nothing be sent."""
+        is_burst = now_us < self.burst_until_us
+        return max(self.held_until_us, self._next_burst_us if is_burst else 0)
 
     def read(self) -> bytes:
         """Return the bytes that the host has sent since the last call."""

@@ -78,7 +78,7 @@ def test_a_scan_waits_for_live_links_but_not_twice():
     assert scan.is_complete()
     scan.build()
     scan.add(0, [sample(3, [[1.0, 1.0]])], [3])
-    scan.set_live(1, False)
+    scan.forget(1)
     assert scan.is_complete()
 
 
@@ -148,7 +148,7 @@ def test_links_that_are_late_by_different_times_make_whole_scans():
     assert taken(scan) == [[4, 10]]
     give(0, 5, 6), give(1, 12, 13, 14)
     assert taken(scan) == [[5, 11, 6, 12]]
-    scan.set_live(0, False)
+    scan.forget(0)
     assert taken(scan) == [[13, 14]], "nobody waits for a link that is gone"
     give(0, 7), give(1, *range(15, 21))
     assert taken(scan) == [[7, *range(15, 21)]], "so far ahead nothing waits"
@@ -164,7 +164,7 @@ def test_each_sample_is_built_once_and_in_order(turns, max_scans):
     for turn, counts in enumerate([*turns, None]):
         for link in (0, 1):
             if counts is None:
-                scan.set_live(link, False)
+                scan.forget(link)
                 continue
             for _ in range(counts[link]):
                 number, stamp_ns = given[link], 1_000_000 * turn + given[link]
@@ -274,7 +274,7 @@ def test_two_cubes_with_one_uid_give_rows_of_one():
     assert rows.cube.tolist() == [0, 1] and rows.frequency[:, 0].tolist() == [1.0, 3.0]
     assert scan.counts.unknown_cube == 3 and scan.rows_waiting() == 0
     assert scan.cubes.learn(1, hello([5, 7])) is None
-    scan.set_live(0, False)
+    scan.forget(0)
     assert scan.cubes.learn(1, hello([5, 7])) == [
         "the hub's cube 1 (uid 0x7) not in the skin file: add it there"
     ]
@@ -295,8 +295,6 @@ def test_a_hub_of_unknown_cubes_is_one_line():
 
 def test_batches_hold_the_first_samples_of_all_links_then_the_second_ones():
     scan = two_links()
-    for link in (0, 1):
-        scan.set_live(link, True)
     for number in range(3):
         for link in (0, 1):
             assert not scan.is_complete(3)

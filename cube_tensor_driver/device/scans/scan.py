@@ -124,22 +124,15 @@ class ScanBuilder:
         # For each link, the host time, in ns, of its newest sample that was built.
         self._built_ns = [0] * n_links
 
-    def set_live(self, link: int, live: bool) -> None:
-        """Set whether a link delivers samples.
+    def forget(self, link: int) -> None:
+        """Note that a link does not deliver samples any more, until its next one is added.
 
         A scan (one sample of each link) waits for the sample of every link that delivers. The cubes
         of a link that delivers nothing may be used from the hub of another link.
-
-        Args:
-            link: Index of the link.
-            live: Whether it delivers samples.
         """
         self._holds_back = False
-        if live:
-            self._live.add(link)
-        else:
-            self._live.discard(link)
-            self.cubes.forget(link)
+        self._live.discard(link)
+        self.cubes.forget(link)
 
     def add(
         self,

@@ -55,4 +55,3 @@ def decode_in_python(code: bytes) -> bytes | None:
 
 
 encode = encode_in_python if wire is None else wire.cobs_encode
-decode = decode_in_python if wire is None else wire.cobs_decode
