@@ -22,7 +22,6 @@ from cube_tensor_driver.ros.launching import (
     FromSkin,
     GivenParameters,
     check_arguments,
-    contacts_file,
     declare_switch,
     declare_text,
     record_skin,
@@ -113,9 +112,7 @@ def generate_launch_description() -> LaunchDescription:
             make_node("reconstruction", skin, UnlessCondition(is_composed)),
             make_node("driver", skin, UnlessCondition(is_composed)),
             make_node("composed", skin, IfCondition(is_composed)),
-            make_node(
-                "contacts", autostart, if_any("contacts"), ParameterFile(FromSkin(contacts_file))
-            ),
+            make_node("contacts", autostart, if_any("contacts")),
             make_node("markers", autostart, if_any("markers", "rviz")),
             OpaqueFunction(function=record_skin, condition=if_any("record")),
             make_state_publisher(),
@@ -141,14 +138,13 @@ def if_any(argument: str, other: str | None = None) -> IfCondition:
     return IfCondition(OrSubstitution(first, second))
 
 
-def make_node(executable: str, parameters: Any, condition: Any, *more: Any) -> Node:
+def make_node(executable: str, parameters: Any, condition: Any) -> Node:
     """Return the launch action that starts a node of this package.
 
     Args:
         executable: Name of the executable.
         parameters: Parameters of the node, as a file or a mapping.
         condition: Condition under which the node starts.
-        more: Further parameters, which override the first ones.
     """
     # A name would be given to both nodes of the process `composed`; they keep their own names.
     name = None if executable == "composed" else executable
@@ -157,7 +153,7 @@ def make_node(executable: str, parameters: Any, condition: Any, *more: Any) -> N
         executable=executable,
         name=name,
         namespace=LaunchConfiguration("namespace"),
-        parameters=[parameters, *more],
+        parameters=[parameters],
         condition=condition,
         output="screen",
         emulate_tty=True,

@@ -13,7 +13,7 @@ import numpy as np
 from cube_tensor_driver.bags.metadata import quality, typestore
 from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.config.calibration import calibration_text
-from cube_tensor_driver.config.skin import read_skin
+from cube_tensor_driver.config.skin import Elastomer, read_skin
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.core.status import STUCK
@@ -37,7 +37,7 @@ def info_of(
     pipeline: Pipeline,
     stamp_ns: int,
     sender: str = "reconstruction",
-    version: int = 3,
+    version: int = 4,
 ) -> object:
     kinds = {cube.calibration.id: cube.calibration for cube in skin.cubes}
     pose = message(
@@ -62,6 +62,7 @@ def info_of(
         )
         for cube, rest in zip(skin.cubes, pipeline.rest_frequency, strict=True)
     ]
+    elastomer = skin.elastomer or Elastomer(np.nan, np.nan, np.nan)
     return message(
         INFO,
         version=version,
@@ -72,6 +73,9 @@ def info_of(
         calibration_ids=list(kinds),
         calibrations=[calibration_text(kind) for kind in kinds.values()],
         covariance=np.zeros(225 * len(kinds)),
+        elastomer_depth=elastomer.depth,
+        elastomer_thickness=elastomer.thickness,
+        elastomer_poisson=elastomer.poisson,
     )
 
 

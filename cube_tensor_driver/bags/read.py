@@ -34,7 +34,7 @@ from .mcap_file import McapReader
 from .metadata import SUFFIXES, BagFiles, Connection, merge_connections, read_metadata, typestore
 from .sqlite_file import SqliteReader
 
-VERSION = 3
+VERSION = 4
 """Version of this package's message definitions that can be read: ``SkinInfo.VERSION``."""
 
 MAX_BATCH_MESSAGES = 128

@@ -21,7 +21,7 @@ from ..core.reconstructor import RecordedHealth
 from ..core.rows import FrequencyRows
 from ..core.tensor import rpy_from_quaternion
 from ..messages.codec import SECOND
-from ..messages.skin_info import cube_calibrations, cube_poses
+from ..messages.skin_info import cube_calibrations, cube_poses, skin_elastomer
 from ..messages.types import INFO
 from .read import Bag
 from .recorded_compensation import CompensationReader
@@ -238,4 +238,12 @@ def recorded_skin(info: Any, calibrations: tuple[Calibration, ...]) -> Skin:
         )
     # A frame id is the prefix of the launch file, and the names of skin and cube.
     frame_prefix = info.cubes[0].frame_id.removesuffix(f"{info.name}_{cubes[0].name}")
-    return Skin(info.name, info.header.frame_id, None, links, tuple(cubes), frame_prefix)
+    return Skin(
+        name=info.name,
+        parent_frame=info.header.frame_id,
+        rate=None,
+        links=links,
+        cubes=tuple(cubes),
+        frame_prefix=frame_prefix,
+        elastomer=skin_elastomer(info),
+    )

@@ -39,10 +39,10 @@ def arguments(parser: Parser) -> None:
     )
     parser.add_argument(
         "--contacts",
-        nargs="+",
+        nargs="*",
         metavar=("METHOD", "KEY:=VALUE"),
-        help="add contacts and traction, as the node contacts makes them with method:=METHOD and "
-        "its other parameters: depth:=0.005 thickness:=0.011 rate:=20",
+        help="add contacts and traction, as the node contacts makes them, with method:=METHOD "
+        "and its other parameters: depth:=0.005 thickness:=0.011 rate:=20",
     )
     parser.add_jobs()
 
@@ -181,7 +181,9 @@ def contacts_of(options: argparse.Namespace) -> ContactsOverTime | None:
         return None
     if options.format != "bag":
         raise ConfigError(f"--contacts with --format {options.format}: only a bag holds contacts")
-    method, *assignments = options.contacts
+    assignments = list(options.contacts)
+    has_method = bool(assignments) and ":=" not in assignments[0]
+    method = assignments.pop(0) if has_method else CONTACT_METHODS[0]
     if method not in CONTACT_METHODS:
         raise ConfigError(f"--contacts {method}: the methods are {', '.join(CONTACT_METHODS)}")
 

@@ -279,9 +279,11 @@ CONTACTS = (
     *SKIN_SUBSCRIBER,
     Parameter(
         "depth",
-        SURFACE_DEPTH,
-        "Depth, in m, of the centres of the cubes below the surface of the skin.",
-        span=(1e-5, 1.0),
+        0.0,
+        "Depth, in m, of the centres of the cubes below the surface of the skin. With 0 it is that "
+        f"of the `elastomer` in the skin file, or else {SURFACE_DEPTH:g}.",
+        span=(0.0, 1.0),
+        minimum=1e-5,
     ),
     Parameter(
         "least",
@@ -294,20 +296,22 @@ CONTACTS = (
         CONTACT_METHODS[0],
         "Method that finds contacts. The method interpolation interpolates the pressure between "
         "the cubes. The method inverse computes the traction (force per area) on the surface from "
-        "the elasticity of the skin, and publishes it on `traction`, too.",
+        "the elasticity of the skin, and publishes it on `traction`, too. The default, auto, is "
+        "inverse if the skin file states the `elastomer`, otherwise interpolation.",
         choices=", ".join(CONTACT_METHODS),
     ),
     Parameter(
         "thickness",
         0.0,
-        "Thickness, in m, of the elastomer on a rigid base, for the method inverse. With 0 the "
-        "elastomer is taken as infinitely thick (a half space).",
+        "Thickness, in m, of the elastomer on a rigid base, for the method inverse. With 0 it is "
+        "that in the skin file, or else infinite (a half space).",
         span=(0.0, 1.0),
     ),
     Parameter(
         "poisson",
-        POISSONS_RATIO,
-        "Poisson's ratio of the elastomer, for the method inverse.",
+        0.0,
+        "Poisson's ratio of the elastomer, for the method inverse. With 0 it is that in the skin "
+        f"file, or else {POISSONS_RATIO:g}.",
         span=(0.0, 0.5),
     ),
     Parameter(

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from ..core.calibration import Calibration
-from ..core.defaults import CONTACT_METHODS, POISSONS_RATIO
+from ..core.defaults import POISSONS_RATIO
 from ..core.errors import ConfigError, CubeError
 from ..core.poses import CubePoses
 from ..core.tensor import rotation_from_rpy
@@ -206,25 +206,6 @@ class Skin:
         """Return the frame id of a cube: the frame prefix, and the names of skin and cube, joined
         by an underscore."""
         return f"{self.frame_prefix}{self.name}_{cube.name}"
-
-
-def contact_parameters(skin: Skin) -> dict[str, str | float]:
-    """Return the parameters of the node `contacts` that follow from a skin file.
-
-    If the file describes the elastomer, the parameter `method` gets the value "inverse": contacts
-    are found by solving for the traction on the surface (linear inverse problem of elasticity).
-    Otherwise no parameter follows, and the node keeps its defaults.
-    """
-    elastomer = skin.elastomer
-    if elastomer is None:
-        return {}
-    return {
-        "method": CONTACT_METHODS[1],
-        "depth": elastomer.depth,
-        # The parameter is 0 for a half space.
-        "thickness": elastomer.thickness if np.isfinite(elastomer.thickness) else 0.0,
-        "poisson": elastomer.poisson,
-    }
 
 
 def read_skin(path: str | Path, frame_prefix: str = "") -> Skin:

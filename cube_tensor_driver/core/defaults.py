@@ -11,11 +11,12 @@ CONTACT_PRESSURE = 300.0
 """Pressure in the plane of the cubes' centres, in Pa, above which a point of the plane counts as
 part of a contact."""
 
-CONTACT_METHODS = ("interpolation", "inverse")
+CONTACT_METHODS = ("auto", "interpolation", "inverse")
 """Names of the methods that find contacts on the skin.
 
 "interpolation" interpolates the pressure between the cubes. "inverse" computes the traction (force
-per area) on the surface of the skin from the elasticity of the layer above the cubes.
+per area) on the surface of the skin from the elasticity of the layer above the cubes. "auto" is
+"inverse" if the skin file states the elastomer, otherwise "interpolation".
 """
 
 YOUNGS_MODULUS = 0.3e6

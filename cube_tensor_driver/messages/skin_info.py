@@ -1,6 +1,6 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Reading of a SkinInfo message: poses and calibrations of the cubes of a skin.
+"""Reading of a SkinInfo message: elastomer of a skin, poses and calibrations of its cubes.
 
 The message may be an object of rclpy or of the bag library.
 """
@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ..config.skin import Elastomer
 from ..config.yaml import parse_yaml
 from ..core.calibration import Calibration
 from ..core.errors import CalibrationError, ConfigError, MessageError
@@ -95,11 +96,22 @@ def _parse_calibration(name: str, text: str) -> Calibration:
     return Calibration.from_dict(parse_yaml(text, f"calibration {name}"))
 
 
+def skin_elastomer(info: Any) -> Elastomer | None:
+    """Return the elastomer around the cubes; None if the skin file does not describe it.
+
+    Args:
+        info: SkinInfo message (depth, thickness and Poisson's ratio of the elastomer).
+    """
+    numbers = (info.elastomer_depth, info.elastomer_thickness, info.elastomer_poisson)
+    return None if np.isnan(numbers).any() else Elastomer(*numbers)
+
+
 def geometry(info: Any) -> list[object]:
     """Return the parts of a SkinInfo message that describe the geometry of the skin.
 
-    They are the coordinate frame and the name, pose and half side of each cube. If they differ from
-    those of an earlier message, results that depend on the geometry must be computed anew.
+    They are the coordinate frame, the elastomer, and the name, pose and half side of each cube. If
+    they differ from those of an earlier message, results that depend on the geometry must be
+    computed anew.
     """
     cubes = [(cube.name, cube.pose, cube.half_side) for cube in info.cubes]
-    return [info.header.frame_id, *cubes]
+    return [info.header.frame_id, skin_elastomer(info), *cubes]

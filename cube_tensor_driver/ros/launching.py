@@ -33,7 +33,7 @@ from ..config.output_files import temporary_folder
 from ..config.package_data import package_data
 from ..config.parameters import DRIVER, RECONSTRUCTION
 from ..config.rviz import rviz_view
-from ..config.skin import Skin, contact_parameters, read_skin
+from ..config.skin import Skin, read_skin
 from ..config.yaml import read_yaml, write_yaml
 from ..core.errors import ConfigError
 from ..device.live import link_configs
@@ -152,17 +152,6 @@ class GivenParameters(Substitution):  # type: ignore[misc]
         path = temporary_folder("cube_parameters_") / "given.yaml"
         write_yaml(path, {"/**": {"ros__parameters": given}})
         return str(path)
-
-
-def contacts_file(skin: Skin) -> str:
-    """Write a temporary file with the parameters of the node `contacts` that follow from a skin.
-
-    Returns:
-        The path of the file.
-    """
-    path = temporary_folder("cube_contacts_") / "contacts.yaml"
-    write_yaml(path, {"/**": {"ros__parameters": contact_parameters(skin)}})
-    return str(path)
 
 
 def rviz_file(skin: Skin) -> str:

@@ -29,7 +29,7 @@ from rclpy.serialization import deserialize_message
 from std_msgs.msg import Header
 
 from ..config.calibration import calibration_text
-from ..config.skin import Skin, SkinCube
+from ..config.skin import Elastomer, Skin, SkinCube
 from ..core.arrays import AnyArray, Array
 from ..core.compensation.motion import UNKNOWN_MOTION, Motion
 from ..core.errors import BagError
@@ -278,10 +278,14 @@ def info_message(
             whose uid is not in the skin file.
         sender: Name of the node that publishes the message: driver or reconstruction.
     """
+    elastomer = skin.elastomer or Elastomer(np.nan, np.nan, np.nan)
     message = SkinInfo(
         version=SkinInfo.VERSION,
         name=skin.name,
         sender=sender,
+        elastomer_depth=elastomer.depth,
+        elastomer_thickness=elastomer.thickness,
+        elastomer_poisson=elastomer.poisson,
     )
     message.header = Header(stamp=to_time(stamp_ns), frame_id=skin.parent_frame)
     rest_frequency = pipeline.rest_frequency

@@ -5,15 +5,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
 from ..config.influence import find_influence
+from ..config.skin import Elastomer
 from ..core.arrays import Array, PadMasks
 from ..core.calibration import Calibration
-from ..core.defaults import CONTACT_METHODS, CONTACT_PRESSURE, POISSONS_RATIO, SURFACE_DEPTH
+from ..core.defaults import CONTACT_METHODS, CONTACT_PRESSURE, SURFACE_DEPTH
 from ..core.pipeline import Pipeline
 from ..core.poses import CubePoses
 from ..mechanics.influence_file import read_influence
@@ -25,9 +26,10 @@ from .slip import NO_CONTACTS, Slip, SlipEstimator
 from .surface import Contact, Surface
 from .tracker.contact_tracker import ContactTracker, TrackedContact
 
-INTERPOLATION, INVERSE = CONTACT_METHODS
-"""Names of the two methods that find contacts: interpolation of the pressure between the cubes, and
-fits of the traction in each contact to the values of the cubes around it."""
+AUTO, INTERPOLATION, INVERSE = CONTACT_METHODS
+"""Names of the methods that find contacts: interpolation of the pressure between the cubes, and
+fits of the traction in each contact to the values of the cubes around it. `AUTO` stands for the
+second if the elastomer is known, otherwise for the first."""
 
 
 @dataclass(frozen=True)
@@ -36,41 +38,51 @@ class ContactSettings:
 
     Attributes:
         method: One of `CONTACT_METHODS`.
-        depth: Distance from the centres of the cubes to the surface, in m.
+        depth: Distance from the centres of the cubes to the surface, in m; 0: as the skin file
+            states, or else `SURFACE_DEPTH`.
         least: Smallest pressure in Pa, at the depth of the cubes, at which a contact is found.
-        thickness: Thickness of the elastomer on rigid ground in m; 0 for a half space. Only the
-            method inverse uses it.
-        poisson: Poisson's ratio of the elastomer. Only the method inverse uses it.
+        thickness: Thickness of the elastomer on rigid ground in m; 0: as the skin file states, or
+            else a half space. Only the method inverse uses it.
+        poisson: Poisson's ratio of the elastomer; 0: as the skin file states, or else
+            `POISSONS_RATIO`. Only the method inverse uses it.
         influence: Name of the file with the influence functions of the pads (influence_file.py),
             whose depth, thickness and Poisson's ratio replace those of these settings. Empty: cubes
             are modelled as points. Only the method inverse uses it.
     """
 
-    method: str = INTERPOLATION
-    depth: float = SURFACE_DEPTH
+    method: str = AUTO
+    depth: float = 0.0
     least: float = CONTACT_PRESSURE
     thickness: float = 0.0
-    poisson: float = POISSONS_RATIO
+    poisson: float = 0.0
     influence: str = ""
 
-    @property
-    def layer(self) -> Layer:
-        """Elastic layer with the thickness and Poisson's ratio of these settings.
+    def for_skin(self, stated: Elastomer | None) -> ContactSettings:
+        """Return these settings with the values of a skin file in place of `AUTO` and zeros.
 
-        Raises:
-            ElasticError: Thickness or Poisson's ratio is out of range.
+        Args:
+            stated: Elastomer of the skin file; None: the file does not describe it.
         """
-        return Layer(self.thickness or np.inf, self.poisson)
+        is_known = stated is not None or self.influence
+        automatic = INVERSE if is_known else INTERPOLATION
+        elastomer = stated or Elastomer(SURFACE_DEPTH, np.inf)
+        return replace(
+            self,
+            method=automatic if self.method == AUTO else self.method,
+            depth=self.depth or elastomer.depth,
+            thickness=self.thickness or elastomer.thickness,
+            poisson=self.poisson or elastomer.poisson,
+        )
 
     def check(self) -> None:
-        """Check the settings.
+        """Check the settings as far as they do not depend on the skin.
 
         Raises:
-            ElasticError: Thickness or Poisson's ratio is out of range, or the depth exceeds the
-                thickness.
+            ElasticError: The depth exceeds the thickness.
             ConfigError: There are no influence functions with this name.
         """
-        self.layer.check_depth(self.depth)
+        if self.depth:
+            Layer(self.thickness or np.inf).check_depth(self.depth)
         if self.influence:
             find_influence(self.influence)
 
@@ -124,19 +136,22 @@ def contact_finder(
     settings: ContactSettings,
     poses: CubePoses,
     calibrations: Sequence[Calibration],
+    elastomer: Elastomer | None = None,
 ) -> ContactFinder:
     """Create the contact finder for one skin. With the method inverse, this takes seconds.
 
     Args:
-        settings: Method and properties of the elastomer.
+        settings: Method and properties of the elastomer that replace those of the skin file.
         poses: Poses of the cubes.
         calibrations: Calibration of each cube.
+        elastomer: Elastomer of the skin file; None: the file does not describe it.
 
     Raises:
         ElasticError: A setting is out of range, no cube observes any component, or the influence
             functions belong to other cubes.
         ConfigError: The influence functions cannot be read.
     """
+    settings = settings.for_skin(elastomer)
     if settings.method == INTERPOLATION:
         return _InterpolationFinder(settings, poses)
     return _InverseFinder(settings, poses, calibrations)
@@ -170,7 +185,7 @@ class _InverseFinder:
         poses: CubePoses,
         calibrations: Sequence[Calibration],
     ) -> None:
-        layer = settings.layer
+        layer = Layer(settings.thickness, settings.poisson)
         depth = settings.depth
         model = None
         if settings.influence:

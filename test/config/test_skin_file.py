@@ -17,7 +17,7 @@ from cube_tensor_driver.calibrate.load_table import read_loads
 from cube_tensor_driver.config.calibration import read_calibration
 from cube_tensor_driver.config.grid import grid
 from cube_tensor_driver.config.package_data import package_data
-from cube_tensor_driver.config.skin import Elastomer, check_skin, contact_parameters, read_skin
+from cube_tensor_driver.config.skin import Elastomer, check_skin, read_skin
 from cube_tensor_driver.config.yaml import parse_yaml, write_yaml
 from cube_tensor_driver.core.errors import ConfigError, FitError
 from cube_tensor_driver.touch.inverse import SurfaceInverse
@@ -82,22 +82,14 @@ def test_pose_and_uid(tmp_path):
 
 
 @pytest.mark.parametrize(("thickness", "expected"), [(0.011, 0.011), (0, np.inf)])
-def test_with_its_elastomer_the_contacts_of_a_skin_are_found_by_the_inverse(
-    tmp_path, thickness, expected
-):
+def test_the_inverse_of_a_skin_takes_its_elastomer(tmp_path, thickness, expected):
     data = copy.deepcopy(GOOD)
     data["elastomer"] = {"depth": 0.005, "thickness": thickness}
     skin = read(tmp_path, data)
     assert skin.elastomer == Elastomer(0.005, expected, 0.48)
-    assert contact_parameters(skin) == {
-        "method": "inverse",
-        "depth": 0.005,
-        "thickness": thickness,
-        "poisson": 0.48,
-    }
     inverse = SurfaceInverse(skin)
     assert (inverse.depth, inverse.kernels.layer.thickness) == (0.005, expected)
-    assert contact_parameters(read(tmp_path, GOOD)) == {}
+    assert read(tmp_path, GOOD).elastomer is None
 
 
 def change(*path, to=None, remove=False):

@@ -79,7 +79,7 @@ def test_info_says_what_the_skin_is():
     pipeline.rest_frequency = rest
     info = info_message(skin, pipeline, START_NS + 7, {0: 0xA0, 1: 0xA1}, "driver")
 
-    assert info.version == info.VERSION == 3 and info.header.frame_id == "wrist"
+    assert info.version == info.VERSION == 4 and info.header.frame_id == "wrist"
     assert info.header.stamp.sec * 10**9 + info.header.stamp.nanosec == START_NS + 7
     assert (info.sender, info.name) == ("driver", "hand")
     assert info.calibration_ids == [PLANAR.id, CUBE.id]
@@ -123,7 +123,7 @@ def test_reprocessed_info_says_what_was_used(tmp_path):
     reprocess(ReprocessJob(bag, tmp_path / "out", "bag", Overrides(skin=skin)))
     with Bag(bag) as recorded, Bag(tmp_path / "out") as made:
         (before,), (after,) = recorded.infos("/info"), made.infos("/info")
-    assert (after.sender, after.name, after.version) == ("reconstruction", skin.name, 3)
+    assert (after.sender, after.name, after.version) == ("reconstruction", skin.name, 4)
     assert after.header == before.header and after.cubes[3].pose == before.cubes[3].pose
     assert list(after.calibration_ids) == [used.id]
     assert Calibration.from_dict(parse_yaml(after.calibrations[0], "info")).id == used.id

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from concurrent.futures import ThreadPoolExecutor, wait
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,12 +21,13 @@ pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 from cube_tensor_driver.bags.read import Bag
 from cube_tensor_driver.bags.reprocess.contacts import ContactsOverTime
 from cube_tensor_driver.bags.reprocess.job import ReprocessJob, reprocess
+from cube_tensor_driver.bags.source import open_bag
 from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.cli.main import main
 from cube_tensor_driver.config.influence import find_influence
 from cube_tensor_driver.config.package_data import package_data
-from cube_tensor_driver.config.skin import Skin, read_skin
-from cube_tensor_driver.core.defaults import FREQUENCY_NOISE, POISSONS_RATIO, SURFACE_DEPTH
+from cube_tensor_driver.config.skin import Elastomer, Skin, read_skin
+from cube_tensor_driver.core.defaults import FREQUENCY_NOISE
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.core.modes import to_matrix
@@ -42,14 +44,16 @@ from cube_tensor_driver.touch.contact_finder import ContactSettings
 FRAME = b"skin_base\0"
 FORCE = np.array([0.5, 0.0, -2.0])
 SCANS = 5
+ELASTOMER = Elastomer(depth=5e-3, thickness=np.inf, poisson=0.46)
+"""Half space whose depth and Poisson's ratio are not the defaults."""
 
 
 def frequencies(skin: Skin, centre: np.ndarray) -> np.ndarray:
     """(cubes, pads) Hz under a ball of 6 mm contact width, by Boussinesq's and Cerruti's forces."""
     places = np.array([cube.xyz for cube in skin.cubes])
-    below = np.column_stack([places[:, :2], np.full(len(places), -SURFACE_DEPTH)])
+    below = np.column_stack([places[:, :2], np.full(len(places), -ELASTOMER.depth)])
     load = contact.hertz(3e-3, FORCE, centre, order=12)
-    stress, slope = contact.field(below, *load, POISSONS_RATIO)
+    stress, slope = contact.field(below, *load, ELASTOMER.poisson)
     calibration = skin.calibrations[0]
     gradient = np.moveaxis(to_matrix(slope.swapaxes(1, 2)), 1, 3)  # (cubes, 3, 3, axis)
     state = calibration.modes.state(to_matrix(stress), calibration.half_side * gradient)
@@ -98,11 +102,11 @@ def points_of(cloud: object) -> np.ndarray:
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        (["guess"], "the methods are interpolation, inverse"),
+        (["guess"], "the methods are auto, interpolation, inverse"),
         (["inverse", "depth=4"], "use NAME:=VALUE with one of rate, depth"),
-        (["inverse", "depth:=deep"], "allowed: 1e-05 to 1"),
+        (["inverse", "depth:=deep"], "allowed: 0, or 1e-05 to 1"),
         (["inverse", "poisson:=0.6"], "allowed: 0 to 0.5"),
-        (["inverse", "thickness:=0.003"], "between 0 and the thickness"),
+        (["depth:=0.004", "thickness:=0.003"], "between 0 and the thickness"),
         (["inverse", "influence:=none"], "one of the shipped: cube_11mm"),
         (["inverse", f"influence:={5000 * 'x'}"], "one of the shipped: cube_11mm"),
         (["inverse", "--format", "csv"], "only a bag holds contacts"),
@@ -180,7 +184,10 @@ def test_a_node_that_cannot_get_ready_says_so_and_tries_again(monkeypatch):
 
 def test_contacts_and_traction_of_a_pressed_skin_live_and_out_of_a_bag(ros, tmp_path):
     """The node is given the stress that reprocessing made of a bag, scan by scan; what it publishes
-    is what reprocessing wrote, but for rounding, which depends on the process."""
+    is what reprocessing wrote, but for rounding, which depends on the process.
+
+    Both take the method and the elastomer from `info`, as do settings that state all of it.
+    """
     pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
     from rclpy.qos import DurabilityPolicy, QoSProfile
     from rclpy.serialization import deserialize_message, serialize_message
@@ -191,17 +198,23 @@ def test_contacts_and_traction_of_a_pressed_skin_live_and_out_of_a_bag(ros, tmp_
     from cube_tensor_driver.processes.skin_processes import Process
     from cube_tensor_driver.ros.messages import info_message
 
-    skin = read_skin(package_data() / "config" / "skin_demo.yaml")
+    skin = replace(read_skin(package_data() / "config" / "skin_demo.yaml"), elastomer=ELASTOMER)
     middle = np.array([cube.xyz for cube in skin.cubes])[:, :2].mean(axis=0)
     described = info_message(skin, Pipeline(skin.calibrations), time.time_ns())
     described.sender = "reconstruction"
     scans = [frequencies(skin, middle + np.array([2e-4 * number, 0])) for number in range(SCANS)]
     bag = bag_of(tmp_path / "bag", skin, serialize_message(described), scans)
-    wanted = ContactsOverTime(ContactSettings("inverse"), rate=50.0)
+    with open_bag(bag) as source:
+        assert source.skin.elastomer == ELASTOMER
     result = tmp_path / "out"
+    wanted = ContactsOverTime(ContactSettings(), rate=50.0)
     reprocess(ReprocessJob(bag, result, "bag", contacts=wanted))
     stress = messages(result, "/stress")
     expected = [messages(result, topic) for topic in ("/contacts", "/traction")]
+    stated = ContactSettings("inverse", depth=ELASTOMER.depth, poisson=ELASTOMER.poisson)
+    wanted = ContactsOverTime(stated, rate=50.0)
+    reprocess(ReprocessJob(bag, tmp_path / "stated", "bag", contacts=wanted))
+    assert messages(tmp_path / "stated", "/contacts") == expected[0]
     assert [len(one) for one in expected] == [SCANS, SCANS] and len(stress) == SCANS
 
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -226,7 +239,7 @@ def test_contacts_and_traction_of_a_pressed_skin_live_and_out_of_a_bag(ros, tmp_
         return abs(contacts[-1].position[0].x - wanted.position[0].x) < 1e-5
 
     with Children(tmp_path) as children:
-        given = {"method": "inverse", "rate": 100.0}
+        given = {"rate": 100.0}
         children.start(
             Process("contacts", "cube_tensor_driver.ros.nodes.contacts", parameters=given)
         )

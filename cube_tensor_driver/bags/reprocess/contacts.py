@@ -13,7 +13,12 @@ from ...core.latest_stress import STALE_S, LatestStress
 from ...core.rows import StressRows
 from ...messages.codec import Decoded
 from ...messages.contacts import contacts_message, traction_message
-from ...messages.skin_info import cube_calibrations, cube_poses, geometry
+from ...messages.skin_info import (
+    cube_calibrations,
+    cube_poses,
+    geometry,
+    skin_elastomer,
+)
 from ...messages.types import CONTACTS, TRACTION
 from ...touch.contact_finder import ContactFinder, ContactSettings, contact_finder
 from ..metadata import quality
@@ -67,9 +72,9 @@ class ContactWriter:
     def set_up(self, info: Any) -> None:
         """Use a SkinInfo message (poses and calibrations of the cubes) for the stress that follows.
 
-        If frame, names, poses and sizes of the cubes are those of the message before, the tracked
-        contacts continue. Otherwise contact estimation begins anew. The ROS node `contacts` does
-        the same.
+        If frame, elastomer, and names, poses and sizes of the cubes are those of the message
+        before, the tracked contacts continue. Otherwise contact estimation begins anew. The ROS
+        node `contacts` does the same.
 
         Raises:
             CubeError: Contacts cannot be computed on a skin with these cubes.
@@ -80,6 +85,7 @@ class ContactWriter:
             self._wanted.settings,
             cube_poses(info),
             cube_calibrations(info),
+            skin_elastomer(info),
         )
         self._latest = LatestStress(len(info.cubes))
         self._geometry, self._frame_id = geometry(info), info.header.frame_id

@@ -16,14 +16,9 @@ from sensor_msgs.msg import PointCloud2
 from ...config.parameters import CONTACTS
 from ...core.arrays import Index
 from ...messages.contacts import contacts_message, traction_message
-from ...messages.skin_info import cube_calibrations
+from ...messages.skin_info import cube_calibrations, skin_elastomer
 from ...msg import SkinContacts
-from ...touch.contact_finder import (
-    INVERSE,
-    ContactFinder,
-    ContactSettings,
-    contact_finder,
-)
+from ...touch.contact_finder import ContactFinder, ContactSettings, contact_finder
 from ..diagnostics.updater import Diagnostics, make_status
 from ..messages import make_message
 from ..node import run
@@ -55,9 +50,7 @@ class Contacts(SkinSubscriberNode):
         self._updater = Diagnostics(self, self._statuses, lambda: self.callback_errors.count)
 
     def configure(self) -> None:
-        self._traction = None
-        if self.value("method") == INVERSE:
-            self._traction = self.own(self.create_lifecycle_publisher(PointCloud2, "traction", 2))
+        self._traction = self.own(self.create_lifecycle_publisher(PointCloud2, "traction", 2))
         super().configure()
 
     def has_listeners(self, publisher: Any) -> bool:
@@ -67,10 +60,15 @@ class Contacts(SkinSubscriberNode):
         # Each field of ContactSettings has a parameter of the same name.
         names = [field.name for field in fields(ContactSettings)]
         settings = ContactSettings(**{name: self.value(name) for name in names})
-        calibrations = cube_calibrations(skin.info)
         self._processed_messages = 0
         self._finder = None
-        self._set_up = partial(contact_finder, settings, skin.poses, calibrations)
+        self._set_up = partial(
+            contact_finder,
+            settings,
+            skin.poses,
+            cube_calibrations(skin.info),
+            skin_elastomer(skin.info),
+        )
         self._future_finder = self._worker.submit(self._set_up)
 
     def compute_message(self, skin: FollowedSkin, health: Index) -> SkinContacts | None:
@@ -82,7 +80,7 @@ class Contacts(SkinSubscriberNode):
         values, frame_id = skin.newest.usable_values(health), skin.info.header.frame_id
         finder.update(1e-9 * skin.stamp_ns, values, skin.newest.left_out)
         # Computing the point cloud takes time, so it is done only while somebody subscribes.
-        if self._traction is not None and self._has_traction_listeners():
+        if self._has_traction_listeners():
             cloud = finder.cloud(values)
             if cloud is not None:
                 message = traction_message(
@@ -135,7 +133,7 @@ class Contacts(SkinSubscriberNode):
         return [make_status("contact finder", "", DiagnosticStatus.ERROR, text, {})]
 
     def _has_traction_listeners(self) -> bool:
-        return self._traction is not None and self._traction.get_subscription_count() > 0
+        return bool(self._traction.get_subscription_count())
 
 
 def main() -> None:
