@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..config.skin import Skin, as_skin
 from ..core.arguments import check_number
@@ -177,7 +176,7 @@ class Touch:
 
         # The largest value of the neighbours is found faster if they are the first axis.
         self._near = near.T.copy()
-        # Slow part of the values, NaN where unknown, and difference of the values from it, 0 there
+        # Slow part of the values, and difference of the values from it; NaN where unknown
         self._slow = np.full(variance.shape, np.nan)
         self._change = np.zeros(variance.shape)
         self._left_out = np.zeros(n, np.uint32)
@@ -207,30 +206,33 @@ class Touch:
         Returns:
             The touches of each scan, the same in one call and in one call for each scan.
         """
-        is_first = np.diff(rows.cube.astype(int), prepend=len(self._sum)) <= 0
-        bounds = [*np.flatnonzero(is_first).tolist(), len(rows)]
+        ends = np.flatnonzero(rows.cube[1:] <= rows.cube[:-1]) + 1
+        bounds = sorted({0, *ends.tolist(), len(rows)})
         return [self._update_scan(rows.select(slice(*pair))) for pair in pairwise(bounds)]
 
     __call__ = update
 
     def _update_scan(self, rows: StressRows) -> Touches:
-        cube = rows.cube
+        # A scan of all cubes is the usual case, in which parts of arrays need no copies.
+        is_complete = len(rows) == len(self._sum)
+        cube = slice(None) if is_complete else rows.cube.astype(np.intp)
         changed = rows.left_out != self._left_out[cube]
         if changed.any():
-            self._use_pads(cube[changed], rows.left_out[changed])
+            self._use_pads(rows.cube[changed], rows.left_out[changed])
 
         elapsed_ns = rows.stamp_ns - self._stamp_ns[cube]
-        elapsed_s = 1e-9 * elapsed_ns
-        elapsed_s = np.clip(elapsed_s, 0, TIME_CONSTANT_S)
+        elapsed_s = (1e-9 * elapsed_ns).clip(0, TIME_CONSTANT_S)
         self._stamp_ns[cube] = rows.stamp_ns
 
-        values = np.hstack([rows.stress, rows.gradient])
-        values = values.astype(np.float64)
+        values = np.concatenate((rows.stress, rows.gradient), axis=1, dtype=np.float64)
         slow = self._slow[cube]
-        # Where a slow part starts again, a load that is there stays.
-        slow = np.where(np.isnan(slow), values - self._change[cube], slow)
+        is_unknown = np.isnan(slow)
+        if is_unknown.any():
+            # Where a slow part starts again, a load that is there stays.
+            load = np.nan_to_num(self._change[cube])
+            slow = np.where(is_unknown, values - load, slow)
         change = values - slow
-        self._change[cube] = np.where(np.isnan(change), 0, change)
+        self._change[cube] = change
 
         pressure = -change[:, PRESSURE]
         self._test(cube, pressure, elapsed_s)
@@ -262,7 +264,7 @@ class Touch:
 
     def _gain(
         self,
-        cube: NDArray[np.uint16],
+        cube: Index | slice,
         pressure: Array,
         elapsed_s: Array,
     ) -> Array:
@@ -272,7 +274,7 @@ class Touch:
         """
         if not self._touched.any():
             has_gone = pressure < -MIN_RELEASE * self._deviation[cube]
-            self._count[cube[has_gone]] = 0
+            self._count[cube] *= ~has_gone
         # The first samples are averaged.
         mean_gain = 1 / (self._count[cube] + 1)
         gain = np.maximum(elapsed_s / TIME_CONSTANT_S, mean_gain)
@@ -281,32 +283,33 @@ class Touch:
 
     def _test(
         self,
-        cube: NDArray[np.uint16],
+        cube: Index | slice,
         pressure: Array,
         elapsed_s: Array,
     ) -> None:
         """Add the pressures of k cubes to their sums.
 
         Args:
-            cube: Indices (k,) of the cubes.
+            cube: Indices (k,) of the cubes; `slice(None)` if these are all cubes.
             pressure: Pressures (k,) without their slow part, in Pa, NaN where unknown.
             elapsed_s: Time (k,) since the row before, in s, up to `TIME_CONSTANT_S`.
         """
-        # While the slow part is held, drift and what remains of the load must not count as touch.
         margin = self._margin[cube]
-        remainder = REMAINDER * np.abs(pressure)
-        growing = np.fmax(margin, remainder) + MAX_DRIFT * elapsed_s
-        fading = (1 - elapsed_s / TIME_CONSTANT_S) * margin
-        margin = np.where(self._held[cube], growing, fading)
-        self._margin[cube] = margin
+        if self._held.any() or margin.any():
+            # While the slow part is held, drift and what remains of the load must not count as
+            # touch.
+            remainder = REMAINDER * np.abs(pressure)
+            growing = np.fmax(margin, remainder) + MAX_DRIFT * elapsed_s
+            fading = (1 - elapsed_s / TIME_CONSTANT_S) * margin
+            margin = np.where(self._held[cube], growing, fading)
+            self._margin[cube] = margin
 
         before = self._sum[cube]
         # A pressure that drifts steadily is ahead of its slow part by one time constant.
         excess = pressure - margin - MAX_DRIFT * TIME_CONSTANT_S
         score = excess / self._deviation[cube]
         # The upper limit makes a touch end within a few scans after any load.
-        after = np.maximum(before + score - REFERENCE, 0)
-        after = np.minimum(after, self.limit + REFERENCE)
+        after = (before + score - REFERENCE).clip(0, self.limit + REFERENCE)
         after = np.where(self._count[cube] < SETTLING_ROWS, before, after)
         self._sum[cube] = np.where(np.isnan(pressure), 0, after)
 
@@ -372,7 +375,7 @@ class Touch:
         near = self._near[:, cube].T
         kind = estimate.kind[cube]
         n_values = near.shape[1] * len(COMPONENTS)
-        values = self._change[near].reshape(len(cube), n_values, 1)
+        values = np.nan_to_num(self._change[near]).reshape(len(cube), n_values, 1)
         terms = values * estimate.weights[kind]
         force = terms.sum(axis=1)
         square = force**2
