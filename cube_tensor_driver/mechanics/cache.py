@@ -35,6 +35,7 @@ _CODE = (
     "mechanics/layer.py",
     "mechanics/circular.py",
     "mechanics/spectra.py",
+    "mechanics/sensitivity.py",
     "mechanics/kernels.py",
     "mechanics/load_response.py",
     "mechanics/contact_tables.py",

@@ -232,17 +232,19 @@ def wavenumber_quadrature(depth: float) -> tuple[Array, Array]:
     return k, weights * half_range * k / (2 * np.pi)
 
 
-def layer_spectra(layer: Layer, depth: float) -> Spectra:
+def layer_spectra(layer: Layer, depth: float, waves_of: float | None = None) -> Spectra:
     """Return the spectra of the circular components of `FIELD` at a point in a layer.
 
     Args:
         layer: Elastic layer.
         depth: Distance from the point to the surface, in m.
+        waves_of: Depth in m whose wavenumbers are used, so that the spectra at two depths can be
+            subtracted; None: those of `depth`.
 
     Raises:
         ElasticError: The layer does not contain this depth.
     """
-    k, weight = wavenumber_quadrature(depth)
+    k, weight = wavenumber_quadrature(waves_of or depth)
     along_x = layer.transfer(k, np.zeros_like(k), depth)
     circular = np.einsum("cf,kfi->kci", CIRCULAR_FROM_FIELD, along_x)
 

@@ -94,6 +94,17 @@ def test_stated_deviations_are_those_of_the_errors(cubes):
     assert 0.7 < below < 1.4 and 0.3 < surface < 1.4
 
 
+@pytest.mark.parametrize("shape", ["ball", "flat punch"])
+@pytest.mark.parametrize("wrong", [{"poisson": 0.46}, {"depth_error": 0.15e-3}])
+def test_wrong_data_of_the_elastomer_are_found_or_stated(wrong, shape):
+    """Taken for right, they cost 3 % of the force, eleven stated deviations, or five of the place.
+    A ball is a Hertz contact, a wide punch is not. Six loads leave 0.6 to 1.5 open."""
+    errors = TractionBench(Setting(shape=shape, **wrong), side=2).errors(15e-3, cases=6)
+    force, place = errors.ratio[1]
+    assert 0.4 < force < 2 and 0.4 < place < 2
+    assert errors.force[1] < 0.003 and errors.position[1] < 0.1e-3
+
+
 @pytest.mark.parametrize("cubes", CUBES[:2])
 def test_between_wide_pitches_the_field_is_that_of_the_fitted_ball(cubes):
     """The linear inverse alone is off by a quarter and more. Eight loads leave 0.65 to 1.35 of the
@@ -376,7 +387,7 @@ def test_beyond_the_outermost_cubes_the_stated_deviation_grows(shape, limit, out
         assert abs(found.normal_force - 3) < min(4 * found.force_uncertainty, 3 * limit)
         assert np.linalg.norm(found.position[:2] - [x, 2e-3]) < 0.3e-3
         stated.append(found.force_uncertainty)
-    assert stated[1] > 1.3 * stated[0]
+    assert stated[1] > 1.2 * stated[0]
 
 
 def test_what_a_scan_has_no_time_for_is_done_in_the_next_ones(monkeypatch):

@@ -113,7 +113,8 @@ class HertzFit:
         self._flatness = self._moments = np.zeros(len(starts.forces))
         deviations = [FORCE_DEVIATION] * 3 + [depth] * 2 + [SIZE_DEVIATION, 1.0]
         deviations.append(FORCE_DEVIATION * depth)
-        self._precision = np.tile(np.array(deviations) ** -2, len(starts.forces))
+        self._contact_precision = np.tile(np.array(deviations) ** -2, len(starts.forces))
+        self._elastomer = np.zeros(0)
 
     @property
     def is_moving(self) -> bool:
@@ -151,7 +152,7 @@ class HertzFit:
         change[:, 5] = self.found.log_sizes - self._at.log_sizes
         change[:, 6] = self._flatness
         change[:, 7] = self._moments
-        return np.asarray(self._explained + self._columns @ change.ravel())
+        return np.asarray(self._explained + self._columns @ np.append(change, self._elastomer))
 
     def predict(self, is_moving: bool) -> None:
         """Begin a new scan (set of values of all cubes).
@@ -191,7 +192,7 @@ class HertzFit:
         self.values = values
         self.last_step = np.inf
 
-    def linearise(self, slopes: Array) -> None:
+    def linearise(self, slopes: Array, sensitivity: Array) -> None:
         """Store the values of the cubes under the contacts `found`, and how these values change.
 
         The results (`jacobian`, `covariance`) serve the next Gauss-Newton step.
@@ -203,6 +204,8 @@ class HertzFit:
                 by x and y of the contact's centre (Pa/m), and the first and second derivative by
                 the logarithm of its radius (Pa). Set 7 is that under a moment of 1 N m about z, in
                 Pa/(N m).
+            sensitivity: Changes (n, S, C) in Pa of the values under the contacts by one standard
+                deviation of each of S quantities of the elastomer (sensitivity.py).
         """
         self._at = self.found
         distance = np.linalg.norm(self.values.place[:, None] - self._at.centres, axis=2)
@@ -213,6 +216,10 @@ class HertzFit:
         columns[:, :, 6] = FLATNESS_STEP**2 * (columns[:, :, 5] - columns[:, :, 6] / 2)
         whitening = self.values.whitening
         by_cube = columns.transpose(1, 3, 0, 2).reshape(*explained.shape, -1)
+        by_cube = np.concatenate([by_cube, sensitivity.swapaxes(1, 2)], axis=2)
+        # In units of their standard deviations, the errors of these quantities have precision 1.
+        precision = np.append(self._contact_precision, np.ones(sensitivity.shape[1]))
+        self._precision = precision
         self._explained, self._columns = explained, by_cube
         self.jacobian = (whitening @ by_cube).reshape(-1, by_cube.shape[2])
         self._model = (whitening @ explained[:, :, None]).ravel()
@@ -234,7 +241,7 @@ class HertzFit:
         deviation = np.zeros((len(at.forces), _N_PARAMETERS))
         deviation[:, :3] = at.forces
         deviation[:, 5] = at.log_sizes - np.log(USUAL_SIZE * self._depth)
-        flat = deviation.ravel()
+        flat = np.append(deviation, 0 * self._precision[deviation.size :])
         right = self.jacobian.T @ residual - self._precision * flat
         change = self.covariance @ right
         penalty = flat @ (self._precision * flat)
@@ -248,7 +255,8 @@ class HertzFit:
         self.score = chi_squared / self.misfit + known * np.log(self.misfit)
         self.score += self._log_determinant
 
-        change = change.reshape(-1, _N_PARAMETERS)
+        self._elastomer = change[deviation.size :]
+        change = change[: deviation.size].reshape(-1, _N_PARAMETERS)
         limit = _MAX_STEP * self._depth
         shift = np.clip(change[:, 3:5], -limit, limit)
         growth = np.clip(change[:, 5], -_MAX_STEP, _MAX_STEP)
@@ -349,5 +357,17 @@ def linearise(inverse: SurfaceInverse, fits: Sequence[HertzFit]) -> None:
         np.concatenate(forces),
     )[:, :, inverse.columns]
     ends = np.cumsum([len(one) for one in angles])
-    for fit, own in zip(fits, np.split(slopes, ends[:-1]), strict=True):
-        fit.linearise(own.reshape(len(fit.found.forces), -1, *own.shape[1:]))
+    sensitivity = inverse.kernels.sensitivity(
+        np.concatenate(offsets),
+        np.concatenate(angles),
+        np.concatenate(sizes),
+        np.concatenate(forces),
+    )[:, :, inverse.columns]
+    for fit, own, changes in zip(
+        fits, np.split(slopes, ends[:-1]), np.split(sensitivity, ends[:-1]), strict=True
+    ):
+        count = len(fit.found.forces)
+        fit.linearise(
+            own.reshape(count, -1, *own.shape[1:]),
+            changes.reshape(count, -1, *changes.shape[1:]).sum(axis=0),
+        )

@@ -204,6 +204,29 @@ class LocalValues:
         values = values.reshape(*self.known.shape, -1)
         return values, (self.whitening @ values).reshape(-1, 3 * count)
 
+    def sensitivity(self, centres: Array, size: float, forces: Array) -> Array:
+        """Compute how the values change by errors of the elastomer's data (sensitivity.py).
+
+        Args:
+            centres: Centres (K, 2) of Hertz contacts in m, in the frame of the home cube.
+            size: Radius of the contacts in m.
+            forces: Forces (3, K) of the contacts in N.
+
+        Returns:
+            Changes (n, C, S) in Pa of the C components of n cubes by one standard deviation of each
+            of S quantities.
+        """
+        n, count = len(self.cubes), len(centres)
+        inverse = self._inverse
+        changes = inverse.kernels.sensitivity(
+            (self.place[:, None] - centres).reshape(-1, 2),
+            np.repeat(self.angle, count),
+            np.full(n * count, size),
+            np.tile(forces.T, (n, 1)),
+        )[:, :, inverse.columns]
+        by_contact = changes.reshape(n, count, *changes.shape[1:])
+        return np.asarray(by_contact.sum(axis=1).swapaxes(1, 2), float)
+
 
 def unroll_points(inverse: SurfaceInverse, home: int, points: Index) -> Array:
     """Return the positions (n, 2) in m of surface points on the skin laid flat around a cube.

@@ -151,6 +151,10 @@ class NodeFit:
         self._white_response = white.reshape(len(white), 3, -1)
         self._peak_width = _PEAK_WIDTH * inverse.depth
         self.is_sharp = False
+        # Errors of the elastomer's data in standard deviations, and changes (n, C, S) by one each.
+        self._errors = np.zeros(0)
+        self._changes = np.zeros((*values.known.shape, 1))
+        self._white_changes = np.zeros((len(white), 1))
         self._decomposition = self._decompose(np.ones(len(self.places)))
 
     def step(self, white: Array) -> None:
@@ -161,22 +165,48 @@ class NodeFit:
                 transformed by `LocalValues.whiten` so that their noise has variance 1.
         """
         design, eigenvalues, vectors, basis = self._decomposition
-        projected = vectors.T @ (design.T @ white)
+        # The columns are the values, then their changes by errors of depth, Poisson's ratio, ...
+        columns = np.column_stack([white, self._white_changes])
+        projected = vectors.T @ (design.T @ columns)
         ratio = _SCALES[:, None] ** 2
-        explained = (ratio * projected**2 / (1 + ratio * eigenvalues)).sum(axis=1)
-        chi_squared = np.maximum(white @ white - explained, 0)
+        shares = ratio / (1 + ratio * eigenvalues)
+        # Products of the columns with W = (1 + s^2 B K B')^-1 between them, for every scale s.
+        products = columns.T @ columns - np.einsum("se,ea,eb->sab", shares, projected, projected)
+        # All errors but that of the depth are estimated together with the forces.
+        information = products[:, 2:, 2:] + np.eye(columns.shape[1] - 2)
+        right = products[:, 2:, :2]
+        errors = np.linalg.solve(information, right)
+        explained = (errors[:, :, 0] * right[:, :, 0]).sum(axis=1)
+        chi_squared = np.maximum(products[:, 0, 0] - explained, 0)
         count = self.values.count
         misfit = np.maximum(chi_squared / count, 1.0)
-        scores = np.log1p(ratio * eigenvalues).sum(axis=1)
+        scores = np.log1p(ratio * eigenvalues).sum(axis=1) + np.linalg.slogdet(information)[1]
         scores += chi_squared / misfit + count * np.log(misfit)
 
         best = int(np.argmin(scores))
         self._scale = float(_SCALES[best])
         self.misfit = float(misfit[best])
+        self._errors = errors[best, :, 0]
         gain = 1 / (eigenvalues + self._scale**-2)
-        forces = (basis @ (gain * projected)).reshape(3, -1)
-        root = (basis * np.sqrt(gain * self.misfit)).reshape(3, -1, len(gain))
-        self.posterior = Posterior(forces, root, float(scores[best]))
+        means = basis @ (gain[:, None] * projected)
+        forces, by_depth = (means[:, :2] - means[:, 2:] @ errors[best]).T
+        # Square root of the covariance: for known data of the elastomer, then one column for each
+        # error of these data.
+        root_errors = np.linalg.inv(np.linalg.cholesky(information[best])).T
+        parts = [basis * np.sqrt(gain), means[:, 2:] @ root_errors, by_depth[:, None]]
+        root = np.sqrt(self.misfit) * np.hstack(parts)
+        self.posterior = Posterior(
+            forces.reshape(3, -1), root.reshape(3, len(self.places), -1), float(scores[best])
+        )
+
+    def update_sensitivity(self) -> None:
+        """Compute how the values change by errors of the elastomer's data, for the present forces.
+
+        It is in use from the next `step` on.
+        """
+        self._changes = self.values.sensitivity(self.places, self.size, self.posterior.forces)
+        white = self.values.whitening @ self._changes
+        self._white_changes = white.reshape(-1, white.shape[2])
 
     def sharpen(self, white: Array) -> None:
         """Fit again with a prior that allows less force where the present fit finds little force.
@@ -187,14 +217,16 @@ class NodeFit:
         Args:
             white: Values (n C,), divided by their noise: C components of each of n cubes.
         """
-        before = self.posterior, self.misfit, self._scale, self._decomposition
+        self.update_sensitivity()
+        self.step(white)
+        before = self.posterior, self.misfit, self._errors, self._scale, self._decomposition
         square = self.posterior.forces[2] ** 2 + (self.posterior.root[2] ** 2).sum(axis=1)
         smoothing = np.exp(-self._squares / (2 * self.spacing**2))
         envelope = np.sqrt(smoothing @ square / smoothing.sum(axis=1))
         self._decomposition = self._decompose(np.maximum(envelope / envelope.max(), ENVELOPE_FLOOR))
         self.step(white)
         if self.posterior.score > before[0].score - MIN_SCORE_GAIN:
-            self.posterior, self.misfit, self._scale, self._decomposition = before
+            self.posterior, self.misfit, self._errors, self._scale, self._decomposition = before
             self.is_sharp = True
         self.label_peaks()
 
@@ -209,7 +241,8 @@ class NodeFit:
     @property
     def explained(self) -> Array:
         """Values (n, C) in Pa of the cubes around the region under the traction on the nodes."""
-        return np.asarray(self.response @ self.posterior.forces.ravel())
+        explained = self.response @ self.posterior.forces.ravel()
+        return np.asarray(explained + self._changes[:, :, 1:] @ self._errors)
 
     @property
     def discs(self) -> Discs:

@@ -387,7 +387,10 @@ class TrackedRegion:
         self.others, values.disturbance = respond_to_others(values.cubes)
         values.refresh()
         fit = NodeFit(inverse, self.points, values)
-        fit.step(values.whiten(scaled, self.others))
+        white = values.whiten(scaled, self.others)
+        fit.step(white)
+        fit.update_sensitivity()
+        fit.step(white)
         fit.label_peaks()
         self._is_hertz_due = True
         self._accept(fit)
