@@ -1,19 +1,25 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""ROS clients of the page: calls of services, and control of a replay."""
+"""What the page controls: services of the nodes, a replay, and the recording of a bag."""
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from rclpy.client import Client
 from rclpy.node import Node
 
+from ..core.errors import ConfigError
 from ..core.latest_stress import STALE_S
 from ..msg import ReplayState
+from ..processes.children import end_with_parent
 from ..srv import SteerReplay
 from .markup import NoteColour
 
@@ -24,6 +30,12 @@ MAX_ANSWER_S = 10.0
 """Maximum time, in seconds, from the call of a service to its answer.
 
 After this time the call is cancelled and the user is told so.
+"""
+
+MAX_END_S = 10.0
+"""Maximum time, in seconds, from SIGINT until the process that records must have finished its file.
+
+A process that takes longer is killed.
 """
 
 
@@ -210,3 +222,72 @@ class ReplayClient:
 
     def _receive(self, state: ReplayState) -> None:
         self.state, self._received_s = state, time.monotonic()
+
+
+class BagRecorder:
+    """Runs `./cube record` as a child process, at most one at a time, each into a new folder.
+
+    Attributes:
+        path: Folder of the bag that was begun last; before the first one, the folder for all bags.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Set the parent folder of all bags; `start` makes it if it does not exist."""
+        self._folder = folder
+        self.path = folder
+        self._process: subprocess.Popen[bytes] | None = None
+
+    @property
+    def recording(self) -> bool:
+        """Whether the child process that records has been started and not yet been ended."""
+        return self._process is not None
+
+    def start(self) -> None:
+        """Start to record into a new folder whose name contains the local time.
+
+        Raises:
+            ConfigError: The parent folder of the bags does not exist and cannot be made.
+        """
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigError(
+                f"{self._folder}: {error.strerror}; name another folder with --recordings"
+            ) from None
+        self.path = self._folder / time.strftime("skin_%Y%m%d_%H%M%S")
+        record = ["-m", "cube_tensor_driver.cli", "record", "-o", str(self.path)]
+        self._process = subprocess.Popen(
+            [*end_with_parent(), sys.executable, *record],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            # Ctrl-C in the terminal reaches every process of its session. In a session of its own,
+            # the recorder does not get it and can finish its file when `end` asks for that.
+            start_new_session=True,
+        )
+
+    def end(self) -> None:
+        """Ask the recorder to finish its bag, and wait up to `MAX_END_S` for it.
+
+        Without a recording nothing happens.
+        """
+        if self._process is None:
+            return
+        self._process.send_signal(signal.SIGINT)
+        try:
+            self._process.wait(MAX_END_S)
+        except subprocess.TimeoutExpired:
+            # ./cube bag repair can make the unfinished bag readable.
+            self._process.kill()
+            self._process.wait()
+        self._process = None
+
+    def ended_by_itself(self) -> int | None:
+        """Check whether the recorder has ended although `end` was not called.
+
+        Returns:
+            Its exit code, in the first call after it has ended; otherwise None.
+        """
+        code = None if self._process is None else self._process.poll()
+        if code is not None:
+            self._process = None
+        return code

@@ -46,9 +46,8 @@ from ..ros.session import start_ros
 from ..ros.skin_subscriber import FollowedSkin, SkinSubscriber
 from ..srv import Tare
 from . import markup
-from .bag_recorder import BagRecorder
 from .charts import HISTORY_S
-from .clients import ReplayClient, ServiceCalls
+from .clients import BagRecorder, ReplayClient, ServiceCalls
 from .gate import LOCAL_HOSTS, check_host, guarded_server
 from .history import History
 from .markup import PageStatus

@@ -28,8 +28,7 @@ class Usage:
             children: The child processes.
             names: Names of the child processes to measure, such as "driver".
         """
-        pids = {name: children.pid(name) for name in names}
-        self._processes = {name: psutil.Process(pid) for name, pid in pids.items()}
+        self._processes = {name: psutil.Process(children.pid(name)) for name in names}
         self._start_s = time.monotonic()
         self._start_cpu_s = self._cpu_seconds()
 
@@ -50,13 +49,9 @@ class Usage:
 
     def threads(self) -> dict[str, int]:
         """Return the number of threads of each process."""
-        processes = self._processes.items()
-        return {name: process.num_threads() for name, process in processes}
+        return {name: process.num_threads() for name, process in self._processes.items()}
 
     def _cpu_seconds(self) -> dict[str, float]:
         # System time counts as well, because messages are sent and received in the kernel.
-        seconds = {}
-        for name, process in self._processes.items():
-            times = process.cpu_times()
-            seconds[name] = float(times.user + times.system)
-        return seconds
+        times = {name: process.cpu_times() for name, process in self._processes.items()}
+        return {name: time.user + time.system for name, time in times.items()}

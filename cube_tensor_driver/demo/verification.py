@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..config.skin import Skin
-from ..core.arrays import AnyArray, Array, Index, Mask
+from ..core.arrays import Array, Index
 from ..core.matching import NO_MATCH, SampleKeys
 from ..core.rows import FrequencyRows, StressRows
 from ..simulation.cubes import hub_cubes
@@ -58,14 +58,6 @@ class Arrivals:
         no_rows = np.empty((4, 0), np.int64)
         self._parts: list[Index] = [no_rows]
 
-    def keeps(self, cube: AnyArray) -> Mask:
-        """Return whether the rows of each of the given cubes are stored (N,).
-
-        Args:
-            cube: (N,) indices of cubes in the skin.
-        """
-        return np.asarray(self.row_count[cube] > 0)
-
     def add(self, rows: FrequencyRows | StressRows, received_ns: int = 0) -> None:
         """Add the rows of one message.
 
@@ -78,18 +70,12 @@ class Arrivals:
         self.rows += len(rows)
         cube, sequence, stamp_ns = rows.cube, rows.sequence, rows.stamp_ns
         if not self._keeps_all:
-            kept = self.keeps(cube)
-            cube = cube[kept]
-            sequence = sequence[kept]
-            stamp_ns = stamp_ns[kept]
+            kept = self.row_count[cube] > 0
+            cube, sequence, stamp_ns = cube[kept], sequence[kept], stamp_ns[kept]
         # The columns are copied, because the rows may be views of a message whose memory is reused
         # for the next message.
-        part = np.empty((4, len(cube)), np.int64)
-        part[0] = cube
-        part[1] = sequence
-        part[2] = stamp_ns
-        part[3] = received_ns
-        self._parts.append(part)
+        received = np.full(len(cube), received_ns)
+        self._parts.append(np.array([cube, sequence, stamp_ns, received], np.int64))
 
     def columns(self) -> Index:
         """Return four columns (4, N) of the stored rows, in the order of their arrival.

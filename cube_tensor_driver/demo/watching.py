@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from diagnostic_msgs.msg import DiagnosticArray
 
-from ..config.load_script import read_script
 from ..config.output_files import to_json, write_json
 from ..config.skin import Skin, read_skin
 from ..core.errors import CubeError, MessageError
@@ -25,7 +24,7 @@ from ..ros.commands.services import ANNOUNCE_S
 from ..ros.qos import batch_profile
 from ..ros.session import domain_text, node_session, spin_until
 from ..simulation.imperfections import read_imperfections
-from ..simulation.load import AnyLoad, Load, default_script
+from ..simulation.load import AnyLoad, read_load
 from ..views.terminal.live_table import LiveTable
 from .running import Interrupted, Observer, end_simulator, observing
 
@@ -137,7 +136,7 @@ def watch(
     if settings.imperfections is not None:
         # The simulator reads the file, too, but would write an error only into its own log.
         read_imperfections(settings.imperfections)
-    load = make_load(skin, settings)
+    load = read_load(skin, settings.load, settings.mujoco)
     verification = None
     if settings.duration is not None:
         from .load_verification import LoadVerification
@@ -188,21 +187,6 @@ def other_skin_error() -> CubeError:
         f"another skin publishes stress in {domain_text()}: "
         "end it, or set another ROS_DOMAIN_ID for this one"
     )
-
-
-def make_load(skin: Skin, settings: DemoSettings) -> AnyLoad:
-    """Return the load on the skin, as the simulator computes it.
-
-    Raises:
-        ConfigError: The load script or the MuJoCo scene cannot be used with this skin.
-    """
-    if settings.mujoco is not None:
-        from ..simulation.mujoco.scene import MujocoLoad
-
-        return MujocoLoad(settings.mujoco, skin)
-    if settings.load is not None:
-        return Load(skin, read_script(settings.load))
-    return Load(skin, default_script())
 
 
 class SkinWatcher:

@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import lru_cache
+from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -112,6 +113,25 @@ class AnyLoad(Fields, Protocol):
         Args:
             seconds: Simulated time in s.
         """
+
+
+def read_load(skin: Skin, script: Path | None, scene: Path | None = None) -> AnyLoad:
+    """Read the load on a skin.
+
+    Args:
+        skin: The skin.
+        script: Load script; None: the one in the package.
+        scene: MuJoCo scene whose bodies touch the skin, instead of a script.
+
+    Raises:
+        ConfigError: The script or the scene cannot be used with this skin.
+    """
+    if scene is not None:
+        # MuJoCo is optional, and importing it takes long.
+        from .mujoco.scene import MujocoLoad
+
+        return MujocoLoad(scene, skin)
+    return Load(skin, default_script() if script is None else read_script(script))
 
 
 class Load:

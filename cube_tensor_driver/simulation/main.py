@@ -13,13 +13,12 @@ import signal
 import sys
 from pathlib import Path
 
-from ..config.load_script import read_script
-from ..config.skin import Skin, read_skin
+from ..config.skin import read_skin
 from ..config.yaml import read_yaml
 from ..core.errors import CubeError
 from .faults import parse_faults
 from .imperfections import read_imperfections
-from .load import AnyLoad, Load, default_script
+from .load import read_load
 from .simulator import Simulator, StopRequest
 
 
@@ -126,7 +125,7 @@ def _create_simulator(
     if options.faults:
         faults = parse_faults(read_yaml(options.faults), str(options.faults))
     skin = read_skin(options.config)
-    load = _read_load(skin, options)
+    load = read_load(skin, options.load, options.mujoco)
     imperfections = None
     if options.imperfections:
         imperfections = read_imperfections(options.imperfections)
@@ -140,24 +139,6 @@ def _create_simulator(
         instants=options.instants,
         faults=faults,
         seed=options.seed,
-    )
-
-
-def _read_load(skin: Skin, options: argparse.Namespace) -> AnyLoad:
-    """Read the load on the skin: a MuJoCo scene or a load script.
-
-    Args:
-        skin: The skin.
-        options: Command line options; without a scene and a script, the default script is read.
-    """
-    if options.mujoco:
-        # MuJoCo is optional, and importing it takes long.
-        from .mujoco.scene import MujocoLoad
-
-        return MujocoLoad(options.mujoco, skin)
-    return Load(
-        skin,
-        read_script(options.load) if options.load else default_script(),
     )
 
 

@@ -12,7 +12,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..config.load_script import read_script
 from ..config.skin import Skin, as_skin
 from ..core.arguments import check_number
 from ..core.arrays import Array
@@ -21,7 +20,7 @@ from ..device.wire.protocol import NOT_MEASURED
 from .cubes import hub_cubes
 from .hub import PERIOD_LIMITS_US, SimulatedHub
 from .imperfections import Imperfections
-from .load import AnyLoad, Load, LoadMemory, default_script
+from .load import AnyLoad, LoadMemory, read_load
 from .sample_log import SEQUENCE_RANGE
 
 
@@ -57,8 +56,7 @@ def simulate(
     """
     skin = as_skin(skin)
     if load is None or isinstance(load, (Path, str)):
-        script = default_script() if load is None else read_script(Path(load))
-        load = Load(skin, script)
+        load = read_load(skin, None if load is None else Path(load))
     if rate is None:
         rate = skin.rate or 1e6 / SimulatedHub.period_us
     # The limits of a hub are sample periods; the longest period gives the lowest rate.

@@ -19,9 +19,8 @@ from cube_tensor_driver.simulation.faults import Fault
 from cube_tensor_driver.simulation.sample_log import FaultRecord, LinkLog, SampleLog, SampleRun
 from workshop.checks.all_checks import check_all
 from workshop.checks.expected import ExpectedReadings, load_tables
-from workshop.checks.record import NodeAction, Received, Record
+from workshop.checks.record import NodeAction, Received, Record, Samples
 from workshop.checks.rest import TRANSPORT_S
-from workshop.checks.samples import Samples
 
 INSTANTS, COUNT, PERIOD_US, EACH = 400, 2000, 2000, 2
 FAULTS = {

@@ -23,8 +23,7 @@ from cube_tensor_driver.simulation.faults import PAD_FAULTS
 from cube_tensor_driver.simulation.injector import broken_reading, centi_celsius, warmed, warming
 from cube_tensor_driver.simulation.load import Load, default_script
 
-from .record import LATEST_NS, Span
-from .samples import HubFault, Samples
+from .record import LATEST_NS, HubFault, Samples, Span
 
 EDGE_NS = 5_000_000
 """Time, in nanoseconds, before and after the begin and the end of a fault of a pad or hub in which

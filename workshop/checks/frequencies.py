@@ -14,9 +14,8 @@ from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.core.status import STAMP
 
 from .expected import Readings, split_in_chunks
-from .record import DRIVER_KILLS, DRIVER_STOPS, DROPPED_BY_HOST, UNFLUSHED_S
+from .record import CUT_FAULTS, DRIVER_KILLS, DRIVER_STOPS, DROPPED_BY_HOST, UNFLUSHED_S
 from .run import Findings, Run, agree, count, find_matched
-from .samples import CUT_FAULTS
 
 RECOVERY_S = 6.0
 """Longest time, in seconds, from the end of a cut of a link until the link delivers again. The

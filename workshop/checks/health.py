@@ -19,9 +19,8 @@ from cube_tensor_driver.core.status import DRIFT, NOISY, OPEN, RANGE, REPORTED, 
 from cube_tensor_driver.simulation.faults import PAD_FAULTS
 
 from .expected import EDGE_NS
-from .record import DRIVER_KILLS, NODE_STARTS, NS_PER_S, Span
+from .record import CUT_FAULTS, DRIVER_KILLS, NODE_STARTS, NS_PER_S, HubFault, Span
 from .run import Findings, Run, count, find_matched
-from .samples import CUT_FAULTS, HubFault
 
 STATUS_OF_FAULT = {
     "open": OPEN,

@@ -14,8 +14,7 @@ from cube_tensor_driver.core.matching import NO_MATCH
 from cube_tensor_driver.simulation.sample_log import SampleLog
 
 from .expected import ExpectedReadings
-from .record import NS_PER_S, Record
-from .samples import Samples
+from .record import NS_PER_S, Record, Samples
 
 EXAMPLES = 3
 """Maximum number of lines that describe examples of one kind of finding."""

@@ -11,9 +11,8 @@ from cube_tensor_driver.core.matching import NO_MATCH
 from cube_tensor_driver.core.status import STAMP
 
 from .frequencies import RECOVERY_S, FrequencyFindings
-from .record import DRIVER_KILLS, DRIVER_STOPS, NS_PER_S, Span
+from .record import CUT_FAULTS, DRIVER_KILLS, DRIVER_STOPS, NS_PER_S, Span
 from .run import Run
-from .samples import CUT_FAULTS
 
 MS_PER_NS = 1e-6
 

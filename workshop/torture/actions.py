@@ -25,8 +25,8 @@ from cube_tensor_driver.processes.skin_processes import Process
 from cube_tensor_driver.srv import Tare
 
 from ..checks.record import NS_PER_S, NodeAction
-from .message_log import TopicLog
 from .mix import HELD_CUBES
+from .recorder import TopicLog
 
 MAX_START_S = 40.0
 """Longest time, in seconds, until a node has started."""

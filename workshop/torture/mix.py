@@ -12,7 +12,7 @@ import numpy as np
 from cube_tensor_driver.config.yaml import read_yaml
 from cube_tensor_driver.simulation.faults import FRAME_FAULTS, PAD_FAULTS
 
-from ..checks.samples import CUT_FAULTS
+from ..checks.record import CUT_FAULTS
 
 HUBS = 4
 """Number of simulated hubs of the tortured skin."""

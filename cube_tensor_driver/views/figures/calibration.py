@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from ...calibrate.fit import Fit
 from ...calibrate.thermal import ThermalFit
 from ...core.arrays import Array
 from ...core.layout import Layout
+from ..meshes import CUBE_EDGES
 from .style import MARKERS, print_style
 
 _VIEW = np.array([0.75, -1.0, 0.75])
@@ -69,21 +69,11 @@ def _draw_edges(axes: Any) -> None:
         axes: The 3-D axes of matplotlib, in units of half the side of the cube.
     """
     # The hidden corner is the one opposite to the viewer.
-    corners = np.array(list(product((-1.0, 1.0), repeat=3)))
     hidden = -np.sign(_VIEW)
-    for i, a in enumerate(corners):
-        for b in corners[i + 1 :]:
-            # Two corners are the ends of an edge if they differ in exactly one coordinate.
-            if np.count_nonzero(a != b) != 1:
-                continue
-            is_hidden = np.array_equal(a, hidden) or np.array_equal(b, hidden)
-            color, dash = ("0.6", ":") if is_hidden else ("0.2", "-")
-            axes.plot(
-                *np.stack([a, b], axis=1),
-                color=color,
-                ls=dash,
-                lw=1,
-            )
+    for edge in CUBE_EDGES:
+        is_hidden = (edge == hidden).all(axis=1).any()
+        color, dash = ("0.6", ":") if is_hidden else ("0.2", "-")
+        axes.plot(*edge.T, color=color, ls=dash, lw=1)
 
 
 def _draw_pad(

@@ -68,28 +68,12 @@ def draw_forces(
     )
 
     path = panels["path"]
-    path.plot(
-        MM * cubes[:, 1],
-        MM * cubes[:, 0],
-        "s",
-        color="0.8",
-        ms=3,
-    )
-    path.plot(
-        MM * centre[:, 1],
-        MM * centre[:, 0],
-        color="black",
-        lw=1,
-    )
-    measured = MM * measured_centre
-    path.plot(
-        measured[:, 1],
-        measured[:, 0],
-        "o",
-        color="C3",
-        mfc="none",
-        ms=3,
-    )
+    for points, style in (
+        (cubes, {"marker": "s", "ls": "", "color": "0.8"}),
+        (centre, {"color": "black", "lw": 1}),
+        (measured_centre, {"marker": "o", "ls": "", "color": "C3", "mfc": "none"}),
+    ):
+        path.plot(MM * points[:, 1], MM * points[:, 0], ms=3, **style)
     path.set(
         xlabel="$y$ / mm",
         ylabel="$x$ / mm",
