@@ -13,6 +13,7 @@ import numpy as np
 from cube_tensor_driver.config.grid import grid
 from cube_tensor_driver.config.yaml import write_yaml
 from cube_tensor_driver.core.errors import CubeError
+from cube_tensor_driver.processes.skin_processes import Process
 from cube_tensor_driver.simulation.sample_log import CUBE_RANGE, SampleTable
 from cube_tensor_hub.firmware import build
 
@@ -86,17 +87,23 @@ class HubLoad:
         write_yaml(path, data)
         return path
 
-    def build(self, folder: Path) -> str:
-        """Build the program in a folder and return its path.
+    def make_process(
+        self, folder: Path, ports: Path, rate: float, log: Path | None = None
+    ) -> Process:
+        """Build the program of the hubs, and return how to start it.
+
+        Args:
+            folder: Folder to build in.
+            ports: Folder for the pseudo-terminals hub0, hub1, …
+            rate: Samples per second of each cube.
+            log: File for the samples that the hubs take; None: they write none.
 
         Raises:
             FirmwareError: A tool is missing, or the compiler failed.
         """
         build(FIRMWARE, folder, "posix")
-        return str(folder / "cube_hub")
-
-    def arguments(self, ports: Path, rate: float) -> tuple[str, ...]:
-        """Return arguments of the program for pseudo-terminals hub0, hub1, … in a folder."""
+        # The program expects the folder to exist.
+        ports.mkdir(exist_ok=True)
         options = {
             "--ports": ports,
             "--hubs": self.hubs,
@@ -104,7 +111,10 @@ class HubLoad:
             "--pads": self.pads,
             "--period": round(1e6 / rate),
         }
-        return tuple(str(word) for option in options.items() for word in option)
+        if log is not None:
+            options["--log"] = log
+        words = tuple(str(word) for option in options.items() for word in option)
+        return Process("hubs", "", node=False, program=str(folder / "cube_hub"), arguments=words)
 
 
 def read_samples(path: Path, load: HubLoad) -> SampleTable:

@@ -4,11 +4,9 @@
 
 from __future__ import annotations
 
-import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -22,6 +20,7 @@ from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.device.chain import LiveLinks
 from cube_tensor_driver.device.live import cube_addresses, link_configs
 from cube_tensor_driver.device.scans.scan import empty_rows
+from cube_tensor_driver.processes.children import Children
 
 from .hubs_in_c import HubLoad
 
@@ -30,9 +29,6 @@ MAX_START_S = 10.0
 
 SETTLE_S = 2.0
 """Time, in seconds, from the first rows to the begin of the measurement."""
-
-MAX_END_S = 2.0
-"""Longest time, in seconds, from the request to end until the hubs have ended."""
 
 POLL_S = 0.05
 """Time, in seconds, between two checks of a condition that is waited for."""
@@ -59,8 +55,8 @@ def bench_links(
     cubes = load.cubes
     with tempfile.TemporaryDirectory(prefix="cube_bench_") as name:
         folder = Path(name)
-        program = load.build(folder / "firmware")
         skin = read_skin(load.write_skin(folder, rate))
+        hubs = load.make_process(folder / "firmware", folder, rate)
         delivered = 0
 
         def on_rows(rows: FrequencyRows) -> None:
@@ -68,7 +64,9 @@ def bench_links(
             # Nothing else is done with the rows: only reading is measured.
             delivered += len(rows)
 
-        with _hubs(program, folder, load, rate):
+        with Children(folder) as children:
+            children.start(hubs)
+            _wait(lambda: len(list(folder.glob("hub[0-9]*"))) == load.hubs)
             links = LiveLinks(
                 link_configs(skin, port_directory=folder),
                 cube_addresses(skin),
@@ -102,24 +100,6 @@ def bench_links(
         "cpu_percent": round(100 * cpu_s / seconds, 1),
         "cpu_us_per_scan": round(1e6 * cpu_s * cubes / max(rows, 1), 1),
     }
-
-
-@contextmanager
-def _hubs(
-    program: str,
-    folder: Path,
-    load: HubLoad,
-    rate: float,
-) -> Iterator[None]:
-    """Run hubs on pseudo-terminals in the folder for the length of a block."""
-    command = [program, *load.arguments(folder, rate)]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
-    try:
-        _wait(lambda: len(list(folder.glob("hub*"))) == load.hubs)
-        yield
-    finally:
-        process.terminate()
-        process.wait(MAX_END_S)
 
 
 def _wait(done: Callable[[], bool]) -> None:

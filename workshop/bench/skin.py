@@ -286,15 +286,10 @@ def _make_processes(
         for process in processes[1:]:
             process.parameters["touch_false_alarms"] = 1.0
     try:
-        program = load.build(path.parent / "firmware")
+        processes[0] = load.make_process(path.parent / "firmware", ports, bench.rate, log)
     except FirmwareError as error:
         progress.console.print(f"The Python simulator is the load, which takes more: {error}")
-        return processes
-    # Unlike the simulator, the program expects the folder to exist.
-    ports.mkdir()
-    arguments = (*load.arguments(ports, bench.rate), "--log", str(log))
-    hubs = Process("hubs", "", node=False, program=program, arguments=arguments)
-    return [hubs, *processes[1:]]
+    return processes
 
 
 def _end_load(

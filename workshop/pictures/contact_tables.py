@@ -10,6 +10,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from cube_tensor_design.studies.pads_study import FORMS, study_pads
 from cube_tensor_design.studies.traction_study import (
     MAIN,
@@ -59,6 +61,8 @@ FORM_COLUMNS = [
     "position, rms error / predicted deviation: points, pads",
 ]
 """Columns of one setting under loads of one width, with cubes taken for points and for pads."""
+FORM_DIGITS = (3, 1, 2, 2, 2)
+"""Number of decimals of each quantity in `FORM_COLUMNS` after the width."""
 
 
 def write_contact_tables(path: Path, true_pads: Influence) -> None:
@@ -135,19 +139,12 @@ def _form_rows(
     rows = []
     for setting in dict.fromkeys(setting for setting, _ in results):
         for both in zip(*(results[setting, form] for form in FORMS), strict=True):
-            cells = (
-                (
-                    one.field[2],
-                    100 * one.force[1],
-                    1e3 * one.position[1],
-                    *one.ratio[1],
-                )
+            forms = [
+                [one.field[2], 100 * one.force[1], 1e3 * one.position[1], *one.ratio[1]]
                 for one in both
-            )
-            columns = zip(*cells, strict=True)
-            rounded = [
-                [round(float(value), digits) for value in column]
-                for column, digits in zip(columns, (3, 1, 2, 2, 2), strict=True)
             ]
+            # Each quantity is a column, with one number for each form.
+            columns = zip(np.transpose(forms), FORM_DIGITS, strict=True)
+            rounded = [column.round(digits).tolist() for column, digits in columns]
             rows.append([setting.cubes, round(1e3 * both[0].width), *rounded])
     return rows

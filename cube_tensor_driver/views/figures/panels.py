@@ -57,7 +57,7 @@ def draw_panels(times: Array, time_label: str, panels: Sequence[Panel]) -> Figur
                 np.insert(values, gaps, np.nan),
                 label=name,
                 markevery=(first_marker, spacing),
-                **curve_style(number),
+                **curve_style(number) | {"linewidth": 0.9},
             )
         axis.set_ylabel(label)
         axis.legend(
