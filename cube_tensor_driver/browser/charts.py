@@ -31,7 +31,7 @@ TIME_SCALE = uplot.Scale(
 )
 """Time axis of the plots: seconds relative to the newest value, without automatic range."""
 
-NUDGE_PERIOD = 10
+NUDGE_PERIOD = 4
 """Number of pictures after which the range of a chart's value axis changes invisibly.
 
 The change makes the browser lay the chart out again. This is needed because a chart that was made

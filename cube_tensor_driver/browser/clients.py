@@ -22,6 +22,7 @@ from ..msg import ReplayState
 from ..processes.children import end_with_parent
 from ..srv import SteerReplay
 from .markup import NoteColour
+from .page import JUMP
 
 Say = Callable[[str, str, NoteColour], None]
 """Function that shows a note to the user: it takes the note's title, text and colour."""
@@ -43,6 +44,7 @@ class _Call(NamedTuple):
     what: str
     future: Any
     asked_s: float
+    notes_success: bool
 
 
 class ServiceCalls:
@@ -57,6 +59,7 @@ class ServiceCalls:
         what: str,
         client: Client,
         request: Any,
+        notes_success: bool = True,
     ) -> None:
         """Call a service; if no running node offers it, show a note instead.
 
@@ -64,18 +67,18 @@ class ServiceCalls:
             what: Name of the action in the notes to the user, such as "tare".
             client: ROS client of the service.
             request: Request of the type that the service has.
+            notes_success: Whether a note is shown if the service did what was requested.
         """
         if not client.service_is_ready():
             text = f"{what}: no node that can do it is running"
             self._say(f"{what} is not possible", text, "red")
             return
-        self._open.append(
-            _Call(
-                what,
-                client.call_async(request),
-                time.monotonic(),
-            )
-        )
+        future = client.call_async(request)
+        self._open.append(_Call(what, future, time.monotonic(), notes_success))
+
+    def awaits(self, what: str) -> bool:
+        """Return whether a call with this name has neither been answered nor timed out."""
+        return any(call.what == what for call in self._open)
 
     def update(self) -> None:
         """Show a note for each call of a service that was answered or has timed out.
@@ -85,7 +88,9 @@ class ServiceCalls:
         still_open = []
         for call in self._open:
             if call.future.done():
-                self._report(call.what, call.future.result())
+                answer = call.future.result()
+                if call.notes_success or not answer.success:
+                    self._report(call.what, answer)
             elif time.monotonic() - call.asked_s > MAX_ANSWER_S:
                 text = f"{call.what}: no answer within {MAX_ANSWER_S:g} s"
                 self._say(f"{call.what} had no answer", text, "red")
@@ -133,8 +138,6 @@ class ReplayClient:
         self._received_s = -np.inf
         self._wanted_position: float | None = None
         self._wanted_s = -np.inf
-        self._jump: Any = None
-        self._jump_asked_s = -np.inf
 
     @property
     def is_held(self) -> bool:
@@ -147,7 +150,7 @@ class ReplayClient:
 
         Until then the position in `state` is not the one that the user has chosen.
         """
-        is_wanted = self._wanted_position is not None or self._jump is not None
+        is_wanted = self._wanted_position is not None or self._services.awaits(JUMP)
         return self.state is not None and is_wanted
 
     def toggle_hold(self) -> None:
@@ -168,18 +171,19 @@ class ReplayClient:
     def update(self) -> bool:
         """Send the jump that `jump_to` stored, unless the answer to an earlier jump is missing.
 
+        Answers to all calls of services are taken before.
+
         If no replay is known, the jump is kept, because on a busy machine the messages of a replay
         arrive late. After `MAX_ANSWER_S` it is dropped, and a note tells the user so.
 
         Returns:
             Whether a jump was sent in this call.
         """
-        now_s = time.monotonic()
-        self._finish_jump(now_s)
-        if self._jump is not None or self._wanted_position is None:
+        self._services.update()
+        if self._wanted_position is None or self._services.awaits(JUMP):
             return False
         if self.state is None or not self._client.service_is_ready():
-            if now_s > self._wanted_s + MAX_ANSWER_S:
+            if time.monotonic() > self._wanted_s + MAX_ANSWER_S:
                 self._wanted_position = None
                 self._say(
                     "No jump is possible",
@@ -192,28 +196,12 @@ class ReplayClient:
         position = min(self._wanted_position, self.state.length)
         request = SteerReplay.Request(position=position, paused=self.state.paused)
         self._wanted_position = None
-        self._jump = self._client.call_async(request)
-        self._jump_asked_s = now_s
+        # The page shows the new position, so a jump that succeeds needs no note.
+        self._services.ask(JUMP, self._client, request, notes_success=False)
         # Without this assignment, the slider would jump back to the old position until the next
         # state of the replay arrives.
         self.state.position = position
         return True
-
-    def _finish_jump(self, now_s: float) -> None:
-        """Forget the jump that was sent, if it was answered or is older than `MAX_ANSWER_S`.
-
-        Args:
-            now_s: Present time on the monotonic clock, in s.
-        """
-        if self._jump is None:
-            return
-        if self._jump.done():
-            self._jump = None
-        elif now_s > self._jump_asked_s + MAX_ANSWER_S:
-            self._jump.cancel()
-            self._jump = None
-            text = f"jump: no answer within {MAX_ANSWER_S:g} s"
-            self._say("The jump had no answer", text, "red")
 
     def forget_if_silent(self) -> None:
         """Set `state` to None if the replay has sent no state for `STALE_S` (1 s)."""

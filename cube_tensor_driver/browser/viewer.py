@@ -112,11 +112,13 @@ class Viewer:
             self._show_skin,
             self._receive_stress,
         )
-        self._subscribe(
-            DiagnosticArray,
-            "/diagnostics",
-            self._receive_diagnostics,
-        )
+        for kind, topic, receive in (
+            (DiagnosticArray, "/diagnostics", self._receive_diagnostics),
+            (SkinContacts, "contacts", self._receive_contacts),
+            (PointCloud2, "traction", self._receive_traction),
+        ):
+            receive_safely = self._callback_errors.catch(receive)
+            self._node.create_subscription(kind, topic, receive_safely, 10)
         self._tare = self._node.create_client(Tare, "reconstruction/tare")
         self._clear_tare = self._node.create_client(Trigger, "reconstruction/clear_tare")
         self._status = PageStatus()
@@ -126,8 +128,6 @@ class Viewer:
             self._services,
             self._status.say,
         )
-        self._subscribe(SkinContacts, "contacts", self._receive_contacts)
-        self._subscribe(PointCloud2, "traction", self._receive_traction)
         self._recorder = BagRecorder(recordings)
         self._links: dict[str, tuple[str, int]] = {}
         self._actions: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
@@ -259,10 +259,9 @@ class Viewer:
 
     def _update(self, skin: ShownSkin) -> None:
         """Show the newest scan (the values of all cubes at one instant) in all browsers."""
-        # After a jump of the replay, the plots would connect values of two different times.
         if self._replay.update():
+            # After a jump of the replay, the plots would connect values of two different times.
             self._history.clear()
-        self._services.update()
         self._replay.forget_if_silent()
         self._update_recording()
 
@@ -314,19 +313,6 @@ class Viewer:
             )
             return
         self._status.say("Recording", f"recording to {self._recorder.path}")
-
-    def _subscribe(
-        self,
-        kind: type,
-        topic: str,
-        receive: Callable[[Any], None],
-    ) -> None:
-        self._node.create_subscription(
-            kind,
-            topic,
-            self._callback_errors.catch(receive),
-            10,
-        )
 
     def _receive_stress(self, stamp_ns: int, rows: StressRows) -> None:
         self._scans.add_rows(stamp_ns, rows, self._subscriber.now())
