@@ -184,8 +184,8 @@ def watch_rest(source: LinkSource, screen: PadScreen) -> PadsAtRest:
     """
     import numpy as np
 
+    from ..calibrate.averages import split_into_scans
     from ..calibrate.pad_rest import MIN_SAMPLES, measure_pads_at_rest
-    from ..device.scans.averages import split_into_scans
 
     parts: list[tuple[np.ndarray, np.ndarray]] = []
     next_shown_s = 0.0
@@ -220,6 +220,7 @@ def press_cubes(source: LinkSource, rest: PadsAtRest) -> dict[int, Explanation]:
     """
     import numpy as np
 
+    from ..calibrate.averages import average_over_time
     from ..calibrate.presses import (
         SIDES,
         PressDetector,
@@ -228,7 +229,6 @@ def press_cubes(source: LinkSource, rest: PadsAtRest) -> dict[int, Explanation]:
         explain_presses,
     )
     from ..core.oscillator import pad_stress
-    from ..device.scans.averages import average_over_time
     from ..views.terminal.output import say
 
     cubes = source.skin.cubes

@@ -264,7 +264,11 @@ class LiveLinks:
                 stamped already; None if there are none.
         """
         if usual is not None and usual.links and not self._deliver_whole(usual):
-            self._add_usual(usual)
+            samples = unpack_all(usual.raws)
+            for link, sample, stamp_ns in zip(usual.links, samples, usual.stamps_ns, strict=True):
+                if isinstance(sample, Sample):
+                    self._rows.received += sample.n_cubes
+                    self._scans.add(link, [sample], [stamp_ns])
         if received:
             self._handle_received(received)
         self._was_clock_set = False
@@ -319,14 +323,6 @@ class LiveLinks:
         if n_rows:
             self._rows.overload += n_rows
             self._overloaded_until = time.monotonic() + OVERLOAD_S
-
-    def _add_usual(self, usual: UsualSamples) -> None:
-        """Add samples that the module in C has counted and stamped already to the scans."""
-        samples = unpack_all(usual.raws)
-        for link, sample, stamp_ns in zip(usual.links, samples, usual.stamps_ns, strict=True):
-            if isinstance(sample, Sample):
-                self._rows.received += sample.n_cubes
-                self._scans.add(link, [sample], [stamp_ns])
 
     def _handle_received(self, received: Sequence[LinkFrames]) -> None:
         """Handle reads of links that the module in C has left to Python, such as those with HELLO.

@@ -381,14 +381,11 @@ def total(loads: Sequence[ContactLoad]) -> Resultant:
         return np.zeros(3), unknown, unknown
     # The centre of pressure is the mean of the contacts' centres, weighted with their forces along
     # the normal into the skin.
-    forces = np.array([load.force for load in loads])
-    positions = np.array([load.position for load in loads])
-    normals = np.array([load.normal for load in loads])
-    weight = np.array([-load.force @ load.normal for load in loads])
-    force = forces.sum(axis=0)
+    _, positions, normals, forces, _ = (np.array(column) for column in zip(*loads, strict=True))
+    weight = -(forces * normals).sum(axis=1)
     centre = weight @ positions / weight.sum()
     normal = weight @ normals
-    return force, centre, normal / np.linalg.norm(normal)
+    return forces.sum(axis=0), centre, normal / np.linalg.norm(normal)
 
 
 class LoadMemory:

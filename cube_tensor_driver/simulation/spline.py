@@ -37,9 +37,10 @@ class CubicSpline:
         # The last point of a closed curve is the first one.
         knots = points[:-1] if closed else points
         identity = np.eye(len(knots))
-        before, after = np.roll(identity, 1, axis=0), np.roll(identity, -1, axis=0)
+        before = np.roll(identity, 1, axis=0)
+        after = np.roll(identity, -1, axis=0)
         matrix = 4 * identity + before + after
-        right = 3 * (np.roll(knots, -1, axis=0) - np.roll(knots, 1, axis=0))
+        right = 3 * (after - before) @ knots
         if not closed:
             ends = [0, -1]
             matrix[ends] = identity[ends]
@@ -48,10 +49,11 @@ class CubicSpline:
         if closed:
             slopes = np.append(slopes, slopes[:1], axis=0)
 
-        p, q = points[:-1], points[1:]
+        step = np.diff(points, axis=0)
         m, n = slopes[:-1], slopes[1:]
-        # Coefficients (4, K - 1, D) of the powers of t (0 to 1 from a point to the next).
-        self._coefficients = np.stack([p, m, 3 * (q - p) - 2 * m - n, 2 * (p - q) + m + n])
+        # Coefficients (K - 1, 4, D) of the powers of t (0 to 1 from a point to the next).
+        powers = [points[:-1], m, 3 * step - 2 * m - n, m + n - 2 * step]
+        self._coefficients = np.stack(powers, axis=1)
 
     def position(self, time: float) -> Array:
         """Return the position (D,) at a time from 0 to 1."""
@@ -61,8 +63,8 @@ class CubicSpline:
     def velocity(self, time: float) -> Array:
         """Return the derivative (D,) of the position by the time, at a time from 0 to 1."""
         t, coefficients = self._interval(time)
-        n_intervals = self._coefficients.shape[1]
-        return np.asarray(n_intervals * polyval(t, polyder(coefficients)))
+        per_interval = polyval(t, polyder(coefficients))
+        return np.asarray(per_interval * len(self._coefficients))
 
     def _interval(self, time: float) -> tuple[float, Array]:
         """Return the interval between two points in which a time from 0 to 1 lies.
@@ -70,6 +72,6 @@ class CubicSpline:
         Returns:
             Elapsed fraction of the interval, and the coefficients (4, D) of its polynomial.
         """
-        n_intervals = self._coefficients.shape[1]
-        i = min(int(time * n_intervals), n_intervals - 1)
-        return time * n_intervals - i, self._coefficients[:, i]
+        scaled = time * len(self._coefficients)
+        i = min(int(scaled), len(self._coefficients) - 1)
+        return scaled - i, self._coefficients[i]

@@ -138,11 +138,14 @@ class CubeTable:
         is_known = cubes != ABSENT
         fits = self._pads[cubes] == hello.n_pads
         shape = hello.n_cubes, hello.n_pads
-        hub.complete = (cubes.astype(np.uint16), shape) if (is_known & fits).all() else None
+        hub.complete = None
+        if (is_known & fits).all():
+            hub.complete = cubes.astype(np.uint16), shape
         known_uids = hello.cube_uids[is_known].tolist()
+        uids = zip(cubes[is_known].tolist(), known_uids, strict=True)
         # Other threads read this dictionary at any time, so it is replaced in one step and never
         # changed in place.
-        self.uids = self.uids | dict(zip(cubes[is_known].tolist(), known_uids, strict=True))
+        self.uids = self.uids | dict(uids)
         return problems
 
     def forget(self, link: int) -> None:
@@ -206,7 +209,8 @@ class CubeTable:
         if key not in self._whole:
             found = [self._hubs[link].complete for link in links]
             cubes = [hub[0] for hub in found if hub is not None]
-            self._whole = {key: np.concatenate(cubes) if len(cubes) == len(links) else None}
+            is_whole = len(cubes) == len(links)
+            self._whole = {key: np.concatenate(cubes) if is_whole else None}
         return self._whole[key]
 
     def _match(self, link: int, hello: Hello) -> tuple[HubIndex, list[str]]:
@@ -247,7 +251,8 @@ class CubeTable:
             if index_of_uid[uid] != index:
                 problem = "left out: an earlier one has the same uid"
             names.setdefault(("the hub's cube", problem), []).append(f"{index} (uid {uid:#x})")
-        return cubes, [_join_names(noun, group, text) for (noun, text), group in names.items()]
+        problems = [_join_names(noun, group, text) for (noun, text), group in names.items()]
+        return cubes, problems
 
 
 def _locate(

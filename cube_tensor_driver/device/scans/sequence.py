@@ -194,12 +194,14 @@ class SequenceTracker:
         """
         if number < self.first:
             return abs(self._track.newest_us - device_us) < RESTART_US
-        seen = self._seen()
-        if any(other == number for other, _ in seen):
+        time_of = dict(self._seen())
+        if number in time_of:
             return False
-        _, below_us = max((entry for entry in seen if entry[0] < number), default=(0, 0))
-        newest = 0, MAX_DEVICE_US
-        _, above_us = min((entry for entry in seen if entry[0] > number), default=newest)
+        # Without a smaller or larger number, any time fits on that side.
+        below = max((other for other in time_of if other < number), default=None)
+        above = min((other for other in time_of if other > number), default=None)
+        below_us = 0 if below is None else time_of[below]
+        above_us = MAX_DEVICE_US if above is None else time_of[above]
         fits_below, fits_above = below_us <= device_us, device_us <= above_us
         return fits_below and fits_above if below_us <= above_us else fits_below or fits_above
 

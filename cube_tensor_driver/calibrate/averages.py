@@ -8,8 +8,8 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from ...core.arrays import Array
-from ...core.rows import FrequencyRows
+from ..core.arrays import Array
+from ..core.rows import FrequencyRows
 
 
 def split_into_scans(rows: FrequencyRows, n_cubes: int) -> tuple[Array, Array]:
