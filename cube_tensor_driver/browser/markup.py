@@ -182,11 +182,13 @@ def clock(seconds: float) -> str:
 def newtons(contact: Contact) -> str:
     """Return normal and shear force of a contact as text in N, and whether it slips.
 
-    The shear force is left out if it is unknown (NaN), because no cube observes shear.
+    The shear force is left out if it is unknown (NaN), because no cube observes shear. "~" stands
+    for forces of the field, before a fit of the contact is ready.
     """
+    about = "~" if contact.is_coarse else ""
     shear = "" if np.isnan(contact.shear_force) else f", shear {contact.shear_force:.2f} N"
     slips = ", slips" if contact.slips else ""
-    return f"{contact.normal_force:.2f} N{shear}{slips}"
+    return f"{about}{contact.normal_force:.2f} N{shear}{slips}"
 
 
 def headline(

@@ -131,7 +131,8 @@ def traction_message(
 
 
 def decode_contacts(message: Any) -> list[Contact]:
-    """Return the contacts of a SkinContacts message; of the values of a tracker only `slips`.
+    """Return the contacts of a SkinContacts message; of the values of a tracker only `slips`
+    and `is_coarse`.
 
     Raises:
         ValueError: The arrays of the message have different lengths.
@@ -141,10 +142,12 @@ def decode_contacts(message: Any) -> list[Contact]:
         return np.array([vector.x, vector.y, vector.z])
 
     columns = [getattr(message, name) for name in (*_VECTORS, *_NUMBERS)]
-    slips = [state == SLIP for state in message.slip] or [False] * len(message.position)
+    unknown = [False] * len(message.position)
+    slips = [state == SLIP for state in message.slip] or unknown
+    is_coarse = [not refined for refined in message.refined] or unknown
     return [
         Contact(read_xyz(position), read_xyz(normal), read_xyz(force), *others)
-        for position, normal, force, *others in zip(*columns, slips, strict=True)
+        for position, normal, force, *others in zip(*columns, slips, is_coarse, strict=True)
     ]
 
 

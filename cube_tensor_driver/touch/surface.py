@@ -70,6 +70,8 @@ class Contact(NamedTuple):
         position_uncertainty: Standard deviation of the position along each axis, in m.
         force_uncertainty: Standard deviation of the normal force, in N.
         slips: Whether the whole contact slides over the skin; False if it is not known.
+        is_coarse: Whether the force is that of the field of the method inverse, because no fit of
+            the contact is ready.
     """
 
     position: Array
@@ -81,6 +83,7 @@ class Contact(NamedTuple):
     position_uncertainty: float
     force_uncertainty: float
     slips: bool = False
+    is_coarse: bool = False
 
 
 class Surface:

@@ -15,6 +15,7 @@ from bag_maker import START_NS, make_bag
 
 from cube_tensor_driver.bags.read import Bag, make_message
 from cube_tensor_driver.bags.reprocess.job import Overrides, ReprocessJob, reprocess
+from cube_tensor_driver.browser.markup import newtons
 from cube_tensor_driver.config.calibration import shipped_calibration
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import Skin, SkinCube, SkinLink, read_skin
@@ -207,7 +208,10 @@ def test_each_number_of_a_contact_is_in_its_field(kind):
     got = [[one.x, one.y, one.z] for one in message.slip_velocity]
     np.testing.assert_array_equal(got, slip.velocity)
     assert message.slip.tolist() == [message.UNKNOWN, message.STICK, message.SLIP] == [0, 1, 2]
-    assert [one.slips for one in decode_contacts(message)] == [False, False, True]
+    read = decode_contacts(message)
+    assert [one.slips for one in read] == [False, False, True]
+    is_tracked = kind is TrackedContact
+    assert [newtons(one)[0] == "~" for one in read] == [is_tracked, False, is_tracked]
     without = contacts_message(make_message, START_NS, "wrist", contacts)
     assert not any(one.slips for one in decode_contacts(without))
 

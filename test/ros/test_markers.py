@@ -248,6 +248,27 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
     assert not np.ptp(rings[1:], axis=1).any()
 
 
+def test_the_text_of_a_contact_is_pale_until_it_is_fitted():
+    pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
+    from geometry_msgs.msg import Point, Vector3
+    from rclpy.serialization import deserialize_message
+    from visualization_msgs.msg import MarkerArray
+
+    from cube_tensor_driver.msg import SkinContacts
+    from cube_tensor_driver.ros.markers.canvas import Canvas
+
+    canvas = Canvas("skin", places(), crosses=False, signed=False)
+    one = {"normal_force": [1.0] * 2, "shear_force": [0.5] * 2, "area": [1e-5] * 2}
+    one |= {"position": [Point()] * 2, "normal": [Vector3(z=1.0)] * 2}
+    opacities = []
+    for refined in ([True, False], []):
+        canvas.draw_contacts(SkinContacts(refined=refined, **one))
+        drawn = deserialize_message(bytes(canvas.data), MarkerArray).markers
+        texts = {marker.ns: marker for marker in drawn}
+        opacities.append([texts[f"contact {number}"].color.a for number in range(2)])
+    assert opacities == [[1.0, 0.5], [1.0, 1.0]]
+
+
 @pytest.mark.parametrize("name", ["a", "ab", "abc", "abcd", "a name of many letters"])
 def test_arrays_of_serialised_markers_are_where_other_nodes_read_them(name):
     """Lengths of texts decide about the alignment of all that follows."""

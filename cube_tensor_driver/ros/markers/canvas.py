@@ -64,6 +64,9 @@ CONTACT_COLOUR: Colour = (1.0, 0.45, 0.75)
 SLIP_COLOUR: Colour = (1.0, 0.1, 0.1)
 """Colour of the text of a contact that slips."""
 
+COARSE_OPACITY = 0.5
+"""Opacity of the text of a contact whose forces do not come from a fit."""
+
 MAX_CONTACTS = 8
 """Maximum number of contacts that are drawn. A message lists those with the largest forces first.
 """
@@ -215,6 +218,8 @@ class Canvas:
     def draw_contacts(self, contacts: SkinContacts | None) -> None:
         """Draw each contact as a ring, with its normal and shear force as text, red if it slips.
 
+        The text is pale if the forces are those of the field, before a fit is ready.
+
         Args:
             contacts: The newest message of contacts; None: all rings and texts are hidden.
         """
@@ -232,7 +237,9 @@ class Canvas:
             radius = float(np.sqrt(area / np.pi))
             rings[number] = scene.ring(position, normal, radius, RING_CORNERS)
             slips = number < len(contacts.slip) and contacts.slip[number] == SkinContacts.SLIP
-            label.colour[:] = *(SLIP_COLOUR if slips else CONTACT_COLOUR), 1.0
+            is_coarse = number < len(contacts.refined) and not contacts.refined[number]
+            opacity = COARSE_OPACITY if is_coarse else 1.0
+            label.colour[:] = *(SLIP_COLOUR if slips else CONTACT_COLOUR), opacity
             label.position[:] = position + max(radius, MIN_TEXT_DISTANCE_M) * normal
             normal_n, shear_n = contacts.normal_force[number], contacts.shear_force[number]
             self._markers.write_text(f"contact {number}", _force_text(normal_n, shear_n))
