@@ -223,9 +223,7 @@ class LoadVerification:
             values[cube[rows]] = components[rows]
             contacts = surface.contacts(values, CONTACT_PRESSURE)
             measured.append(total_force(contacts))
-        columns = zip(*measured, strict=True)
-        measured_force, measured_centre = map(np.array, columns)
-
+        measured_force, measured_centre = map(np.array, zip(*measured, strict=True))
         return ForceHistory(
             seconds=seconds,
             force=force,
@@ -258,8 +256,7 @@ class LoadVerification:
     def _seconds(self, times_ns: Index) -> Array:
         """Return the simulated times, in s after the start of the simulator, of times (T,) in ns
         since the Unix epoch."""
-        elapsed_ns = times_ns - self._log.start_time_ns
-        return np.asarray(elapsed_ns * 1e-9, float)
+        return np.asarray(1e-9 * (times_ns - self._log.start_time_ns), float)
 
     def _errors(self, comparison: Comparison) -> dict[str, object]:
         """Compute the errors of the tensors that arrived.
@@ -274,40 +271,27 @@ class LoadVerification:
         """
         cube, components, taken_ns = self._received(comparison)
         if not len(cube):
-            return {
-                "error_rel_rms": np.nan,
-                "error_rel_worst": np.nan,
-                "error_over_noise": np.nan,
-            }
+            return dict.fromkeys(("error_rel_rms", "error_rel_worst", "error_over_noise"), np.nan)
         errors, allowed = [], []
         noise = component_noise(self._skin)
         times_ns = thin_out(np.unique(taken_ns))
-        for time_ns, seconds in zip(
-            times_ns,
-            self._seconds(times_ns),
-            strict=True,
-        ):
+        for time_ns, seconds in zip(times_ns, self._seconds(times_ns), strict=True):
             rows = np.flatnonzero(taken_ns == time_ns)
-            members = cube[rows]
             truth = self._truth(seconds)
-            errors.append(components[rows] - truth[members])
-            allowed.append(noise[members])
+            errors.append(components[rows] - truth[cube[rows]])
+            allowed.append(noise[cube[rows]])
 
         times = np.linspace(0, self._load.period, RANGE_TIMES)
         script = [self._truth(time) for time in times]
-        lowest = np.nanmin(script, axis=(0, 1))
-        highest = np.nanmax(script, axis=(0, 1))
-        span = highest - lowest
+        span = np.nanmax(script, axis=(0, 1)) - np.nanmin(script, axis=(0, 1))
         # A component that is constant under the load has a range of 0 and is left out.
         varies = span > 0
         error = np.concatenate(errors)
         relative = error[:, varies] / span[varies]
-        worst = np.nanmax(np.abs(relative))
-        over_noise = error / np.concatenate(allowed)
         return {
             "error_rel_rms": rms(relative),
-            "error_rel_worst": float(worst),
-            "error_over_noise": rms(over_noise),
+            "error_rel_worst": float(np.nanmax(np.abs(relative))),
+            "error_over_noise": rms(error / np.concatenate(allowed)),
         }
 
     def _truth(self, seconds: float) -> Array:
@@ -374,8 +358,7 @@ def total_force(contacts: list[Contact]) -> tuple[Array, Array]:
         return np.zeros(3), np.full(3, np.nan)
     # The common centre of pressure is the mean of the contacts' positions, weighted by their normal
     # forces.
-    weights = np.array([contact.normal_force for contact in contacts])
-    positions = np.array([contact.position for contact in contacts])
-    forces = [contact.force for contact in contacts]
-    centre = weights @ positions / weights.sum()
-    return np.sum(forces, axis=0), centre
+    weights = [contact.normal_force for contact in contacts]
+    positions = [contact.position for contact in contacts]
+    force = np.sum([contact.force for contact in contacts], axis=0)
+    return force, np.average(positions, axis=0, weights=weights)

@@ -148,25 +148,14 @@ def watch(
         observer = stack.enter_context(
             observing("demo", children, interrupted=interrupted, on_step=table.refresh)
         )
-        watcher = SkinWatcher(
-            skin,
-            rate,
-            children,
-            table,
-            observer,
-            verification,
-        )
+        watcher = SkinWatcher(skin, rate, children, table, observer, verification)
         watcher.wait_for_tensors()
         if settings.view:
             watcher.note_address()
         if settings.duration is None or verification is None:
             watcher.run()
         figures = watcher.measure(verification, settings.duration, log)
-    head = {
-        "cubes": len(skin.cubes),
-        "rate_hz": rate,
-        "duration_s": settings.duration,
-    }
+    head = {"cubes": len(skin.cubes), "rate_hz": rate, "duration_s": settings.duration}
     return DemoResult(head | figures, verification, load)
 
 
@@ -344,8 +333,7 @@ class SkinWatcher:
             self._observer.log_error(str(error))
             return
         # A cube index beyond the cubes of this skin can only come from another, larger skin.
-        last_cube = int(rows.cube.max(initial=0))
-        if last_cube >= self._n_cubes:
+        if rows.cube.max(initial=0) >= self._n_cubes:
             self._sees_other_skin = True
             return
         if self._verification is not None:

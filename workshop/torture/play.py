@@ -11,7 +11,7 @@ import socket
 import time
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -58,21 +58,9 @@ NODES = ("driver", "reconstruction")
 """Names of the processes whose memory and threads are measured."""
 
 
-@dataclass(frozen=True)
-class Played:
-    """Results of a torture (run of a simulated skin under faults).
-
-    Attributes:
-        record: What arrived and what was done.
-        log: What the hubs did.
-        began_s: Monotonic time at which the driver became active, in seconds.
-        figures: Figures of the processes, by the name that torture prints.
-    """
-
-    record: Record
-    log: SampleLog
-    began_s: float
-    figures: dict[str, Any]
+Played = tuple[Record, SampleLog, dict[str, Any]]
+"""Results of a torture (run of a simulated skin under faults): what arrived and what was done; what
+the hubs did; figures of the processes, by the name that torture prints."""
 
 
 def play(
@@ -111,7 +99,7 @@ def play(
                 observer, children, processes, skin, stress, recorder.on_driver_killed
             )
             actions.start_driver(ports / FAULT_PIPE)
-            began_s, begin_ns = time.monotonic(), time.time_ns()
+            begin_ns = time.time_ns()
             # Faults begin only when every cube delivers.
             observer.spin(
                 MAX_START_S,
@@ -146,7 +134,7 @@ def play(
         "rss_slope_mb_per_min": growth,
         "crashes": logs_text.count("Traceback"),
     }
-    return Played(record, log, began_s, figures)
+    return record, log, figures
 
 
 def _describe(actions: Actions, log: SampleLog) -> dict[str, Any]:
