@@ -165,15 +165,20 @@ class TableWriter(BufferedTable):
         """
         super().__init__(path)
         self._cubes = pyarrow.array(cubes)
-        self._is_csv = path.suffix == ".csv"
         self._schema = STRESS_SCHEMA
-        if self._is_csv:
-            # CSV has no dictionary encoding, so every row contains the name of its cube.
-            plain = pyarrow.field("cube", pyarrow.string())
-            self._schema = STRESS_SCHEMA.set(1, plain)
-        make = pyarrow.csv.CSVWriter if self._is_csv else pyarrow.parquet.ParquetWriter
         with report_write_errors(path):
-            self._writer = make(str(path), self._schema)
+            if path.suffix == ".csv":
+                # CSV has no dictionary encoding, so every row contains the name of its cube.
+                plain = pyarrow.field("cube", pyarrow.string())
+                self._schema = STRESS_SCHEMA.set(1, plain)
+                self._writer = pyarrow.csv.CSVWriter(str(path), self._schema)
+            else:
+                # Measured values rarely repeat, so that dictionaries of them cost time and space.
+                self._writer = pyarrow.parquet.ParquetWriter(
+                    str(path),
+                    self._schema,
+                    use_dictionary=["cube"],
+                )
 
     def __enter__(self) -> TableWriter:
         return self

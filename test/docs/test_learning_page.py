@@ -59,7 +59,7 @@ def test_program_goes_on_where_it_was_interrupted(page, tmp_path, monkeypatch):
     """A bag whose file is complete is skipped, and half a file is never taken for a whole one."""
     assert page["write_stress"](BAGS[0]) == {"rows": 320}
 
-    def fail(table, file):
+    def fail(table, file, **options):
         file.write(b"PAR1")
         raise KeyboardInterrupt
 
