@@ -288,16 +288,6 @@ class Bag:
             BagError: A file of the bag is damaged, or has another number of messages than its
                 summary states.
         """
-        for connection, time_ns, data in self._stored(topics, start_ns, stop_ns):
-            yield Entry(connection.topic, connection.msgtype, time_ns, data)
-
-    def _stored(
-        self,
-        topics: set[str] | None = None,
-        start_ns: int = 0,
-        stop_ns: int = MAX_TIME_NS,
-    ) -> Iterator[tuple[Connection, int, bytes]]:
-        """Read messages as `entries` does; yield topic, time of recording in ns, and bytes."""
         wanted = {one.topic for one in self.connections}
         if topics is not None:
             wanted &= topics
@@ -315,7 +305,7 @@ class Bag:
                         except READ_ERRORS as error:
                             self.skip(connection.topic, time_ns, error)
                             continue
-                    yield connection, time_ns, data
+                    yield Entry(connection.topic, connection.msgtype, time_ns, data)
 
         # If the name of a topic or the number of a channel is damaged, no library raises an error:
         # messages are only missing. Therefore their number is compared with the one stated.
@@ -466,7 +456,7 @@ class Bag:
                     except MessageError as error:
                         self.skip(topic, time_ns, error)
 
-        for _, time_ns, data in self._stored({topic}):
+        for _, _, time_ns, data in self.entries({topic}):
             has_same_shape = len(data) == size and data.startswith(shape, SHAPE_AT)
             if len(waiting) >= limit or not has_same_shape:
                 if waiting:

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from ..core.calibration import Calibration
 from ..core.errors import CalibrationError, ConfigError
 from ..core.layout import LAYOUTS, Layout, find_layout
 from .output_files import YAML_SUFFIXES
-from .package_data import package_data
+from .package_data import find_shipped, package_data
 from .yaml import read_yaml, to_yaml, write_yaml
 
 
@@ -21,23 +20,13 @@ def find_calibration(name: str, folder: Path) -> Path:
 
     Args:
         name: Name of a calibration in the package such as "cube", or a path relative to `folder`.
-            The package is searched first, so that a file which happens to be called cube in the
-            folder (the executable of a checkout, for example) is not taken for a calibration.
         folder: The folder of the skin file that contains the name.
 
     Raises:
-        ConfigError: The package has no calibration of this name and the path leads to no file. The
-            message lists the names in the package.
+        ConfigError: The package has no calibration of this name and the path leads to no file.
     """
-    shipped = package_data() / "config" / "calibration"
-    for path in (shipped / f"{name}.yaml", folder / name):
-        # os.path.isfile, unlike Path.is_file, is false for a name that is too long.
-        if os.path.isfile(path):  # noqa: PTH113
-            return path
-    names = ", ".join(sorted(path.stem for path in shipped.glob("*.yaml")))
-    raise ConfigError(
-        f"no file {name!r} in {folder}; name a file, or one of the shipped calibrations: {names}"
-    )
+    advice = "a file, or one of the shipped calibrations"
+    return find_shipped("calibration/*.yaml", name, folder, advice)
 
 
 def read_calibration(path: Path) -> Calibration:

@@ -8,11 +8,10 @@ they are tables computed with finite elements.
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from ..core.errors import ConfigError
-from .package_data import package_data
+from .package_data import find_shipped
 
 
 def find_influence(name: str) -> Path:
@@ -22,20 +21,13 @@ def find_influence(name: str) -> Path:
         name: Name of such a file in the package, without its suffix, or a path.
 
     Raises:
-        ConfigError: The package has no file of this name and the path leads to no file. The message
-            lists the names in the package.
+        ConfigError: The package has no file of this name and the path leads to no file.
     """
-    # The package is searched before the file system, as for calibrations.
-    shipped = package_data() / "config" / "influence"
-    for path in (shipped / f"{name}.npz", Path(name)):
-        # os.path.isfile, unlike Path.is_file, is false for a name that is too long.
-        if os.path.isfile(path):  # noqa: PTH113
-            return path
-    names = ", ".join(sorted(path.stem for path in shipped.glob("*.npz")))
-    raise ConfigError(
-        f"no influence functions {name!r}; name a file that ./cube fem MODEL --surface -o FILE.npz "
-        f"made, or one of the shipped: {names}"
+    advice = (
+        "a file of influence functions that ./cube fem MODEL --surface -o FILE.npz made, or one of "
+        "the shipped"
     )
+    return find_shipped("influence/*.npz", name, Path(), advice)
 
 
 def influence_problem(name: str) -> str:

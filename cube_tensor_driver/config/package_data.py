@@ -5,6 +5,7 @@ files."""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from ..core.errors import ConfigError
@@ -32,3 +33,27 @@ def package_data() -> Path:
         f"the data files of {_NAME} are not next to {Path(__file__).parent}: "
         "install the package again (colcon build, or pip install .)"
     )
+
+
+def find_shipped(pattern: str, name: str, folder: Path, advice: str) -> Path:
+    """Return the path of a file that the package contains, or that the user names.
+
+    Args:
+        pattern: Path of such files below config/ in the package, with * for the name.
+        name: Name of a file in the package, or a path relative to `folder`. The package is searched
+            first, so that a file which happens to have that name in the folder (cube is the
+            executable of a checkout, for example) is not taken.
+        folder: Folder in which the user names files.
+        advice: What can be named, for the error message.
+
+    Raises:
+        ConfigError: The package has no file of this name and the path leads to none. The message
+            lists the names in the package.
+    """
+    shipped = package_data() / "config"
+    for path in (shipped / pattern.replace("*", name), folder / name):
+        # os.path.isfile, unlike Path.is_file, is false for a name that is too long.
+        if os.path.isfile(path):  # noqa: PTH113
+            return path
+    names = ", ".join(sorted(path.stem for path in shipped.glob(pattern)))
+    raise ConfigError(f"no file {name!r} in {folder}; name {advice}: {names}")
