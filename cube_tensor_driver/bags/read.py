@@ -28,7 +28,7 @@ from rosbags.typesys import TypesysError, get_types_from_msg
 from ..core.arrays import AnyArray, Times
 from ..core.errors import BagError, ConfigError, MessageError
 from ..core.rows import FrequencyRows, StressRows
-from ..messages.codec import SHAPE_AT, Decoded, MessageCodec, frequency_codec, stress_codec
+from ..messages.codec import SECOND, SHAPE_AT, Decoded, MessageCodec, frequency_codec, stress_codec
 from ..messages.types import FREQUENCIES, PACKAGE
 from .mcap_file import McapReader
 from .metadata import SUFFIXES, BagFiles, Connection, merge_connections, read_metadata, typestore
@@ -157,6 +157,12 @@ def make_message(kind: str, **fields: Any) -> Any:
 def serialise(message: Any) -> bytes:
     """Return the bytes (CDR) of a message that `make_message` made or `Bag.decoded` read."""
     return bytes(typestore().serialize_cdr(message, message.__msgtype__))
+
+
+def stamp_ns(message: Any) -> int:
+    """Return the stamp in a message's header, in ns since the Unix epoch."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * SECOND + int(stamp.nanosec)
 
 
 class Entry(NamedTuple):

@@ -21,7 +21,7 @@ from ..core.rows import FrequencyRows, concatenate
 from ..messages.codec import SECOND, Decoded
 from ..messages.compensation import read_motion, read_states
 from ..messages.types import COMPENSATION
-from .read import Bag
+from .read import Bag, stamp_ns
 
 MAX_DISORDER_NS = SECOND
 """Largest time, in ns, by which messages in a bag may be out of the order of their stamps."""
@@ -70,32 +70,35 @@ class CompensationReader:
         self._newest_ns = 0
         self._wanted_ns = 0
 
-    def at(self, stamp_ns: int) -> RecordedCompensation:
+    def at(self, wanted_ns: int) -> RecordedCompensation:
         """Return the compensation that the bag has recorded for one message of frequencies.
 
         Args:
-            stamp_ns: Stamp in the header of the message of frequencies, in ns since the Unix epoch.
+            wanted_ns: Stamp in the header of the message of frequencies, in ns since the Unix
+                epoch.
 
         Returns:
             Motion of the skin and states of effects (creep, temperature) from the message of
             `compensation` with this stamp. If the bag has none: unknown motion if an earlier
             message has one, else no compensation.
         """
-        if stamp_ns < self._wanted_ns - MAX_DISORDER_NS:
+        if wanted_ns < self._wanted_ns - MAX_DISORDER_NS:
             self._restart()
-        self._wanted_ns = stamp_ns
-        while stamp_ns not in self._known and self._newest_ns < stamp_ns + MAX_DISORDER_NS:
+        self._wanted_ns = wanted_ns
+        # Without a message of compensation there is nothing to read, and the loop ends at once.
+        while wanted_ns not in self._known and self._newest_ns < wanted_ns + MAX_DISORDER_NS:
             item = next(self._unread, None)
             if item is None:
                 break
-            self._newest_ns, self._known[item[0]] = item[0], item[1]
-            if item[1].motion is not None:
+            self._newest_ns, recorded = item
+            self._known[self._newest_ns] = recorded
+            if recorded.motion is not None:
                 self._missing = RecordedCompensation(UNKNOWN_MOTION)
             # Messages come nearly in the order of their stamps, so the first is the oldest.
             oldest_ns = next(iter(self._known))
-            if oldest_ns < stamp_ns - MAX_DISORDER_NS:
+            if oldest_ns < wanted_ns - MAX_DISORDER_NS:
                 del self._known[oldest_ns]
-        return self._known.get(stamp_ns, self._missing)
+        return self._known.get(wanted_ns, self._missing)
 
     def add_forces(
         self, messages: Decoded[FrequencyRows], recorded: Sequence[RecordedCompensation]
@@ -109,19 +112,19 @@ class CompensationReader:
         """
         if recorded[0].motion is None:
             return messages
-        parts = [
-            self._forces.add_to(messages.select(slice(k, k + 1)).rows, one.motion or UNKNOWN_MOTION)
-            for k, one in enumerate(recorded)
-        ]
+        parts = []
+        for k, one in enumerate(recorded):
+            rows = messages.select(slice(k, k + 1)).rows
+            motion = one.motion or UNKNOWN_MOTION
+            parts.append(self._forces.add_to(rows, motion))
         return replace(messages, rows=concatenate(parts))
 
     def _read(self) -> Iterator[tuple[int, RecordedCompensation]]:
         """Yield stamp and content of the messages in the order of recording."""
-        for time_ns, message in self._bag.decoded({self._topic} if self.is_recorded else set()):
-            header = message.header.stamp
-            stamp_ns = int(header.sec) * SECOND + int(header.nanosec)
+        topics = {self._topic} if self.is_recorded else set()
+        for time_ns, message in self._bag.decoded(topics):
             try:
-                motion = read_motion(message, stamp_ns)
-                yield stamp_ns, RecordedCompensation(motion, read_states(message))
+                motion = read_motion(message, stamp_ns(message))
+                yield stamp_ns(message), RecordedCompensation(motion, read_states(message))
             except MessageError as error:
                 self._bag.skip(self._topic, time_ns, error)

@@ -123,20 +123,20 @@ class BagSource:
             # A message without rows has no newest row, so its own stamp is used.
             newest_ns = times_ns.max(axis=1) if times_ns.size else messages.stamp_ns
             number = self.recording.number_at(newest_ns)
+            compensation = self.recording.compensation
+            recorded = [compensation.at(stamp_ns) for stamp_ns in messages.stamp_ns.tolist()]
 
             # A segment (messages reconstructed together) ends where the next message has other
             # cubes, a newer SkinInfo message (calibrations, rest frequencies) applies, or the next
             # message states what is compensated, or from which state on.
             has_other_cubes = (cube[1:] != cube[:-1]).any(axis=1)
             has_other_info = number[1:] != number[:-1]
-            compensation = self.recording.compensation
-            recorded = [compensation.at(stamp_ns) for stamp_ns in messages.stamp_ns.tolist()]
             has_motion = np.array([one.motion is not None for one in recorded])
-            begins_anew = np.array([bool(one.states) for one in recorded[1:]], bool)
-            begins_anew |= has_motion[1:] != has_motion[:-1]
-            ends = np.flatnonzero(has_other_cubes | has_other_info | begins_anew) + 1
-            bounds = [0, *ends.tolist(), len(messages)]
-            for begin, end in pairwise(bounds):
+            has_other_effects = has_motion[1:] != has_motion[:-1]
+            has_states = np.array([bool(one.states) for one in recorded[1:]], bool)
+            is_end = has_other_cubes | has_other_info | has_other_effects | has_states
+            ends = np.flatnonzero(is_end) + 1
+            for begin, end in pairwise([0, *ends.tolist(), len(messages)]):
                 # A scan ends where the cube number does not rise. Messages are reconstructed
                 # together only if their scans stay apart, so that the health finds the same scans.
                 are_apart = len(cube[begin]) and cube[begin, 0] <= cube[begin, -1]
@@ -147,7 +147,10 @@ class BagSource:
                     self.messages += len(part)
                     self.rows += len(part.rows)
                     yield Segment(
-                        part, recorded_ns[chosen], int(number[first]), recorded[first].states
+                        messages=part,
+                        recorded_ns=recorded_ns[chosen],
+                        number=int(number[first]),
+                        states=recorded[first].states,
                     )
 
 

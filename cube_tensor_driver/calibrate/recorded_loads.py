@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..bags.read import Bag
-from ..bags.recording import stamp_ns as header_stamp_ns
+from ..bags.read import stamp_ns as header_stamp_ns
 from ..bags.source import BagSource, open_bag
 from ..core.arrays import AnyArray, Array, Index, Times
 from ..core.calibration import Calibration

@@ -11,8 +11,7 @@ from typing import Any, NoReturn
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from ..bags.read import Bag
-from ..bags.recording import stamp_ns
+from ..bags.read import Bag, stamp_ns
 from ..core.arrays import Single
 from ..core.errors import BagError
 from .plan import Episode

@@ -17,8 +17,7 @@ from typing import Any
 import numpy as np
 from rosbags.interfaces import Nodetype
 
-from ..bags.read import Bag, message_fields
-from ..bags.recording import stamp_ns
+from ..bags.read import Bag, message_fields, stamp_ns
 from ..core.arrays import Single, Times
 from ..core.errors import BagError
 from ..messages.types import PACKAGE

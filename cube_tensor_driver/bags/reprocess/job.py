@@ -29,8 +29,8 @@ from ...core.rows import StressRows
 from ...messages.codec import stress_codec
 from ...messages.types import FREQUENCIES, INFO, STRESS
 from ..metadata import quality
-from ..read import Bag, serialise
-from ..recording import Settings, stamp_ns
+from ..read import Bag, serialise, stamp_ns
+from ..recording import Settings, reconstruct_rows
 from ..source import BagSource, Segment
 from ..tables import TableWriter
 from ..write import BagWriter
@@ -322,12 +322,7 @@ def _reconstruct(
         if use_health:
             reconstructor.compensation.restore(segment.states)
         try:
-            # If the recording states the health of every row, it is not determined again, which
-            # saves two fifths of the time.
-            if health is not None and health.known.all():
-                stress = reconstructor.process_known(rows, health)
-            else:
-                stress = reconstructor.process(rows, health)
+            stress = reconstruct_rows(reconstructor, rows, health)
         except CubeError as error:
             # The node refused these messages, too, as those with another number of pads.
             refused = error

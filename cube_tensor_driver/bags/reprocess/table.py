@@ -18,6 +18,7 @@ from ...core.arrays import Array
 from ...core.errors import BagError, LayoutError
 from ...core.reconstructor import CalibratedSkin, Reconstructor, RecordedHealth
 from ...core.rows import FrequencyRows
+from ..recording import reconstruct_rows
 from ..source import BagSource
 from ..tables import STRESS_SCHEMA, as_array, as_column, stress_batch
 
@@ -122,14 +123,16 @@ def reprocess_table(frequencies: pyarrow.Table, skin: CalibratedSkin) -> pyarrow
     reconstructor = Reconstructor(skin)
     if not len(frequencies):
         return STRESS_SCHEMA.empty_table()
-    has_parts = "part" in frequencies.column_names
-    part = frequencies["part"].to_numpy() if has_parts else np.zeros(len(frequencies))
-    begins = (np.flatnonzero(np.diff(part)) + 1).tolist()
+    bounds = [0, len(frequencies)]
+    if "part" in frequencies.column_names:
+        part = frequencies["part"].to_numpy()
+        begins = np.flatnonzero(np.diff(part)) + 1
+        bounds[1:1] = begins.tolist()
 
     names = pyarrow.array(skin.names, pyarrow.string())
     cubes = pyarrow.array([*skin.names, "unknown"])
     batches = []
-    for begin, end in pairwise([0, *begins, len(frequencies)]):
+    for begin, end in pairwise(bounds):
         piece = frequencies.slice(begin, end - begin)
         columns = {
             name: piece[name].combine_chunks()
@@ -141,31 +144,33 @@ def reprocess_table(frequencies: pyarrow.Table, skin: CalibratedSkin) -> pyarrow
             raise LayoutError(
                 f"no {', '.join(sorted(missing))} in the table; frequency_table makes one of a bag"
             )
-        number = pyarrow.compute.index_in(columns["cube"].cast(pyarrow.string()), value_set=names)
+        cube = columns["cube"].cast(pyarrow.string())
+        number = pyarrow.compute.index_in(cube, value_set=names)
         columns["cube"] = number.fill_null(len(names)).cast(pyarrow.uint16())
         _restore(reconstructor, columns)
-        rows = FrequencyRows.of(
-            **{key: as_array(columns[name]) for name, key in COLUMNS.items() if name in columns}
-        )
+        attributes = {
+            attribute: as_array(columns[name])
+            for name, attribute in COLUMNS.items()
+            if name in columns
+        }
+        rows = FrequencyRows.of(**attributes)
         health = _recorded_health(columns)
-        # As for a bag, pads are not examined where the health of all rows is recorded.
-        if health is not None and health.known.all():
-            stress = reconstructor.process_known(rows, health)
-        else:
-            stress = reconstructor.process(rows, health)
+        stress = reconstruct_rows(reconstructor, rows, health)
         batches.append(stress_batch(stress, cubes))
     return pyarrow.Table.from_batches(batches, STRESS_SCHEMA)
 
 
 def _recorded_health(columns: dict[str, Any]) -> RecordedHealth | None:
     """Return the health of the pads that Arrow columns state; None: they state none."""
-    names = "recorded_left_out", "recorded_status"
-    if not columns.keys() >= {*names}:
+    if not columns.keys() >= {"recorded_left_out", "recorded_status"}:
         return None
-    left_out, status = (as_array(columns[name]).astype(float) for name in names)
-    known = ~np.isnan(left_out)
-    left_out, status = np.nan_to_num(left_out), np.nan_to_num(status)
-    return RecordedHealth(known, left_out.astype(np.uint32), status.astype(np.uint16))
+    left_out = columns["recorded_left_out"]
+    status = columns["recorded_status"]
+    return RecordedHealth(
+        known=as_array(left_out.is_valid()),
+        left_out=as_array(left_out.fill_null(0)).astype(np.uint32),
+        status=as_array(status.fill_null(0)).astype(np.uint16),
+    )
 
 
 def _restore(reconstructor: Reconstructor, columns: dict[str, Any]) -> None:
