@@ -6,17 +6,16 @@ In rclpy each point and each colour of a marker is a Python object, so that seri
 thousands of points would be slow. Here a MarkerArray with placeholders is serialised once, and each
 new picture is written by numpy into the bytes of the serialised message.
 
-A message is serialised in the format CDR: four bytes of encapsulation, then all fields in order,
-each aligned to a multiple of its size. Before a text or a sequence stands its length, in 4 bytes.
-Source: OMG Common Object Request Broker Architecture 3.3, part 2, section 9.3 (CDR transfer
-syntax).
+The places of the fields in these bytes are found by a search: in a copy of the markers, each field
+begins with a number or text that occurs nowhere else.
 """
 
 from __future__ import annotations
 
-import re
+import copy
+import struct
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from geometry_msgs.msg import Point
@@ -25,29 +24,10 @@ from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
 from ...core.arrays import AnyArray, Array, Single
-from ...core.errors import MessageError
 
 LIFETIME_S = 2
 """Time, in seconds, after which viewers remove a picture if the node `markers` has sent no newer
 one. So an old load is not shown as the present one after the node has ended."""
-
-ENCAPSULATION_BYTES = 4
-"""Number of bytes of the encapsulation, which precedes the first field of a serialised message."""
-
-MAX_PADDING_BYTES = 3
-"""Maximum number of bytes that the middleware appends to a serialised message, to make its size a
-multiple of four."""
-
-ITEM_BYTES = {
-    "boolean": 1,
-    "octet": 1,
-    "uint8": 1,
-    "int32": 4,
-    "uint32": 4,
-    "float": 4,
-    "double": 8,
-}
-"""Primitive type of a field of a Marker -> its size in a serialised message, in bytes."""
 
 Colour = tuple[float, float, float]
 """Red, green and blue, each from 0 to 1."""
@@ -153,33 +133,22 @@ class SerialisedMarkers:
 
         Args:
             markers: The markers. Their numbers of points and colours and the lengths of their texts
-                cannot change afterwards.
-
-        Raises:
-            MessageError: The serialised message has another size than computed, because the
-                installed version of visualization_msgs has other fields.
+                cannot change afterwards; texts have at least four letters.
         """
         self.data = bytearray(serialize_message(MarkerArray(markers=list(markers))))
+        # All lengths in the copies are those of the markers, and so are the places of all fields.
+        copies = copy.deepcopy(list(markers))
+        marks = [_mark(marker, number) for number, marker in enumerate(copies)]
+        marked = serialize_message(MarkerArray(markers=copies))
         self._arrays: dict[str, MarkerArrays] = {}
-        walk = _CdrWalk()
-        walk.skip("uint32", len(markers))
-        for marker in markers:
-            start = walk.skip_message(marker)
+        for marker, begins in zip(markers, marks, strict=True):
+            points, colours, text, position, colour = map(marked.index, begins)
             self._arrays[marker.ns] = MarkerArrays(
-                points=self._view("<f8", start["points"], (len(marker.points), 3)),
-                colours=self._view("<f4", start["colors"], (len(marker.colors), 4)),
-                text=self._view("u1", start["text"], (len(marker.text),)),
-                # The position is the first field of the pose. Only numbers are aligned, not the
-                # messages that contain them, so the alignment of the first number is added.
-                position=self._view("<f8", _align(start["pose"], 8), (3,)),
-                colour=self._view("<f4", _align(start["color"], 4), (4,)),
-            )
-
-        expected = ENCAPSULATION_BYTES + walk.end
-        if not 0 <= len(self.data) - expected <= MAX_PADDING_BYTES:
-            raise MessageError(
-                f"MarkerArray: serialised into {len(self.data)} bytes, expected are {expected}: "
-                "this version of visualization_msgs is not known"
+                points=self._view("<f8", points, (len(marker.points), 3)),
+                colours=self._view("<f4", colours, (len(marker.colors), 4)),
+                text=self._view("u1", text, (len(marker.text),)),
+                position=self._view("<f8", position, (3,)),
+                colour=self._view("<f4", colour, (4,)),
             )
 
     def __getitem__(self, namespace: str) -> MarkerArrays:
@@ -197,90 +166,33 @@ class SerialisedMarkers:
         """
         self._arrays[namespace].text[:] = np.frombuffer(text.encode(), np.uint8)
 
-    def _view(
-        self,
-        dtype: str,
-        start: int,
-        shape: tuple[int, ...],
-    ) -> AnyArray:
-        view: AnyArray = np.ndarray(
-            shape,
-            dtype,
-            self.data,
-            ENCAPSULATION_BYTES + start,
-        )
+    def _view(self, dtype: str, start: int, shape: tuple[int, ...]) -> AnyArray:
+        view: AnyArray = np.ndarray(shape, dtype, self.data, start)
         return view
 
 
-class _CdrWalk:
-    """Computes the byte offsets of the fields of a serialised message, one after the other.
-
-    Offsets are measured from the end of the encapsulation.
-
-    Attributes:
-        end: Byte offset at which the last value ended.
-    """
-
-    def __init__(self) -> None:
-        self.end = 0
-
-    def skip(self, type_name: str, value: Any) -> int:
-        """Advance over a value of any type.
-
-        Args:
-            type_name: Type of the value, as ROS names it.
-            value: The value; its lengths of texts and sequences determine its size.
-
-        Returns:
-            Byte offset of the number, of the first character of the text or of the first item of
-            the sequence. For a message it is the end of the previous value, which may be followed
-            by padding.
-        """
-        sequence = re.fullmatch(r"sequence<(.*)>", type_name)
-        if sequence:
-            return self._skip_sequence(sequence[1], value)
-        if type_name == "string":
-            start = self.skip("uint32", len(value)) + ITEM_BYTES["uint32"]
-            self.end = start + len(value.encode()) + 1  # A text ends with a zero byte.
-            return start
-        if type_name in ITEM_BYTES:
-            size = ITEM_BYTES[type_name]
-            start = _align(self.end, size)
-            self.end = start + size
-            return start
-        start = self.end
-        self.skip_message(value)
-        return start
-
-    def skip_message(self, message: Any) -> dict[str, int]:
-        """Advance over all fields of a message.
-
-        Returns:
-            Name of a field -> byte offset at which its content begins, as `skip` returns it.
-        """
-        types = message.get_fields_and_field_types()
-        return {name: self.skip(types[name], getattr(message, name)) for name in types}
-
-    def _skip_sequence(self, item_type: str, items: Sequence[Any]) -> int:
-        self.skip("uint32", len(items))
-        if not len(items):
-            return self.end
-        if item_type in ITEM_BYTES:
-            start = self.skip(item_type, items[0])
-        else:
-            # The first field may follow padding, which is not a part of the item.
-            start = min(self.skip_message(items[0]).values())
-        # All items have the same size, and there is no padding between them, because the size is a
-        # multiple of the alignment.
-        self.end = start + len(items) * (self.end - start)
-        return start
-
-
-def _align(start: int, size: int) -> int:
-    """Return the byte offset at which a number begins that is aligned to its size.
+def _mark(marker: Marker, number: int) -> tuple[bytes, bytes, bytes, bytes, bytes]:
+    """Let each field of a marker begin with a number or text that no other field has.
 
     Args:
-        start: Byte offset at which the previous value ended.
-        size: Size of the number, in bytes; the result is a multiple of it, at least `start`.
+        marker: The marker, which is changed.
+        number: Index of the marker among those of the message.
+
+    Returns:
+        The bytes with which the fields begin, in the order of `MarkerArrays`; no bytes for a field
+        that is empty.
     """
-    return -(-start // size) * size
+    # These numbers are far above all coordinates and colours.
+    first, second = 1e30 * (2 * number + 1), 1e30 * (2 * number + 2)
+    points = colours = text = b""
+    if marker.points:
+        marker.points[0] = Point(x=first)
+        points = struct.pack("<d", first)
+    if marker.colors:
+        marker.colors[0] = ColorRGBA(r=first)
+        colours = struct.pack("<f", first)
+    if marker.text:
+        marker.text = f"#{number:03}".ljust(len(marker.text))
+        text = marker.text.encode()
+    marker.pose.position.x = marker.color.r = second
+    return points, colours, text, struct.pack("<d", second), struct.pack("<f", second)
