@@ -16,6 +16,9 @@ from typing import Any
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 
+Callback = Callable[..., Any]
+"""Callback of a subscription, timer or service: rclpy decides on its arguments."""
+
 MAX_CHARACTERS = 1000
 """Maximum number of characters of a text that a service returns and logs. A longer text is cut: it
 quotes the request of a client, which may have megabytes."""
@@ -35,7 +38,7 @@ class CallbackErrors:
         self.count = 0
         self._node = node
 
-    def catch(self, callback: Callable[..., Any]) -> Callable[..., Any]:
+    def catch(self, callback: Callback) -> Callback:
         """Wrap the callback of a subscription or a timer so that its exceptions are caught.
 
         Returns:
@@ -52,7 +55,7 @@ class CallbackErrors:
 
         return call
 
-    def catch_in_service(self, callback: Callable[..., Any]) -> Callable[..., Any]:
+    def catch_in_service(self, callback: Callback) -> Callback:
         """Wrap the callback of a service so that its exceptions are caught.
 
         After an exception the response is sent with the values that it has by then, and with the
@@ -104,7 +107,7 @@ def shorten(text: str) -> str:
     return f"{text[:MAX_CHARACTERS]}… ({len(text)} characters)"
 
 
-def refuse_on_error(callback: Callable[..., Any], errors: type[Exception]) -> Callable[..., Any]:
+def refuse_on_error(callback: Callback, errors: type[Exception]) -> Callback:
     """Wrap the callback of a service so that certain exceptions give a response without success.
 
     Args:

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 
@@ -35,7 +36,7 @@ __all__ = [
 ]
 
 
-def make_executor(warn: Callable[[str], object] = lambda text: None) -> Any:
+def make_executor(warn: Callable[[str], object] = lambda text: None) -> Executor:
     """Return a new executor: an EventsExecutor if this rclpy has it, else a SingleThreadedExecutor.
 
     The EventsExecutor takes a third of the CPU time of the other one. ROS 2 Jazzy (rclpy 7.1.4),
@@ -47,8 +48,6 @@ def make_executor(warn: Callable[[str], object] = lambda text: None) -> Any:
     try:
         from rclpy.experimental.events_executor import EventsExecutor
     except ImportError:
-        from rclpy.executors import SingleThreadedExecutor
-
         warn(
             "this rclpy has no EventsExecutor: the nodes take about three times the CPU time; "
             "install rclpy 7.1.4 (ROS 2 Jazzy) or newer"

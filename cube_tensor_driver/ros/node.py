@@ -28,6 +28,7 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.lifecycle import (
     LifecycleNode,
     LifecyclePublisher,
+    State,
     TransitionCallbackReturn,
 )
 from rclpy.node import Node
@@ -42,7 +43,7 @@ from ..config.parameters import Parameter
 from ..config.skin import Skin, read_skin
 from ..core.errors import ConfigError, CubeError
 from ..processes.stop_signals import stop_event
-from .callbacks import CallbackErrors, refuse_on_error, shorten
+from .callbacks import Callback, CallbackErrors, refuse_on_error, shorten
 from .compat import after_parameters_are_set, make_executor
 from .qos import SERVICES, batch_profile, scans_per_message
 from .session import spin_until, start_ros
@@ -211,38 +212,24 @@ class CubeNode(LifecycleNode):
 
     # Methods of rclpy that register callbacks; here they catch the callbacks' exceptions.
 
-    def create_subscription(self, *arguments: Any, **options: Any) -> Any:
-        message_type, topic, callback, *others = arguments
+    def create_subscription(
+        self, msg_type: type, topic: str, callback: Callback, *others: Any, **options: Any
+    ) -> Any:
         callback = self.callback_errors.catch(callback)
-        return super().create_subscription(
-            message_type,
-            topic,
-            callback,
-            *others,
-            **options,
-        )
+        return super().create_subscription(msg_type, topic, callback, *others, **options)
 
-    def create_timer(self, *arguments: Any, **options: Any) -> Any:
-        period, callback, *others = arguments
+    def create_timer(
+        self, timer_period_sec: float, callback: Callback, *others: Any, **options: Any
+    ) -> Any:
         callback = self.callback_errors.catch(callback)
-        return super().create_timer(
-            period,
-            callback,
-            *others,
-            **options,
-        )
+        return super().create_timer(timer_period_sec, callback, *others, **options)
 
-    def create_service(self, *arguments: Any, **options: Any) -> Any:
-        service_type, name, callback, *others = arguments
+    def create_service(
+        self, srv_type: type, srv_name: str, callback: Callback, *others: Any, **options: Any
+    ) -> Any:
         callback = self.callback_errors.catch_in_service(callback)
         options.setdefault("qos_profile", SERVICES)
-        return super().create_service(
-            service_type,
-            name,
-            callback,
-            *others,
-            **options,
-        )
+        return super().create_service(srv_type, srv_name, callback, *others, **options)
 
     def _protect_lifecycle_services(self) -> None:
         """Catch exceptions in the lifecycle services, which rclpy makes without `create_service`.
@@ -277,23 +264,25 @@ class CubeNode(LifecycleNode):
             given[parameter.name] = self._as_declared(given[parameter.name])
         self.declare_parameter(parameter.name, parameter.default, descriptor)
 
-    def set_parameters_atomically(self, parameter_list: list[Any]) -> SetParametersResult:
+    def set_parameters_atomically(
+        self, parameter_list: list[RclpyParameter]
+    ) -> SetParametersResult:
         return super().set_parameters_atomically(list(map(self._as_declared, parameter_list)))
 
-    def _as_declared(self, parameter: Any) -> Any:
+    def _as_declared(self, parameter: RclpyParameter) -> RclpyParameter:
         """Return a parameter in the type of its declaration if it is an integer for a real number.
 
         rclpy refuses `rate: 250` for a parameter whose type is double.
 
         Args:
-            parameter: Name and value (rclpy.parameter.Parameter).
+            parameter: Name and value.
         """
         known = self._parameters_by_name.get(parameter.name)
         if known and isinstance(known.default, float) and type(parameter.value) is int:
             return RclpyParameter(parameter.name, value=float(parameter.value))
         return parameter
 
-    def _check_parameters(self, parameters: list[Any]) -> SetParametersResult:
+    def _check_parameters(self, parameters: list[RclpyParameter]) -> SetParametersResult:
         for parameter in parameters:
             reason = self._refusal(parameter.name, parameter.value)
             if reason:
@@ -319,7 +308,7 @@ class CubeNode(LifecycleNode):
             )
         return refusal
 
-    def _apply_parameters(self, parameters: list[Any]) -> None:
+    def _apply_parameters(self, parameters: list[RclpyParameter]) -> None:
         for parameter in parameters:
             known = self._parameters_by_name.get(parameter.name)
             if self.is_configured and known is not None and known.live:
@@ -327,32 +316,32 @@ class CubeNode(LifecycleNode):
 
     # Transitions of the lifecycle.
 
-    def on_configure(self, state: Any) -> TransitionCallbackReturn:
+    def on_configure(self, state: State) -> TransitionCallbackReturn:
         result = self._attempt(self.configure)
         self.is_configured = result == TransitionCallbackReturn.SUCCESS
         if not self.is_configured:
             self._resources.close()  # destroys the objects that were made before the error
         return result
 
-    def on_activate(self, state: Any) -> TransitionCallbackReturn:
+    def on_activate(self, state: State) -> TransitionCallbackReturn:
         result: TransitionCallbackReturn = super().on_activate(state)
         if result == TransitionCallbackReturn.SUCCESS:
             result = self._attempt(self.activate)
         self.is_active = result == TransitionCallbackReturn.SUCCESS
         return result
 
-    def on_deactivate(self, state: Any) -> TransitionCallbackReturn:
+    def on_deactivate(self, state: State) -> TransitionCallbackReturn:
         self.is_active = False
         self.deactivate()
         result: TransitionCallbackReturn = super().on_deactivate(state)
         return result
 
-    def on_cleanup(self, state: Any) -> TransitionCallbackReturn:
+    def on_cleanup(self, state: State) -> TransitionCallbackReturn:
         self.end()
         gc.collect()  # explicitly, because the thresholds that `run` sets make it rare
         return TransitionCallbackReturn.SUCCESS
 
-    def on_shutdown(self, state: Any) -> TransitionCallbackReturn:
+    def on_shutdown(self, state: State) -> TransitionCallbackReturn:
         self.end()
         return TransitionCallbackReturn.SUCCESS
 

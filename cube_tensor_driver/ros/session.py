@@ -8,9 +8,10 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import NamedTuple
 
 import rclpy
+from rclpy.executors import Executor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
@@ -39,15 +40,19 @@ def start_ros() -> None:
         raise ConfigError(f"ROS 2 does not start: {reason}; correct ROS_* and RMW_*") from None
 
 
+class Session(NamedTuple):
+    """The node of a command, and the executor that contains it, which the main thread must spin."""
+
+    node: Node
+    executor: Executor
+
+
 @contextmanager
-def node_session(name: str) -> Iterator[tuple[Node, Any]]:
+def node_session(name: str) -> Iterator[Session]:
     """Start rclpy with a node for a `with` block, and shut rclpy down at its end.
 
     Args:
         name: Name of the node.
-
-    Yields:
-        The node, and an executor that contains it. The executor must be spun in the main thread.
 
     Raises:
         ConfigError: rclpy does not start.
@@ -57,7 +62,7 @@ def node_session(name: str) -> Iterator[tuple[Node, Any]]:
         node, executor = rclpy.create_node(name), make_executor()
         executor.add_node(node)
         try:
-            yield node, executor
+            yield Session(node, executor)
         finally:
             executor.remove_node(node)
             node.destroy_node()
@@ -66,7 +71,7 @@ def node_session(name: str) -> Iterator[tuple[Node, Any]]:
 
 
 def spin_until(
-    executor: Any,
+    executor: Executor,
     is_done: Callable[[], object],
     seconds: float = float("inf"),
     *,

@@ -289,7 +289,7 @@ def test_nodes_that_are_found_late_are_listed_too(monkeypatch):
         return ["/demo", "/driver", "/reconstruction"][: len(seen)]
 
     seen: list[list[str]] = []
-    assert services.discover_all(executor, lambda: seen.append(found()) or seen[-1])
+    assert services.discover(executor, lambda: seen.append(found()) or seen[-1])
     assert seen[-1] == ["/demo", "/driver", "/reconstruction"] and rounds
 
 
@@ -311,6 +311,6 @@ def test_a_list_of_nodes_waits_until_lost_announcements_are_repeated(monkeypatch
         get_service_names_and_types=found, get_fully_qualified_name=lambda: "/parameters"
     )
     executor = types.SimpleNamespace(spin_once=lambda timeout_sec: None)
-    session = contextlib.nullcontext((node, executor))
+    session = contextlib.nullcontext(services.Session(node, executor))
     monkeypatch.setattr(services, "node_session", lambda _: session)
     assert services.list_nodes() == ["/driver", "/reconstruction"]

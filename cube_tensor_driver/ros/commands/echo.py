@@ -80,11 +80,11 @@ def listen(topic: str, once: bool) -> Iterator[list[Item]]:
     with node_session("echo") as (node, executor):
         name = resolve_topics(node, [topic])[0]
         listener = _Listener(node, name)
-        found = discover(executor, lambda: stop.is_set() or listener.subscribe())
-        if not found:
+        if not discover(executor, lambda: stop.is_set() or node.count_publishers(name)):
             raise CubeError(
                 f"nobody publishes {name} in {domain_text()}; ./cube topics lists what there is"
             )
+        listener.subscribe()
         spin_until(executor, lambda: stop.is_set() or listener.has_names, MAX_INFO_S)
         # Without `once`, the user watches the topic and ends the command himself (Ctrl-C).
         wait_s = MAX_MESSAGE_S if once else float("inf")
@@ -166,11 +166,8 @@ class _Listener:
         """Whether the names of the cubes are known, or are not needed for this topic."""
         return self._names is not None or not self._needs_names
 
-    def subscribe(self) -> bool:
-        """Subscribe if the topic has a publisher by now.
-
-        Returns:
-            Whether there is a publisher. If not, the method should be called again later.
+    def subscribe(self) -> None:
+        """Subscribe to the topic, which has a publisher by now, unless the command is to end.
 
         Raises:
             CubeError: Publishers of the topic have different types, or the type of its messages is
@@ -178,7 +175,7 @@ class _Listener:
         """
         offers = self._node.get_publishers_info_by_topic(self._topic)
         if not offers:
-            return False
+            return
         kinds = sorted({offer.topic_type for offer in offers})
         # A subscription has one type, and messages of publishers with another type would be
         # missing without an error.
@@ -189,7 +186,7 @@ class _Listener:
         kind = message_class(self._topic, kinds[0])
         if self._early_subscription is not None:
             if kind is StressTensorStamped:
-                return True
+                return
             self._node.destroy_subscription(self._early_subscription)
 
         profile = offered_profile(offers, QUEUE_DEPTH)
@@ -206,7 +203,6 @@ class _Listener:
             self._add(SkinStress, self._on_stress, profile, raw=True)
         else:
             self._add(kind, self._on_message, profile)
-        return True
 
     def take(self) -> list[Item]:
         """Remove the oldest message from `waiting`, and return its content.

@@ -15,13 +15,13 @@ from rcl_interfaces.srv import (
     ListParameters,
     SetParameters,
 )
-from rclpy.node import Node
+from rclpy.executors import Executor
 from rclpy.parameter import get_parameter_value, parameter_value_to_python
 from std_srvs.srv import Trigger
 
 from ...core.errors import ConfigError, CubeError, TareError
 from ...srv import Tare
-from ..session import domain_text, node_session, spin_until
+from ..session import Session, domain_text, node_session, spin_until
 
 MAX_DISCOVERY_S = 5.0
 """Maximum time, in seconds, for which topics and services of other nodes are searched."""
@@ -81,8 +81,8 @@ def request_tare(cubes: Sequence[str], clear: bool) -> list[TareAnswer]:
     Raises:
         CubeError: No reconstruction runs, or one has not responded within `MAX_ANSWER_S`.
     """
-    with node_session("tare_request") as (node, executor):
-        services = find_services(node, executor, "cube_tensor_driver/srv/Tare")
+    with node_session("tare_request") as session:
+        services = find_services(session, "cube_tensor_driver/srv/Tare")
         if not services:
             raise TareError(
                 f"no reconstruction runs in {domain_text()}; start ./cube demo or the launch file"
@@ -92,23 +92,10 @@ def request_tare(cubes: Sequence[str], clear: bool) -> list[TareAnswer]:
             # The name of the service begins with that of its node, as in /reconstruction/tare.
             name = service.rpartition("/")[0]
             if clear:
-                request = Trigger.Request()
-                answer = call_service(
-                    node,
-                    executor,
-                    Trigger,
-                    f"{name}/clear_tare",
-                    request,
-                )
+                answer = call_service(session, Trigger, f"{name}/clear_tare", Trigger.Request())
             else:
                 request = Tare.Request(cubes=list(cubes))
-                answer = call_service(
-                    node,
-                    executor,
-                    Tare,
-                    service,
-                    request,
-                )
+                answer = call_service(session, Tare, service, request)
             answers.append(TareAnswer(name, bool(answer.success), answer.message))
         return answers
 
@@ -119,9 +106,9 @@ def list_nodes() -> list[str]:
     Raises:
         ConfigError: No such node was found within `MAX_DISCOVERY_S`.
     """
-    with node_session("parameters") as (node, executor):
-        spin_until(executor, lambda: False, ANNOUNCE_S)
-        return _find_nodes(node, executor)
+    with node_session("parameters") as session:
+        spin_until(session.executor, lambda: False, ANNOUNCE_S)
+        return _find_nodes(session)
 
 
 def read_parameters(name: str, parameter: str | None) -> dict[str, Any]:
@@ -137,8 +124,8 @@ def read_parameters(name: str, parameter: str | None) -> dict[str, Any]:
     Raises:
         ConfigError: There is no such node or parameter.
     """
-    with node_session("parameters") as (node, executor):
-        parameters = _NodeParameters(node, executor, name)
+    with node_session("parameters") as session:
+        parameters = _NodeParameters(session, name)
         names = parameters.names()
         if parameter is not None:
             parameters.check_name(parameter)
@@ -160,8 +147,8 @@ def set_parameter(name: str, parameter: str, text: str) -> Any:
     Raises:
         ConfigError: There is no such node or parameter, or the node refuses the value.
     """
-    with node_session("parameters") as (node, executor):
-        parameters = _NodeParameters(node, executor, name)
+    with node_session("parameters") as session:
+        parameters = _NodeParameters(session, name)
         parameters.check_name(parameter)
         parameters.set(parameter, text)
         return parameters.values([parameter])[parameter]
@@ -170,20 +157,19 @@ def set_parameter(name: str, parameter: str, text: str) -> Any:
 class _NodeParameters:
     """Reads and sets the parameters of another node through the services of that node."""
 
-    def __init__(self, node: Node, executor: Any, name: str) -> None:
+    def __init__(self, session: Session, name: str) -> None:
         """Find the node whose parameters are read and set.
 
         Args:
-            node: The node of this process, which calls the services.
-            executor: The executor that contains `node`.
+            session: The node of this process, which calls the services.
             name: Name of the other node.
 
         Raises:
             ConfigError: No node of this name was found within `MAX_DISCOVERY_S`.
         """
-        self._node, self._executor = node, executor
+        self._session = session
         self._name = f"/{name.removeprefix('/')}"
-        nodes = _find_nodes(node, executor, f"{self._name}{LIST_SERVICE}")
+        nodes = _find_nodes(session, f"{self._name}{LIST_SERVICE}")
         if self._name not in nodes:
             others = ", ".join(nodes)
             raise ConfigError(f"no node {self._name} in {domain_text()}; its nodes: {others}")
@@ -238,91 +224,58 @@ class _NodeParameters:
         if not result.successful:
             raise ConfigError(f"{refusal}: {result.reason}")
 
-    def _call(
-        self,
-        service_type: type,
-        service: str,
-        request: Any,
-    ) -> Any:
-        name = f"{self._name}/{service}"
-        return call_service(
-            self._node,
-            self._executor,
-            service_type,
-            name,
-            request,
-        )
+    def _call(self, service_type: type, service: str, request: Any) -> Any:
+        return call_service(self._session, service_type, f"{self._name}/{service}", request)
 
 
-def _find_nodes(
-    node: Node,
-    executor: Any,
-    wanted_service: str = "",
-) -> list[str]:
+def _find_nodes(session: Session, wanted_service: str = "") -> list[str]:
     """Return the full names of the nodes in the DDS domain that have parameters.
 
     Args:
-        node: The node that searches, which is left out.
-        executor: The executor that contains `node`.
+        session: The node that searches, which is left out.
         wanted_service: Full name of a service with which the search ends; empty: all are searched.
 
     Raises:
         ConfigError: No node was found within `MAX_DISCOVERY_S`.
     """
     kind = "rcl_interfaces/srv/ListParameters"
-    services = find_services(node, executor, kind, wanted_service)
+    services = find_services(session, kind, wanted_service)
     nodes = [service.removesuffix(LIST_SERVICE) for service in services]
     if not nodes:
         raise ConfigError(f"no node runs in {domain_text()}; start ./cube demo or a skin")
     return nodes
 
 
-def find_services(
-    node: Node,
-    executor: Any,
-    kind: str,
-    wanted: str = "",
-) -> list[str]:
+def find_services(session: Session, kind: str, wanted: str = "") -> list[str]:
     """Return the full names of all services of one type, sorted; the list may be empty.
 
     Args:
-        node: The node that searches. Its own services are left out.
-        executor: The executor that contains `node`.
+        session: The node that searches. Its own services are left out.
         kind: Type of the services, as in std_srvs/srv/Trigger.
         wanted: Full name of a service with which the search ends. If it is empty, the search ends
             when no further service has appeared for `SETTLE_S`, at the latest after
             `MAX_DISCOVERY_S`.
     """
-    own = f"{node.get_fully_qualified_name()}/"
+    own = f"{session.node.get_fully_qualified_name()}/"
 
     def find() -> list[str]:
-        services = node.get_service_names_and_types()
+        services = session.node.get_service_names_and_types()
         return sorted(
             name for name, kinds in services if kind in kinds and not name.startswith(own)
         )
 
-    if wanted:
-        # Only the named service is needed, so the search need not go on for others.
-        discover(executor, lambda: wanted in find())
-    else:
-        discover_all(executor, find)
+    # If only one service is needed, the search does not go on for others.
+    discover(session.executor, (lambda: wanted in find()) if wanted else find)
     return find()
 
 
-def call_service(
-    node: Node,
-    executor: Any,
-    service_type: type,
-    name: str,
-    request: Any,
-) -> Any:
+def call_service(session: Session, service_type: type, name: str, request: Any) -> Any:
     """Call a service and return its response.
 
     The request is sent again every `REPEAT_S`, so it must be one that may be executed twice.
 
     Args:
-        node: The node that calls.
-        executor: The executor that contains `node`.
+        session: The node that calls.
         service_type: Type of the service.
         name: Full name of the service.
         request: The request.
@@ -331,16 +284,16 @@ def call_service(
         CubeError: The service was not found within `MAX_DISCOVERY_S`, or no response has come
             within `MAX_ANSWER_S`.
     """
-    client = node.create_client(service_type, name)
+    client = session.node.create_client(service_type, name)
     try:
-        if not discover(executor, client.service_is_ready):
+        if not discover(session.executor, client.service_is_ready):
             raise CubeError(f"{name}: nobody offers this service in {domain_text()}")
         futures: list[Any] = []
         until = time.monotonic() + MAX_ANSWER_S
         while time.monotonic() < until:
             # DDS may lose a request, and then no response comes; so the request is repeated.
             futures.append(client.call_async(request))
-            spin_until(executor, lambda: any(future.done() for future in futures), REPEAT_S)
+            spin_until(session.executor, lambda: any(future.done() for future in futures), REPEAT_S)
             for future in futures:
                 if future.done():
                     return future.result()
@@ -348,31 +301,15 @@ def call_service(
             f"{name}: no answer within {MAX_ANSWER_S:g} s; is its node stopped, or very busy?"
         )
     finally:
-        node.destroy_client(client)
+        session.node.destroy_client(client)
 
 
-def discover(executor: Any, find: Callable[[], object]) -> bool:
-    """Spin until `find` returns a true value, and `SETTLE_S` longer.
-
-    Args:
-        executor: The executor to spin.
-        find: Returns what was found so far; called repeatedly.
-
-    Returns:
-        Whether anything was found within `MAX_DISCOVERY_S`.
-    """
-    if not spin_until(executor, find, MAX_DISCOVERY_S):
-        return False
-    spin_until(executor, lambda: False, SETTLE_S)
-    return True
-
-
-def discover_all(executor: Any, find: Callable[[], object]) -> bool:
-    """Spin until the result of `find` is not empty and has not changed for `SETTLE_S`.
+def discover(executor: Executor, find: Callable[[], object]) -> bool:
+    """Spin until the result of `find` is true and has not changed for `SETTLE_S`.
 
     Args:
         executor: The executor to spin.
-        find: Returns what was found so far; called repeatedly.
+        find: Returns what was found so far, such as a list of names; called repeatedly.
 
     Returns:
         Whether anything was found within `MAX_DISCOVERY_S`.

@@ -9,6 +9,7 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
+from rclpy.executors import Executor
 from rclpy.node import Node
 
 from ...core.errors import BagError, CubeError
@@ -16,7 +17,7 @@ from ..messages import message_class
 from ..qos import offered_profile
 from ..session import domain_text, node_session, spin_until
 from .echo import QUEUE_DEPTH
-from .services import SETTLE_S, discover_all
+from .services import SETTLE_S, discover
 
 COUNT_S = 1.0
 """Time, in seconds, for which the messages of each topic are counted."""
@@ -70,7 +71,7 @@ def list_topics() -> list[ListedTopic]:
         CubeError: No topic was found.
     """
     with node_session("topic_list") as (node, executor):
-        if not discover_all(executor, lambda: _find_topics(node)):
+        if not discover(executor, lambda: _find_topics(node)):
             raise CubeError(f"nobody publishes in {domain_text()}; start ./cube demo or a skin")
         for _ in range(MAX_TRIES):
             topics = _find_topics(node)
@@ -96,7 +97,7 @@ def _find_topics(node: Node) -> list[ListedTopic]:
 
 def _count_messages(
     node: Node,
-    executor: Any,
+    executor: Executor,
     topics: list[ListedTopic],
 ) -> None:
     """Count the messages of topics for `COUNT_S`, and store the number in each `ListedTopic`.

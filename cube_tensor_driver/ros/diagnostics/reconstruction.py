@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -18,6 +18,9 @@ from ...core.rows import FrequencyRows, StressRows
 from ...core.status import INVALID, LEFT_OUT, WORDS
 from ..compat import SubscriptionEventCallbacks
 from .updater import make_status
+
+if TYPE_CHECKING:
+    from ..nodes.taring import Taring
 
 MAX_CUBE_STATUSES = 64
 """Maximum number of cubes that have a status in one message of /diagnostics.
@@ -43,22 +46,6 @@ LogChanges = list[tuple[str, bool]]
 """Lines for the log, each with whether it reports a problem (True) or the end of one (False)."""
 
 
-class TareState(Protocol):
-    """The part of the class `Taring` that diagnostics use.
-
-    Attributes:
-        uids: Index of a cube in the skin -> its uid.
-    """
-
-    uids: dict[int, int]
-
-    def age(self) -> dict[str, str]:
-        """Return the number of tared cubes and the age of the oldest tare, in s, as texts.
-
-        The keys are those of the status on /diagnostics.
-        """
-
-
 class ReconstructionDiagnostics:
     """Makes the diagnostic statuses of the reconstruction. It is used once a second.
 
@@ -69,7 +56,7 @@ class ReconstructionDiagnostics:
     """
 
     def __init__(
-        self, skin: Skin, reconstructor: Reconstructor, tare: TareState, lost: LostMessages
+        self, skin: Skin, reconstructor: Reconstructor, tare: Taring, lost: LostMessages
     ) -> None:
         self.refused_messages = 0
         self.compensation_problem = ""

@@ -51,8 +51,9 @@ class Taring:
     Attributes:
         uids: Index of a cube in the skin -> its uid (unique number), for cubes whose uid is known
             from the skin file or from the hub.
-        created: Index of a cube in the skin -> time at which its tare was measured, for cubes that
-            have a tare.
+        created: Index of a cube in the skin -> time at which its tare was measured; None: it was
+            cleared. A tare that was measured or cleared before the uid was known is stored as soon
+            as the uid is known.
     """
 
     def __init__(
@@ -78,10 +79,7 @@ class Taring:
         self._skin, self._folder = skin, folder
         self._lock, self._on_change = lock, on_change
         self.uids: dict[int, int] = {}
-        self.created: dict[int, datetime] = {}
-        # Index of a cube whose uid is unknown yet -> time of its tare, or None if its tare was
-        # cleared. Its file is written or removed when the uid becomes known.
-        self._pending: dict[int, datetime | None] = {}
+        self.created: dict[int, datetime | None] = {}
 
         # Neither the lock nor on_change is needed: the reconstructor is not used before the node
         # is configured.
@@ -112,11 +110,12 @@ class Taring:
 
         The keys are those of the diagnostics.
         """
-        if not self.created:
+        times = [created for created in self.created.values() if created]
+        if not times:
             return {"cubes tared": "0"}
-        oldest = datetime.now(timezone.utc) - min(self.created.values())
+        oldest = datetime.now(timezone.utc) - min(times)
         return {
-            "cubes tared": str(len(self.created)),
+            "cubes tared": str(len(times)),
             "oldest tare s": f"{oldest.total_seconds():.0f}",
         }
 
@@ -135,15 +134,16 @@ class Taring:
         rest = self._reconstructor.rest_frequency
         before = rest.copy()
         for number, uid in uids.items():
-            if self.uids.get(number) == uid:
+            known = self.uids.get(number)
+            if known == uid:
                 continue
-            # The cube had another uid before, so it was exchanged, and its tare is not valid.
-            if number in self.uids:
-                self._forget_tare(number, rest)
             self.uids[number] = uid
-            # A request in this run of the node is newer than the file of an earlier run.
-            if number in self._pending:
-                self._keep_pending(number, rest)
+            if known is not None:
+                # The cube was exchanged, so that its tare is not valid.
+                self._forget_tare(number, rest)
+            if number in self.created:
+                # A request in this run of the node is newer than the file of an earlier run.
+                self._store_late(number, rest)
             else:
                 self._restore_tare(number, uid, rest)
         return None if np.array_equal(before, rest, equal_nan=True) else rest
@@ -185,7 +185,7 @@ class Taring:
         rest[number, : calibration.layout.n_pads] = calibration.rest_frequency
         self.created.pop(number, None)
 
-    def _keep_pending(self, number: int, rest: Array) -> None:
+    def _store_late(self, number: int, rest: Array) -> None:
         """Write or remove the tare file of a cube, as was requested before its uid was known.
 
         A failure gives a warning in the log.
@@ -194,32 +194,27 @@ class Taring:
             number: Index of the cube in the skin.
             rest: Rest frequencies (without load) of all cubes, (cubes, pads), in Hz.
         """
-        created = self._pending.pop(number)
         try:
-            self._update_file(number, rest, created)
+            self._store(number, rest)
         except ConfigError as error:
             name = self._skin.names[number]
             self._node.get_logger().warning(f"cube {name}: tare not kept: {error}")
 
-    def _update_file(
-        self,
-        number: int,
-        rest: Array,
-        created: datetime | None,
-    ) -> None:
-        """Write or remove the tare file of a cube whose uid is known.
+    def _store(self, number: int, rest: Array) -> None:
+        """Write the tare file of a cube, or remove it if the tare was cleared.
+
+        Nothing is done while the uid of the cube is unknown.
 
         Args:
             number: Index of the cube in the skin.
             rest: Rest frequencies of all cubes, (cubes, pads), in Hz.
-            created: Time of the tare; None: the tare was cleared, and its file is removed.
 
         Raises:
             ConfigError: The file cannot be written or removed.
         """
-        if self._folder is None:
+        if self._folder is None or number not in self.uids:
             return
-        uid = self.uids[number]
+        uid, created = self.uids[number], self.created[number]
         if created is None:
             remove_tare(self._folder, uid)
             return
@@ -276,36 +271,14 @@ class Taring:
             self._reconstructor.clear_tare()
             self._on_change()
             rest = self._reconstructor.rest_frequency
-        self.created.clear()
-        self._pending.clear()
+        self.created = dict.fromkeys(range(len(self._skin.cubes)))
         try:
-            for number in range(len(self._skin.cubes)):
-                self._decide(number, rest, None)
+            for number in self.created:
+                self._store(number, rest)
         except ConfigError as error:
             response.success, response.message = False, str(error)
         self._node.get_logger().info(f"clear_tare: {response.message}")
         return response
-
-    def _decide(
-        self,
-        number: int,
-        rest: Array,
-        created: datetime | None,
-    ) -> None:
-        """Write or remove the tare file of a cube now, or as soon as its uid is known.
-
-        Args:
-            number: Index of the cube in the skin.
-            rest: Rest frequencies of all cubes, (cubes, pads), in Hz.
-            created: Time of the tare; None: the tare was cleared.
-
-        Raises:
-            ConfigError: The file cannot be written or removed.
-        """
-        if number in self.uids:
-            self._update_file(number, rest, created)
-        else:
-            self._pending[number] = created
 
     def _find_cubes(self, names: list[str]) -> list[int]:
         """Return the indices of the cubes with these names; an empty list stands for all cubes.
@@ -334,13 +307,11 @@ class Taring:
         self.created.update(dict.fromkeys(cubes, created))
         if self._folder is None:
             return "; not kept"
-        # An error of the disk ends the loop. The tare of a cube whose uid is unknown is kept in
-        # memory until then, which cannot fail, so these cubes come first and are never skipped.
-        for number in sorted(cubes, key=lambda number: number in self.uids):
-            try:
-                self._decide(number, rest, created)
-            except ConfigError as error:
-                return f"; in force, but not kept: {error}"
+        try:
+            for number in cubes:
+                self._store(number, rest)
+        except ConfigError as error:
+            return f"; in force, but not kept: {error}"
         without_uid = [self._skin.names[number] for number in cubes if number not in self.uids]
         if without_uid:
             return f"; kept when their uid is known: {', '.join(without_uid)}"
