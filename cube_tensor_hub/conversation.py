@@ -175,7 +175,7 @@ class Conversation:
         try:
             # A hub that was running sends HELLO and STATS by itself.
             self._ask("opened", seconds=SECOND_S)
-            self._ask("hello", Request(Command.HELLO))
+            self._ask("hello", Command.HELLO)
             if self._n_frames:
                 self._requests()
                 self._samples()
@@ -198,7 +198,7 @@ class Conversation:
 
     def _requests(self) -> None:
         """Send all kinds of requests and bytes that are no requests to a stopped hub."""
-        self._ask("stop", Request(Command.STOP))
+        self._ask("stop", Command.STOP)
         self._ask("quiet", seconds=QUIET_S)
         self._ask(
             # A hub must keep order, and must read more than one request at a time.
@@ -218,19 +218,19 @@ class Conversation:
     def _samples(self) -> None:
         """Start the hub, start it again, change its sample period, and stop it."""
         self._ask("impossible period", Request(Command.SET_PERIOD, 0))
-        self._ask("after impossible period", Request(Command.HELLO))
+        self._ask("after impossible period", Command.HELLO)
         self._ask("period", Request(Command.SET_PERIOD, PERIOD_US))
-        self._ask("after period", Request(Command.HELLO))
+        self._ask("after period", Command.HELLO)
         self._ask("start", Request(Command.START, ANY_ARGUMENT), seconds=FLOW_S)
         self._ask_time("started")
         # Each START comes at another place within a period.
         for number in range(3):
-            self._ask(f"start again {number}", Request(Command.START), seconds=BETWEEN_START_S)
+            self._ask(f"start again {number}", Command.START, seconds=BETWEEN_START_S)
         self._ask("refused while started", Request(Command.SET_PERIOD, 0), seconds=STOPPED_S)
         self._ask("slower", Request(Command.SET_PERIOD, SLOWER_US), seconds=NEW_PERIOD_S)
-        self._ask("stop samples", Request(Command.STOP), seconds=STOPPED_S)
-        self._ask("stop again", Request(Command.STOP))
-        self._ask("start after stop", Request(Command.START), seconds=SECOND_S)
+        self._ask("stop samples", Command.STOP, seconds=STOPPED_S)
+        self._ask("stop again", Command.STOP)
+        self._ask("start after stop", Command.START, seconds=SECOND_S)
 
     def _host_that_does_not_read(self) -> None:
         """Let buffers overflow without reading, then close and open the port."""
@@ -243,28 +243,32 @@ class Conversation:
         self._begin("gone")
         self._wire.reopen(AWAY_S)
         self._listener.reopen()
-        self._ask("back", Request(Command.HELLO), seconds=SECOND_S)
+        self._ask("back", Command.HELLO, seconds=SECOND_S)
 
     def _leave_as_found(self) -> None:
         """Stop the hub, open its port once more, and restore its sample period."""
-        self._ask("end", Request(Command.STOP))
+        self._ask("end", Command.STOP)
         # A hub that was stopped when its port was closed must not send samples to the next host.
         self._begin("gone while stopped")
         self._wire.reopen(STOPPED_S)
         self._listener.reopen()
-        self._ask("back while stopped", Request(Command.HELLO), seconds=STOPPED_S)
+        self._ask("back while stopped", Command.HELLO, seconds=STOPPED_S)
         # The first sample comes so soon after START that its device time is known from TIME.
         self._ask("shortest period", Request(Command.SET_PERIOD, FAST_US))
         self._ask_time("before start")
-        self._ask("start at once", Request(Command.START))
-        self._ask("last stop", Request(Command.STOP))
+        self._ask("start at once", Command.START)
+        self._ask("last stop", Command.STOP)
         hello = next(iter(self._transcript.frames(Hello)), None)
         # 0 means that no host had set a period yet.
         if hello is not None and hello.period_us:
             self._ask("first period", Request(Command.SET_PERIOD, hello.period_us))
 
-    def _ask(self, name: str, *requests: Request, seconds: float = GRACE_S) -> None:
-        """Send requests at once, wait for their ACKs and HELLOs, and listen for `seconds`."""
+    def _ask(self, name: str, *asked: Request | Command, seconds: float = GRACE_S) -> None:
+        """Send requests at once, wait for their ACKs and HELLOs, and listen for `seconds`.
+
+        A command stands for its request with the argument 0.
+        """
+        requests = [Request(one) if isinstance(one, Command) else one for one in asked]
         step = self._begin(name, *requests)
         self._wire.send(b"".join(map(encode, requests)))
         hellos = sum(request.request == Command.HELLO for request in requests)

@@ -111,6 +111,10 @@ class Transcript:
         """Return the frames of a kind in the named steps, or in all steps."""
         return [heard.frame for heard in self.heard(*names) if isinstance(heard.frame, kind)]
 
+    def ack(self, name: str, request: int) -> Ack | None:
+        """Return the first ACK to a request in the named step; None: there is none."""
+        return self.steps[name].ack(request)
+
     @property
     def first_visit(self) -> list[str]:
         """Names of the steps before the port was closed for the first time.
@@ -119,6 +123,14 @@ class Transcript:
         the port is closed.
         """
         return list(itertools.takewhile(lambda name: name != REOPENING_STEP, self.steps))
+
+    def visit(self, kind: type[FrameType]) -> list[FrameType]:
+        """Return the frames of a kind in the steps of `first_visit`."""
+        return self.frames(kind, *self.first_visit)
+
+    def visit_frames(self) -> Iterator[Frame]:
+        """Yield all frames in the steps of `first_visit`."""
+        return (heard.frame for heard in self.heard(*self.first_visit))
 
     @property
     def hello(self) -> Hello | None:

@@ -8,6 +8,8 @@ from collections import Counter
 from itertools import pairwise
 from statistics import mode
 
+import numpy as np
+
 from cube_tensor_driver.device.wire.protocol import Ack, Command, Hello, Sample, Stats
 
 from ..rule import RuleResult, failed, never_tried, not_tried, passed, rule
@@ -26,21 +28,19 @@ MAX_PADS = 32
 SAMPLE."""
 
 
-def once_a_second(heard: list[Heard], name: str, what: str) -> str:
-    """Return what is wrong with the times of frames that must come once a second; "" if nothing is.
-
-    Args:
-        heard: The frames.
-        name: Name of the frames, such as HELLO, for the text.
-        what: State of the hub, such as "while stopped", for the text.
-    """
-    if len(heard) < 3:
-        return f"{len(heard)} {name} {what} in a time in which 3 were due"
-    gaps = [after.at_s - before.at_s for before, after in pairwise(heard)]
-    mean = sum(gaps) / len(gaps)
-    # A busy host or emulator is late by some tenths of a second now and then.
-    if not 0.9 < mean < 1.1 or max(gaps) > 1.6:
-        return f"{name} {what} every {mean:.2f} s, at most {max(gaps):.2f} s apart"
+def once_a_second(transcript: Transcript, kind: type) -> str:
+    """Return what is wrong with the times of frames of a kind, which must come once a second while
+    the hub has stopped and while it has started; "" if nothing is."""
+    for step, state in (("quiet", "stopped"), ("start", "started")):
+        heard = of_kind(transcript, kind, step)
+        what = f"{kind.__name__.upper()} while {state}"
+        if len(heard) < 3:
+            return f"{len(heard)} {what} in a time in which 3 were due"
+        gaps = [after.at_s - before.at_s for before, after in pairwise(heard)]
+        mean = sum(gaps) / len(gaps)
+        # A busy host or emulator is late by some tenths of a second now and then.
+        if not 0.9 < mean < 1.1 or max(gaps) > 1.6:
+            return f"{what} every {mean:.2f} s, at most {max(gaps):.2f} s apart"
     return ""
 
 
@@ -99,10 +99,9 @@ def hello_comes(transcript: Transcript) -> RuleResult:
         return failed(f"no HELLO within {MAX_BEHIND_ACK_S:g} s behind the ACK of request 1")
     if is_late_after_power_up(transcript):
         return failed(f"no HELLO in the first {MAX_FIRST_HELLO_S:g} s after power-up")
-    for name, what in (("quiet", "while stopped"), ("start", "while started")):
-        wrong = once_a_second(of_kind(transcript, Hello, name), "HELLO", what)
-        if wrong:
-            return failed(wrong)
+    wrong = once_a_second(transcript, Hello)
+    if wrong:
+        return failed(wrong)
     return passed("behind the ACK of request 1, and once a second, stopped and started")
 
 
@@ -118,13 +117,13 @@ def uids_differ(transcript: Transcript) -> RuleResult:
         same_number = one.n_cubes == other.n_cubes
         if same_number and one.cube_uids.tolist() != other.cube_uids.tolist():
             return failed("the uids of the cubes, or their order, changed between two HELLOs")
+    uids = Counter(hellos[-1].cube_uids.tolist())
     # A uid of 0 means that the cube has none.
-    uids = [uid for uid in hellos[-1].cube_uids.tolist() if uid]
-    twice = [uid for uid in set(uids) if uids.count(uid) > 1]
-    if twice:
-        places = [at for at, uid in enumerate(hellos[-1].cube_uids.tolist()) if uid == twice[0]]
-        return failed(f"cubes {' and '.join(map(str, places))} both have uid 0x{twice[0]:x}")
-    without = hellos[-1].n_cubes - len(uids)
+    without = uids.pop(0, 0)
+    for uid, number in uids.items():
+        if number > 1:
+            cubes = np.flatnonzero(hellos[-1].cube_uids == uid)
+            return failed(f"cubes {' and '.join(map(str, cubes))} both have uid 0x{uid:x}")
     text = f"hub 0x{hubs[0]:x}, {len(uids)} cubes with different uids"
     return passed(text + (f", {without} without one" if without else ""))
 
@@ -151,17 +150,18 @@ def cubes_stay(transcript: Transcript) -> RuleResult:
     """
     frames = frames_per_sample(transcript)
     hello, last = 0, None
-    for heard in transcript.heard(*transcript.first_visit):
-        if isinstance(heard.frame, Hello):
+    for frame in transcript.visit_frames():
+        if isinstance(frame, Hello):
             # From here on another number of cubes is right.
-            if heard.frame.n_cubes != hello:
-                hello, last = heard.frame.n_cubes, None
+            if frame.n_cubes != hello:
+                hello, last = frame.n_cubes, None
         # A frame of a split sample does not have all cubes.
-        elif isinstance(heard.frame, Sample) and frames == 1:
-            cubes = heard.frame.n_cubes
-            if last is not None and cubes != last:
-                return failed(f"samples had {last} cubes, then {cubes}, and no HELLO said so")
-            last = cubes
+        elif isinstance(frame, Sample) and frames == 1:
+            if last not in (None, frame.n_cubes):
+                return failed(
+                    f"samples had {last} cubes, then {frame.n_cubes}, and no HELLO said so"
+                )
+            last = frame.n_cubes
     return passed("the cubes of the samples are the same from HELLO to HELLO")
 
 

@@ -26,7 +26,7 @@ this time. Below it, the hub has stopped sampling."""
 @rule("L1", "no flow control, neither RTS/CTS nor XON/XOFF")
 def no_flow_control(transcript: Transcript) -> RuleResult:
     """A hub with XON/XOFF would stop sending behind an XOFF byte."""
-    if transcript.steps["XOFF"].ack(Command.STOP) is None:
+    if transcript.ack("XOFF", Command.STOP) is None:
         return failed("the hub did not answer behind an XOFF byte (0x13)")
     return passed("an XOFF byte (0x13) does not stop the hub")
 
@@ -69,8 +69,8 @@ never_tried("L4", "A connection that ends or fails is lost.", "a rule of the hos
 )
 def host_goes_away(transcript: Transcript) -> RuleResult:
     """The counters of STATS around the time in which the port was closed must have gone on."""
-    before = transcript.frames(Stats, *transcript.first_visit)[-1]
-    earlier = transcript.frames(Hello, *transcript.first_visit)
+    before = transcript.visit(Stats)[-1]
+    earlier = transcript.visit(Hello)
     after = transcript.frames(Stats, "back")
     hellos = transcript.frames(Hello, "back")
     if not hellos:

@@ -89,7 +89,7 @@ def arguments_that_are_0(transcript: Transcript) -> RuleResult:
         # The result of a second START or STOP is for R6 to check.
         if ack.request in (Command.HELLO, Command.IDENTIFY) and ack.result != Result.DONE:
             return failed(f"request {ack.request} was answered with result {ack.result}")
-    unknown = transcript.steps["unknown request"].ack(UNKNOWN)
+    unknown = transcript.ack("unknown request", UNKNOWN)
     if unknown is not None and unknown.result != Result.UNKNOWN:
         return failed(f"unknown request {UNKNOWN} was answered with result {unknown.result}")
     return passed(f"in {len(acks)} ACKs; the arguments of requests are ignored")
@@ -102,7 +102,7 @@ def arguments_that_are_0(transcript: Transcript) -> RuleResult:
 )
 def period_is_kept(transcript: Transcript) -> RuleResult:
     """Check that ACK, HELLO and samples agree on the sample period."""
-    ack = transcript.steps["period"].ack(Command.SET_PERIOD)
+    ack = transcript.ack("period", Command.SET_PERIOD)
     if ack is None or ack.result == Result.REFUSED:
         return not_tried(f"the hub did not take a period of {PERIOD_US} µs")
     if ack.result != Result.DONE:
@@ -146,7 +146,7 @@ def _other_period(transcript: Transcript) -> str:
 )
 def impossible_period(transcript: Transcript) -> RuleResult:
     """Check that a sample period of 0 changes nothing, whether the hub has started or not."""
-    ack = transcript.steps["impossible period"].ack(Command.SET_PERIOD)
+    ack = transcript.ack("impossible period", Command.SET_PERIOD)
     if ack is None:
         return not_tried("request 4 was not answered: see R1")
     # The last HELLO before the request tells the period that was in force.
@@ -188,7 +188,7 @@ def start_and_stop_again(transcript: Transcript) -> RuleResult:
     asked = [(Command.START, name) for name in again]
     asked += [(Command.STOP, name) for name in ("three at once", "stop again")]
     for command, name in asked:
-        ack = transcript.steps[name].ack(command)
+        ack = transcript.ack(name, command)
         if ack is not None and ack.result != Result.DONE:
             return failed(f"a second {command.name} was answered with result {ack.result}")
     period_us = in_force(transcript.steps["period"])
@@ -239,7 +239,7 @@ def stopped_until_start(transcript: Transcript) -> RuleResult:
     If it was switched on before the check, samples may be those of an earlier START.
     """
     restarted = transcript.frames(Stats, "back")
-    visit = transcript.frames(Stats, *transcript.first_visit)
+    visit = transcript.visit(Stats)
     if restarted and visit and restarted[-1].uptime_ms < visit[-1].uptime_ms:
         # Opening the port has restarted this hub, and no START was sent after that. Samples from
         # before the restart may still be on the way until it answers.

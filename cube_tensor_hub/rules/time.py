@@ -138,7 +138,7 @@ def unknown_time(transcript: Transcript) -> RuleResult:
     """Check how a hub answers that does not know the request for TIME."""
     if knows_time(transcript):
         return not_tried("this hub knows request 6")
-    ack = transcript.steps["time stopped 0"].ack(Command.TIME)
+    ack = transcript.ack("time stopped 0", Command.TIME)
     if ack is None:
         return failed("request 6 got neither TIME nor ACK")
     if ack.result != Result.UNKNOWN:
