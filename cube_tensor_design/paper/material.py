@@ -42,9 +42,7 @@ class Material:
     def energy(self, f: Array) -> Array:
         """Return W (E, Q), in Pa, where the deformation is F (2, 2, E, Q)."""
         if not self.finite:
-            strain = _strain(f)
-            volume_part = self.lam / 2 * trace(strain) ** 2
-            return volume_part + self.mu * ddot(strain, strain)
+            return ddot(f - _ONE, self.stress(f)) / 2
         log = np.log(det(f))
         distortion = self.mu / 2 * (ddot(f, f) - 2 - 2 * log)
         return distortion + self.lam / 2 * log**2
@@ -55,7 +53,7 @@ class Material:
         P is the force over the undeformed area.
         """
         if not self.finite:
-            strain = _strain(f)
+            strain = (f + transpose(f)) / 2 - _ONE
             volume_part = self.lam * trace(strain) * _ONE
             return volume_part + 2 * self.mu * strain
         inverse = transpose(inv(f))
@@ -83,7 +81,3 @@ class Material:
         # The derivative of F^-T by F is -crossed.
         shear_part = self.mu * identity + (self.mu - self.lam * log) * crossed
         return shear_part + self.lam * outer
-
-
-def _strain(f: Array) -> Array:
-    return (f + transpose(f)) / 2 - _ONE

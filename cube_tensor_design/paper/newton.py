@@ -11,7 +11,6 @@ Source: J. Nocedal, S. J. Wright, Numerical Optimization (2006), 3.1 and 18.1.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -43,23 +42,10 @@ class Balance(NamedTuple):
     energy: float
 
 
-@dataclass(frozen=True, eq=False)
-class Constraints:
-    """Conditions on the unknown displacements.
-
-    Attributes:
-        prescribed: (dofs,) prescribed displacements; NaN where an unknown is free.
-        row: (dofs,) weights of a combination of the unknowns u that is held, row @ u = 0; None: no
-            combination is held.
-    """
-
-    prescribed: Array
-    row: Array | None = None
-
-
 def find_balance(
     u: Array,
-    constraints: Constraints,
+    prescribed: Array,
+    rows: Array,
     balance: Callable[[Array], Balance | None],
     tangents: Callable[[Array], Iterable[sp.csr_matrix]],
     linear: bool = False,
@@ -68,7 +54,8 @@ def find_balance(
 
     Args:
         u: (dofs,) the guess.
-        constraints: Conditions on the unknowns.
+        prescribed: (dofs,) prescribed displacements; NaN where an unknown is free.
+        rows: (k, dofs) weights of k combinations of the unknowns u that are held, rows @ u = 0.
         balance: Returns forces and energy, or None at displacements that are not possible.
         tangents: Yields the derivative of the forces, then matrices to try where that one gives no
             descent.
@@ -77,10 +64,10 @@ def find_balance(
     Returns:
         u (dofs,), or None where the method does not converge.
     """
-    fixed = ~np.isnan(constraints.prescribed)
+    fixed = ~np.isnan(prescribed)
     # The first step moves the prescribed unknowns to their values, where they stay.
-    jump = np.where(fixed, constraints.prescribed - u, 0.0)
-    search = _Search(np.flatnonzero(~fixed), constraints.row, balance)
+    jump = np.where(fixed, prescribed - u, 0.0)
+    search = _Search(np.flatnonzero(~fixed), rows, balance)
     state = balance(u)
     for _ in range(MAX_ITERATIONS):
         if state is None:
@@ -113,12 +100,11 @@ class _Search:
     def __init__(
         self,
         free: Index,
-        row: Array | None,
+        rows: Array,
         balance: Callable[[Array], Balance | None],
     ) -> None:
         self._free = free
-        self._row = row
-        self._held = None if row is None else row[free]
+        self._rows = rows
         self._balance = balance
 
     def correction(
@@ -139,16 +125,12 @@ class _Search:
         free = self._free
         right = -(state.force + matrix @ jump)[free]
         inner = matrix[free][:, free]
+        # Forces along the rows hold rows @ (u + change) = 0.
+        border = sp.csr_matrix(self._rows[:, free])
+        bordered = sp.bmat([[inner, border.T], [border, None]])
+        right = np.append(right, -self._rows @ u)
         change = jump.copy()
-        if self._held is None or self._row is None:
-            change[free] = factors(inner).solve(right)
-            return change
-        # A force along the row holds row @ (u + change) = 0.
-        border = sp.csr_matrix(self._held)
-        blocks = [[inner, border.T], [border, None]]
-        bordered = sp.bmat(blocks)
-        right = np.append(right, -float(self._row @ u))
-        change[free] = factors(bordered).solve(right)[:-1]
+        change[free] = factors(bordered).solve(right)[: len(free)]
         return change
 
     def descend(
@@ -175,14 +157,12 @@ class _Search:
         return None
 
     def _unbalanced(self, force: Array) -> float:
-        """Return the norm of the forces that neither a prescribed unknown nor the held row
+        """Return the norm of the forces that neither a prescribed unknown nor a held combination
         bears."""
-        free = force[self._free]
-        held = self._held
-        if held is not None:
-            # The part of the force along the row is the force that holds the row.
-            free = free - held * (held @ free) / (held @ held)
-        return float(np.linalg.norm(free))
+        held = self._rows[:, self._free]
+        # The part of the force along a row is the force that holds the combination.
+        along_rows = np.linalg.lstsq(held.T, force[self._free])[0]
+        return float(np.linalg.norm(force[self._free] - along_rows @ held))
 
 
 def factors(matrix: sp.spmatrix) -> SuperLU:

@@ -29,7 +29,7 @@ from ..fem.mesh import mesh_quarter, mirror_quarter
 from ..fem.pads import pad_weights
 from ..fem.solid import lame
 from .material import Material
-from .newton import Balance, Constraints, factors, find_balance
+from .newton import Balance, factors, find_balance
 from .rod import Rod, RodContact
 from .section import Section
 
@@ -110,10 +110,11 @@ class Deformation:
 
 @dataclass(frozen=True, eq=False)
 class _Task:
-    """Constraints of the unknown displacements in one step of the load, and the rod that
-    presses."""
+    """Conditions in one step of the load: prescribed displacements (dofs,), NaN where free; rows
+    (k, dofs) of weights with rows @ u = 0; and the rod that presses."""
 
-    constraints: Constraints
+    prescribed: Array
+    rows: Array
     rod: Rod | None
 
 
@@ -255,7 +256,7 @@ class VirtualBench:
         """Return the numbers of the unknown displacements that a step from rest does not
         prescribe."""
         task = self._task(step, np.zeros(self.section.basis.N))
-        return np.flatnonzero(np.isnan(task.constraints.prescribed))
+        return np.flatnonzero(np.isnan(task.prescribed))
 
     def rod_contact(self, rod: Rod) -> RodContact:
         """Return the contact of a rod with the top."""
@@ -312,8 +313,9 @@ class VirtualBench:
         prescribed = by_component[component, np.arange(basis.N)] / self._half_side
         if step.gripped:
             prescribed = prescribed + np.where(component == 0, loose, 0.0)
-        row = self._bottom_mean if step.sliding else None
-        return _Task(Constraints(prescribed, row), step.rod)
+        # Without sliding there are no rows.
+        rows = self._bottom_mean[None][: int(step.sliding)]
+        return _Task(prescribed, rows, step.rod)
 
     def _advance(
         self,
@@ -347,8 +349,7 @@ class VirtualBench:
         if rod is not None:
             pressed = start.rod.pressed if start.rod else 0.0
             rod = replace(rod, pressed=(rod.pressed + pressed) / 2)
-        halfway = (start.u + task.constraints.prescribed) / 2
-        return _Task(replace(task.constraints, prescribed=halfway), rod)
+        return replace(task, prescribed=(start.u + task.prescribed) / 2, rod=rod)
 
     def _newton(self, u: Array, task: _Task) -> Array | None:
         """Return displacements (dofs,) in balance, found from the guess u; None if none were
@@ -368,7 +369,7 @@ class VirtualBench:
         linear = not self.finite and contact is None
         balance = partial(self._balance, contact=contact)
         with np.errstate(all="ignore"):  # A failed attempt has inverted elements.
-            return find_balance(u, task.constraints, balance, tangents, linear)
+            return find_balance(u, task.prescribed, task.rows, balance, tangents, linear)
 
     def _balance(self, u: Array, contact: RodContact | None) -> Balance | None:
         """Return nodal forces out of balance, and energy; None when an element is inside out."""
