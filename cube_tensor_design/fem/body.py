@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import skfem
@@ -135,10 +135,10 @@ class Body:
         if self.plane not in ("strain", "stress"):
             raise ElasticError(f"plane is {self.plane!r}; it must be 'strain' or 'stress'")
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain types for JSON; None stands for infinity."""
-        values = vars(self)
-        return {name: None if values[name] == np.inf else values[name] for name in values}
+    @property
+    def depth_of_cube(self) -> float:
+        """Depth of the cube's centre below the upper face, in m."""
+        return self.height / 2 - self.z
 
 
 def strip_layout(

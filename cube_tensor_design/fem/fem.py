@@ -11,11 +11,10 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import skfem
@@ -44,6 +43,10 @@ from .solid import Parity, Solid, lame
 
 Progress = Callable[[float, float, str], None]
 """Called as progress(done, total, what) before every step of a computation and at its end."""
+Load = Callable[[Parity], Sequence[Array]]
+"""Nodal forces of n loads on a meshed body as a function of the parity: of their part that is even
+(+1) or odd (-1) under the mirror of each axis (0: without mirror). They are those on the body, and
+after them those on the cube if there are some, each (dofs, n)."""
 
 MAX_MESHES = 3
 """Largest number of meshes on which one response is computed, from the coarsest to the finest."""
@@ -90,13 +93,12 @@ class Response:
     seconds: float
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain types for JSON."""
+        """Return the content of the file of --json."""
         return {
             **vars(self),
-            "matrix": self.matrix.tolist(),
-            "pads": list(self.layout.pads),
+            "pads": self.layout.pads,
             "layout": self.layout.to_dict(),
-            "body": self.body.to_dict(),
+            "body": vars(self.body),
         }
 
 
@@ -120,37 +122,20 @@ def compute_response(
         ElasticError: Pads overlap, or the mesh does not fit into memory.
         SymmetryError: The layout does not have the symmetry.
     """
-    start = time.perf_counter()
     structure = find_structure(layout, symmetry)
-    if not 1 <= meshes <= MAX_MESHES:
-        raise ElasticError(f"{meshes} meshes are asked for; 1, 2 or {MAX_MESHES} are possible")
-    check_pads(body, layout)
-    grids = [make_mesh(body, layout, level) for level in range(meshes)]
-    check_memory(grids[-1])
-
-    # Each axis with a mirror has two parities, and each parity is one solve.
-    mirrors = [int(np.sum(grid.p.min(axis=1) >= 0)) for grid in grids]
-    total = sum(2**count for count in mirrors)
-    report = count_steps(progress, total)
-
-    rows: list[dict[str, Any]] = []
-    matrices: list[Array] = []
-    for number, grid in enumerate(grids, 1):
-        began = time.perf_counter()
-        matrix, unknowns = _solve_mesh(body, layout, grid, number, report)
-        matrices.append(matrix)
+    results = solve_meshes(body, layout, meshes, partial(load_modes, layout=layout), progress)
+    changes = [result.change for result in results[1:]]
+    rows = []
+    for result, change in zip(results, [*changes, None], strict=True):
         row = {
-            "unknowns": unknowns,
-            "seconds": time.perf_counter() - began,
-            "coefficients": project(structure, matrix)[0],
-            "change": None,
+            "unknowns": result.unknowns,
+            "seconds": result.seconds,
+            "coefficients": project(structure, result.pads)[0],
+            "change": change,
         }
         rows.append(row)
-    report("done")
-    for row, (coarse, fine) in zip(rows, pairwise(matrices), strict=False):
-        change = np.abs(fine - coarse).max()
-        row["change"] = float(change / np.abs(fine).max())
 
+    matrix = results[-1].pads
     coefficients, residual = project(structure, matrix)
     rank, unobservable = _find_observable(matrix, structure.modes.names)
     return Response(
@@ -165,7 +150,7 @@ def compute_response(
         rank=rank,
         unobservable=unobservable,
         convergence=tuple(rows),
-        seconds=time.perf_counter() - start,
+        seconds=sum(result.seconds for result in results),
     )
 
 
@@ -181,59 +166,75 @@ def count_steps(progress: Progress | None, total: int) -> Callable[[str], None]:
     return report
 
 
+class MeshResult(NamedTuple):
+    """Mean stresses of the pads under n loads, computed on one mesh.
+
+    Attributes:
+        unknowns: Number of unknown displacements.
+        seconds: Time of the computation, in s.
+        pads: (pads, n) stresses.
+        change: Largest change of a stress from the mesh before, relative to the largest stress;
+            None on the first mesh.
+    """
+
+    unknowns: int
+    seconds: float
+    pads: Array
+    change: float | None
+
+
 def solve_meshes(
     body: Body,
     layout: Layout,
     meshes: int,
-    solve: Callable[[Solid, int], Array],
-) -> tuple[Array, float | None]:
-    """Solve a problem on finer and finer meshes.
+    load: Callable[[Solid], Load],
+    progress: Progress | None,
+) -> list[MeshResult]:
+    """Compute the stresses of the pads under loads, on finer and finer meshes.
 
     Args:
         body: The body.
         layout: Pads of the cube.
         meshes: Number of meshes, 1 to 3.
-        solve: Returns the result on a solid; its second argument is the number of the mesh, from 1.
-
-    Returns:
-        Result on the finest mesh, and its largest change from the mesh before, relative to the
-        largest entry of the result; None: there is one mesh.
+        load: Returns the loads on a meshed body.
+        progress: Called before every solve and at the end.
 
     Raises:
-        ElasticError: Pads overlap, or a mesh does not fit into memory.
+        ElasticError: The number of meshes is another one, pads overlap, or a mesh does not fit into
+            memory.
     """
+    if not 1 <= meshes <= MAX_MESHES:
+        raise ElasticError(f"{meshes} meshes are asked for; 1, 2 or {MAX_MESHES} are possible")
     check_pads(body, layout)
-    results = []
-    for level in range(meshes):
-        grid = make_mesh(body, layout, level)
-        check_memory(grid)
-        solid = make_solid(body, layout, grid)
-        results.append(solve(solid, level + 1))
+    grids = [make_mesh(body, layout, level) for level in range(meshes)]
+    check_memory(grids[-1])
+    # Each axis with a mirror has two parities, and each parity is one solve.
+    n_mirrors = int(np.sum(grids[0].p.min(axis=1) >= 0))
+    report = count_steps(progress, meshes * 2**n_mirrors)
 
-    fine = results[-1]
-    if meshes == 1:
-        return fine, None
-    change = np.abs(fine - results[-2]).max()
-    return fine, float(change / np.abs(fine).max())
+    results: list[MeshResult] = []
 
+    def report_solve(what: str) -> None:
+        report(f"mesh {len(results) + 1}, {what}")
 
-def _solve_mesh(
-    body: Body,
-    layout: Layout,
-    grid: skfem.Mesh,
-    number: int,
-    report: Callable[[str], None],
-) -> tuple[Array, int]:
-    """Return the response matrix on one mesh, and the number of unknowns of the mesh."""
-    try:
-        solid = make_solid(body, layout, grid)
-        matrix = linear_response(solid, layout, lambda what: report(f"mesh {number}, {what}"))
-    except MemoryError:  # Some limit that check_memory does not know was reached.
-        raise ElasticError(
-            f"the memory ran out on mesh {number}, of {grid.nvertices} corners; "
-            "ask for fewer meshes or wider pads"
-        ) from None
-    return matrix, int(solid.basis.N)
+    for number, grid in enumerate(grids, 1):
+        start = time.perf_counter()
+        try:
+            solid = make_solid(body, layout, grid)
+            pads = pad_stresses(solid, layout, load(solid), report_solve)
+        except MemoryError:  # Some limit that check_memory does not know was reached.
+            raise ElasticError(
+                f"the memory ran out on mesh {number}, of {grid.nvertices} corners; "
+                "ask for fewer meshes or wider pads"
+            ) from None
+        change = None
+        if results:
+            largest_change = np.abs(pads - results[-1].pads).max()
+            change = float(largest_change / np.abs(pads).max())
+        seconds = time.perf_counter() - start
+        results.append(MeshResult(len(solid.component), seconds, pads, change))
+    report("done")
+    return results
 
 
 def _mode_residual(
@@ -278,13 +279,12 @@ def calibration_from_fem(
         neglect: Names of modes that are assumed to be zero, so that few pads can tell the others.
         source: Text about the origin of the calibration, which the calibration stores.
     """
-    # A calibration holds either coefficients or the whole matrix.
-    content: dict[str, Any] = {"coefficients": result.coefficients}
-    if whole_matrix:
-        content = {"matrix": result.matrix}
     return Calibration(
         layout=result.layout,
         symmetry=result.symmetry,
+        # A calibration holds either coefficients or the whole matrix.
+        coefficients=None if whole_matrix else result.coefficients,
+        matrix=result.matrix if whole_matrix else None,
         half_side=result.body.side / 2,
         rest_frequency=np.array(REST_FREQUENCY),
         beta=np.array(BETA),
@@ -292,7 +292,6 @@ def calibration_from_fem(
         noise=np.array(FREQUENCY_NOISE * FOAM_MODULUS * (1 + BETA)),
         neglect=neglect,
         source=source,
-        **content,
     )
 
 
@@ -319,17 +318,10 @@ def make_solid(
     return Solid(mesh, lame(1.0, body.poisson, plane), cube, body.ground, body.confined)
 
 
-def linear_response(
-    solid: Solid,
-    layout: Layout,
-    report: Callable[[str], None] = lambda _: None,
-) -> Array:
-    """Return the response matrix (pads, modes) on one mesh, in Pa per Pa.
+def load_modes(solid: Solid, layout: Layout) -> Load:
+    """Return the tractions of all modes of a layout on the outer faces of a body.
 
-    Args:
-        solid: The meshed body.
-        layout: Pads of the cube.
-        report: Called as report(what) before every solve.
+    Their stresses on the pads are the response matrix, in Pa per Pa.
     """
     axes = field_axes(layout)
     modes = default_modes(layout)
@@ -340,34 +332,41 @@ def linear_response(
     def field(x: Array) -> Array:
         return stress + np.einsum("mijk,qk->qmij", gradient, x)
 
-    return pad_stresses(solid, layout, partial(solid.outer_forces, field=field), report)
+    return load_outside(solid, field)
+
+
+def load_outside(solid: Solid, field: Callable[[Array], Array]) -> Load:
+    """Return the tractions of a field on the outer faces of a body; see `Solid.outer_forces`."""
+    return lambda parity: [solid.outer_forces(parity, field)]
 
 
 def pad_stresses(
     solid: Solid,
     layout: Layout,
-    forces: Callable[[Parity], Array],
+    load: Load,
     report: Callable[[str], None] = lambda _: None,
 ) -> Array:
-    """Return the mean normal stress (pads, n) under n loads, as the sum over all parities.
+    """Return the mean normal stresses (pads, n) under n loads, as sums over all parities.
 
     Args:
         solid: The meshed body.
         layout: Pads of the cube.
-        forces: Returns, for a parity (+1 even or -1 odd under the mirror of each axis, 0 without
-            mirror), the nodal forces (dofs, n) of that part of the loads.
+        load: The loads.
         report: Called as report(what) before every solve.
     """
     stresses: Any = 0.0
     for parity in each_parity(solid, report):
-        load = forces(parity)
-        part = np.zeros((layout.n_pads, load.shape[1]))
+        in_body, *in_cube = load(parity)
+        forces = sum(in_cube, in_body)
+        part = np.zeros((layout.n_pads, forces.shape[1]))
         # Most loads have no part of this parity and need no solve.
-        largest = np.abs(load).max(axis=0)
+        largest = np.abs(forces).max(axis=0)
         used = np.flatnonzero(largest > NO_FORCE * largest.max())
         weights = solid.pad_weights(layout, parity)
         if len(used) and weights.any():
-            reactions = solid.body @ solid.solve(parity, load[:, used])
+            # The cube bears what the stresses in the body and the loads on it do not balance.
+            displacement = solid.solve(parity, forces[:, used])
+            reactions = solid.body @ displacement - in_body[:, used]
             part[:, used] = weights @ reactions
         stresses = stresses + part
     return stresses

@@ -42,16 +42,7 @@ from .body import Body, strip_layout
 DEFAULT_LAYOUT = "planar"
 """Name of the layout (places of the pads) of a model file that names none."""
 
-_LENGTH = real("a length in m greater than 0", exclusiveMinimum=0)
-_OFFSET = real("a distance in m")
-_YOUNG = real("a Young's modulus in Pa greater than 0", exclusiveMinimum=0)
-_POISSON = real(
-    "a Poisson's ratio of at least 0 and below 0.5",
-    minimum=0,
-    exclusiveMaximum=0.5,
-)
-_EXPANSION = real("a thermal expansion in 1/K")
-_DENSITY = real("a density in kg/m³ greater than 0", exclusiveMinimum=0)
+_NUMBER = real("a number in SI units")
 _MODES = list_of(TEXT, "names of modes") | {
     "minItems": 0,
     "description": "a list of modes",
@@ -62,26 +53,11 @@ _SYMMETRY = {
     "description": "full, slab, mirrors or none",
 }
 _PLANE = {"enum": ["strain", "stress"], "description": "strain or stress"}
-_BODY = {
-    "width": _LENGTH,
-    "depth": _LENGTH,
-    "height": _LENGTH,
-    "young": _YOUNG,
-    "poisson": _POISSON,
-    "expansion": _EXPANSION,
-    "density": _DENSITY,
-}
-_CUBE = {
-    "side": _LENGTH,
-    "rigid": _RIGID,
-    "young": _YOUNG,
-    "poisson": _POISSON,
-    "expansion": _EXPANSION,
-    "density": _DENSITY,
-    "x": _OFFSET,
-    "z": _OFFSET,
-}
-_PADS = {"width": _LENGTH, "centre": _LENGTH}
+_MATERIAL = ("young", "poisson", "expansion", "density")
+# `Body` checks the ranges.
+_BODY = dict.fromkeys(("width", "depth", "height", *_MATERIAL), _NUMBER)
+_CUBE = {**dict.fromkeys(("side", "x", "z", *_MATERIAL), _NUMBER), "rigid": _RIGID}
+_PADS = dict.fromkeys(("width", "centre"), _NUMBER)
 _SCHEMA = Schema(
     mapping(
         (),

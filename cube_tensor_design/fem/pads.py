@@ -21,6 +21,7 @@ of the corner is ours.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import comb
 
 import numpy as np
 
@@ -109,56 +110,32 @@ def interval_weights(
         start: Begin of the interval, -1 <= start < stop; the end of an element.
         stop: End of the interval, at most 1; the end of an element.
     """
-    if parity == 0:
-        half = len(nodes) // 2
-        # The forces are split into an even and an odd part about the centre.
-        upper = nodes[half:]
-        even = interval_weights(upper, order, 1, start, stop)
-        odd = interval_weights(upper, order, -1, start, stop)
-        weights = np.zeros(len(nodes))
-        weights[half:] = (even + odd) / 2
-        weights[half::-1] += (even - odd) / 2
-        weights[half] = even[0] / 2  # The node in the centre belongs to both halves.
-        return weights
+    if parity:
+        # The whole face has the same tractions as its half and their mirror images.
+        whole = np.concatenate([-nodes[:0:-1], nodes])
+        weights = interval_weights(whole, order, 0, start, stop)
+        centre = len(nodes) - 1
+        return weights[centre:] + parity * weights[centre::-1]
 
-    def from_centre(end: float) -> Array:
-        # An interval on the other half is the mirror image of one on this half.
-        sign = 1 if end >= 0 else -parity
-        return sign * _weights_from_centre(nodes, order, parity, abs(end))
-
-    return from_centre(stop) - from_centre(start)
-
-
-def _weights_from_centre(
-    nodes: Array,
-    order: int,
-    parity: int,
-    stop: float,
-) -> Array:
-    """Return the weights (n,) of nodal reactions for the integral of the traction from 0 to stop.
-
-    They solve (int phi_i t_j)^T w = int_0^stop t_j for all trial functions t_j of the traction,
-    with the nodal functions phi_i.
-    """
+    # The weights solve (int phi_i t_j)^T w = int_start^stop t_j for all trial functions t_j of the
+    # traction, with the nodal functions phi_i.
     n = len(nodes)
     mass = np.zeros((n, n))
     integral = np.zeros(n)
     element_mass, element_integral = _line_element(order)
     for first in range(0, n - 1, order):
         own = slice(first, first + order + 1)
-        length = nodes[first + order] - nodes[first]
-        mass[own, own] += length * element_mass
-        if nodes[first + order] <= stop * (1 + 1e-12):
-            integral[own] += length * element_integral
+        begin, end = nodes[[first, first + order]]
+        mass[own, own] += (end - begin) * element_mass
+        if start <= (begin + end) / 2 <= stop:
+            integral[own] += (end - begin) * element_integral
 
-    # An odd traction is zero in the centre, and the mirror plane holds the node there.
-    keep = slice(0 if parity > 0 else 1, n - 1)
-    trial = np.eye(n)[:, keep]
-    # The traction at the corner is that of the polynomial of the last element.
+    # The traction at a corner is that of the polynomial of the last element.
+    trial = np.eye(n)[:, 1:-1]
     trial[-1, -order:] = _continuation(order)
+    trial[0, :order] = _continuation(order)[::-1]
     weights = np.zeros(n)
-    matrix = (mass @ trial)[keep].T
-    weights[keep] = np.linalg.solve(matrix, trial.T @ integral)
+    weights[1:-1] = np.linalg.solve((mass @ trial)[1:-1].T, trial.T @ integral)
     return weights
 
 
@@ -176,8 +153,6 @@ def _line_element(order: int) -> tuple[Array, Array]:
 
 def _continuation(order: int) -> Array:
     """Return the values (order,) at the end 1 of an element [0, 1] of the polynomials that are 1 at
-    one of its other nodes and 0 at the rest."""
-    nodes = np.arange(order) / order
-    powers = np.vander(nodes, increasing=True)
-    # At the end 1 of the element all powers are one.
-    return np.ones(order) @ np.linalg.inv(powers)
+    one of its other nodes and 0 at the rest: binomial coefficients of alternating sign."""
+    signed = [(-1) ** (order - 1 - k) * comb(order, k) for k in range(order)]
+    return np.array(signed, float)

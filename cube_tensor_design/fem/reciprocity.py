@@ -59,7 +59,7 @@ def compute_influence(
         layout=layout,
         side=body.side,
         layer=Layer(body.height, body.poisson),
-        depth=body.height / 2 - body.z,
+        depth=body.depth_of_cube,
         place=place * d0,
         # The stress of unit nodal forces in units of d0 has one power of d0 less in a plane.
         pads=pads / d0 ** (solid.dim - 1),
@@ -70,9 +70,9 @@ def _surface_influence(solid: Solid, layout: Layout) -> tuple[Array, Array]:
     """Return positions (n, dim - 1) of the nodes on the surface, and the stress (P, n, dim) of P
     pads under unit forces there; lengths in d0 (half the side of the cube)."""
     dim = solid.dim
-    # The components of one node are neighbours among the unknowns.
-    x = solid.positions[:, ::dim]
+    x = solid.basis.doflocs
     nodes = np.flatnonzero(x[-1] > x[-1].max() - 1e-12)
+    # The components of one node are neighbours among the unknowns.
     dofs = dim * nodes[:, None] + np.arange(dim)
 
     total: Array | float = 0.0

@@ -59,33 +59,30 @@ def lame(
     return lam, mu
 
 
-def stiffness(basis: skfem.Basis, moduli: tuple[float, float]) -> sp.csr_matrix:
+def stiffness(scalar: skfem.Basis, moduli: tuple[float, float]) -> sp.csr_matrix:
     """Assemble the stiffness K_ij = int lambda div w_i div w_j + 2 mu eps(w_i) : eps(w_j) dV.
 
     w_i are the nodal functions and eps their strain. The sparse matrix (dofs, dofs) is put together
-    from the integrals of d_a f d_b g over the scalar elements f and g: vector elements have as many
-    zeros as components, which cost time.
+    from the integrals of d_a f d_b g over the scalar elements f and g. Vector elements have as many
+    zeros as components, and with them the assembly takes seven times as long.
 
     Args:
-        basis: The elements, whose dofs number the components of one node one after the other.
+        scalar: The elements of one component; the components of one node are neighbours among the
+            dofs.
         moduli: Lame's constants lambda and mu.
     """
     lam, mu = moduli
-    axes = range(basis.mesh.dim())
-    scalar = basis.with_element(basis.elem.elem)
-    slopes = {}
-    for a, b in itertools.combinations_with_replacement(axes, 2):
+    dim = scalar.mesh.dim()
+    total: Any = 0
+    for a, b in itertools.product(range(dim), repeat=2):
         form = skfem.BilinearForm(lambda u, w, _, a=a, b=b: w.grad[a] * u.grad[b])
-        slopes[a, b] = form.assemble(scalar)
-        slopes[b, a] = slopes[a, b].T
-    # The part of mu grad u : grad w couples equal components only.
-    laplace = sum(slopes[a, a] for a in axes)
-    total = sp.kron(mu * laplace, sp.identity(len(axes)))
-    for (a, b), product in slopes.items():
+        slopes = form.assemble(scalar)
         # Components a of the test function and b of the displacement are coupled by this block.
-        place = np.zeros((len(axes), len(axes)))
-        place[a, b] = 1.0
-        total = total + sp.kron(lam * product + mu * product.T, place)
+        place = np.outer(np.eye(dim)[a], np.eye(dim)[b])
+        total = total + sp.kron(lam * slopes + mu * slopes.T, place)
+        if a == b:
+            # The part of mu grad u : grad w couples equal components only.
+            total = total + sp.kron(mu * slopes, np.eye(dim))
     return total.tocsr()
 
 
@@ -121,10 +118,11 @@ class Solid:
     """A meshed body with a cube: triangles of order 4 in a plane, 27-node bricks in space.
 
     Attributes:
-        basis: The elements; its dofs are the unknown displacements.
+        basis: The elements of one component. The components of the displacement of one node are
+            neighbours among the unknowns (dofs).
         positions: (dim, dofs) position of each unknown, in d0 (half the side of the cube).
         component: (dofs,) number of the axis along which each unknown displacement is.
-        moduli: Lame's constants of the body, and of the cube or None.
+        moduli: Lame's constants of the body, and those of a cube that is not rigid.
         body: (dofs, dofs) stiffness of the body without the cube.
         total: (dofs, dofs) stiffness of body and cube.
         parities: Parities (+1 even or -1 odd under the mirror of each axis, 0 without mirror) of
@@ -154,7 +152,7 @@ class Solid:
         self.dim = int(mesh.dim())
         self.order = 4 if self.dim == 2 else 2
         self.is_rigid = cube is None
-        self.moduli = (body, cube)
+        self.moduli = [body] if cube is None else [body, cube]
         self._ground = ground
         self._confined = confined
         # Without a mirror, an axis has the parity 0 alone.
@@ -162,14 +160,13 @@ class Solid:
         signs = [(1, -1) if mirrored else (0,) for mirrored in has_mirror]
         self.parities: list[Parity] = list(itertools.product(*signs))
 
-        scalar = skfem.ElementTriP4() if self.dim == 2 else skfem.ElementHex2()
-        element = skfem.ElementVector(scalar)
+        element = skfem.ElementTriP4() if self.dim == 2 else skfem.ElementHex2()
         self.basis = skfem.Basis(mesh, element, intorder=2 * self.order)
-        self.positions = self.basis.doflocs
-        self.component = np.arange(self.basis.N) % self.dim
+        self.positions = np.repeat(self.basis.doflocs, self.dim, axis=1)
+        self.component = np.arange(self.positions.shape[1]) % self.dim
 
         # (dim, nodes) number of the line of the product grid of bricks on which each node lies
-        rounded = np.round(self.positions[:, :: self.dim], 9)
+        rounded = np.round(self.basis.doflocs, 9)
         lines = [np.unique(x, return_inverse=True) for x in rounded]
         self._grid = np.stack([index for _, index in lines])
         # Axes with the same lines have the same number here.
@@ -177,12 +174,10 @@ class Solid:
         self._axis_kind = [coordinates.index(line) for line in coordinates]
         self._last_solve: _Factors | None = None
 
-        centres = mesh.p[:, mesh.t].mean(axis=1)
-        in_cube = np.all(np.abs(centres) < 1.0, axis=0)
-        self.body = stiffness(self._restrict(~in_cube), body)
+        self.body = stiffness(self.part(in_cube=False), body)
         self.total = self.body
         if cube is not None:
-            self.total = self.body + stiffness(self._restrict(in_cube), cube)
+            self.total = self.body + stiffness(self.part(in_cube=True), cube)
 
     def outer_forces(self, parity: Parity, field: Callable[[Array], Array]) -> Array:
         """Return the nodal forces (dofs, n) of n fields that act as tractions on the outer faces.
@@ -200,7 +195,7 @@ class Solid:
             if end < SAME_COORDINATE:
                 continue  # a mirror
             outer = edges[_is_at(sign * centres[axis], end)]
-            face = skfem.FacetBasis(mesh, self.basis.elem.elem, facets=outer, intorder=6)
+            face = skfem.FacetBasis(mesh, self.basis.elem, facets=outer, intorder=6)
             x = np.asarray(face.default_parameters()["x"])
             stress = _parity_part(field, x.reshape(self.dim, -1).T, parity)
             traction = sign * stress[..., axis]  # (q, n, dim)
@@ -208,9 +203,8 @@ class Solid:
             values = np.stack([np.asarray(shape[0]) for shape in face.basis])
             samples = sample_matrix(face, values * face.dx)
             forces = samples.T @ traction.reshape(face.dx.size, -1)
-            # The components of one node are neighbours among the unknowns.
             by_node = forces.reshape(face.N, -1, self.dim).swapaxes(1, 2)
-            total = total + by_node.reshape(self.basis.N, -1)
+            total = total + by_node.reshape(len(self.component), -1)
         return total
 
     def solve(self, parity: Parity, forces: Array) -> Array:
@@ -252,7 +246,7 @@ class Solid:
             axes exchanged in this way.
         """
         if self.dim == 2:  # triangles are on no product grid
-            return parity, np.arange(self.basis.N)
+            return parity, np.arange(len(self.component))
         axes = np.arange(self.dim)
         for kind in set(self._axis_kind):
             equal = np.flatnonzero(np.array(self._axis_kind) == kind)
@@ -265,34 +259,12 @@ class Solid:
         swap = self.dim * before[:, None] + axes
         return tuple(parity[k] for k in axes), swap.ravel()
 
-    def expansion_forces(self, load: Callable[[Array], Array], in_cube: bool) -> Array:
-        """Return the nodal forces (dofs, n) that pressures have in the body, or in the cube.
-
-        Args:
-            load: From positions (dim, ...) to n pressures (n, ...).
-            in_cube: Whether the pressures are in the cube.
-        """
+    def part(self, in_cube: bool) -> skfem.Basis:
+        """Return the elements of one component in the cube, or in the body around it."""
         mesh = self.basis.mesh
         centres = mesh.p[:, mesh.t].mean(axis=1)
         is_cube = np.all(np.abs(centres) < 1.0, axis=0)
-        part = self._restrict(is_cube == in_cube)
-        form = skfem.LinearForm(lambda v, w: w.p * np.trace(v.grad))
-        pressures = load(np.asarray(part.default_parameters()["x"]))
-        return np.stack([form.assemble(part, p=p) for p in pressures], axis=1)
-
-    def body_forces(self, axis: int, in_cube: bool) -> Array:
-        """Return the nodal forces (dofs,) of a force of 1 per volume along an axis.
-
-        Args:
-            axis: Number of the axis.
-            in_cube: Whether the force acts in the cube; else it acts in the body.
-        """
-        mesh = self.basis.mesh
-        centres = mesh.p[:, mesh.t].mean(axis=1)
-        is_cube = np.all(np.abs(centres) < 1.0, axis=0)
-        part = self._restrict(is_cube == in_cube)
-        forces: Array = skfem.LinearForm(lambda v, _: v[axis]).assemble(part)
-        return forces
+        return self.basis.with_elements(np.flatnonzero(is_cube == in_cube))
 
     def pad_weights(self, layout: Layout, parity: Parity) -> Array:
         """Return weights (P, dofs) from nodal forces on the body to the mean stresses of the pads.
@@ -301,19 +273,11 @@ class Solid:
         """
         return -pad_weights(self.positions, self.order, layout, parity)
 
-    def _restrict(self, elements: Mask) -> skfem.Basis:
-        """Return the basis on some of the elements."""
-        mesh = self.basis.mesh
-        order = 2 * self.order
-        numbers = np.flatnonzero(elements)
-        return skfem.Basis(mesh, self.basis.elem, elements=numbers, intorder=order)
-
     def _held(self, parity: Parity) -> Mask:
         """Return which unknowns (dofs,) are held at zero.
 
         Mirrors, the ground and a rigid cube hold some; others are held to stop rigid motions. A
-        translation is odd along its axis, a rotation along both axes of its plane. A rigid cube can
-        be held altogether, since these motions are free for the body, too.
+        rigid cube can be held altogether, since these motions are free for the body, too.
         """
         x = self.positions
         component = self.component
@@ -334,21 +298,15 @@ class Solid:
             in_cube = np.all(np.abs(x) < 1.0 + SAME_COORDINATE, axis=0)
             return held | in_cube
 
-        def admits(*odd: int) -> bool:
-            """Return whether a motion that is odd along these axes has the parity."""
-            wanted = [-1 if k in odd else 1 for k in range(self.dim)]
-            return all(sign in (0, want) for sign, want in zip(parity, wanted, strict=True))
-
-        for k in range(self.dim):
-            if admits(k):  # a translation along k: hold the centre
-                at_centre = np.all(_is_at(x, 0.0), axis=0)
-                held |= (component == k) & at_centre
+        # Translations: the centre is held. A parity without a translation is zero there anyway.
+        held |= np.all(_is_at(x, 0.0), axis=0)
         for i, j in itertools.combinations(range(self.dim), 2):
-            if admits(i, j):  # a rotation: hold component i of a point on axis j
-                point = np.zeros(self.dim)
-                point[j] = 1.0
+            # A rotation: component i of a point on axis j is held. It is odd along i and j; where
+            # axis i has an even parity, the mirror holds this component.
+            if parity[j] <= 0:
+                point = np.eye(self.dim)[j]
                 at_point = np.all(_is_at(x, point[:, None]), axis=0)
-                held |= (component == i) & at_point
+                held |= at_point & (component == i)
         return held
 
 

@@ -16,7 +16,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,7 +32,8 @@ from ..fem.body import Body, make_mesh
 from ..fem.fem import (
     Progress,
     count_steps,
-    linear_response,
+    load_modes,
+    load_outside,
     make_solid,
     pad_stresses,
 )
@@ -109,21 +109,8 @@ class LayoutStudy:
         return rows
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain types for JSON; None where a layout does not observe a component."""
-        errors = {}
-        for name, error in self.error.items():
-            # JSON knows no NaN.
-            plain = error.astype(object)
-            plain[np.isnan(error)] = None
-            errors[name] = plain.tolist()
-        return {
-            "sides": self.sides.tolist(),
-            "widths": self.widths.tolist(),
-            "offsets": self.offsets.tolist(),
-            "depth": DEPTH,
-            "components": list(COMPONENTS),
-            "error": errors,
-        }
+        """Return the content of the file of --json; NaN becomes null there."""
+        return {**vars(self), "depth": DEPTH, "components": COMPONENTS}
 
 
 @dataclass(frozen=True)
@@ -226,8 +213,8 @@ def _solve_box(
 
     # All parities are solved for the modes and for the passages.
     report = count_steps(progress, 2 * len(solid.parities))
-    matrix = linear_response(solid, layout, report)
-    pads = pad_stresses(solid, layout, partial(solid.outer_forces, field=field), report)
+    matrix = pad_stresses(solid, layout, load_modes(solid, layout), report)
+    pads = pad_stresses(solid, layout, load_outside(solid, field), report)
     report("done")
     return matrix, pads
 

@@ -72,16 +72,6 @@ class SurfaceRow(NamedTuple):
     measured: dict[str, float]
     true: dict[str, float]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain types for JSON."""
-        return {
-            "load": self.load,
-            "width": self.width,
-            "place": self.offset,
-            "said": self.measured,
-            "there": self.true,
-        }
-
 
 @dataclass(frozen=True, eq=False)
 class SurfaceStudy:
@@ -94,13 +84,14 @@ class SurfaceStudy:
     rows: tuple[SurfaceRow, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain types for JSON."""
+        """Return the content of the file of --json."""
+        keys = ("load", "width", "place", "said", "there")
         return {
-            "body": self.body.to_dict(),
+            "body": vars(self.body),
             "layout": self.layout.to_dict(),
-            "rows": [row.to_dict() for row in self.rows],
-            "place": self.influence.place.tolist(),
-            "pads": self.influence.pads.tolist(),
+            "rows": [dict(zip(keys, row, strict=True)) for row in self.rows],
+            "place": self.influence.place,
+            "pads": self.influence.pads,
         }
 
 
@@ -202,7 +193,7 @@ def _true_stress_in_plane(
         # Plane stress is plane strain of a material with this ratio.
         poisson = body.poisson / (1 + body.poisson)
     layer = Layer(body.height, poisson)
-    modes = line_load(layer, x, _depth(body), body.side / 2)
+    modes = line_load(layer, x, body.depth_of_cube, body.side / 2)
     return {name: parts @ modes[PLANE.names.index(name)] for name in COMPONENTS}
 
 
@@ -213,15 +204,10 @@ def _true_stress_in_space(
 ) -> dict[str, Array]:
     """Return, by component, the stress (3,) at the cube's centre under a ball's unit force."""
     layer = Layer(body.height, body.poisson)
-    kernels = Kernels(layer, _depth(body), body.side / 2)
+    kernels = Kernels(layer, body.depth_of_cube, body.side / 2)
     from_load = np.array([[-offset, 0.0]])
     field = kernels.field(from_load, width / 2)[0]
     return {name: field[FIELD.index(name)] for name in COMPONENTS}
-
-
-def _depth(body: Body) -> float:
-    """Return the depth of the cube's centre below the surface, in m."""
-    return body.height / 2 - body.z
 
 
 def hertz_points(radius: float, dim: int) -> tuple[Array, Array]:

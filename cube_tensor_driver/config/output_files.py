@@ -116,13 +116,15 @@ def to_json(value: Any, indent: int | None = None) -> str:
     """Return plain values as JSON text. NaN and infinity, which JSON lacks, become null.
 
     Args:
-        value: Numbers, texts, lists and mappings.
+        value: Numbers, texts, arrays of numpy, lists and mappings.
         indent: Number of spaces per level of nesting; None: the text is one line.
     """
     return json.dumps(_without_nan(value), indent=indent, allow_nan=False)
 
 
 def _without_nan(value: Any) -> Any:
+    if hasattr(value, "tolist"):
+        value = value.tolist()
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, Mapping):

@@ -1,0 +1,361 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
+"""Results of `./cube fem` and `./cube study` as tables on the terminal, files and pictures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from cube_tensor_driver.config.calibration import (
+    read_calibration,
+    shipped_calibration,
+    write_calibration,
+)
+from cube_tensor_driver.config.yaml import write_yaml
+from cube_tensor_driver.core.arrays import Array
+from cube_tensor_driver.core.compensation.models import WeightModel
+from cube_tensor_driver.core.compensation.weight import STANDARD_GRAVITY
+from cube_tensor_driver.core.errors import ConfigError
+from cube_tensor_driver.core.layout import Layout
+from cube_tensor_driver.core.modes import COMPONENTS, STRESS
+from cube_tensor_driver.core.pipeline import Pipeline
+from cube_tensor_driver.mechanics.influence_file import write_influence
+
+from .fem.body import Body
+from .fem.fem import Response, calibration_from_fem
+from .fem.volume_loads import ThermalStress, VolumeResponse
+from .studies.layout_study import DEPTH, LayoutStudy
+from .studies.surface_study import SurfaceRow, SurfaceStudy
+
+MAX_STRUCTURE_RESIDUAL = 1e-3
+"""Largest part of the response (relative, Frobenius norm) that the coefficients of a calibration
+may leave out. If more is left out, the calibration holds the whole matrix."""
+MAX_MODE_COLUMNS = 7
+"""Maximum number of modes (columns) in one printed table of the response matrix, so that the table
+fits into 80 characters."""
+LABEL_WIDTH = 9
+"""Width of the first column of a printed response matrix, with the names of pads, in characters."""
+MIN_COLUMN_WIDTH = 9
+"""Width of a value in a printed response matrix and of the space before it, in characters."""
+MAX_COEFFICIENTS_SHOWN = 40
+"""Maximum number of coefficients in the printed table of convergence; the file of --json has
+all."""
+THERMAL_HEADER = """Stress on each pad in Pa per K of the temperature P_k(s), k = 0, 1, ...:
+P_k is the Legendre polynomial, s grows from -1 at the ground to 1 at the surface."""
+"""Comment at the top of a file of thermal stress."""
+SMALLEST_SHOWN_STRESS = 0.05
+"""Stress by weight in Pa or by temperature in Pa/K (gradient in Pa/m or Pa/m/K) below which a
+component is not printed."""
+MIN_SHOWN_SHARE = 0.05
+"""Share of the largest stress under a load below which no ratio of measured to true stress is
+printed, because it would be noise."""
+
+Result = Response | SurfaceStudy | VolumeResponse
+"""Result of a computation of `./cube fem`."""
+
+_console = Console(highlight=False, soft_wrap=True)
+
+
+def describe(body: Body, layout: Layout) -> str:
+    """Return one line about the cube, its body and its place."""
+    lengths = [body.width, body.depth, body.height]
+    plane = ""
+    if layout.planar:
+        del lengths[1]
+        plane = f", plane {body.plane}"
+    size = " x ".join(f"{1e3 * length:g}" for length in lengths)
+    cube = "steel"
+    if math.isinf(body.cube_young):
+        cube = "rigid"
+    elif body.cube_young != Body.cube_young:
+        cube = f"{body.cube_young / 1e9:g} GPa"
+    where = ""
+    if body.x or body.z:
+        where = f", {1e3 * body.x:g} mm along x and {1e3 * body.z:g} mm along z off its centre"
+    law = f"E {body.young / 1e6:g} MPa, nu {body.poisson:g}{plane}"
+    return f"{cube} cube of {1e3 * body.side:g} mm in a body of {size} mm{where} ({law})"
+
+
+def show(result: Result) -> None:
+    """Print a result."""
+    if isinstance(result, Response):
+        _show_response(result)
+    elif isinstance(result, SurfaceStudy):
+        _show_surface(result)
+    else:
+        _show_volume(result)
+
+
+def _show_response(result: Response) -> None:
+    """Print the matrix, the coefficients on each mesh, and what they leave unexplained."""
+    modes, layout = result.modes, result.layout
+    labels = layout.pads
+    if layout.planar:
+        labels = tuple(f"V{number} {pad}" for number, pad in enumerate(labels, 1))
+    title = "response, Pa per Pa; below, what the symmetry does not explain"
+    # A narrow terminal gets several tables one below the other.
+    column = max(MIN_COLUMN_WIDTH, *(2 + len(name) for name in modes))
+    fitting = (_console.width - LABEL_WIDTH) // column
+    count = max(1, min(MAX_MODE_COLUMNS, fitting))
+    for start in range(0, len(modes), count):
+        names = modes[start : start + count]
+        numbers = result.matrix[:, start : start + count]
+        left = [f"{100 * result.mode_residual[name]:.2f}" for name in names]
+        _print_table(title, ("pad", *names), _rows(labels, numbers, 4), [["left, %", *left]])
+        title = ""
+    _show_convergence(result)
+    hidden = len(result.coefficients) - MAX_COEFFICIENTS_SHOWN
+    if hidden > 0:
+        _console.print(f"and {hidden} coefficients more, in the --json file")
+    _console.print(
+        f"symmetry {result.symmetry} leaves {100 * result.structure_residual:.3g} % "
+        f"of the response unexplained; rank {result.rank} of {len(modes)}; "
+        f"unobservable: {', '.join(result.unobservable) or 'nothing'}; {result.seconds:.1f} s"
+    )
+
+
+def _show_convergence(result: Response) -> None:
+    """Print the coefficients on each mesh."""
+    meshes = result.convergence
+    rows = []
+    for name in list(result.coefficients)[:MAX_COEFFICIENTS_SHOWN]:
+        values = [mesh["coefficients"][name] for mesh in meshes]
+        step = ""
+        if len(values) > 1 and values[-2]:
+            step = f"{100 * abs(values[-1] / values[-2] - 1):.2g} %"
+        rows.append([name, *(f"{value:.5f}" for value in values), step])
+    # The last mesh has no next one.
+    changes = [f"{100 * mesh['change']:.2g} %" for mesh in meshes[:-1]]
+    seconds = [f"{mesh['seconds']:.1f}" for mesh in meshes]
+    footer = [["change to the next", *changes], ["seconds", *seconds]]
+    unknowns = [str(mesh["unknowns"]) for mesh in meshes]
+    _print_table("coefficients on each mesh", ["unknowns", *unknowns, "last step"], rows, footer)
+
+
+def write(
+    path: Path,
+    result: Result,
+    command: str,
+    neglect: tuple[str, ...],
+    base: Path | None,
+) -> None:
+    """Write the file of --output.
+
+    Args:
+        path: The file.
+        result: The result.
+        command: Command line that computes the result.
+        neglect: Names of modes that a calibration takes as zero.
+        base: Calibration to which a response to weight is added; None: the shipped one.
+    """
+    if isinstance(result, Response):
+        _write_response(path, result, command, neglect)
+    elif isinstance(result, SurfaceStudy):
+        write_influence(path, result.influence, command)
+        print(f"wrote {path}")
+    elif isinstance(result, ThermalStress):
+        write_yaml(path, result.to_dict(), f"Made by: {command} -o {path}\n{THERMAL_HEADER}")
+        print(f"wrote {path}")
+    else:
+        _write_weight(path, result, command, base)
+
+
+def _write_response(
+    path: Path,
+    result: Response,
+    command: str,
+    neglect: tuple[str, ...],
+) -> None:
+    """Write a calibration; its first lines say what is computed and what is a placeholder."""
+    # A body without the symmetry would lose a part of its response in the coefficients.
+    needs_matrix = result.structure_residual > MAX_STRUCTURE_RESIDUAL
+    source = f"computed by {command}"
+    calibration = calibration_from_fem(result, needs_matrix, neglect, source)
+    # A pad is crushed where its stress reaches the modulus of its foam.
+    largest = np.abs(result.matrix[:, result.modes.index("zz")]).max()
+    crushing_kpa = calibration.modulus.max() / largest / 1e3
+    header = (
+        f"Made by: {command} -o {path}\n"
+        f"The response is computed: {describe(result.body, result.layout)}.\n"
+        "Rest frequencies, beta and modulus are not: they are placeholders until the cube is tared"
+        " and fitted.\n"
+        f"With this modulus a uniform sigma_zz of -{crushing_kpa:.3g} kPa crushes a pad, which is"
+        " where its law ends."
+    )
+    if neglect:
+        header += (
+            "\nThe modes under neglect must be small: too few pads to tell them from the others."
+        )
+    write_calibration(path, calibration, header)
+    text = f"wrote {path}: calibration {calibration.id}"
+    if needs_matrix:
+        text += f", with the whole matrix: symmetry {result.symmetry} does not explain it"
+    print(text)
+
+
+def _show_surface(study: SurfaceStudy) -> None:
+    """Print for each load the measured stress, the true one, and their ratio where it is large."""
+    # Short headings let the table fit into 80 characters.
+    names = study.rows[0].measured
+    heads = [f"{name} {column}" for name in names for column in ("cube", "true", "ratio")]
+    # A stress in Pa under 1 N/m has the same number in kPa under 1 N/mm.
+    force, unit, digits = ("1 N/mm", 1.0, 1) if study.layout.planar else ("1 N", 1e3, 2)
+    _print_table(
+        f"stress in kPa under {force}: measured by the cube, and true",
+        ["load", "width, mm", "at x, mm", *heads],
+        [_surface_cells(row, unit, digits) for row in study.rows],
+    )
+
+
+def _surface_cells(row: SurfaceRow, unit: float, digits: int) -> list[str]:
+    """Return the load, and measured stress, true stress and their ratio for each component."""
+    cells = [row.load, f"{1e3 * row.width:g}", f"{1e3 * row.offset:g}"]
+    largest = max(map(abs, row.true.values()))
+    for name, measured in row.measured.items():
+        true = row.true[name]
+        ratio = f"{measured / true:.2f}" if abs(true) > MIN_SHOWN_SHARE * largest else ""
+        cells += [_format_number(value / unit, digits) for value in (measured, true)] + [ratio]
+    return cells
+
+
+def _show_volume(result: VolumeResponse) -> None:
+    """Print the stress of the pads per K or per m/s², and what a cube with the shipped calibration
+    measures in a uniform temperature, or under the weight of each pose."""
+    heads = [f"P{degree}" for degree in range(result.pads.shape[1])]
+    title = "stress of the pads, Pa per K of a temperature P0 (uniform), P1, ... of the height"
+    digits = 2
+    cases = [("", result.pads[:, 0], "/K")]
+    if not isinstance(result, ThermalStress):
+        heads = [*"xyz"]
+        title = "stress of the pads, Pa per m/s² of specific force"
+        digits = 3
+        by_axis = STANDARD_GRAVITY * result.pads.T
+        cases = [(f"{axis} up, ", pads, "") for axis, pads in zip("xyz", by_axis, strict=True)]
+
+    _print_table(title, ["pad", *heads], _rows(result.layout.pads, result.pads, digits))
+    if result.change is not None:
+        _console.print(f"change from the mesh before: {100 * result.change:.2g} %")
+    calibration = shipped_calibration(result.layout)
+    if calibration is None:
+        return
+    matrix = Pipeline([calibration]).matrix(0)
+    for label, pads, unit in cases:
+        for name, value in zip(COMPONENTS, (matrix @ pads).tolist(), strict=True):
+            # Symmetry makes most components vanish but for rounding.
+            if abs(value) > SMALLEST_SHOWN_STRESS:
+                text = f"{value:+.1f} Pa" if name in STRESS else f"{1e-3 * value:+.1f} Pa/mm"
+                _console.print(f"{label}measured with the shipped calibration: {name} {text}{unit}")
+
+
+def _write_weight(
+    path: Path,
+    result: VolumeResponse,
+    command: str,
+    base: Path | None,
+) -> None:
+    """Write the base calibration, by default the shipped one of the layout, with the response to
+    specific force."""
+    body, layout = result.body, result.layout
+    old = read_calibration(base) if base else shipped_calibration(layout)
+    if old is None or not old.layout.same_as(layout):
+        raise ConfigError(
+            f"--base: the weight is that of a cube with the layout {layout.name!r}, and "
+            f"{'no calibration is shipped' if old is None else 'the calibration is not'} for it; "
+            "name a calibration of the same layout"
+        )
+    calibration = replace(old, weight=WeightModel(result.pads))
+    header = (
+        f"Made by: {command} -o {path}\n"
+        f"The block weight is computed: {describe(body, layout)} on rigid ground, densities "
+        f"{body.density:g} and {body.cube_density:g} kg/m³."
+    )
+    write_calibration(path, calibration, header)
+    print(f"wrote {path}: calibration {calibration.id}")
+
+
+def draw(result: Result, folder: Path) -> None:
+    """Draw influence functions, or convergence, response and the loads of a layout in a plane."""
+    from cube_tensor_driver.views.figures.style import save
+
+    from .figures.deformation import draw_loads
+    from .figures.response import draw_convergence, draw_influence, draw_response
+    from .paper.experiments import mode_deformations
+
+    folder.mkdir(parents=True, exist_ok=True)
+    body, layout = result.body, result.layout
+    if isinstance(result, SurfaceStudy):
+        figure = draw_influence(result.influence, layout, body.side / 2)
+        save(figure, folder / "influence.png")
+    elif isinstance(result, Response):
+        save(draw_convergence(result), folder / "convergence.png")
+        save(draw_response(result), folder / "response.png")
+        if layout.planar:
+            save(draw_loads(layout, mode_deformations(body, layout)), folder / "loads.png")
+    print(f"pictures in {folder}")
+
+
+def show_study(result: LayoutStudy) -> None:
+    """Print the narrowest trusted indenter for each component, layout and side of the cube."""
+    _console.print(
+        "narrowest indenter, mm, from which on the error stays below 20 % "
+        f"of the component's range; cube's centre {1e3 * DEPTH:g} mm deep"
+    )
+    columns = [(name, float(side)) for name in result.error for side in result.sides]
+    heads = [f"{name}\n{1e3 * side:g} mm" for name, side in columns]
+    trusted = result.trusted()
+    widths = {(row.layout, row.side, row.component): _format_width(row.width) for row in trusted}
+    rows = []
+    for component in dict.fromkeys(row.component for row in trusted):
+        cells = [widths.get((*column, component), "·") for column in columns]
+        rows.append([component, *cells])
+    _print_table("", ["", *heads], rows)
+    _console.print("· not observed by the layout")
+
+
+def _format_width(width: float | None) -> str:
+    """Format a width (m) in mm; None means that no indenter is wide enough."""
+    return "never" if width is None else f"{1e3 * width:g}"
+
+
+def _print_table(
+    title: str,
+    heads: Sequence[str],
+    rows: Iterable[Iterable[str]],
+    footer: Iterable[Iterable[str]] = (),
+) -> None:
+    """Print a table with a first column of names and columns of numbers.
+
+    Args:
+        title: Line above the table, or "".
+        heads: Heading of each column.
+        rows: Texts of the cells of each row.
+        footer: The same for the rows below a line.
+    """
+    table = Table(title=title or None, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    for number, head in enumerate(heads):
+        table.add_column(head, justify="right" if number else "left")
+    for row in rows:
+        table.add_row(*row)
+    table.add_section()
+    for row in footer:
+        table.add_row(*row)
+    Console(highlight=False).print(table)
+
+
+def _rows(names: Iterable[str], values: Array, digits: int) -> list[list[str]]:
+    """Return the cells of rows of numbers, with a name before each."""
+    pairs = zip(names, values.tolist(), strict=True)
+    return [[name, *(_format_number(value, digits) for value in row)] for name, row in pairs]
+
+
+def _format_number(value: float, digits: int) -> str:
+    """Format a number with this many digits after the point; -0 becomes 0."""
+    return f"{round(value, digits) + 0.0:.{digits}f}"
