@@ -42,7 +42,7 @@ from .fingers import draw_fingers
 START_S = 30.0
 """Longest time for the processes to start, in s."""
 LOAD = """\
-period: 8.0
+period: 16.0
 indenters:
 - name: finger
   shape: disc
@@ -51,7 +51,7 @@ indenters:
   does:
   - press:
       from: 0.0
-      to: 8.0
+      to: 16.0
       at: [-0.004, -0.003, 0]
       force: [0, 2.6, 2.6, 2.6, 0]
       shear: [1.0, 0.4, 0]

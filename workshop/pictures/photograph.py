@@ -49,8 +49,8 @@ The picture is taken while the load rests, because a browser that draws on the p
 3-D view some pictures later than the numbers.
 """
 
-STEADY_S = 0.6
-"""Time between the two pressures that are compared, in seconds."""
+STEADY_S = 3.0
+"""Time between the two pressures that are compared, in seconds; the load rests for 8 s."""
 
 MAX_WAIT_S = 60.0
 """Time that each step may take, in seconds."""
