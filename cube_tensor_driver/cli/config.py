@@ -71,17 +71,9 @@ def write_grid(options: argparse.Namespace) -> int:
     from ..core.errors import ConfigError
     from ..views.terminal.output import counted, working
 
-    skin = grid(
-        options.name,
-        nx=options.nx,
-        ny=options.ny,
-        pitch=options.pitch,
-        links=options.links,
-        calibration=options.calibration,
-        layout=options.layout,
-        rate=options.rate,
-        port=options.port,
-    )
+    # Each option has the name of its argument of `grid`.
+    names = "name", "nx", "ny", "pitch", "links", "calibration", "layout", "rate", "port"
+    skin = grid(**{name: getattr(options, name) for name in names})
     # Of a large grid only a few cubes are checked, because checking all of them would take longer
     # than writing the file.
     part = skin if len(skin["cubes"]) <= MAX_SPACED_CUBES else ends_of_links(skin)

@@ -85,6 +85,8 @@ def run(options: argparse.Namespace) -> int:
     Raises:
         CubeError: A bag, an option or the output folder cannot be used.
     """
+    from dataclasses import fields
+
     from ..bags.reprocess.all_bags import RECIPE_NAME
     from ..lerobot.export import check_empty, export_lerobot
     from ..lerobot.plan import Choices
@@ -97,17 +99,10 @@ def run(options: argparse.Namespace) -> int:
             check_empty(options.output)
         return reprocess.run(options)
 
-    # All bags become one data set, so these choices apply to every bag.
-    choices = Choices(
-        fps=options.fps,
-        task=options.task,
-        marks=options.marks,
-        frequencies=options.frequencies,
-        topics=options.topics,
-        state=options.state,
-        action=options.action,
-        overrides=reprocess.overrides_of(options),
-    )
+    # All bags become one data set, so these choices apply to every bag. Each option has the name of
+    # its field.
+    options.overrides = reprocess.overrides_of(options)
+    choices = Choices(**{field.name: getattr(options, field.name) for field in fields(Choices)})
     with progress_bar() as report:
         exported = export_lerobot(options.bags, options.output, choices, report)
     show_exported(options.output, exported)

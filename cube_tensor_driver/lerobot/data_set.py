@@ -120,10 +120,7 @@ class DataSet:
 
     def new_statistics(self) -> dict[str, Statistics]:
         """Return empty statistics, by the names of the features (columns) that have statistics."""
-        statistics = {}
-        for key, rows in self._statistic_rows.items():
-            statistics[key] = Statistics(rows)
-        return statistics
+        return {key: Statistics(rows) for key, rows in self._statistic_rows.items()}
 
     def write(
         self,
@@ -226,9 +223,7 @@ class DataSet:
                 "features": self._features(),
             },
         )
-        statistics = {}
-        for key, one in self._statistics.items():
-            statistics[key] = _as_lists(one, self.frames)
+        statistics = {key: _as_lists(one, self.frames) for key, one in self._statistics.items()}
         _write_json(meta / "stats.json", statistics)
 
     def _place(self) -> dict[str, int]:
@@ -336,11 +331,8 @@ def _as_lists(
         frames: Number of frames (time steps of the data set), which LeRobot uses as the weight of
             the statistics when it merges data sets.
     """
-    lists: dict[str, Any] = {"count": [frames]}
-    result = statistics.result()
-    for name, values in result.items():
-        lists[name] = values.tolist()
-    return lists
+    lists = {name: values.tolist() for name, values in statistics.result().items()}
+    return {"count": [frames], **lists}
 
 
 def _task_table(tasks: list[str]) -> pyarrow.Table:

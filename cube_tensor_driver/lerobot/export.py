@@ -209,9 +209,9 @@ class EpisodeWriter:
         data_set, last = self._data_set, self._windows.done
         frames = len(windows[TACTILE])
         first = last - frames
-        columns: dict[str, Any] = {}
-        for key, source in self._topics.items():
-            columns[key] = source.at(self._episode, first, last)
+        columns: dict[str, Any] = {
+            key: source.at(self._episode, first, last) for key, source in self._topics.items()
+        }
 
         frame = np.arange(first, last)
         task = data_set.task_index(self._episode.task)
@@ -296,13 +296,8 @@ def _write_bag(
         report: Function that displays progress.
     """
     with Bag(plan.path) as bag:
-        sources = {}
-        for topic in topics:
-            sources[topic.key] = topic.open(bag)
-        waiting = []
-        for episode in plan.episodes:
-            writer = EpisodeWriter(data_set, episode, sources)
-            waiting.append(writer)
+        sources = {topic.key: topic.open(bag) for topic in topics}
+        waiting = [EpisodeWriter(data_set, episode, sources) for episode in plan.episodes]
         total = sum(episode.rows for episode in plan.episodes)
         done = 0
         for rows in _stress_rows(data_set, plan, choices):
@@ -345,10 +340,5 @@ def _stress_rows(
             # the same throughout.
             if not noted or noted[-1]["ids"] != ids:
                 since_ns = int(known.stamp_ns.min())
-                change = {
-                    "bag": plan.path.name,
-                    "since_ns": since_ns,
-                    "ids": ids,
-                }
-                noted.append(change)
+                noted.append({"bag": plan.path.name, "since_ns": since_ns, "ids": ids})
             yield known

@@ -97,8 +97,7 @@ class ImageStream:
         Raises:
             BagError: An image cannot be read, or has another shape than `shape`.
         """
-        frames = range(first, last)
-        return [self._newest_in(episode, frame) for frame in frames]
+        return [self._newest_in(episode, frame) for frame in range(first, last)]
 
     def _newest_in(self, episode: Episode, frame: int) -> bytes:
         """Return the file of the newest image that is stamped before the end of a frame.

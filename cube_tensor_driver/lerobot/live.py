@@ -143,10 +143,12 @@ class LiveWindows:
             )
         rows = concatenate(parts)
         # The clock of the computer may step back or stand still for longer than 1 ms.
-        self._number = max(self._number + 1, time.time_ns() // 1_000_000)
+        now_ms = time.time_ns() // 1_000_000
+        self._number = max(self._number + 1, now_ms)
         self._write(rows)
         # In an assignment with repeated indices numpy keeps the last value, which is the newest.
-        self._pressure[rows.cube] = -rows.stress[:, 2]
+        stress_zz = rows.stress[:, 2]
+        self._pressure[rows.cube] = -stress_zz
         return self._picture()
 
     def close(self) -> None:
@@ -174,9 +176,10 @@ class LiveWindows:
 
     def _write(self, rows: StressRows) -> None:
         """Write the rows (samples of cubes) of one frame as one batch of the Arrow stream."""
-        counts = np.bincount(rows.cube, minlength=self._cubes)[np.newaxis]
-        windows = Windows(counts, depth=int(counts.max()))
-        windows.add(np.zeros(len(rows), np.intp), rows)
+        counts = np.bincount(rows.cube, minlength=self._cubes)
+        windows = Windows(counts[np.newaxis], depth=int(counts.max()))
+        first_frame = np.zeros(len(rows), np.intp)
+        windows.add(first_frame, rows)
         (columns,) = windows.complete()
         arrays = {name: as_column(values) for name, values in columns.items()}
         batch = pyarrow.record_batch({NUMBER: pyarrow.array([self._number])} | arrays)
@@ -196,9 +199,11 @@ class LiveWindows:
         picture = colours.astype(np.uint8)[self._cube_at]
 
         number = self._number.to_bytes(NUMBER_BYTES, "big")
-        bits = np.unpackbits(np.frombuffer(number, np.uint8)).reshape(NUMBER_GRID)
+        number_bytes = np.frombuffer(number, np.uint8)
+        bits = np.unpackbits(number_bytes).reshape(NUMBER_GRID)
         side = picture.shape[1] // NUMBER_GRID[1]
-        squares = 255 * bits.repeat(MIN_SQUARE, axis=0).repeat(side, axis=1)
+        strips = bits.repeat(MIN_SQUARE, axis=0)
+        squares = 255 * strips.repeat(side, axis=1)
         rows, columns = squares.shape
         picture[:rows, :columns] = squares[..., np.newaxis]
         return picture
@@ -220,8 +225,10 @@ class RecordedWindows:
         if not paths:
             raise BagError(f"{folder}: no recordings (NUMBER.arrow); name the camera's folder")
         for path in paths:
-            for batch in pyarrow.ipc.open_stream(pyarrow.memory_map(str(path))):
-                self._frames[batch[NUMBER][0].as_py()] = batch
+            file = pyarrow.memory_map(str(path))
+            for batch in pyarrow.ipc.open_stream(file):
+                number = batch[NUMBER][0].as_py()
+                self._frames[number] = batch
 
     def __len__(self) -> int:
         """Return the number of frames that were read, including those that no data set kept."""
@@ -262,10 +269,12 @@ def frame_number(picture: AnyArray) -> int:
     rows, columns = NUMBER_GRID
     side = grey.shape[1] // columns
     strip = grey[: rows * MIN_SQUARE, : columns * side]
-    squares = strip.reshape(rows, MIN_SQUARE, columns, side).mean(axis=(1, 3))
+    by_square = strip.reshape(rows, MIN_SQUARE, columns, side)
+    squares = by_square.mean(axis=(1, 3))
     # Each number has bits of both kinds, so the threshold follows the scale of the picture.
-    bits = squares > 0.5 * (squares.min() + squares.max())
-    return int.from_bytes(np.packbits(bits).tobytes(), "big")
+    threshold = 0.5 * (squares.min() + squares.max())
+    number = np.packbits(squares > threshold)
+    return int.from_bytes(number.tobytes(), "big")
 
 
 def nearest_cubes(skin: Skin, width: int, height: int) -> AnyArray:
@@ -282,7 +291,8 @@ def nearest_cubes(skin: Skin, width: int, height: int) -> AnyArray:
     offset = position - position.mean(axis=0)
     thickness = np.ptp(offset, axis=0)
     # In parent coordinates, so that a flat skin appears as in its skin file: x right, y up.
-    kept = np.sort(np.argsort(-thickness, kind="stable")[:2])
+    widest = np.argsort(-thickness, kind="stable")[:2]
+    kept = np.sort(widest)
     across, up = offset[:, kept].T
     top = NUMBER_GRID[0] * MIN_SQUARE
     free = height - top
@@ -293,6 +303,8 @@ def nearest_cubes(skin: Skin, width: int, height: int) -> AnyArray:
     nearest = np.zeros((height, width), np.intp)
     for row in range(top, height):
         y = pixel * (top + free / 2 - row)
-        distance = np.subtract.outer(columns, across) ** 2 + (y - up) ** 2
-        nearest[row] = distance.argmin(axis=1)
+        distance_x = np.subtract.outer(columns, across)
+        distance_y = y - up
+        squared = distance_x**2 + distance_y**2
+        nearest[row] = squared.argmin(axis=1)
     return nearest

@@ -403,14 +403,12 @@ def _marked_spans(
         raise BagError(
             f"{bag.path}: no marks ({MARK_TYPE}) on {topic}; topics of that type: {names}"
         )
-    marks = []
-    for time_ns, mark in bag.decoded({topic}):
-        marks.append((time_ns, mark.data.strip()))
-    marks.append((MAX_NS, ""))
-    spans = []
-    for (since_ns, task), (until_ns, _) in pairwise(marks):
-        if task:
-            spans.append((since_ns, until_ns, task))
+    marks = [(time_ns, mark.data.strip()) for time_ns, mark in bag.decoded({topic})]
+    spans = [
+        (since_ns, until_ns, task)
+        for (since_ns, task), (until_ns, _) in pairwise([*marks, (MAX_NS, "")])
+        if task
+    ]
     if not spans:
         raise BagError(f"{bag.path}: no mark on {topic} begins an episode; publish its task there")
     return spans
