@@ -351,8 +351,8 @@ class HubClock:
         """
         is_same = device_us == self._last_us
         self._n_still += is_same
-        still_ns = arrival_ns - self._moved_ns
-        stood_still = self._n_still >= MIN_STILL_READS and still_ns > MIN_STILL_NS
+        is_long = self._n_still >= MIN_STILL_READS
+        stood_still = is_long and arrival_ns - self._moved_ns > MIN_STILL_NS
         if is_same and stood_still:
             return CLOCK_STANDS_STILL
         if not is_same:

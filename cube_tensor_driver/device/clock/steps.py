@@ -133,7 +133,9 @@ def find_step(track: LinkTrack, number: int, device_us: int) -> int:
         # The change of the period is limited, because otherwise a clock that stands still would
         # look like a shorter and shorter period.
         bound = period / PERIOD_SAMPLES
-        track.period_us = period + min(max(error, -bound), bound) / PERIOD_SAMPLES
+        if abs(error) > bound:
+            error = math.copysign(bound, error)
+        track.period_us = period + error / PERIOD_SAMPLES
     # While the hub's clock stands still, the reference sample stays the same, so that the
     # deviation grows with each sample until it counts as a step.
     if interval or is_step or period <= 0.0:

@@ -215,7 +215,8 @@ class ScanBuilder:
         sizes = [len(part.cubes) for part in parts]
         rows = self._make_rows(sum(sizes), self.cubes.n_pads)
         np.concatenate([part.cubes for part in parts], out=rows.cube)
-        rows.status[:] = np.repeat([part.status for part in parts], sizes)
+        statuses = [part.status for part in parts]
+        rows.status[:] = np.repeat(statuses, sizes) if any(statuses) else 0
         raws = [part.sample.raw for part in parts]
         if wire is not None and all(raws):
             _place(rows, raws, [part.stamp_ns for part in parts])

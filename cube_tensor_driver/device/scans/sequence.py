@@ -370,8 +370,10 @@ class SampleAccount:
     @property
     def is_usual(self) -> bool:
         """Whether each sample comes in one frame, which holds all cubes of the hub."""
-        sizes = {first: tracker.n_cubes for first, tracker in self._trackers.items()}
-        return sizes == {0: self._track.n_cubes}
+        tracker = self._trackers.get(0)
+        if tracker is None or len(self._trackers) > 1:
+            return False
+        return tracker.n_cubes == self._track.n_cubes
 
     @property
     def missing(self) -> int:
