@@ -17,6 +17,7 @@ from typing import Any
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.subscription import Subscription
 
 try:
@@ -96,7 +97,7 @@ def with_number(callback: Callable[[Any, int | None], None]) -> Callable[..., No
     return call
 
 
-def after_parameters_are_set(node: Node, callback: Callable[[list[Any]], None]) -> None:
+def after_parameters_are_set(node: Node, callback: Callable[[list[Parameter]], None]) -> None:
     """Register a callback that is called after parameters of a node have been set.
 
     This function must be called before callbacks that may refuse a change are added to the node.
@@ -111,7 +112,7 @@ def after_parameters_are_set(node: Node, callback: Callable[[list[Any]], None]) 
         node.add_post_set_parameters_callback(callback)
         return
 
-    def before_change(parameters: list[Any]) -> SetParametersResult:
+    def before_change(parameters: list[Parameter]) -> SetParametersResult:
         # rclpy also calls this while a parameter is declared. The node does not have the parameter
         # yet, so it is left out.
         known = [parameter for parameter in parameters if node.has_parameter(parameter.name)]

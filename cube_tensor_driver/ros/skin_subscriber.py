@@ -13,6 +13,7 @@ from functools import partial
 from typing import Any
 
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 
 from ..config.parameters import Parameter
 from ..core.arrays import Index
@@ -41,7 +42,7 @@ class FollowedSkin:
         stamp_ns: Stamp of the newest message of `stress`, in ns since the Unix epoch; 0: none came.
     """
 
-    info: Any
+    info: SkinInfo
     poses: CubePoses
     newest: LatestStress
     messages: int = 0
@@ -165,7 +166,7 @@ class SkinSubscriberNode(CubeNode):
             health: Health of each cube (cubes,), as in `compute_message`.
         """
 
-    def has_listeners(self, publisher: Any) -> bool:
+    def has_listeners(self, publisher: Publisher) -> bool:
         """Return whether the topic has a subscriber. Without one, nothing is computed."""
         return bool(publisher.get_subscription_count())
 

@@ -5,13 +5,14 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
 
 from ...core.errors import ConfigError, CubeError, MessageError
 from ...core.rows import StressRows
@@ -100,7 +101,7 @@ def listen(topic: str, once: bool) -> Iterator[list[Item]]:
         )
 
 
-def resolve_topics(node: Node, topics: tuple[str, ...] | list[str]) -> list[str]:
+def resolve_topics(node: Node, topics: Sequence[str]) -> list[str]:
     """Return the full names of topics, with the namespace and remaps of a node.
 
     Args:
@@ -152,7 +153,7 @@ class _Listener:
         self._node, self._topic = node, topic
         self._names: list[str] | None = None
         self._needs_names = False
-        self._early_subscription: Any = None
+        self._early_subscription: Subscription | None = None
         cubes, _, what = topic.rpartition("/")
         self._cube = cubes.rpartition("/")[2]
         if what == "stress" and cubes.rpartition("/")[0].endswith("/cubes"):
@@ -194,12 +195,7 @@ class _Listener:
             # Rows contain the index of a cube in the skin; its name is in the topic `info`.
             self._needs_names = True
             info = f"{self._topic.rpartition('/')[0]}/info"
-            self._node.create_subscription(
-                SkinInfo,
-                info,
-                self._on_info,
-                LATCHED,
-            )
+            self._node.create_subscription(SkinInfo, info, self._on_info, LATCHED)
             self._add(SkinStress, self._on_stress, profile, raw=True)
         else:
             self._add(kind, self._on_message, profile)
@@ -218,14 +214,8 @@ class _Listener:
 
     def _add(
         self, kind: type, receive: Callable[[Any], None], profile: QoSProfile, raw: bool = False
-    ) -> Any:
-        return self._node.create_subscription(
-            kind,
-            self._topic,
-            receive,
-            profile,
-            raw=raw,
-        )
+    ) -> Subscription:
+        return self._node.create_subscription(kind, self._topic, receive, profile, raw=raw)
 
     def _on_message(self, message: Any) -> None:
         self.waiting.append(message)

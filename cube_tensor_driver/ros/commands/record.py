@@ -13,10 +13,10 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from ...bags.metadata import quality
@@ -26,7 +26,7 @@ from ...core.errors import BagError
 from ...processes.stop_signals import stop_event
 from ..messages import message_class
 from ..qos import offered_profile
-from ..session import domain_text, node_session, spin_until
+from ..session import Session, domain_text, node_session, spin_until
 from .echo import resolve_topics
 
 QUEUE_DEPTH = 2000
@@ -103,8 +103,8 @@ class Recorder:
         self.error: BagError | None = None
         self._node, self._bag = node, bag
         self._wanted = list(topics)
-        self._subscriptions: list[Any] = []
-        self._unconnected: dict[str, Any] = {}
+        self._subscriptions: list[Subscription] = []
+        self._unconnected: dict[str, Subscription] = {}
         self._latched: set[str] = set()
         self._connected_s = self._begin_s = 0.0
         self._waiting: deque[tuple[str, int, bytes]] = deque()
@@ -202,13 +202,7 @@ class Recorder:
             self._waiting.append((topic, clock.now().nanoseconds, data))
 
         kind = message_class(topic, type_name)
-        subscription = self._node.create_subscription(
-            kind,
-            topic,
-            receive,
-            profile,
-            raw=True,
-        )
+        subscription = self._node.create_subscription(kind, topic, receive, profile, raw=True)
         self._subscriptions.append(subscription)
         self._unconnected[topic] = subscription
 
@@ -264,24 +258,15 @@ def record(
         ConfigError: ROS does not allow the name of a topic, or rclpy does not start.
     """
     stop = stop_event()
-    with node_session("recorder") as (node, executor):
-        names = resolve_topics(node, list(topics))
+    with node_session("recorder") as session:
+        names = resolve_topics(session.node, topics)
         bag = BagWriter(folder, storage, max_bytes, max_seconds)
-        return fill(
-            bag,
-            node,
-            executor,
-            names,
-            stop=stop,
-            duration=duration,
-            show=show,
-        )
+        return fill(bag, session, names, stop=stop, duration=duration, show=show)
 
 
 def fill(
     bag: BagWriter,
-    node: Node,
-    executor: Any,
+    session: Session,
     names: Sequence[str],
     *,
     stop: threading.Event,
@@ -292,8 +277,7 @@ def fill(
 
     Args:
         bag: The bag, which is empty.
-        node: The node that subscribes.
-        executor: The executor that contains the node.
+        session: The node that subscribes.
         names: Full names of the topics.
         stop: Recording ends when this event is set.
         duration: See `record`.
@@ -302,7 +286,7 @@ def fill(
     Raises:
         BagError: See `record`.
     """
-    recorder = Recorder(node, names, bag)
+    recorder = Recorder(session.node, names, bag)
     begin = find_at = show_at = time.monotonic()
     until = float("inf") if duration is None else begin + duration
     has_come = False
@@ -327,7 +311,7 @@ def fill(
             show(recorder, now - begin)
 
     try:
-        spin_until(executor, is_done, on_step=find_and_show)
+        spin_until(session.executor, is_done, on_step=find_and_show)
     finally:
         _close(recorder, bag.folder)
     if not bag.messages:

@@ -12,11 +12,12 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from typing import Any
 
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
 
+from ...bags.metadata import Connection
 from ...bags.read import Bag, Entry
 from ...core.errors import BagError
 from ...messages.codec import SECOND
@@ -114,7 +115,7 @@ class Player:
         # This condition guards the four states above, and wakes `run` when one of them changes.
         self._wake = threading.Condition()
         self._node, self._bag, self._rate = node, bag, rate
-        self._publishers: dict[str, Any] = {}
+        self._publishers: dict[str, Publisher] = {}
         self._latched: set[str] = set()
         # A bag may contain several skins in different namespaces; each has a topic `frequencies`.
         skins = [topic.removesuffix("frequencies") for topic in bag.topics(FREQUENCIES)]
@@ -196,7 +197,7 @@ class Player:
                     next_ns, self._jump_ns = self._jump_ns, None
                     self._shown_until_ns = next_ns + SHOWN_NS
 
-    def _announce(self, topic: str, connection: Any) -> None:
+    def _announce(self, topic: str, connection: Connection) -> None:
         """Make the publisher of a topic, with the quality of service of the recorded publisher.
 
         Args:
@@ -316,7 +317,7 @@ class Player:
         self.published += 1
 
 
-def _is_reconstructed(connection: Any, skins: list[str]) -> bool:
+def _is_reconstructed(connection: Connection, skins: list[str]) -> bool:
     """Return whether a reconstruction published a topic of a bag.
 
     Other nodes publish messages of type WrenchStamped, too, so a topic of this type counts only if
@@ -348,11 +349,7 @@ class ReplayControl:
     def _publish_state(self) -> None:
         player = self._player
         self._state.publish(
-            ReplayState(
-                position=player.position,
-                length=player.length,
-                paused=player.paused,
-            )
+            ReplayState(position=player.position, length=player.length, paused=player.paused)
         )
 
     def _steer(
@@ -399,13 +396,7 @@ def replay(
     """
     errors: list[BagError] = []
     with node_session("player") as (node, executor):
-        player = Player(
-            node,
-            bag,
-            rate=rate,
-            stress=stress,
-            clock=clock,
-        )
+        player = Player(node, bag, rate=rate, stress=stress, clock=clock)
         ReplayControl(node, player)
         on_stop_signal(player.end)
 

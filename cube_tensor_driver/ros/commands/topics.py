@@ -7,15 +7,14 @@ from __future__ import annotations
 import re
 import time
 from dataclasses import dataclass
-from typing import Any
 
-from rclpy.executors import Executor
 from rclpy.node import Node
+from rclpy.subscription import Subscription
 
 from ...core.errors import BagError, CubeError
 from ..messages import message_class
 from ..qos import offered_profile
-from ..session import domain_text, node_session, spin_until
+from ..session import Session, domain_text, node_session, spin_until
 from .echo import QUEUE_DEPTH
 from .services import SETTLE_S, discover
 
@@ -70,12 +69,13 @@ def list_topics() -> list[ListedTopic]:
     Raises:
         CubeError: No topic was found.
     """
-    with node_session("topic_list") as (node, executor):
+    with node_session("topic_list") as session:
+        node, executor = session
         if not discover(executor, lambda: _find_topics(node)):
             raise CubeError(f"nobody publishes in {domain_text()}; start ./cube demo or a skin")
         for _ in range(MAX_TRIES):
             topics = _find_topics(node)
-            _count_messages(node, executor, topics)
+            _count_messages(session, topics)
             if len(topics) == len(_find_topics(node)):
                 break
         return topics
@@ -95,18 +95,14 @@ def _find_topics(node: Node) -> list[ListedTopic]:
     return list(topics.values())
 
 
-def _count_messages(
-    node: Node,
-    executor: Executor,
-    topics: list[ListedTopic],
-) -> None:
+def _count_messages(session: Session, topics: list[ListedTopic]) -> None:
     """Count the messages of topics for `COUNT_S`, and store the number in each `ListedTopic`.
 
     Args:
-        node: The node that subscribes to the topics.
-        executor: The executor that contains `node`.
+        session: The node that subscribes to the topics.
         topics: The topics, whose `count` is set.
     """
+    node, executor = session
     subscriptions = [_subscribe(node, topic) for topic in topics]
     # Counting begins after a pause: DDS needs time to connect the subscriptions, and latched
     # messages, which were published earlier, arrive in this time and are not counted.
@@ -123,7 +119,7 @@ def _count_messages(
         node.destroy_subscription(subscription)
 
 
-def _subscribe(node: Node, topic: ListedTopic) -> Any:
+def _subscribe(node: Node, topic: ListedTopic) -> Subscription | None:
     """Return a subscription that counts messages in `topic.count`.
 
     None means that the type of the messages is not installed; the count is then None, too.
@@ -143,10 +139,4 @@ def _subscribe(node: Node, topic: ListedTopic) -> Any:
 
     offers = node.get_publishers_info_by_topic(topic.listened)
     profile = offered_profile(offers, QUEUE_DEPTH)
-    return node.create_subscription(
-        kind,
-        topic.listened,
-        receive,
-        profile,
-        raw=True,
-    )
+    return node.create_subscription(kind, topic.listened, receive, profile, raw=True)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.impl.rcutils_logger import RcutilsLogger
 
 from ...config.skin import Skin
 from ...core.arrays import AnyArray, Mask
@@ -313,7 +314,7 @@ class LostMessages:
         self._reported = event.total_count
 
 
-def log_changes(logger: Any, changes: LogChanges) -> None:
+def log_changes(logger: RcutilsLogger, changes: LogChanges) -> None:
     """Write lines to the log: problems as warnings, and the end of problems as information."""
     for line, is_bad in changes:
         # rclpy requires that a line of code always logs with the same level, so there are two.

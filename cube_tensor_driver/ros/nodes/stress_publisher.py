@@ -8,12 +8,11 @@ All rows go to `stress`, forces of all cubes to `forces`, and the rows of single
 
 from __future__ import annotations
 
-import array
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import WrenchStamped
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Header
@@ -27,7 +26,7 @@ from ...core.status import INVALID
 from ...core.tensor import contact_wrench
 from ...messages.codec import stress_codec
 from ...msg import SkinStress, StressTensorStamped
-from ..messages import tensor_message, to_time, wrench_message
+from ..messages import pack_array, tensor_message, to_time, wrench_message
 from ..node import MAX_BUFFERS, CubeNode
 
 LISTENERS_PERIOD_S = 0.5
@@ -178,10 +177,7 @@ class ForceCloud:
         known = rows.select(rows.cube < self._n_cubes)
         force = self._forces.of_skin(known)
         cloud = np.hstack([self._forces.position, force]).astype("<f4")
-        # rclpy checks each byte of other types, but takes an `array.array` of type "B" as it is.
-        data = array.array("B")
-        data.frombytes(cloud.tobytes())
-        self._message.data = data
+        self._message.data = pack_array("B", cloud.view(np.uint8))
         self._message.is_dense = bool(np.isfinite(force).all())
         self._message.header.stamp = to_time(stamp_ns)
         self._publisher.publish(self._message)
@@ -201,11 +197,11 @@ class CubeTopics:
         self._sides = np.array([side or own_side for own_side in own_sides])
         self._covariances: dict[tuple[int, int], Array] = {}
         # Index of a cube -> the publisher of its stress or its wrench.
-        self._tensors: dict[int, Any] = {}
-        self._wrenches: dict[int, Any] = {}
+        self._tensors: dict[int, Publisher] = {}
+        self._wrenches: dict[int, Publisher] = {}
         # Topic without a publisher yet -> type of its messages, the dictionary in which its
         # publisher is to be stored, and the index of its cube.
-        self._unannounced: dict[str, tuple[type, dict[int, Any], int]] = {}
+        self._unannounced: dict[str, tuple[type, dict[int, Publisher], int]] = {}
         for number, cube in enumerate(skin.cubes):
             for message_type, publishers, what in (
                 (StressTensorStamped, self._tensors, "stress"),
@@ -297,7 +293,7 @@ class CubeTopics:
         return noise if growth is None else noise + growth
 
 
-def _find_listened(publishers: dict[int, Any]) -> list[int]:
+def _find_listened(publishers: dict[int, Publisher]) -> list[int]:
     """Return the indices of the cubes whose publisher has at least one subscriber."""
     return [
         number for number, publisher in publishers.items() if publisher.get_subscription_count()

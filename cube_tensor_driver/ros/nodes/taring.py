@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from std_srvs.srv import Trigger
@@ -62,7 +61,7 @@ class Taring:
         skin: Skin,
         reconstructor: Reconstructor,
         folder: Path | None,
-        lock: AbstractContextManager[Any],
+        lock: AbstractContextManager[object],
         on_change: Callable[[], None],
     ) -> None:
         """Offer the services, and restore the tares of cubes whose uid is in the skin file.
