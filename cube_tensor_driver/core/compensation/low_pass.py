@@ -58,7 +58,7 @@ class LowPass:
         self.time = time
         self.lag = np.zeros((len(time), n_cubes, n_signals))
 
-    def advance(self, elapsed_s: Array, change: Real) -> Array:
+    def advance(self, elapsed_s: Real, change: Real) -> Array:
         """Advance the filters by one interval for each cube.
 
         Args:
@@ -74,7 +74,7 @@ class LowPass:
             lag += part * change
         return share
 
-    def find_shares(self, elapsed_s: Array) -> tuple[Array, Array]:
+    def find_shares(self, elapsed_s: Real) -> tuple[Array, Array]:
         """Return the shares m and m time / t of intervals t (C,), in s, as (K, C)."""
         if self.time.shape[1] > 1:
             return self._find_shares(elapsed_s)
@@ -84,7 +84,7 @@ class LowPass:
         share, mean = self._find_shares(elapsed_s[begins])
         return np.repeat(share, counts, axis=1), np.repeat(mean, counts, axis=1)
 
-    def _find_shares(self, elapsed_s: Array) -> tuple[Array, Array]:
+    def _find_shares(self, elapsed_s: Real) -> tuple[Array, Array]:
         ratio = elapsed_s / self.time
         share = relaxed_share(ratio)
         # A step without duration changes the lag as much as the input.
