@@ -67,6 +67,20 @@ RESPONSE = np.array(
     ]
 )
 """Stress of the pads of a steel bar, in Pa per m/s²: ./cube fem planar_slab --weight."""
+TRUE_RESPONSE = np.array(
+    [
+        [3.447, 0, -3.469],
+        [-3.447, 0, -3.469],
+        [-6.461, 0, -24.667],
+        [6.461, 0, -24.667],
+        [9.193, 0, -6.457],
+        [0.367, 0, -5.146],
+        [-9.193, 0, -6.457],
+        [-0.367, 0, -5.146],
+    ]
+)
+"""The same of a bar as it was really built, by one coarse mesh: a section of 58 x 11.3 mm of 1100
+kg/m³ with Poisson's ratio 0.475, and a bar of 7750 kg/m³ that lies 0.2 mm too deep."""
 
 
 @pytest.fixture
@@ -152,7 +166,7 @@ def scan_at(t: float, moving: MovingSkin | None = None) -> FrequencyRows:
     stamps = START_NS + np.array([round(1e9 * t), round(1e9 * t) + 1_000_000])
     pads = np.full((2, 8), -300.0)
     if moving is not None:
-        pads = np.array([RESPONSE @ true_force(moving, t + 1e-3 * c, c) for c in range(2)])
+        pads = np.array([TRUE_RESPONSE @ true_force(moving, t + 1e-3 * c, c) for c in range(2)])
     c = illustrative("planar")
     f = pad_frequency(pads, c.rest_frequency, c.beta, c.modulus).astype(np.float32)
     cube = np.arange(2, dtype=np.uint16)
@@ -215,15 +229,20 @@ def played(node, moving: MovingSkin, seconds: float) -> FrequencyRows:
 
 
 def test_a_shaken_arm_leaves_no_weight_and_no_contact(start, monkeypatch):
-    """With the lever arm, in the axes of each cube, while samples come late and rows between."""
+    """With the lever arm, in the axes of each cube, while samples come late and rows between.
+
+    The pads have the response of the bar as built, which the calibration does not know.
+    """
     fake_tf(monkeypatch, imu=IMU_FRAME)
-    node, moving = start(imu="/imu"), MovingSkin()
+    # It turns through all poses within this second.
+    node, moving = start(imu="/imu"), MovingSkin(turn_s=1.0)
     rows = played(node, moving, 1.0)
     stress = concatenate([stress_codec.decode(one).rows for one in node.sent["stress"]])
     assert (stress.status & (WEIGHT | COMPENSATION) == WEIGHT).all()
     # Nothing presses, so all that is left is wrong; a contact is 300 Pa.
     left = stress.stress[:, [0, 2, 4]]
-    assert np.sqrt((left**2).mean()) < 5
+    # Measured: 2.9, 3.0 and 4.9 Pa, and 13 Pa at most.
+    assert (np.sqrt((left**2).mean(axis=0)) < 5).all()
     assert np.abs(left).max() < 30
     off = Reconstructor([illustrative("planar")] * 2).process(rows)
     assert np.abs(off.stress[:, [0, 2, 4]]).max() > 200
