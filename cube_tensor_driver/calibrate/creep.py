@@ -7,13 +7,13 @@ low-passed with relaxation times tau_k (`core/compensation/creep.py`). While a l
 constant but unknown, and after it s = 0. So s and the amplitudes a_k follow from linear least
 squares. How the load came on does not matter, because memories are computed from measured readings.
 
-The relaxation times are a fixed number per decade: the smallest with which the law describes the
-readings. They reach far beyond the hold. What the readings do not determine continues smoothly in
-k, because the second differences of a_k are part of the sum of squares.
+The relaxation times reach far beyond the hold. What the readings do not determine continues as
+they suggest. If creep grows as a power of time, the amplitudes grow by a constant factor q from one
+relaxation time to the next, so (a_k+1 - 2 q a_k + q² a_k-1)² is a part of the sum of squares. A
+first fit with q = 1 yields q.
 
-How wrong this continuation is, is measured: the fit is repeated with the first part of the hold
-only. The difference of the two laws, moved along the relaxation times by the ratio of the two
-durations, is the deviation of the law.
+The deviation of the law is that which least squares state for a load that lasts `FORECAST` times as
+long as the hold.
 
 Source: J. D. Ferry, Viscoelastic Properties of Polymers (1980), 4.A and 11.F.
 """
@@ -36,30 +36,41 @@ from ..messages.codec import SECOND
 from .fit import measured_stress
 from .recorded_loads import average_neighbours, find_cube, read_samples
 
-TIMES_PER_DECADE = (1.0, 1.5, 2.0)
-"""Numbers of relaxation times of the creep law per decade (factor 10 of time) that are tried, in
-this order, until its error is at most `GOOD_MISFIT` of the load."""
+TIMES_PER_DECADE = 2.0
+"""Number of relaxation times of the creep law per decade (factor 10 of time). With 1.5, the error
+of the sum of exponentials makes the law wrong by 0.4 % of the load after an hour."""
 
 SHORTEST_TIME_S = 0.1
 """Shortest relaxation time of the creep law, in s. Creep that is faster than this counts as part of
 the immediate response of a pad to a load."""
 
-REACH = 20.0
+REACH = 60.0
 """Smallest ratio of the longest relaxation time of the creep law to the duration for which the load
 was held. It makes a law from a hold of minutes serve for loads that last an hour."""
 
-GOOD_MISFIT = 2e-4
-"""Error of the creep law (rms difference between the measured and the computed stress readings of
-the pads), divided by the load. At or below this error, no further relaxation times are tried. It is
-small against the largest error that is accepted (0.5 %) and visible above the noise of the pads."""
+FORECAST = 6.0
+"""Ratio of the duration of a load to that of the hold, for which the law's deviation is computed:
+an hour for a hold of ten minutes."""
+
+READING_ERROR = 1e-4
+"""Standard deviation of a mean reading, besides noise, divided by the load: the error of a sum of
+exponentials (rms)."""
 
 MAX_MISFIT = 5e-3
 """Largest error of the creep law (rms difference between the measured and the computed stress
 readings of the pads), divided by the load. With a larger error, the load was not held constant."""
 
-BEND = 0.15
-"""Expected second difference of the creep law's amplitudes at successive relaxation times, divided
-by their mean. Creep that grows as a power of time has 0.03 to 0.7 for exponents of 0.1 to 0.4."""
+FIRST_BEND = 0.15
+"""Standard deviation of the second differences of the amplitudes at successive relaxation times in
+the first fit, divided by their mean. For creep that grows as a power of time it is 0.03 to 0.7 for
+exponents of 0.1 to 0.4."""
+
+BEND = 0.05
+"""The same in the second fit, which takes out a power of time."""
+
+FAST_ERROR = 0.02
+"""Standard deviation of the fastest memory's amplitude divided by it: creep of shorter times, which
+it stands for, is not a part of the recording."""
 
 REST_S = 2.0
 """Duration at the begin of a recording, in s, in which the cube must be unloaded. The mean stress
@@ -117,6 +128,21 @@ class _Hold(NamedTuple):
     is_loaded: Array
     n_readings: Array
     reading: Array
+
+
+class _Solution(NamedTuple):
+    """Amplitudes by least squares.
+
+    Attributes:
+        amplitude: Amplitudes of each pad (P, K).
+        error: Errors of the mean readings (N, P), in Pa.
+        deviation: Pattern of one standard deviation of the amplitudes (P, K), the one that makes a
+            forecast wrong.
+    """
+
+    amplitude: Array
+    error: Array
+    deviation: Array
 
 
 def fit_recorded_creep(path: Path, name: str | None) -> tuple[CreepFit, Calibration]:
@@ -195,15 +221,19 @@ def fit_creep(
             "press harder, so that every pad is loaded"
         )
 
-    for order in TIMES_PER_DECADE:
-        decades = np.log10(REACH * hold_s / SHORTEST_TIME_S)
-        n_times = 1 + int(np.ceil(order * decades))
-        time = SHORTEST_TIME_S * 10 ** (np.arange(n_times) / order)
-        memory = _find_memories(seconds, reading, time, blocks)
-        amplitude, error = _solve(means, memory, load, noise)
-        misfit = float(np.sqrt(np.mean((error / load) ** 2)))
-        if misfit < GOOD_MISFIT:
-            break
+    decades = np.log10(REACH * hold_s / SHORTEST_TIME_S)
+    n_times = 1 + int(np.ceil(TIMES_PER_DECADE * decades))
+    time = SHORTEST_TIME_S * 10 ** (np.arange(n_times) / TIMES_PER_DECADE)
+    memory = _find_memories(seconds, reading, time, blocks)
+    forecast = relaxed_share(FORECAST * hold_s / time)
+    first = _solve(means, memory, load, noise, forecast, 1.0, FIRST_BEND)
+    # Memories between the time at which readings begin and the end of the hold are well known.
+    is_known = (time > SETTLE_S) & (time < hold_s / 3)
+    known = first.amplitude[:, is_known]
+    growth = float((known[:, 1:] * known[:, :-1]).sum() / (known[:, :-1] ** 2).sum())
+    solution = _solve(means, memory, load, noise, forecast, growth, BEND)
+    amplitude = solution.amplitude
+    misfit = float(np.sqrt(np.mean((solution.error / load) ** 2)))
     total = amplitude.sum(axis=1).max()
     if misfit > MAX_MISFIT or total >= 1:
         raise FitError(
@@ -212,27 +242,10 @@ def fit_creep(
             f"{SETTLE_S:g} s, and hold a constant load, such as a dead weight"
         )
 
-    # The first part is shorter than the hold by the ratio of some successive relaxation times, and
-    # the law reaches as far beyond it as an hour lies beyond ten minutes.
-    shift = max(1, round(order * np.log10(6)))
-    first_s = hold_s / 10 ** (shift / order)
-    is_first = (means.time < first_s) & (means.is_loaded > 0)
-    first = _Hold(*(part[is_first] for part in means))
-    early, _ = _solve(first, memory[is_first], load, noise)
-
-    # The amplitudes of a power law grow with the relaxation time, and so does the deviation.
-    n_known = int(np.searchsorted(time, hold_s / 3))
-    slower = amplitude[:, shift:n_known]
-    faster = amplitude[:, : n_known - shift]
-    growth = (slower * faster).sum(axis=1) / (faster**2).sum(axis=1)
-    change = amplitude - early
-    beyond = np.zeros_like(amplitude)
-    beyond[:, shift:] = growth[:, None] * change[:, :-shift]
-
     # The fastest memory is the reading itself, so its amplitude changes all readings alike.
-    within = np.zeros_like(amplitude)
-    within[:, 0] = misfit
-    model = CreepModel(time, amplitude, np.array([within, beyond]))
+    fast = np.zeros_like(amplitude)
+    fast[:, 0] = np.hypot(misfit, FAST_ERROR * amplitude[:, 0])
+    model = CreepModel(time, amplitude, np.array([fast, solution.deviation]))
     return CreepFit(model, load, hold_s, misfit)
 
 
@@ -350,7 +363,10 @@ def _solve(
     memory: Array,
     load: Array,
     noise: Array,
-) -> tuple[Array, Array]:
+    forecast: Array,
+    growth: float,
+    bend: float,
+) -> _Solution:
     """Fit amplitudes to the means of readings by least squares with smooth amplitudes.
 
     Args:
@@ -358,32 +374,35 @@ def _solve(
         memory: Memories of the pads (N, K, P), in Pa.
         load: Load of each pad (P,), in Pa.
         noise: Standard deviation of a reading of each pad (P,), in Pa.
-
-    Returns:
-        Amplitudes (P, K), and errors of the readings (N, P), in Pa.
+        forecast: Memories (K,) of a reading of 1 that has lasted for the time of the forecast.
+        growth: Expected ratio of successive amplitudes.
+        bend: Standard deviation of second differences divided by the mean amplitude.
     """
     n_times = memory.shape[1]
     held = means.reading[means.is_loaded > 0]
     # The creep during the hold is that of about half the relaxation times.
     creep = np.abs(held[-1] / held[0] - 1).mean()
     mean_amplitude = 2 * creep / n_times
-    bend = np.diff(np.eye(n_times), n=2, axis=0)
-    slope = np.diff(np.eye(n_times)[:2], axis=0)
-    smooth = np.concatenate([slope, bend]) / (BEND * mean_amplitude + 1e-9)
+    steps = np.eye(n_times)[1:] - growth * np.eye(n_times)[:-1]
+    bends = steps[1:] - growth * steps[:-1]
+    smooth = np.concatenate([steps[:1], bends]) / (bend * mean_amplitude + 1e-9)
     smooth = np.pad(smooth, ((0, 0), (1, 0)))
-    no_bend = np.zeros(len(smooth))
 
-    amplitude = np.empty((len(load), n_times))
-    error = np.empty_like(means.reading)
+    shape = len(load), n_times
+    found = _Solution(np.empty(shape), np.empty_like(means.reading), np.empty(shape))
     for pad, pad_load in enumerate(load):
         reading = means.reading[:, pad]
         mean_noise = noise[pad] / np.sqrt(means.n_readings)
-        deviation = np.hypot(mean_noise, 0.5 * GOOD_MISFIT * pad_load)
+        deviation = np.hypot(mean_noise, READING_ERROR * pad_load)
         # Unknown are the stress under the load, and the amplitudes.
         columns = np.column_stack([means.is_loaded, memory[..., pad]])
         system = np.concatenate([columns / deviation[:, None], smooth])
-        right = np.concatenate([reading / deviation, no_bend])
+        right = np.concatenate([reading / deviation, np.zeros(len(smooth))])
         solution = np.linalg.lstsq(system, right, rcond=None)[0]
-        amplitude[pad] = solution[1:]
-        error[:, pad] = reading - columns @ solution
-    return amplitude, error
+        found.amplitude[pad] = solution[1:]
+        found.error[:, pad] = reading - columns @ solution
+        # The error of the amplitudes that makes the forecast wrong by its standard deviation, if
+        # the stress is known, in whose place gains are calibrated.
+        spread = np.linalg.solve(system[:, 1:].T @ system[:, 1:], forecast)
+        found.deviation[pad] = spread / np.sqrt(forecast @ spread)
+    return found

@@ -82,15 +82,17 @@ def reconstructed(time, scale, growth, exponent=0.2, seed=0, calibration=None):
     return error, np.sqrt(reconstruct.covariance(0)[2, 2])
 
 
-GROWTHS = [(0.05, 1.5), (0.1, 2.5), (0.25, 6.0)]
-"""Creep from 1 s to 10 min, and the error after an hour that is allowed, in percent of the load."""
+GROWTHS = [0.05, 0.1, 0.25]
+"""Creep from 1 s to 10 min, divided by the load."""
 
 
-@pytest.mark.parametrize(("growth", "hour_limit"), GROWTHS)
-def test_a_load_of_ten_minutes_and_of_an_hour_stays_what_it_is(growth, hour_limit):
+@pytest.mark.parametrize("growth", GROWTHS)
+def test_a_load_of_ten_minutes_and_of_an_hour_stays_what_it_is(growth):
     """In percent of 20 kPa: 0.5 from 3 to 600 s, and what is left after it at most 30 Pa.
 
-    After an hour, the deviation that is stated is that of a law beyond its recording.
+    After an hour, the deviation that is stated is that of a law beyond its recording. Over nine
+    laws (growths of 5, 10, 25 %, exponents of 0.1, 0.2, 0.35), two seeds each, the error divided by
+    it was 0.99 (rms), and 2.6 at most.
     """
     time = held_times(600.0)
     error, stated = reconstructed(time, pressed(time, 5, 605), growth)
@@ -98,6 +100,8 @@ def test_a_load_of_ten_minutes_and_of_an_hour_stays_what_it_is(growth, hour_limi
     held = (time > 8) & (time < 604)
     assert np.abs(plain[held]).max() / 200 == pytest.approx(100 * growth, rel=0.1)
     assert np.abs(error[held]).max() / 200 < 0.5
+    # Rows up to 5 s apart are no gap, after which earlier loads would be unknown.
+    assert stated / 200 < 0.3
     for after in (10, 60):
         # Means of 3 s or more, because the noise of one row is 8 Pa.
         chosen = (time > 604 + after) & (time < 608 + after)
@@ -107,8 +111,7 @@ def test_a_load_of_ten_minutes_and_of_an_hour_stays_what_it_is(growth, hour_limi
     time = time[time < 3604]
     error, stated = reconstructed(time, pressed(time, 5, 3605), growth)
     last = abs(error[-5:].mean())
-    assert last / 200 < hour_limit
-    assert 0.4 * stated < last < 2 * stated
+    assert last < 1.5 * stated and stated / 200 < 0.3
 
 
 @pytest.mark.parametrize("hertz", [0.1, 1.0])

@@ -27,16 +27,9 @@ from ..pipeline import Pipeline, Watch
 from ..rows import FrequencyRows, StressRows
 from ..status import COMPENSATION, WEIGHT
 from .creep import Creep
+from .low_pass import STEP_NS
 from .thermal import Thermal
 from .weight import Weight
-
-STEP_NS = 100_000_000
-"""Duration of a step, in ns, within which temperature counts as constant, and the readings of the
-pads as straight lines for creep.
-
-With a lag of 100 s and 150 Pa/K, the effect of temperature changes by 2 Pa within a step after the
-skin warmed by 15 K at once, less than the noise of one sample (3 Pa).
-"""
 
 
 class Compensation:
@@ -111,7 +104,7 @@ class Compensation:
             return
         self.offsets.since_ns[:] = self.offsets.newest_ns
         if self.creep in self._lasting:
-            self.creep.advance(self._thermal.offset, newest_ns, STEP_NS)
+            self.creep.advance(self._thermal.offset, newest_ns)
         if self._thermal in self._lasting:
             self._thermal.advance(scan)
         self._fill_offsets()

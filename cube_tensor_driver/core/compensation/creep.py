@@ -33,10 +33,10 @@ import math
 import numpy as np
 
 from ..arrays import Array, Index, Mask, Times, multiply
-from ..kernel.contract import MAX_GAP_NS, Offsets
+from ..kernel.contract import Offsets
 from ..pipeline import Pipeline
 from ..status import CREEP
-from .low_pass import LowPass
+from .low_pass import MAX_STEP_NS, STEP_NS, LowPass
 
 MAX_UNKNOWN = 100.0
 """Deviation of the stress on a pad because of unknown earlier loads, in Pa, above which the
@@ -101,13 +101,12 @@ class Creep:
         """Whether the effect on a cube is known and not too uncertain (C,)."""
         return self.has_model & self._is_certain
 
-    def advance(self, thermal: Array, end_ns: int, step_ns: int) -> None:
+    def advance(self, thermal: Array, end_ns: int) -> None:
         """Advance the memories to the newest row of each cube.
 
         Args:
             thermal: What was subtracted from the readings because of temperature (C, P).
             end_ns: Newest time stamp of the scan that comes next, in ns.
-            step_ns: Shortest step, in ns.
         """
         elapsed_ns, is_lost, is_gap = self._find_gaps()
         # Pads that are not used keep their last reading.
@@ -123,7 +122,7 @@ class Creep:
         self._time_ns[:] = self._newest.newest_ns
         self._reading[:] = now
         self._check_certainty()
-        self._set_line(np.maximum(end_ns - self._time_ns, step_ns) * 1e-9)
+        self._set_line(np.maximum(end_ns - self._time_ns, STEP_NS) * 1e-9)
 
     def _find_gaps(self) -> tuple[Times, Mask, Mask]:
         """Compare the newest row of each cube with that of the last step.
@@ -135,7 +134,7 @@ class Creep:
         elapsed_ns = self._newest.newest_ns - self._time_ns
         # A time stamp before the last one is from another clock.
         is_lost = (elapsed_ns < 0) | (self._time_ns == 0)
-        return np.where(is_lost, 0, elapsed_ns), is_lost, is_lost | (elapsed_ns > MAX_GAP_NS)
+        return np.where(is_lost, 0, elapsed_ns), is_lost, is_lost | (elapsed_ns > MAX_STEP_NS)
 
     def _set_line(self, duration_s: Array) -> None:
         """Compute what is subtracted from cubes, for a straight line over durations (C,) in s."""

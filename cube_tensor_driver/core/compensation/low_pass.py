@@ -20,6 +20,19 @@ from __future__ import annotations
 import numpy as np
 
 from ..arrays import Array, Real
+from ..kernel.contract import MAX_GAP_NS
+
+STEP_NS = 100_000_000
+"""Duration of a step, in ns, within which temperature counts as constant, and the readings of the
+pads as straight lines for creep.
+
+With a lag of 100 s and 150 Pa/K, the effect of temperature changes by 2 Pa within a step after the
+skin warmed by 15 K at once, less than the noise of one sample (3 Pa).
+"""
+
+MAX_STEP_NS = MAX_GAP_NS + STEP_NS
+"""Longest time between the rows of two steps, in ns, in which all rows of a cube can be at most
+`MAX_GAP_NS` apart."""
 
 HALVINGS = 10
 """Number of times that the argument of the exponential function is halved for its series."""

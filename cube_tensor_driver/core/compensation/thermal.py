@@ -16,10 +16,10 @@ from __future__ import annotations
 import numpy as np
 
 from ..arrays import Array, index_cubes
-from ..kernel.contract import MAX_GAP_NS, Columns
+from ..kernel.contract import Columns
 from ..pipeline import Pipeline
 from ..status import THERMAL
-from .low_pass import LowPass
+from .low_pass import MAX_STEP_NS, LowPass
 
 START_KELVIN = 1.0
 """Standard deviation, in K, of the difference between elastomer and thermometer at the first row.
@@ -114,7 +114,7 @@ class Thermal:
         change[is_first] = 0
         share = self._filters.advance(elapsed_ns * 1e-9, change[:, None])
         slowest = 1 - share.min(axis=0, initial=1.0)
-        is_lost = is_missing | (elapsed_ns > MAX_GAP_NS)
+        is_lost = is_missing | (elapsed_ns > MAX_STEP_NS)
         self._unknown *= slowest
         self._unknown += np.where(is_lost, LOST_KELVIN, 0) * (1 - slowest)
         self._measured[~is_missing] = given[~is_missing]
