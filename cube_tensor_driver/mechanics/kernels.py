@@ -85,13 +85,18 @@ combination of stresses and gradients that only changes its phase if the frame i
 z."""
 
 _CUBIC_LAGRANGE = (
-    np.array([[0, -2, 3, -1], [6, -3, -6, 3], [0, 6, 3, -3], [0, -1, 0, 1]]) / 6,
-    np.array([[-2, 6, -3, 0], [-3, -12, 9, 0], [6, 6, -9, 0], [-1, 0, 3, 0]]) / 6,
-    np.array([[6, -6, 0, 0], [-12, 18, 0, 0], [6, -18, 0, 0], [0, 6, 0, 0]]) / 6,
+    np.array(
+        [
+            [[0, -2, 3, -1], [6, -3, -6, 3], [0, 6, 3, -3], [0, -1, 0, 1]],
+            [[-2, 6, -3, 0], [-3, -12, 9, 0], [6, 6, -9, 0], [-1, 0, 3, 0]],
+            [[6, -6, 0, 0], [-12, 18, 0, 0], [6, -18, 0, 0], [0, 6, 0, 0]],
+        ]
+    )
+    / 6
 )
-"""Coefficients (4 table entries, 4 powers) of the weights of cubic Lagrange interpolation, and of
-their first and second derivative: with the fraction t of the index between the second and the third
-entry, the weight of an entry is the sum of its coefficients times 1, t, t^2, t^3."""
+"""Coefficients (3, 4 table entries, 4 powers) of the weights of cubic Lagrange interpolation, and
+of their first and second derivative: with the fraction t of the index between the second and the
+third entry, the weight of an entry is the sum of its coefficients times 1, t, t^2, t^3."""
 
 _MIN_DISTANCE = 1 / 50
 """Distance between contact and cube along the surface, divided by the depth of the cubes' centres,
@@ -363,47 +368,31 @@ class Kernels:
         """
         true_distance, direction = _polar(place)
         distance = np.maximum(true_distance, _MIN_DISTANCE * self.depth)
-        first, by_distance, distance_slope = self._distance_weights(distance, 2)
-        size_row, *by_size = _cubic_weights(_size_index(size, self.depth), 3)
-
-        table = self._response.reshape(-1, 3 * len(self._order))
-        # Rows of the table at four radii times four distances.
-        neighbour = np.arange(-1, 3)
-        rows = (size_row[:, None] + neighbour)[:, :, None] * self._response.shape[1]
-        rows = rows + (first[:, None] + neighbour + 1)[:, None]
-        neighbours = table.take(rows.reshape(-1, 16), axis=0)
-        # Value, slope over the distance, first and second derivative by the logarithm of the radius
-        over_distance = np.stack([by_distance, distance_slope / self.step])
-        over_distance = over_distance[[0, 1, 0, 0]].transpose(2, 0, 1)
-        over_size = np.stack(by_size)[[0, 0, 1, 2]].transpose(2, 0, 1)
-        over_size[:, 2:] *= (_SIZE_LOG_STEP ** -np.array([1, 2]))[:, None]
-        weights = over_size[..., None] * over_distance[:, :, None]
-        weights = weights.reshape(-1, 4, 16)
-        parts = (weights @ neighbours).reshape(len(place), 4, 3, -1)
+        parts = self._interpolate_slopes(distance, size)
 
         # c = exp(i m phi) (R F_r + Z F_z + i T F_t), and its derivatives by r and by phi
-        cosine = np.cos(direction)[:, None]
-        sine = np.sin(direction)[:, None]
-        force_x, force_y, force_z = force.T[..., None]
+        cosine = np.cos(direction).astype(np.float32)[:, None]
+        sine = np.sin(direction).astype(np.float32)[:, None]
+        force_x, force_y, force_z = force.astype(np.float32).T[..., None]
         radial = cosine * force_x + sine * force_y
         tangential = cosine * force_y - sine * force_x
-        loads = np.empty((len(place), 4, len(self._order)), complex)
+        loads = np.empty((len(place), 4, len(self._order)), np.complex64)
         loads.real = radial[:, None] * parts[:, :, 0] + force_z[:, None] * parts[:, :, 1]
         loads.imag = tangential[:, None] * parts[:, :, 2]
         value, by_r, by_log, by_log_twice = loads.swapaxes(0, 1)
-        order = 1j * self._order
-        inverse = (1 / distance)[:, None]
+        order = self._order.astype(np.float32)
+        inverse = (1 / distance).astype(np.float32)[:, None]
         r, z, t = parts[:, 0].swapaxes(0, 1)
-        t = 1j * t
-        by_phi = order * value + tangential * r - radial * t
-        moment = (inverse * (order * r - t) - 1j * parts[:, 1, 2]) / 2
+        r_slope, z_slope, t_slope = parts[:, 1].swapaxes(0, 1)
+        by_phi = 1j * (order * value - radial * t) + tangential * r
+        moment = 0.5j * (inverse * (order * r - t) - t_slope)
         # Nearer than `_MIN_DISTANCE`, the value follows from the slope.
-        below = (true_distance - distance)[:, None]
-        r = r + below * parts[:, 1, 0]
-        z = z + below * parts[:, 1, 1]
-        t = t + 1j * below * parts[:, 1, 2]
+        below = (true_distance - distance).astype(np.float32)[:, None]
+        r = r + below * r_slope
+        z = z + below * z_slope
+        t = 1j * (t + below * t_slope)
 
-        circular = np.empty((len(place), 8, len(self._order)), complex)
+        circular: Complex = np.empty((len(place), 8, len(self._order)), np.complex64)
         circular[:, 0] = cosine * r - sine * t
         circular[:, 1] = sine * r + cosine * t
         circular[:, 2] = z
@@ -412,9 +401,38 @@ class Kernels:
         circular[:, 5] = by_log
         circular[:, 6] = by_log_twice
         circular[:, 7] = moment
-        circular *= np.exp(1j * np.multiply.outer(direction - angle, self._order))[:, None]
+        circular *= _fast_phases(direction - angle, self._order)[:, None]
         measured: Array = self._measure(_split(circular), variant).swapaxes(1, 2)
         return measured
+
+    def _interpolate_slopes(self, distance: Array, size: Array) -> Single:
+        """Interpolate the functions R, Z and T of circular.py, and their derivatives.
+
+        Args:
+            distance: Distances (N,) of the cubes from the centre of a contact, in m.
+            size: Radius (N,) of the contact in m.
+
+        Returns:
+            Functions (N, 4, 3, n) and their derivatives: value, slope over the distance, first and
+            second derivative by the logarithm of the radius.
+        """
+        first, by_distance, distance_slope = self._distance_weights(distance, 2)
+        size_row, *by_size = _cubic_weights(_size_index(size, self.depth), 3)
+
+        # Rows of the table at four radii times four distances.
+        columns = self._response.shape[1]
+        corner = (size_row - 1) * columns + first
+        steps = np.add.outer(columns * np.arange(4), np.arange(4)).ravel()
+        neighbours = self._rows.take(corner[:, None] + steps, axis=0)
+
+        by_log = by_size[1] / _SIZE_LOG_STEP
+        by_log_twice = by_size[2] / _SIZE_LOG_STEP**2
+        over_size = np.stack([by_size[0], by_size[0], by_log, by_log_twice]).T
+        slope = distance_slope / self.step
+        over_distance = np.stack([by_distance, slope, by_distance, by_distance]).T
+        weights = over_size[:, :, None] * over_distance[:, None]
+        by_row = weights.reshape(-1, 16, 4).swapaxes(1, 2).astype(np.float32)
+        return np.asarray(by_row @ neighbours).reshape(len(distance), 4, 3, -1)
 
     def response_to_forces(
         self,
@@ -806,5 +824,4 @@ def _cubic_weights(index: Array | float, count: int = 1) -> tuple[Array, ...]:
     first = np.floor(index).astype(np.intp)
     t = index - first
     powers = np.stack([np.ones_like(t), t, t * t, t * t * t])
-    weights = [np.tensordot(matrix, powers, axes=1) for matrix in _CUBIC_LAGRANGE[:count]]
-    return first, *weights
+    return first, *(_CUBIC_LAGRANGE[:count] @ powers)

@@ -22,7 +22,7 @@ def kernels():
 
 
 def test_slopes_are_differences_of_the_response(kernels):
-    """The tolerances are ten times what central differences leave at these steps.
+    """The tolerances are ten times what central differences and single precision leave.
 
     The steps are a thousandth of the depth, and 2 % of the radius.
     """
@@ -43,7 +43,7 @@ def test_slopes_are_differences_of_the_response(kernels):
         np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance * largest)
 
     unit = kernels.response(place, angle, variant, size).swapaxes(1, 2)
-    assert_close(slopes[:, :3], unit, 1e-12)
+    assert_close(slopes[:, :3], unit, 1e-6)
     for axis in range(2):
         shift = step * np.eye(2)[axis]
         # The cubes move against the contact.
@@ -51,7 +51,7 @@ def test_slopes_are_differences_of_the_response(kernels):
         assert_close(slopes[:, 3 + axis], difference / (2 * step), 1e-5)
     wider, narrower = (under_force(place, size * np.exp(sign * 0.02)) for sign in (1, -1))
     assert_close(slopes[:, 5], (wider - narrower) / 0.04, 2e-3)
-    assert_close(slopes[:, 6], (wider + narrower - 2 * under_force(place)) / 0.02**2, 1e-9)
+    assert_close(slopes[:, 6], (wider + narrower - 2 * under_force(place)) / 0.02**2, 1e-4)
 
 
 def test_a_moment_is_a_pair_of_forces(kernels):

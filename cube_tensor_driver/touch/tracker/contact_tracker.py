@@ -48,6 +48,10 @@ The unit is a node, one of the small contacts whose sum is the traction of a reg
 nodes is a work of 80. The limit bounds the time of a scan; what remains is done in the next scans.
 """
 
+MAX_LINEARISED_FITS = 6
+"""Largest number of fits of Hertz contacts whose response is linearised again in one scan. Those
+whose contacts have moved farthest since the last time come first."""
+
 MAX_PIECES_OF_WORK = 12
 """Largest number of steps (new fits and improvements of fits) per region of contact in one scan
 (set of values of all cubes). It ends scans that may do any amount of work."""
@@ -146,7 +150,9 @@ class ContactTracker:
             self._noise.update(
                 scaled, np.unique(np.concatenate([one.values.cubes for one in fits]))
             )
-        linearise(inverse, [one for one in fits if isinstance(one, HertzFit) and one.is_moving])
+        moving = [one for one in fits if isinstance(one, HertzFit) and one.is_moving]
+        moving.sort(key=lambda fit: -fit.displacement)
+        linearise(inverse, moving[:MAX_LINEARISED_FITS])
         self._update_fits()
 
         # A region that has no fit yet is described by the field.
@@ -259,13 +265,20 @@ class ContactTracker:
         if len(fitted) > 1:
             cubes = np.unique(np.concatenate([fit.values.cubes for fit in self._fits]))
             update_responses(self._inverse, fitted, cubes)
+        everything = np.arange(len(self._scaled))
+        total, deviation = self._sum_others(everything, None)
         for region in fitted:
             if region.fit is not None:
                 values = region.fit.values
-                region.others, values.disturbance = self._sum_others(values.cubes, region)
+                cubes = values.cubes
+                own = region.response[cubes]
+                region.others = total[cubes] - own
+                values.disturbance = deviation[cubes] - region.relative_error * np.abs(own)
                 region.fit.step(values.whiten(self._scaled, region.others))
                 if region.near:
-                    region.response[values.cubes] = region.fit.explained
+                    explained = region.fit.explained
+                    total[cubes] += explained - own
+                    region.response[cubes] = explained
 
     def _respond(self, cubes: Index, but: TrackedRegion) -> tuple[Array, Array]:
         """Compute the response to all regions but one where contacts have changed, and return it.
@@ -282,12 +295,12 @@ class ContactTracker:
         update_responses(self._inverse, others, cubes)
         return self._sum_others(cubes, but)
 
-    def _sum_others(self, cubes: Index, but: TrackedRegion) -> tuple[Array, Array]:
+    def _sum_others(self, cubes: Index, but: TrackedRegion | None) -> tuple[Array, Array]:
         """Return the response of some cubes to all regions of contact but one.
 
         Args:
             cubes: Indices (n,) of the cubes that respond.
-            but: Region that is left out.
+            but: Region that is left out; None: no region is left out.
 
         Returns:
             Change (n, C), in Pa, of the C measured components of each cube by the other regions,
@@ -449,12 +462,12 @@ class ContactTracker:
         positions = np.array([one.position for one in contacts]).reshape(-1, 3)
         distance = cdist(positions, self._known)
         ids = [-1] * len(contacts)
-        for flat in np.argsort(distance, axis=None).tolist():
-            row, column = np.unravel_index(flat, distance.shape)
-            if distance[row, column] > MATCH_PITCHES * self._inverse.pitch:
-                break
-            if ids[row] < 0 and self._ids[column] not in ids:
-                ids[row] = self._ids[column]
+        rows, columns = np.nonzero(distance < MATCH_PITCHES * self._inverse.pitch)
+        nearest_first = np.argsort(distance[rows, columns], kind="stable")
+        for pair in nearest_first.tolist():
+            row, number = int(rows[pair]), self._ids[columns[pair]]
+            if ids[row] < 0 and number not in ids:
+                ids[row] = number
         for row, number in enumerate(ids):
             if number < 0:
                 ids[row] = self._next_id

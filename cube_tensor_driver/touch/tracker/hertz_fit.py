@@ -54,6 +54,14 @@ SETTLED_STEP = 0.02
 numbers: the shift of a contact divided by the depth of the cubes' centres, and the change of the
 natural logarithm of its radius."""
 
+START_STIFFNESS = 1e4
+"""Precision of the errors of the elastomer's data in the first step of a fit, in which the contacts
+alone are to explain the values."""
+
+MAX_STIFFNESS = 2.0
+"""Ratio of the precision of these errors to the misfit above which the precision is lowered to the
+misfit, the value that the prior has if the noise has this variance."""
+
 MAX_UNFOLLOWED_STEP = 0.1
 """Largest size of a Gauss-Newton step, as in `SETTLED_STEP`, after which the linearised response is
 still used for the values of the same scan."""
@@ -79,8 +87,6 @@ class HertzFit:
 
     Attributes:
         found: Parameters (force, centre, radius) of the contacts that the last step has found.
-        score: -2 ln of the evidence (probability of the values, in Laplace approximation),
-            comparable with the score of a fit of the traction on nodes.
         misfit: Squared deviation of the values from the fit, divided by the value that their noise
             causes; at least 1.
         shape_misfit: Mean squared deviation of the whitened values of the cubes nearest to the
@@ -106,8 +112,7 @@ class HertzFit:
         # table.
         self._log_range = np.log(DISC_SIZES[[1, -3]] * depth)
         self.found = starts._replace(log_sizes=np.clip(starts.log_sizes, *self._log_range))
-        self.score = np.inf
-        self.misfit = self.shape_misfit = 1.0
+        self.misfit = self.shape_misfit = self._stiffness = 1.0
         self.last_step = np.inf
         self._previous = self._at = self.found
         self._flatness = self._moments = np.zeros(len(starts.forces))
@@ -117,22 +122,43 @@ class HertzFit:
         self._elastomer = np.zeros(0)
 
     @property
+    def displacement(self) -> float:
+        """Difference of the contacts from those at which the response was linearised.
+
+        It has the unit of `SETTLED_STEP`, and is infinite if no step was made yet.
+        """
+        if not np.isfinite(self.last_step):
+            return np.inf
+        shift = np.abs(self.found.centres - self._at.centres).max() / self._depth
+        growth = np.abs(self.found.log_sizes - self._at.log_sizes).max()
+        return float(max(shift, growth))
+
+    @property
     def is_moving(self) -> bool:
         """Whether the response of the cubes must be linearised again before the next step.
 
-        This is so if the contacts are more than `SETTLED_STEP` from those at which the response
-        was linearised, if no step was made yet, or if the noise of the cubes has changed.
+        This is so if the `displacement` exceeds `SETTLED_STEP`, if the misfit has fallen, or if the
+        noise of the cubes has changed.
         """
-        shift = np.abs(self.found.centres - self._at.centres).max() / self._depth
-        growth = np.abs(self.found.log_sizes - self._at.log_sizes).max()
-        is_settled = max(shift, growth) < SETTLED_STEP and np.isfinite(self.last_step)
-        return not is_settled or self.values.is_stale
+        is_stiff = self._stiffness > MAX_STIFFNESS * self.misfit
+        return self.displacement >= SETTLED_STEP or is_stiff or self.values.is_stale
 
     @property
     def is_unsettled(self) -> bool:
         """Whether the last step was larger than `MAX_UNFOLLOWED_STEP`, so that the response of the
         cubes, linearised before the step, is not exact after it."""
         return self.last_step > MAX_UNFOLLOWED_STEP
+
+    @property
+    def score(self) -> float:
+        """-2 ln of the evidence (probability of the values, in Laplace approximation).
+
+        It is comparable with the score of a fit of the traction on nodes.
+        """
+        _, log_determinant = np.linalg.slogdet(self._information)
+        volume = log_determinant - np.log(self._precision).sum()
+        scatter = max(self.values.count, 1) * np.log(self.misfit)
+        return float(self._chi_squared / self.misfit + scatter + volume)
 
     @property
     def discs(self) -> Discs:
@@ -217,8 +243,13 @@ class HertzFit:
         whitening = self.values.whitening
         by_cube = columns.transpose(1, 3, 0, 2).reshape(*explained.shape, -1)
         by_cube = np.concatenate([by_cube, sensitivity.swapaxes(1, 2)], axis=2)
-        # In units of their standard deviations, the errors of these quantities have precision 1.
-        precision = np.append(self._contact_precision, np.ones(sensitivity.shape[1]))
+        # In units of their standard deviations, the errors of these quantities have precision 1,
+        # for values whose noise has the variance `misfit`. Far from the solution, the misfit is so
+        # large that they do not take up what is due to the contacts.
+        has_misfit = np.isfinite(self.last_step)
+        self._stiffness = self.misfit if has_misfit else START_STIFFNESS
+        of_elastomer = np.full(sensitivity.shape[1], self._stiffness)
+        precision = np.append(self._contact_precision, of_elastomer)
         self._precision = precision
         self._explained, self._columns = explained, by_cube
         self.jacobian = (whitening @ by_cube).reshape(-1, by_cube.shape[2])
@@ -226,8 +257,7 @@ class HertzFit:
         information = self.jacobian.T @ self.jacobian
         information[np.diag_indices(len(information))] += self._precision
         self.covariance = np.linalg.inv(information)
-        _, log_determinant = np.linalg.slogdet(information)
-        self._log_determinant = log_determinant - float(np.log(self._precision).sum())
+        self._information = information
 
     def step(self, white: Array) -> None:
         """Make a Gauss-Newton step from the parameters at which the response is linearised.
@@ -252,8 +282,7 @@ class HertzFit:
         near = self._near
         below = max(int(self.values.known[near].sum()), 1)
         self.shape_misfit = float((rest[near] ** 2).sum()) / below
-        self.score = chi_squared / self.misfit + known * np.log(self.misfit)
-        self.score += self._log_determinant
+        self._chi_squared = chi_squared
 
         self._elastomer = change[deviation.size :]
         change = change[: deviation.size].reshape(-1, _N_PARAMETERS)

@@ -28,6 +28,11 @@ MODEL_ERROR = 1e-4
 a pad in the surrounding cubes."""
 
 
+_MIN_DISTURBANCE = 1e-3
+"""Sum of the standard deviations of the response to other contacts, in Pa, that counts as none. It
+is far below the noise of a pad and far above rounding errors."""
+
+
 class CubeNoise:
     """Noise of all cubes of a skin, which grows with the stress of their pads.
 
@@ -163,7 +168,7 @@ class LocalValues:
     def is_stale(self) -> bool:
         """Whether the noise of the cubes or the disturbance has changed since `refresh`."""
         sums = self._disturbed, float(self.disturbance.sum())
-        is_other = max(sums) > MAX_NOISE_CHANGE * min(sums)
+        is_other = max(sums) > MAX_NOISE_CHANGE * min(sums) + _MIN_DISTURBANCE
         return is_other or not np.array_equal(self._versions, self._noise.version[self.cubes])
 
     @property

@@ -202,9 +202,10 @@ class TrackedRegion:
         values = fit.values
         centres = fit.found.centres
         below = values.cubes[np.linalg.norm(centres[:, None] - values.place, axis=2).argmin(axis=1)]
-        around = inverse.near[inverse.cube[self.points], : NEAREST_CUBES[-1]]
+        is_around = np.zeros(len(inverse.near), bool)
+        is_around[inverse.near[inverse.cube[self.points], : NEAREST_CUBES[-1]]] = True
         is_pressing = fit.found.forces[:, 2] < 0
-        if not (is_pressing & np.isin(below, around)).all():
+        if not (is_pressing & is_around[below]).all():
             self.fit = None
             return
         middle = np.linalg.norm(centres.mean(axis=0) - values.place, axis=1)
