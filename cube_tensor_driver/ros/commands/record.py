@@ -113,7 +113,8 @@ class Recorder:
         self._received_bytes = self._written_bytes = 0
         self._lock = threading.Lock()
         self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._write, name="bag writer")
+        # It does not keep a process alive that ends by an error before `close`.
+        self._thread = threading.Thread(target=self._write, name="bag writer", daemon=True)
         self._thread.start()
 
     @property

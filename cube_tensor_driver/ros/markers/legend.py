@@ -7,7 +7,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from geometry_msgs.msg import Point, Vector3
+from geometry_msgs.msg import Vector3
 from visualization_msgs.msg import Marker
 
 from ...core.arrays import Array, Index
@@ -217,11 +217,7 @@ class Legend:
             traction_pa: Traction (force per area on the upper face) of the longest arrow, in Pa.
             gradient_pa_per_m: Gradient of stress of the longest arrow, in Pa/m.
         """
-        for scale, value in zip(
-            SCALES,
-            (traction_pa, gradient_pa_per_m),
-            strict=True,
-        ):
+        for scale, value in zip(SCALES, (traction_pa, gradient_pa_per_m), strict=True):
             self._markers.write_text(f"{scale.name} scale", _scale_text(scale, value))
 
 
@@ -252,39 +248,25 @@ def legend_markers(
 
     for number, across in enumerate(NUMBER_POSITIONS):
         placeholder = ("+" if signed else "") + four_characters(0.0)
-        text = make_text(
-            frame_id,
-            f"legend number {number}",
-            height,
-            placeholder,
-        )
-        markers.append(_move(text, place.point(across, NUMBERS_LINE)))
+        position = place.point(across, NUMBERS_LINE)
+        name = f"legend number {number}"
+        markers.append(make_text(frame_id, name, height, placeholder, position))
 
     for number, scale in enumerate(SCALES):
-        arrow = make_marker(
-            frame_id,
-            f"{scale.name} arrow",
-            Marker.LINE_LIST,
-            scale.colour,
-        )
+        arrow = make_marker(frame_id, f"{scale.name} arrow", Marker.LINE_LIST, scale.colour)
         arrow.scale.x = 0.05 * place.pitch
         allocate(arrow, 6, with_colours=False)
         placeholder = _scale_text(scale, 0.0)
-        text = make_text(
-            frame_id,
-            f"{scale.name} scale",
-            height,
-            placeholder,
-        )
         # The text begins to the right of the longest arrow. Its position is its centre, and its
         # width is estimated from letters that are half as wide as high.
         begin = (TRACTION_LENGTH + 0.3) * place.pitch / place.width
         across = begin + 0.25 * len(placeholder) * TEXT_HEIGHT
-        point = place.point(across, FIRST_SCALE_LINE + SCALE_LINES * number)
-        markers += [arrow, _move(text, point)]
+        position = place.point(across, FIRST_SCALE_LINE + SCALE_LINES * number)
+        text = make_text(frame_id, f"{scale.name} scale", height, placeholder, position)
+        markers += [arrow, text]
 
-    title = make_text(frame_id, "legend", height, "." * TITLE_BYTES)
-    return [*markers, _move(title, place.point(0.5, TITLE_LINE))]
+    centre = place.point(0.5, TITLE_LINE)
+    return [*markers, make_text(frame_id, "legend", height, "." * TITLE_BYTES, centre)]
 
 
 def four_characters(value: float) -> str:
@@ -327,13 +309,3 @@ def _scale_text(scale: ArrowScale, value: float) -> str:
         value: Value of the longest arrow, in SI units.
     """
     return f"{scale.name} {four_characters(value / scale.unit_si)} {scale.unit}"
-
-
-def _move(marker: Marker, position: Array) -> Marker:
-    x, y, z = position.tolist()
-    marker.pose.position = Point(
-        x=x,
-        y=y,
-        z=z,
-    )
-    return marker

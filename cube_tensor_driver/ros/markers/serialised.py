@@ -74,6 +74,7 @@ def make_text(
     name: str,
     height: float,
     text: str,
+    position: Array | None = None,
 ) -> Marker:
     """Return a marker that shows a text, which always faces the viewer.
 
@@ -82,12 +83,16 @@ def make_text(
         name: Name of the marker, which becomes its namespace.
         height: Height of the letters, in m.
         text: The text. Texts that replace it must have the same length.
+        position: Position of the centre of the text, (3,), in m; None: the origin of the frame.
     """
     marker = make_marker(frame_id, name, Marker.TEXT_VIEW_FACING)
     marker.scale.z = height
     # RViz 2 draws a space half as wide as scale.x, and more than a metre wide if scale.x is 0.
     marker.scale.x = 0.5 * height
     marker.text = text
+    if position is not None:
+        x, y, z = position.tolist()
+        marker.pose.position = Point(x=x, y=y, z=z)
     return marker
 
 

@@ -196,31 +196,13 @@ class CubeTopics:
         own_sides = [2 * cube.calibration.half_side for cube in skin.cubes]
         self._sides = np.array([side or own_side for own_side in own_sides])
         self._covariances: dict[tuple[int, int], Array] = {}
-        # Index of a cube -> the publisher of its stress or its wrench.
-        self._tensors: dict[int, Publisher] = {}
-        self._wrenches: dict[int, Publisher] = {}
-        # Topic without a publisher yet -> type of its messages, the dictionary in which its
-        # publisher is to be stored, and the index of its cube.
-        self._unannounced: dict[str, tuple[type, dict[int, Publisher], int]] = {}
-        for number, cube in enumerate(skin.cubes):
-            for message_type, publishers, what in (
-                (StressTensorStamped, self._tensors, "stress"),
-                (WrenchStamped, self._wrenches, "wrench"),
-            ):
-                topic = node.resolve_topic_name(f"cubes/{cube.name}/{what}")
-                self._unannounced[topic] = message_type, publishers, number
-        if len(skin.cubes) <= MAX_ANNOUNCED_CUBES:
-            self._announce(set(self._unannounced))
-        self._listened_tensors: list[int] = []
-        self._listened_wrenches: list[int] = []
+        self._tensors = _CubePublishers(node, skin, "stress", StressTensorStamped)
+        self._wrenches = _CubePublishers(node, skin, "wrench", WrenchStamped)
 
     def find_listeners(self) -> None:
         """Find out which topics of single cubes have subscribers. A timer calls this regularly."""
-        if self._unannounced:
-            known_topics = {name for name, _ in self._node.get_topic_names_and_types()}
-            self._announce(known_topics & self._unannounced.keys())
-        self._listened_tensors = _find_listened(self._tensors)
-        self._listened_wrenches = _find_listened(self._wrenches)
+        self._tensors.find_listeners()
+        self._wrenches.find_listeners()
 
     def publish(self, rows: StressRows) -> None:
         """Publish rows on the topics of their cubes that have subscribers.
@@ -232,7 +214,7 @@ class CubeTopics:
         """
         # In a process with the driver this runs in the reader's thread, while `find_listeners` may
         # replace the lists in the main thread.
-        tensors, wrenches = self._listened_tensors, self._listened_wrenches
+        tensors, wrenches = self._tensors.listened, self._wrenches.listened
         if wrenches:
             self._publish_wrenches(rows, wrenches)
         if tensors:
@@ -246,7 +228,7 @@ class CubeTopics:
             covariance = self._covariance(cube, left_out)
             header = self._header(rows, row, cube)
             message = tensor_message(header, rows, row, covariance)
-            self._tensors[cube].publish(message)
+            self._tensors.publish(cube, message)
 
     def _publish_wrenches(self, rows: StressRows, listened: list[int]) -> None:
         # The wrench of an invalid row would be 0, which looks like the measurement of no load.
@@ -266,13 +248,7 @@ class CubeTopics:
         for row, cube, force, torque in each:
             header = self._header(rows, row, cube)
             message = wrench_message(header, force, torque)
-            self._wrenches[cube].publish(message)
-
-    def _announce(self, topics: set[str]) -> None:
-        for topic in sorted(topics):
-            message_type, publishers, number = self._unannounced.pop(topic)
-            publisher = self._node.create_publisher(message_type, topic, CUBE_TOPIC_DEPTH)
-            publishers[number] = self._node.own(publisher)
+            self._wrenches.publish(cube, message)
 
     def _header(self, rows: StressRows, row: int, cube: int) -> Header:
         stamp = to_time(int(rows.stamp_ns[row]))
@@ -293,8 +269,50 @@ class CubeTopics:
         return noise if growth is None else noise + growth
 
 
-def _find_listened(publishers: dict[int, Publisher]) -> list[int]:
-    """Return the indices of the cubes whose publisher has at least one subscriber."""
-    return [
-        number for number, publisher in publishers.items() if publisher.get_subscription_count()
-    ]
+class _CubePublishers:
+    """Publishers of one topic of each cube, such as `cubes/<name>/stress`.
+
+    Attributes:
+        listened: Indices of the cubes whose topic has a subscriber.
+    """
+
+    def __init__(self, node: CubeNode, skin: Skin, what: str, message_type: type) -> None:
+        """Make the publishers, or on a large skin only find the names of the topics.
+
+        Args:
+            node: The node, which is being configured.
+            skin: The skin.
+            what: Last part of the names of the topics.
+            message_type: Type of the messages.
+        """
+        self.listened: list[int] = []
+        self._node, self._message_type = node, message_type
+        self._publishers: dict[int, Publisher] = {}
+        # Topic without a publisher yet -> index of its cube.
+        self._unannounced = {
+            node.resolve_topic_name(f"cubes/{name}/{what}"): number
+            for number, name in enumerate(skin.names)
+        }
+        if len(skin.cubes) <= MAX_ANNOUNCED_CUBES:
+            self._announce(set(self._unannounced))
+
+    def find_listeners(self) -> None:
+        """Update `listened`, after publishers were made for topics that have a subscriber."""
+        if self._unannounced:
+            known_topics = {name for name, _ in self._node.get_topic_names_and_types()}
+            self._announce(known_topics & self._unannounced.keys())
+        self.listened = [
+            cube
+            for cube, publisher in self._publishers.items()
+            if publisher.get_subscription_count()
+        ]
+
+    def publish(self, cube: int, message: StressTensorStamped | WrenchStamped) -> None:
+        """Publish a message of the cube with this index, which is in `listened`."""
+        self._publishers[cube].publish(message)
+
+    def _announce(self, topics: set[str]) -> None:
+        for topic in sorted(topics):
+            cube = self._unannounced.pop(topic)
+            publisher = self._node.create_publisher(self._message_type, topic, CUBE_TOPIC_DEPTH)
+            self._publishers[cube] = self._node.own(publisher)
