@@ -106,12 +106,18 @@ class CreepFit(NamedTuple):
         load: Load of each pad in the hold (P,), in Pa.
         hold_s: Duration of the hold, in s.
         misfit: Error of the law (rms), divided by the load.
+        seconds: Times of mean readings since the press (N,), in s.
+        before: Mean readings of the pads minus the first one in the hold, during it (N, P), in Pa.
+        after: Mean readings minus what the law makes of the load (N, P), in Pa.
     """
 
     model: CreepModel
     load: Array
     hold_s: float
     misfit: float
+    seconds: Array
+    before: Array
+    after: Array
 
 
 class _Hold(NamedTuple):
@@ -246,7 +252,8 @@ def fit_creep(
     fast = np.zeros_like(amplitude)
     fast[:, 0] = np.hypot(misfit, FAST_ERROR * amplitude[:, 0])
     model = CreepModel(time, amplitude, np.array([fast, solution.deviation]))
-    return CreepFit(model, load, hold_s, misfit)
+    before = means.reading - np.outer(means.is_loaded, means.reading[0])
+    return CreepFit(model, load, hold_s, misfit, means.time, before, solution.error)
 
 
 def reading_after_step(model: CreepModel, seconds: float) -> Array:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,8 +35,24 @@ MIN_BLOCKS = 20
 """Smallest number of blocks of `BLOCK_NS`, four times the number of unknowns of a pad."""
 
 
-def fit_weight(path: Path, name: str | None = None) -> Calibration:
-    """Return the recorded calibration with the response to specific force that a bag shows.
+class WeightFit(NamedTuple):
+    """The response to specific force that a recording shows.
+
+    Attributes:
+        calibration: The recorded calibration with the response.
+        seconds: Times of the means of the first cube (N,), in s.
+        before: Its mean stresses of the pads without constant and drift (N, P), in Pa.
+        after: The same without the effect of weight (N, P), in Pa.
+    """
+
+    calibration: Calibration
+    seconds: Array
+    before: Array
+    after: Array
+
+
+def fit_weight(path: Path, name: str | None = None) -> WeightFit:
+    """Fit the response to specific force to a bag.
 
     Args:
         path: Path of a bag in which nothing touches the skin.
@@ -68,14 +85,19 @@ def fit_weight(path: Path, name: str | None = None) -> Calibration:
 
     responses = []
     variances = []
+    shown: list[tuple[Array, Array, Array]] = []
     for cube in cubes:
         number, means = blocks.of_cube(cube)
         label = f"{path}: cube {names[cube]}"
-        response, variance = _fit_cube(means, number.astype(float), label)
+        response, variance, residual = _fit_cube(means, number.astype(float), label)
         gain = calibrations[cube].gain[:, None]
         present = slice(len(gain))
         responses.append(response[present] / gain)
         variances.append(variance[present] / gain**2)
+        after = residual[:, present]
+        before = after + means[:, -3:] @ response[present].T
+        seconds = number.astype(float) * (BLOCK_NS * 1e-9)
+        shown.append((seconds, before - before.mean(axis=0), after))
 
     scatter = np.mean(variances, axis=0)
     # Cubes of one kind differ, and the common response is wrong by that for each of them.
@@ -83,20 +105,24 @@ def fit_weight(path: Path, name: str | None = None) -> Calibration:
     deviation = np.sqrt(scatter / len(responses) + between)
     model = WeightModel(np.mean(responses, axis=0), deviation)
     base = calibrations[cubes[0]]
-    return replace(base, weight=model, source=f"{base.source}; weight fitted to {path.name}")
+    source_text = f"{base.source}; weight fitted to {path.name}"
+    return WeightFit(replace(base, weight=model, source=source_text), *shown[0])
 
 
 def _fit_cube(
     means: Array,
     time: Array,
     label: str,
-) -> tuple[Array, Array]:
-    """Return the response of the pads of one cube with gains (P, 3), and its variance (P, 3).
+) -> tuple[Array, Array, Array]:
+    """Fit the response of the pads of one cube.
 
     Args:
         means: Means of the stresses of P pads, then of the specific force, of blocks (n, P + 3).
         time: Times of the blocks (n,), in any unit.
         label: Bag and cube, for error messages.
+
+    Returns:
+        Response with gains (P, 3), its variance (P, 3), and what it leaves of the stresses (n, P).
 
     Raises:
         BagError: The blocks are too few, or the specific force varies too little.
@@ -126,4 +152,4 @@ def _fit_cube(
     variance = (residual**2).sum(axis=0) / degrees_of_freedom
     inverse = np.linalg.inv(columns.T @ columns)
     spreads = np.diag(inverse)[:3]
-    return solution[:3].T, variance[:, None] * spreads
+    return solution[:3].T, variance[:, None] * spreads, residual

@@ -81,7 +81,7 @@ def arguments(parser: Parser) -> None:
         "--figure",
         kind="picture",
         default=lambda options: options.output.with_suffix(".png"),
-        help="picture of measured against fitted (default: next to -o, .png)",
+        help="picture of measured against fitted, or before and after (default: next to -o, .png)",
     )
     parser.add_json()
 
@@ -181,9 +181,11 @@ def run_rest(options: argparse.Namespace) -> int:
 def run_weight(options: argparse.Namespace) -> int:
     """Fit the response to weight and inertia to a bag, print it and write the calibration."""
     from ..calibrate.weight import fit_weight
+    from ..views.figures.calibration import draw_correction
+    from ..views.figures.style import save
     from ..views.terminal.output import print_table
 
-    calibration = fit_weight(options.weight, options.cube)
+    calibration, *shown = fit_weight(options.weight, options.cube)
     model = calibration.weight
     if model is not None and model.deviation is not None:
         rows = []
@@ -193,6 +195,8 @@ def run_weight(options: argparse.Namespace) -> int:
             pairs = zip(values, deviations, strict=True)
             rows.append((pad, *(f"{value:+.3f} ± {sd:.2g}" for value, sd in pairs)))
         print_table(("pad",), [f"{axis}, Pa per m/s²" for axis in "xyz"], rows)
+    title = f"stress of the {len(calibration.gain)} pads under weight alone"
+    save(draw_correction(title, *shown), options.figure)
     write_result(options.output, calibration, f"--weight {options.weight.name}")
     return 0
 
@@ -200,6 +204,8 @@ def run_weight(options: argparse.Namespace) -> int:
 def run_creep(options: argparse.Namespace) -> int:
     """Fit the creep of the foam to a bag with one press, print it and write the calibration."""
     from ..calibrate.creep import fit_recorded_creep, reading_after_step
+    from ..views.figures.calibration import draw_correction
+    from ..views.figures.style import save
     from ..views.terminal.output import print_table, say
 
     result, calibration = fit_recorded_creep(options.creep, options.cube)
@@ -215,6 +221,8 @@ def run_creep(options: argparse.Namespace) -> int:
         f"{len(result.model.time)} relaxation times explain a hold of {result.hold_s:.0f} s to "
         f"{100 * result.misfit:.2g} % of the load"
     )
+    title = f"change of the {len(result.load)} pads' readings under a constant load, and after it"
+    save(draw_correction(title, result.seconds, result.before, result.after), options.figure)
     write_result(options.output, calibration, f"--creep {options.creep.name}")
     return 0
 

@@ -188,6 +188,7 @@ def test_three_commands_lead_from_a_bag_to_a_calibration(tmp_path, capsys):
             writer.write("/frequencies", stamp_ns, frequency_codec.encode(rows, b"base\0"))
     assert cli.main(["fit", "--creep", str(bag), "-o", str(saved)]) == 0
     assert "relaxation times explain a hold of 85 s to 0.0" in capsys.readouterr().out
+    assert saved.with_suffix(".png").stat().st_size > 20_000
     found = read_calibration(saved)
     error, _ = reconstructed(time, pressed(time, 5, 90), 0.1, calibration=found)
     assert np.abs(error[60:880]).max() / 200 < 0.3

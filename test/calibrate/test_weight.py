@@ -95,7 +95,7 @@ def make_bag(folder, poses=POSES, spread=0.0, cubes=3, motion=True, **changes):
 
 def test_the_response_is_found_and_its_deviation_is_stated(tmp_path):
     """24 numbers of white noise: their error over the stated one is 1 within 5 x 1/sqrt(48)."""
-    model = fit_weight(make_bag(tmp_path / "bag")).weight
+    model = fit_weight(make_bag(tmp_path / "bag")).calibration.weight
     ratio = (model.response - RESPONSE) / model.deviation
     assert 0.3 < np.sqrt((ratio**2).mean()) < 1.7
     assert np.abs(model.response - RESPONSE).max() < 0.1  # Pa per m/s², of 8
@@ -103,11 +103,11 @@ def test_the_response_is_found_and_its_deviation_is_stated(tmp_path):
 
 def test_cubes_that_differ_widen_the_deviation_of_their_mean(tmp_path):
     folder = make_bag(tmp_path / "bag", spread=0.1, cubes=30)
-    model = fit_weight(folder).weight
+    model = fit_weight(folder).calibration.weight
     large = np.abs(RESPONSE) > 3
     found = (model.deviation / np.abs(RESPONSE))[large]
     np.testing.assert_allclose(found, 0.1, rtol=0.4)  # the spread of 30 draws, to 3 sigma
-    alone = fit_weight(folder, "c3").weight
+    alone = fit_weight(folder, "c3").calibration.weight
     assert np.median((alone.deviation / np.abs(RESPONSE))[large]) < 0.02
 
 

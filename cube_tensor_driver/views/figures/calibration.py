@@ -197,17 +197,38 @@ def draw_thermal_fit(fit: ThermalFit) -> Figure:
     warm.plot(time, elastomer, "C3--", label=f"elastomer, lag {lags}")
     warm.set(ylabel="temperature / °C")
     warm.legend(fontsize=7)
-    for axes, stress in ((before, data.stress - fit.offset), (after, fit.residual)):
-        for pad, values in enumerate(stress.T):
-            shade = str(0.7 * pad / max(1, len(stress.T) - 1))
-            axes.plot(time, values, color=shade, lw=0.8)
+    _draw_pads(before, after, time, data.stress - fit.offset, fit.residual)
     if fit.model.ramp is not None:
         # Deviation of a typical pad, because the elastomer lags behind.
         size = float(np.sqrt((fit.model.ramp**2).sum(axis=1).mean()))
         bound = size * np.abs(data.temperature - elastomer)
         after.fill_between(time, -bound, bound, color="C0", alpha=0.25, label="deviation")
         after.legend(fontsize=7)
-    before.set(ylabel="before / Pa")
-    after.set(xlabel="time / min", ylabel="after / Pa")
     before.set_title(f"stress of the {data.stress.shape[1]} pads without load", fontsize=9)
     return figure
+
+
+@print_style()
+def draw_correction(title: str, seconds: Array, before: Array, after: Array) -> Figure:
+    """Draw stresses of pads that are no load, before and after a fit of creep or weight.
+
+    Args:
+        title: What the stresses are.
+        seconds: Times (N,), in s.
+        before, after: Stresses of P pads (N, P), in Pa.
+    """
+    figure = Figure(figsize=(7, 4))
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    _draw_pads(upper, lower, seconds / 60, before, after)
+    upper.set_title(title, fontsize=9)
+    return figure
+
+
+def _draw_pads(upper: Any, lower: Any, minutes: Array, before: Array, after: Array) -> None:
+    """Draw stresses (N, P) of pads before and after a compensation, in Pa, in two axes."""
+    for axes, stress, label in ((upper, before, "before / Pa"), (lower, after, "after / Pa")):
+        for pad, values in enumerate(stress.T):
+            shade = str(0.7 * pad / max(1, len(stress.T) - 1))
+            axes.plot(minutes, values, color=shade, lw=0.8)
+        axes.set(ylabel=label)
+    lower.set(xlabel="time / min")
