@@ -63,6 +63,7 @@ def make_bag(folder, knots, faces="both", seconds=600.0, measured=True):
     names = [f"c{k}" for k in range(N_CUBES)]
     skin = SimpleNamespace(
         name="skin",
+        elastomer=None,
         frame=lambda cube: cube.name,
         cubes=[
             SimpleNamespace(name=name, link="hub0", index=k, uid=0, calibration=CUBE)

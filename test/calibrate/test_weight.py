@@ -51,6 +51,7 @@ def make_bag(folder, poses=POSES, spread=0.0, cubes=3, motion=True, **changes):
     rng, calibration = np.random.default_rng(7), replace(BASE, **changes)
     skin = SimpleNamespace(
         name="skin",
+        elastomer=None,
         frame=lambda cube: cube.name,
         cubes=[
             SimpleNamespace(name=f"c{k}", link="hub0", index=k, uid=0, calibration=calibration)
@@ -146,6 +147,7 @@ def test_a_tare_from_a_bag_is_that_of_a_cube_without_weight(tmp_path):
 def test_the_command_writes_the_calibration(tmp_path, capsys):
     bag, saved = make_bag(tmp_path / "bag"), tmp_path / "heavy.yaml"
     assert cli.main(["fit", "--weight", str(bag), "-o", str(saved)]) == 0
+    assert saved.with_suffix(".png").stat().st_size > 20_000
     found = read_calibration(saved)
     np.testing.assert_allclose(found.weight.response, RESPONSE, atol=0.1)
     assert f"{found.weight.response[0, 0]:+.3f} ±" in capsys.readouterr().out
