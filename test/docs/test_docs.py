@@ -24,6 +24,7 @@ import pytest
 
 import cube_tensor_driver as ctd
 from conftest import ROOT, end
+from workshop.cli import docs
 
 PAGES = [*sorted((ROOT / "docs").glob("*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 ELSEWHERE = {
@@ -174,6 +175,14 @@ def test_documentation_builds_without_a_warning(tmp_path):
     messages = (tmp_path / "messages.txt").read_text()
     assert '"left_out"' in messages and '"PAD_DRIFT"' in messages and "table:" not in messages
     assert '"tare_folder"' in (tmp_path / "parameters.txt").read_text()
+
+
+@pytest.mark.parametrize(("code", "said"), [(0, "wrote {}/index.html\n"), (2, "")])
+def test_the_command_names_the_pages_that_it_wrote(tmp_path, monkeypatch, capsys, code, said):
+    ended = types.SimpleNamespace(returncode=code)
+    monkeypatch.setattr(docs.subprocess, "run", lambda *_, **options: ended)
+    assert docs.run(types.SimpleNamespace(output=tmp_path)) == code
+    assert capsys.readouterr().out == said.format(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -67,7 +67,9 @@ def skin(tmp_path):
     return SimpleNamespace(
         services=node.services,
         rest=lambda: reconstructor.rest_frequency[0],
-        learn_uid=lambda: tares.on_info(SkinInfo(name=SKIN.name, cubes=[CubeInfo(uid=UID)])),
+        learn_uid=lambda uid=UID: tares.on_info(
+            SkinInfo(name=SKIN.name, cubes=[CubeInfo(uid=uid)])
+        ),
         on_disk=lambda: read_tare(tmp_path, UID, CALIBRATION),
     )
 
@@ -75,6 +77,16 @@ def skin(tmp_path):
 def test_the_tare_of_a_cube_is_restored_when_its_uid_is_known(skin):
     skin.learn_uid()
     np.testing.assert_allclose(skin.rest(), KEPT)
+
+
+def test_a_cube_that_was_exchanged_does_not_keep_the_tare_of_the_other(skin):
+    skin.learn_uid()
+    answer = skin.services["~/tare"](Tare.Request(duration=1.0), Tare.Response())
+    assert answer.success, answer.message
+    skin.learn_uid(UID + 1)
+    np.testing.assert_array_equal(skin.rest(), CALIBRATION.rest_frequency)
+    skin.learn_uid(UID)
+    np.testing.assert_allclose(skin.rest(), 1.002 * CALIBRATION.rest_frequency, rtol=1e-7)
 
 
 def test_a_tare_writes_one_file_per_cube_and_its_answer_is_short(skin, monkeypatch):
