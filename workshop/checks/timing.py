@@ -98,10 +98,7 @@ def count_wrong_periods(run: Run) -> int:
                 cut.link == link and cut.contains(settled.end_ns, BEFORE_CUT_S, RECOVERY_S)
                 for cut in cuts
             )
-            periods = {
-                sample_run.period_us
-                for sample_run in log.runs
-                if sample_run.start_us <= time_us < sample_run.end_us
-            }
-            wrong += not is_cut and periods != {wanted_us}
+            # A hub that skips samples on a busy machine may be between two runs of samples.
+            begun = [run.period_us for run in log.runs if run.start_us <= time_us]
+            wrong += not is_cut and begun[-1:] != [wanted_us]
     return wrong
