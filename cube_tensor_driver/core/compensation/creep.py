@@ -109,10 +109,13 @@ class Creep:
             end_ns: Newest time stamp of the scan that comes next, in ns.
         """
         elapsed_ns, is_lost, is_gap = self._find_gaps()
-        # Pads that are not used keep their last reading.
         newest = self._newest.reading.astype(float)
-        now = np.where(np.isnan(newest), self._reading, newest - thermal)
-        share = self._memories.advance(elapsed_ns * 1e-9, now - self._reading)
+        # Pads that are not used keep their last reading.
+        is_unused = np.isnan(newest)
+        now = np.where(is_unused, self._reading, newest - thermal)
+        change = now - self._reading
+        share = self._memories.advance(elapsed_ns * 1e-9, change)
+        # A memory forgets what it was before the interval by this share.
         self._unknown += share * (is_gap - self._unknown)
         self._unknown[:, is_lost] = 1.0
         if is_gap.any():
@@ -122,7 +125,9 @@ class Creep:
         self._time_ns[:] = self._newest.newest_ns
         self._reading[:] = now
         self._check_certainty()
-        self._set_line(np.maximum(end_ns - self._time_ns, STEP_NS) * 1e-9)
+        ahead_ns = end_ns - self._time_ns
+        duration_ns = np.maximum(ahead_ns, STEP_NS)
+        self._set_line(duration_ns * 1e-9)
 
     def _find_gaps(self) -> tuple[Times, Mask, Mask]:
         """Compare the newest row of each cube with that of the last step.
@@ -132,27 +137,30 @@ class Creep:
             whether the load between them is unknown (C,).
         """
         elapsed_ns = self._newest.newest_ns - self._time_ns
+        is_first = self._time_ns == 0
         # A time stamp before the last one is from another clock.
-        is_lost = (elapsed_ns < 0) | (self._time_ns == 0)
-        return np.where(is_lost, 0, elapsed_ns), is_lost, is_lost | (elapsed_ns > MAX_STEP_NS)
+        is_lost = is_first | (elapsed_ns < 0)
+        is_gap = is_lost | (elapsed_ns > MAX_STEP_NS)
+        elapsed_ns[is_lost] = 0
+        return elapsed_ns, is_lost, is_gap
 
     def _set_line(self, duration_s: Array) -> None:
         """Compute what is subtracted from cubes, for a straight line over durations (C,) in s."""
         share, mean = self._memories.find_shares(duration_s)
-        rate = share / duration_s
-        # Before the first row of a cube, there was no reading.
-        follow = np.where(self._time_ns > 0, (1 - mean) / duration_s, 0)
+        # Shares per second of a lag, and of a change of the reading, by which memories change.
+        of_lag = share / duration_s
+        of_change = (1 - mean) / duration_s
+        # Before the first row of a cube, there was no reading that could change.
+        of_change[:, self._time_ns == 0] = 0
         self.offset[:] = self._total * self._reading
         self.slope[:] = 0
         self.gain[:] = 0
-        for amplitude, lag, one, other in zip(
-            self._amplitude, self._memories.lag, rate[..., None], follow[..., None], strict=True
-        ):
-            missing = amplitude * lag
+        for k, amplitude in enumerate(self._amplitude):
+            missing = amplitude * self._memories.lag[k]
             self.offset -= missing
-            missing *= one
+            missing *= of_lag[k, :, None]
             self.slope += missing
-            self.gain += amplitude * other
+            self.gain += amplitude * of_change[k, :, None]
         self.slope -= self.gain * self._reading
 
     def deviation(self, cube: int) -> Array:
@@ -160,19 +168,24 @@ class Creep:
         model = self._models[cube]
         if model is None:
             return np.zeros((len(self._reading[cube]), 0))
+        stiffness = self._stiffness[cube]
+        reading = self._reading[cube]
         patterns = [self._find_unknown(np.array([cube]))[0]]
-        if self._find_gaps()[2][cube]:
+        _, _, is_gap = self._find_gaps()
+        if is_gap[cube]:
             # The next step will find how much of the memories depends on the gap: at most all.
             newest = np.nan_to_num(self._newest.reading[cube])
-            larger = np.maximum(np.abs(self._reading[cube]), np.abs(newest))
-            largest = self._total[cube] * larger * self._stiffness[cube]
+            larger = np.maximum(np.abs(reading), np.abs(newest))
+            largest = self._total[cube] * larger * stiffness
             patterns = [largest * UNIFORM_DEVIATION]
-        lag = self._memories.lag[np.searchsorted(self._times, model.time), cube]
-        memory = self._reading[cube] - lag
-        for pattern in () if model.deviation is None else model.deviation:
-            known = np.zeros_like(patterns[0])
-            known[: model.n_pads] = (pattern.T * memory[:, : model.n_pads]).sum(axis=0)
-            patterns.append(known * self._stiffness[cube])
+        if model.deviation is not None:
+            places = np.searchsorted(self._times, model.time)
+            memory = reading - self._memories.lag[places, cube]
+            pads = slice(model.n_pads)
+            known = np.zeros((len(model.deviation), len(reading)))
+            products = model.deviation.swapaxes(1, 2) * memory[:, pads]
+            known[:, pads] = products.sum(axis=1)
+            patterns += list(known * stiffness)
         return np.stack(patterns, axis=1)
 
     def _check_certainty(self) -> None:

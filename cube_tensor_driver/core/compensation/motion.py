@@ -104,17 +104,22 @@ def _interpolate(motion: Motion, stamp_ns: Times) -> tuple[Single, Single]:
     if n_instants < 2:
         state = np.full((12, len(stamp_ns)), known if n_instants else np.nan, np.float32)
         return state[:3], state[3:].reshape(3, 3, -1)
-    # Few instants lie within the rows of a message, usually none.
+    # Number of the instant before each row. Few instants lie within a message, usually none.
     inner_ns = motion.time_ns[1:-1]
-    first = np.searchsorted(inner_ns, stamp_ns, "right") if len(inner_ns) else np.zeros(1, int)
+    first = np.zeros(1, int)
+    if len(inner_ns):
+        first = np.searchsorted(inner_ns, stamp_ns, side="right")
     length_ns = np.diff(motion.time_ns)[first]
     elapsed_ns = stamp_ns - motion.time_ns[first]
     beyond_ns = np.maximum(-elapsed_ns, elapsed_ns - length_ns)
-    is_near = beyond_ns <= np.maximum(MAX_EXTRAPOLATION_NS, 2 * length_ns)
+    max_beyond_ns = np.maximum(MAX_EXTRAPOLATION_NS, 2 * length_ns)
+    is_near = beyond_ns <= max_beyond_ns
     # A damaged recording may state equal instants.
-    is_known = is_near & (length_ns > 0) & (length_ns <= MAX_INTERVAL_NS)
-    share = np.where(is_known, elapsed_ns / np.maximum(length_ns, 1), np.nan)
-    state = np.diff(known)[:, first] * share.astype(np.float32)
+    is_usual = (length_ns > 0) & (length_ns <= MAX_INTERVAL_NS)
+    share = elapsed_ns / np.maximum(length_ns, 1)
+    share[~(is_near & is_usual)] = np.nan
+    change = np.diff(known)[:, first]
+    state = change * share.astype(np.float32)
     state += known[:, first]
     return state[:3], state[3:].reshape(3, 3, -1)
 

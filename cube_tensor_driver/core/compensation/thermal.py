@@ -103,8 +103,10 @@ class Thermal:
         """Advance the filters of the cubes of one scan to its time stamps."""
         n = len(self._models)
         cube = index_cubes(scan.cube, n)
-        time_ns, given = self._time_ns.copy(), self._measured.copy()
-        time_ns[cube], given[cube] = scan.stamp_ns, scan.temperature
+        time_ns = self._time_ns.copy()
+        time_ns[cube] = scan.stamp_ns
+        given = self._measured.copy()
+        given[cube] = scan.temperature
         is_missing = np.isnan(given)
         is_first = np.isnan(self._measured) & ~is_missing
         # A time that went back is no time. Before the first temperature nothing is filtered.
@@ -115,8 +117,9 @@ class Thermal:
         share = self._filters.advance(elapsed_ns * 1e-9, change[:, None])
         slowest = 1 - share.min(axis=0, initial=1.0)
         is_lost = is_missing | (elapsed_ns > MAX_STEP_NS)
+        lost = np.where(is_lost, LOST_KELVIN, 0)
         self._unknown *= slowest
-        self._unknown += np.where(is_lost, LOST_KELVIN, 0) * (1 - slowest)
+        self._unknown += lost * (1 - slowest)
         self._measured[~is_missing] = given[~is_missing]
         self._time_ns[:] = time_ns
         self.resume()
