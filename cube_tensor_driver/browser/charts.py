@@ -31,11 +31,12 @@ TIME_SCALE = uplot.Scale(
 )
 """Time axis of the plots: seconds relative to the newest value, without automatic range."""
 
-NUDGE_PERIOD = 4
-"""Number of pictures after which the range of a chart's value axis changes invisibly.
+RELAYOUT_PERIOD = 4
+"""Number of updates of the page between two changes of the range of a chart's value axis that are
+too small to be seen.
 
-The change makes the browser lay the chart out again. This is needed because a chart that was made
-before the browser knew its width has no time axis until a range changes.
+A chart that was made before the browser knew its width has no time axis. Each change of a range
+makes the browser lay the chart out again, with the time axis.
 """
 
 MAX_LINES = 12
@@ -112,7 +113,7 @@ class Chart(NamedTuple):
     lines: tuple[ChartLine, ...]
 
     def values(self, history: History) -> dict[str, Array]:
-        """Return the values (M,) of each line at the M instants of a history, by its label."""
+        """Return label -> values (M,) of each line at the M instants of a history, in `unit`."""
         return {line.label: history.of(line.cube, line.column) / self.unit for line in self.lines}
 
 
@@ -143,7 +144,7 @@ class Charts:
                 hint="names, for example: c05 c06. The chosen cube comes first.",
                 order=0,
             )
-            # Each chart takes two positions in the tab: its drop-down list and its plot.
+            # Each chart takes two positions (`order`) in the tab: its drop-down list and its plot.
             self.lists = [
                 gui.add_dropdown(
                     "plot",
@@ -170,7 +171,7 @@ class Charts:
         """Return the charts that the user has chosen.
 
         Args:
-            history: Values of all cubes in the last seconds, which tell what the cubes observe.
+            history: Values of all cubes in the last seconds; only those that are not NaN get lines.
             chosen: Index of the cube that the user chose on the page.
         """
         self._history = history
@@ -183,7 +184,7 @@ class Charts:
             # A browser may send any text, so the value is checked.
             group = one.value if one.value in GROUPS else FIRST_GROUPS[0]
             chart = make_chart(history, self._names, self._cubes, group)
-            # A chart without lines would have no axes; the one before stays.
+            # A chart without lines would have no axes, so the last one with lines is kept.
             if chart.lines:
                 self._charts[number] = chart
         return tuple(self._charts)
@@ -200,9 +201,10 @@ class Charts:
         new: dict[str, Any] = {}
         for number, chart in enumerate(charts):
             plot = self._plots[number]
-            labels = [one["label"] for one in plot.series[1:]] if plot is not None else []
-            # A chart without lines is not plotted yet, so it is equal to one without labels.
-            if labels == [line.label for line in chart.lines]:
+            # A plot is made only when its chart has lines; until then both lists are empty.
+            plotted = [one["label"] for one in plot.series[1:]] if plot is not None else []
+            wanted = [line.label for line in chart.lines]
+            if plotted == wanted:
                 continue
             if plot is not None:
                 plot.remove()
@@ -266,7 +268,9 @@ class Charts:
 
 
 def make_chart(history: History, names: Sequence[str], cubes: Sequence[int], group: str) -> Chart:
-    """Return a chart of the observed values of a group, of some cubes.
+    """Return a chart with one line for each cube and each value of a group that is observed.
+
+    At most `MAX_LINES` lines are drawn. A value is observed if any cube has had it in the history.
 
     Args:
         history: Values of all cubes in the last seconds.
@@ -285,7 +289,7 @@ def make_chart(history: History, names: Sequence[str], cubes: Sequence[int], gro
 
 
 def chart_properties(history: History, chart: Chart) -> dict[str, Any]:
-    """Return the values of a plot and the ranges of its axes; nothing if it has no lines.
+    """Return the data and the ranges of a plot, by their names in viser; {} if it has no lines.
 
     Args:
         history: Values of all cubes in the last seconds.
@@ -298,7 +302,7 @@ def chart_properties(history: History, chart: Chart) -> dict[str, Any]:
     finite = np.concatenate(values)
     finite = finite[np.isfinite(finite)]
     low, high = round_range(finite.min(initial=0.0), finite.max(initial=0.0))
-    if history.count // NUDGE_PERIOD % 2:
+    if history.count // RELAYOUT_PERIOD % 2:
         high += 1e-9 * (high - low)
     return {"data": (history.times, *values), "scales": _scales(low, high)}
 

@@ -169,12 +169,11 @@ class ReplayClient:
         self._wanted_s = time.monotonic()
 
     def update(self) -> bool:
-        """Send the jump that `jump_to` stored, unless the answer to an earlier jump is missing.
+        """Process the answers of services, then send the jump that `jump_to` stored, if any.
 
-        Answers to all calls of services are taken before.
-
-        If no replay is known, the jump is kept, because on a busy machine the messages of a replay
-        arrive late. After `MAX_ANSWER_S` it is dropped, and a note tells the user so.
+        The jump waits while an earlier jump is not answered, and while no replay is known: on a
+        busy machine the messages of a replay arrive late. If no replay appears within
+        `MAX_ANSWER_S`, the jump is dropped, and a note tells the user so.
 
         Returns:
             Whether a jump was sent in this call.

@@ -56,7 +56,8 @@ class Colouring(NamedTuple):
         above = None if sigma is None else np.stack([middle, sigma[surface.middle]], axis=1)
         if quantity is DEVIATION and above is not None:
             cubes = above[:, 1]
-        # For other quantities, each point has the value of the cube around which it lies.
+        # Only these three quantities have values between the cubes. For all others, each point of
+        # the surface has the value of its cube.
         field = {
             QUANTITIES["pressure"].label: scan.field.pressure,
             QUANTITIES["shear"].label: scan.field.shear,
@@ -64,7 +65,7 @@ class Colouring(NamedTuple):
         }.get(quantity.label)
         if field is None:
             field = cubes[surface.cube]
-        top = fixed_top or scene.automatic(
+        top = fixed_top or scene.automatic_top(
             quantity,
             np.concatenate([cubes, field]),
             last_top,

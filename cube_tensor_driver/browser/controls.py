@@ -141,8 +141,8 @@ class ReplayControls:
         self._button.label = "go on with the replay" if replay.paused else "stop the replay"
 
     def _move_slider(self, position: float) -> None:
-        # A slider that differs from `_drawn` was moved by the user, and its event, which another
-        # thread handles, has not arrived yet. It must not be moved back before that.
+        # If the slider is not where this object has put it, the user has moved it, and another
+        # thread will call `on_update`. Until then the position that the user set must stay.
         if self._slider.value == self._drawn and position != self._drawn:
             self._drawn = position
             self._slider.value = position  # type: ignore[misc]

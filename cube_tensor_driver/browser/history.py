@@ -14,12 +14,17 @@ RATE_PERIOD_S = 1.0
 """Minimum time, in seconds, between the two samples of a cube from which its rate is computed."""
 
 MAX_RATE_PERIOD_S = 60.0
-"""Maximum time, in seconds, between two samples from which a rate is computed. After a longer time
-the cube was silent, or its clock was set, and the rate is computed from new samples."""
+"""Maximum time, in seconds, between the two samples of a cube from which its rate is computed.
 
-MAX_SAMPLES = 2**24
-"""Maximum number of samples between two from which a rate is computed. A larger difference of their
-numbers means that the hub has restarted and counts from 0 again."""
+A longer time means that the cube was silent or that its clock was set. Then the later sample
+becomes the first one of a new pair.
+"""
+
+MAX_NUMBER_DIFFERENCE = 2**24
+"""Maximum difference of the numbers of the two samples from which a rate is computed.
+
+A larger difference (modulo 2**32) means that the hub has restarted and counts from 0 again.
+"""
 
 
 class History:
@@ -122,7 +127,8 @@ class SampleRate:
     def __init__(self, n_cubes: int) -> None:
         self.hertz = np.zeros(n_cubes)
         self._first_sequence = np.zeros(n_cubes, np.uint32)
-        # No sample has come: any stamp is then a period or more later.
+        # Stamps count from 1970. So the first sample of a cube is more than `MAX_RATE_PERIOD_S`
+        # after 0, and no rate is computed from it.
         self._first_ns = np.zeros(n_cubes, np.int64)
 
     def update(self, rows: StressRows) -> None:
@@ -134,9 +140,12 @@ class SampleRate:
         """
         cube = rows.cube
         elapsed_s = 1e-9 * (rows.stamp_ns - self._first_ns[cube])
-        # Numbers of samples wrap around, as the unsigned difference does.
+        # Numbers of samples continue at 0 after 2**32 - 1. The difference of two uint32 is right in
+        # that case, too.
         samples = rows.sequence - self._first_sequence[cube]
-        is_new = (elapsed_s < 0) | (elapsed_s > MAX_RATE_PERIOD_S) | (samples > MAX_SAMPLES)
+        is_new = (
+            (elapsed_s < 0) | (elapsed_s > MAX_RATE_PERIOD_S) | (samples > MAX_NUMBER_DIFFERENCE)
+        )
         is_over = ~is_new & (elapsed_s > RATE_PERIOD_S)
         self.hertz[cube[is_over]] = samples[is_over] / elapsed_s[is_over]
 

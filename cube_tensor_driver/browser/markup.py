@@ -22,15 +22,15 @@ from .scan import Scan
 from .surface_field import DEVIATION, SurfaceField
 
 GREEN = "#2b8a3e"
-"""Colour of the mark before the first line while all cubes are live."""
+"""Colour of the dot at the beginning of the page's headline while all cubes send usable samples."""
 AMBER = "#e67700"
-"""Colour of the mark before the first line while some cubes are not live, and of warnings about a
-link."""
+"""Colour of the dot at the beginning of the page's headline while only some cubes send usable
+samples, and of warnings about a link."""
 RED = "#c92a2a"
-"""Colour of the mark before the first line while no cube is live, of errors of a link, and of a
-running recording."""
+"""Colour of the dot at the beginning of the page's headline while no cube sends usable samples, of
+errors of a link, and of the sign of a running recording."""
 BLUE = "#1864ab"
-"""Colour of the mark before the first line while the page or a replay is paused."""
+"""Colour of the dot at the beginning of the page's headline while page or replay is paused."""
 
 LEVEL_COLOURS = ("inherit", AMBER, RED, RED)
 """Colour of the text about a link for each level of its diagnostics: OK, WARN, ERROR and STALE."""
@@ -182,8 +182,8 @@ def clock(seconds: float) -> str:
 def newtons(contact: Contact) -> str:
     """Return normal and shear force of a contact as text in N, and whether it slips.
 
-    The shear force is left out if it is unknown (NaN), because no cube observes shear. "~" stands
-    for forces of the field, before a fit of the contact is ready.
+    A shear force that is unknown (NaN), because no cube measures shear, is left out. "~" marks
+    forces that are integrals of the pressure field, until a fit of the contact gives better ones.
     """
     about = "~" if contact.is_coarse else ""
     shear = "" if np.isnan(contact.shear_force) else f", shear {contact.shear_force:.2f} N"
@@ -196,11 +196,13 @@ def headline(
     paused: bool,
     recording: bool,
 ) -> str:
-    """Return the first line of the page as HTML: state, live cubes, sampling rate, force.
+    """Return the headline of the page as HTML.
+
+    It states whether samples arrive, the number of cubes that send usable ones, the sampling rate
+    of the fastest cube, and the forces of the strongest contact.
 
     Args:
-        scan: The instant; the rate is that of the fastest cube, the force that of the strongest
-            contact.
+        scan: Values of all cubes at the instant that is shown.
         paused: Whether the page or the replay is stopped.
         recording: Whether a bag is being recorded.
     """

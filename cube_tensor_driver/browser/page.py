@@ -113,7 +113,7 @@ class Layout:
         self.target = PHONE_TARGET if is_phone else CAMERA_TARGET
         free = width - LEFT_WIDTH - RIGHT_WIDTH
         self.is_folded = is_phone or free < MIN_FREE_SHARE * width
-        # The skin, the scale bar and the axes fill the width that the panels leave free.
+        # On a phone the panels cover the lower part of the picture, and not its sides.
         if is_phone:
             free = width
         elif self.is_folded:
@@ -152,7 +152,7 @@ class Page:
         history: History,
         status: PageStatus,
     ) -> None:
-        """Show a scan; a paused page goes on to show the last scan before the pause.
+        """Show a scan, or again the scan at which the user paused the page.
 
         A paused page still follows its user's choice of colour, cube and parts of the view.
 
@@ -164,8 +164,8 @@ class Page:
         is_frozen = self._history is not None
         if not self._paused or not is_frozen:
             self._scan, self._ranges_before = scan, self._ranges
-            # The first scan after a pause began is the one that stays. Its history is copied,
-            # because the history itself goes on for the other pages.
+            # A paused page keeps the first scan that it gets after the pause began. Its history is
+            # copied, because the pages of other browsers still add to the common one.
             self._history = copy.deepcopy(history) if self._paused else None
         self._show_status(status)
         shown_history = self._history or history
@@ -203,7 +203,7 @@ class Page:
         """Return what the user has chosen, as the browser has reported it."""
         quantity = self._colours.quantity
         if quantity is not self._quantity:
-            # The automatic range of the colours belongs to another quantity.
+            # The old range is that of another quantity, so the automatic range starts anew.
             self._quantity = quantity
             self._ranges_before = self._ranges_before._replace(colours=0.0)
         return Choices(
@@ -326,7 +326,6 @@ def show_waiting(
     text: str,
 ) -> None:
     """Show a text in a browser while no skin is published."""
-    # viser draws a green tick before the title while the browser is connected.
     set_up(client, layout, "cube_tensor_driver")
     client.gui.add_html(markup.STYLE + markup.box(text))
     client.scene.add_label(

@@ -25,9 +25,10 @@ A larger difference means that the node has ended.
 """
 
 MAX_WAITING_MESSAGES = 300
-"""Maximum number of `stress` messages that wait until the node `contacts` has processed one.
+"""Maximum number of `stress` messages that are kept until the node `contacts` has processed them.
 
-It bounds the memory if the node processes none of them: 30 MB for a skin of 1260 cubes.
+It bounds the memory if the node does not keep up: 30 MB for a skin of 1260 cubes. With more
+messages, the page shows the newest stress without results of the node.
 """
 
 MAX_RESULTS = 64
@@ -134,15 +135,14 @@ class ScanSynchronizer:
         ]
         if len(self._waiting) > MAX_WAITING_MESSAGES:
             required = []
-        # `count` messages would be taken if those up to this one were; the last possible is chosen.
-        complete = [
-            count
-            for count, (stamp_ns, _, _) in enumerate(self._waiting, 1)
-            if all(stamp_ns in results for results in required)
-        ]
-        if not complete:
+        # All messages up to the newest one with a result on every required topic are taken.
+        n_taken = 0
+        for number, (stamp_ns, _, _) in enumerate(self._waiting, 1):
+            if all(stamp_ns in results for results in required):
+                n_taken = number
+        if not n_taken:
             return False
-        for _ in range(complete[-1]):
+        for _ in range(n_taken):
             self.stamp_ns, rows, arrival = self._waiting.popleft()
             self.latest.update(rows, arrival)
             self.sample_rate.update(rows)
@@ -158,7 +158,8 @@ def _add_result(
     result: Any,
 ) -> None:
     """Store a result under its stamp, and forget the oldest of more than `MAX_RESULTS`."""
-    # A stamp that was present, as after a jump of a replay, becomes the newest one.
+    # After a jump of a replay, the same stamp can come again. A dict would keep its old position,
+    # so the old result is removed first.
     results.pop(stamp_ns, None)
     results[stamp_ns] = result
     if len(results) > MAX_RESULTS:

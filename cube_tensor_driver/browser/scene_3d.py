@@ -28,7 +28,7 @@ from ..views.meshes import (
     NO_MESH,
     SquareLayer,
     corner_lines,
-    hit,
+    find_hit_cube,
     step_colours,
 )
 from ..views.round_numbers import round_down
@@ -269,7 +269,7 @@ class Scene:
             start, direction = np.array(event.ray_origin), np.array(event.ray_direction)
             # viser reports a click as a ray from the camera through the point that was clicked.
             placement = self._placement
-            cube = hit(placement.poses.position, placement.pitch, start, direction)
+            cube = find_hit_cube(placement.poses.position, placement.pitch, start, direction)
             if cube is not None:
                 pick(cube)
 
@@ -464,7 +464,7 @@ class Scene:
         )
 
     def _add_edges(self, api: viser.SceneApi) -> None:
-        """Draw the edges of the cubes: neighbours of one colour could not be told apart."""
+        """Draw the edges of the cubes, which separate neighbours of the same colour."""
         poses = self._placement.poses
         edges = np.einsum("nij,eaj->neai", poses.rotation, CUBE_EDGES)
         lines = poses.position[:, None, None] + poses.half_side[:, None, None, None] * edges
@@ -502,12 +502,12 @@ def _make_squares(
     surface: Surface,
     with_cubes: bool,
 ) -> SquareLayer:
-    """Return the squares of the field, and of the upper faces of the cubes if they are no solids.
+    """Return the squares that draw the field and, on a large skin, the upper faces of the cubes.
 
     Args:
         placement: Poses of the cubes in the scene.
         surface: Grid of points around the cubes at which the field is drawn.
-        with_cubes: Whether the cubes are drawn as squares.
+        with_cubes: Whether the cubes are drawn as squares, instead of as solids.
     """
     poses, of_cube = placement.poses, surface.cube
     # The field is drawn at the lower faces of the cubes, so that it does not hide them.

@@ -66,11 +66,11 @@ class FieldModel:
     between the cubes.
 
     Attributes:
-        prepared: Solver of the inverse problem, which another thread prepares.
+        prepared: Future whose result is the solver of the inverse problem; a thread prepares it.
     """
 
     def __init__(self, surface: Surface, calibrations: Sequence[Calibration]) -> None:
-        """Begin to prepare the inverse in another thread.
+        """Begin to prepare the solver in another thread.
 
         Args:
             surface: Points at which the field is computed.
@@ -88,8 +88,9 @@ class FieldModel:
 
         Args:
             values: (N, 15) values of the cubes, in Pa and Pa/m; NaN where unknown.
-            cloud: Points (M, 6) of the topic `traction` at the same instant; None if the node
-                `contacts` does not publish it.
+            cloud: Points (M, 6) of the topic `traction` at the same instant: position in m,
+                pressure, shear and standard deviation of the pressure in Pa. None if the node
+                `contacts` does not publish the topic.
         """
         if cloud is not None and len(cloud):
             pressure, shear, sigma = self._interpolate(cloud[:, :3], cloud[:, 3:]).T
@@ -99,7 +100,8 @@ class FieldModel:
                 "on the surface, from the node contacts",
                 sigma,
             )
-        # A failed preparation raises its error in `result`, so that is not called then.
+        # If the preparation has failed, `result` would raise its error. The page then interpolates
+        # between the cubes instead.
         if self.prepared.done() and self.prepared.exception() is None:
             inverse = self.prepared.result()
             traction = inverse.field(values).traction

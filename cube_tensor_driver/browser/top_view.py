@@ -82,8 +82,8 @@ class TopView:
             colouring: The values that are drawn as colours.
             contacts: The contacts to draw.
             chosen: Index of the chosen cube, which gets a thick outline.
-            with_texts: Whether cubes have tool tips in a skin above `MAX_NAMED_CUBES`, too. They
-                take most of the time and of the data.
+            with_texts: Whether cubes have tool tips even if there are more than
+                `MAX_NAMED_CUBES`. Drawing and sending tool tips takes longer than all the rest.
         """
         parts = [
             self._heat_map(colouring.colours(colouring.field)),

@@ -222,7 +222,7 @@ class Viewer:
         # The event waited in the queue, and the browser may have disconnected in that time.
         if client.client_id in self._pages or client.client_id not in self._server.get_clients():
             return
-        # Later, panels take a part of the width away.
+        # The size is read before panels are added, because they make the picture narrower.
         size = client.camera.image_width, client.camera.image_height
         layout = self._layouts.setdefault(client.client_id, Layout(*size))
         if self._shown is None:
@@ -341,8 +341,7 @@ def make_scan(
 ) -> Scan:
     """Return everything that the pages show of the present instant.
 
-    Contacts that the node `contacts` does not find are found here, by interpolation between the
-    cubes.
+    If the node `contacts` does not run, contacts are found by interpolation between the cubes.
 
     Args:
         skin: The skin.

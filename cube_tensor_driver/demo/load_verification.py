@@ -97,7 +97,7 @@ class LoadVerification:
     """Collects the rows (one cube at one sampling time) of messages, and compares them with what
     was simulated: the samples that the hubs took in a period, and the load on the skin.
 
-    Call `compare` when the simulator has ended, then `result` or `forces`.
+    Call `set_sent_samples` when the simulator has ended, then `result` or `forces`.
     """
 
     def __init__(self, skin: Skin, load: AnyLoad) -> None:
@@ -149,15 +149,13 @@ class LoadVerification:
         """
         return bool(self._newest_ns.min() > end_ns)
 
-    def compare(
+    def set_sent_samples(
         self,
         log: SampleLog,
         start_ns: int,
         end_ns: int,
     ) -> None:
-        """Set the samples with which the received rows of stress will be compared.
-
-        The methods `result` and `forces` compute and return the comparison.
+        """Set the sent samples with which `result` and `forces` compare the received rows.
 
         Args:
             log: Log of the simulator, which contains the samples that its hubs took.

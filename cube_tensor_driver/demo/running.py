@@ -26,7 +26,7 @@ class Interrupted(CubeError):
 
 
 class Observer:
-    """A ROS node that receives the messages of a skin in child processes; see `observing`.
+    """A ROS node that receives what the nodes in child processes publish; see `observing`.
 
     Attributes:
         node: The ROS node.

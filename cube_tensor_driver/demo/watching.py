@@ -260,7 +260,8 @@ class SkinWatcher:
         Raises:
             ChildError: The view did not print its URL within `MAX_START_S`.
         """
-        # `spin` draws the table while it waits for the view to start; `wait_for_line` would not.
+        # `spin` also draws the table while the view starts. `wait_for_line` alone would stop the
+        # table for that time.
         children = self._children
         self._observer.spin(MAX_START_S, lambda: "http://" in children.log("view"))
         line = children.wait_for_line("view", "http://", 0.0)
@@ -303,7 +304,7 @@ class SkinWatcher:
         # taken all samples of the measured period.
         spin(MAX_LATE_S, lambda: verification.is_beyond(end_ns))
         sent = end_simulator(self._children, log)
-        verification.compare(sent, start_ns, end_ns)
+        verification.set_sent_samples(sent, start_ns, end_ns)
         # The tensors of the last samples may arrive after the simulator has ended.
         spin(MAX_LATE_S, verification.is_complete)
         self._check_alone()

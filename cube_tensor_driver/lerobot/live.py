@@ -28,9 +28,12 @@ from ..core.rows import StressRows, concatenate
 from ..device.live import LinkSource
 from .windows import Windows
 
-NUMBER = "frame_number"
-"""Column with the number of a frame: the time at which the frame was read, in ms since the Unix
-epoch, so that the frames of all recordings have different numbers."""
+NUMBER_COLUMN = "frame_number"
+"""Name of the column with the number of a frame.
+
+The number is the time at which the frame was read, in ms since the Unix epoch, so that the frames
+of all recordings have different numbers.
+"""
 
 NUMBER_BYTES = 6
 """Size of a frame number (time of reading in ms since the Unix epoch), which reaches beyond the
@@ -51,11 +54,11 @@ MIN_HEIGHT = 4 * MIN_SQUARE
 """Smallest height of a picture, in pixels. The frame number takes two squares of it."""
 
 HANDOVER_S = 1e-3
-"""Time, in s, for which the caller of `next_picture` sleeps before it takes the samples.
+"""Time, in s, for which `next_picture` sleeps before it takes the samples that have arrived.
 
-Only one thread of Python runs at a time. While the recorder computes, the threads that read the
-links get their turn only every 5 ms (`sys.getswitchinterval`), one after the other. Asleep, it lets
-them finish what has arrived, which would otherwise be missing in its frame.
+Only one thread of Python runs at a time. While the thread of the recorder computes, the threads
+that read the links wait up to 5 ms each (`sys.getswitchinterval`) for their turn. While it sleeps,
+they process the bytes that have arrived; otherwise these samples would be missing in the frame.
 """
 
 UNKNOWN_GREY = 90
@@ -63,11 +66,12 @@ UNKNOWN_GREY = 90
 
 
 class LiveWindows:
-    """Writes the stress of a live skin, divided into windows (all samples since the last frame).
+    """Writes the stress of a live skin to a file, for each frame the samples since the last one.
 
-    A thread takes all samples as they arrive, so none waits for the recorder. Each window is as
-    long as its own number of samples, so a pause lengthens only one window. The windows are in
-    FOLDER/NUMBER.arrow, an Arrow stream that also a program that is killed leaves readable.
+    The samples of one frame are a window. A thread collects them as they arrive, whatever the
+    recorder does meanwhile. Windows may differ in length, so a pause of the recorder makes only one
+    window longer. The file is FOLDER/NUMBER.arrow, with the number of the first frame. It is an
+    Arrow stream, which stays readable if the program is killed.
     """
 
     def __init__(
@@ -142,7 +146,7 @@ class LiveWindows:
                 "are connected and that no other program reads them"
             )
         rows = concatenate(parts)
-        # The clock of the computer may step back or stand still for longer than 1 ms.
+        # Frame numbers must rise, although the clock of the computer may be set back.
         now_ms = time.time_ns() // 1_000_000
         self._number = max(self._number + 1, now_ms)
         self._write(rows)
@@ -182,7 +186,7 @@ class LiveWindows:
         windows.add(first_frame, rows)
         (columns,) = windows.complete()
         arrays = {name: as_column(values) for name, values in columns.items()}
-        batch = pyarrow.record_batch({NUMBER: pyarrow.array([self._number])} | arrays)
+        batch = pyarrow.record_batch({NUMBER_COLUMN: pyarrow.array([self._number])} | arrays)
         if self._writer is None:
             path = self._folder / f"{self._number}.arrow"
             self._file = pyarrow.OSFile(str(path), "wb")
@@ -210,7 +214,9 @@ class LiveWindows:
 
 
 class RecordedWindows:
-    """The windows (samples of one frame) in a folder that `LiveWindows` wrote, found by pictures.
+    """Reads windows (the samples of one frame each) from a folder that `LiveWindows` wrote.
+
+    A window is found by the frame number in the picture of its frame.
 
     Args:
         folder: Folder of the recordings.
@@ -227,7 +233,7 @@ class RecordedWindows:
         for path in paths:
             file = pyarrow.memory_map(str(path))
             for batch in pyarrow.ipc.open_stream(file):
-                number = batch[NUMBER][0].as_py()
+                number = batch[NUMBER_COLUMN][0].as_py()
                 self._frames[number] = batch
 
     def __len__(self) -> int:
@@ -255,7 +261,7 @@ class RecordedWindows:
             raise BagError(f"no window has the number {number}; name the folder of this data set")
         batch = self._frames[number]
         names = batch.schema.names
-        return {name: as_array(batch[name])[0] for name in names if name != NUMBER}
+        return {name: as_array(batch[name])[0] for name in names if name != NUMBER_COLUMN}
 
 
 def frame_number(picture: AnyArray) -> int:
@@ -271,7 +277,8 @@ def frame_number(picture: AnyArray) -> int:
     strip = grey[: rows * MIN_SQUARE, : columns * side]
     by_square = strip.reshape(rows, MIN_SQUARE, columns, side)
     squares = by_square.mean(axis=(1, 3))
-    # Each number has bits of both kinds, so the threshold follows the scale of the picture.
+    # Pixels may be scaled to 0 to 1 or 0 to 255. Every frame number has black and white squares, so
+    # the threshold is half way between the darkest and the brightest one.
     threshold = 0.5 * (squares.min() + squares.max())
     number = np.packbits(squares > threshold)
     return int.from_bytes(number.tobytes(), "big")
@@ -290,14 +297,16 @@ def nearest_cubes(skin: Skin, width: int, height: int) -> AnyArray:
     position = skin.poses.position
     offset = position - position.mean(axis=0)
     thickness = np.ptp(offset, axis=0)
-    # In parent coordinates, so that a flat skin appears as in its skin file: x right, y up.
+    # The two widest directions are sorted, so that a flat skin appears as in its skin file, with x
+    # to the right and y up.
     widest = np.argsort(-thickness, kind="stable")[:2]
     kept = np.sort(widest)
     across, up = offset[:, kept].T
     top = NUMBER_GRID[0] * MIN_SQUARE
     free = height - top
     extent = max(np.ptp(across) / width, np.ptp(up) / free)
-    # The margin shows the cubes at the edges as large as the others.
+    # The centres of the cubes fill 1/1.2 of the picture. With this margin, the cubes at the edges
+    # appear about as large as the others.
     pixel = 1.2 * extent if extent > 0 else 1.0
     columns = pixel * (np.arange(width) - width / 2)
     nearest = np.zeros((height, width), np.intp)

@@ -95,8 +95,8 @@ class Statistics:
         high = highest.max(axis=0)
 
         drawn = np.concatenate(self._sample)
-        # Of a number with few known values, the random rows may contain none by chance. Then the
-        # mean stands for all of its quantiles.
+        # If a number is NaN in most rows, the rows that were drawn may contain only NaN for it.
+        # Then its mean is used for all of its quantiles.
         is_drawn = np.isfinite(drawn).any(axis=0)
         substitute = np.where(is_drawn, np.nan, mean)
         known = np.concatenate([drawn, substitute[np.newaxis]])

@@ -48,8 +48,8 @@ _FRAME_LENGTH_AT = _NANOSECONDS_AT + 4
 _FRAME_AT = _FRAME_LENGTH_AT + 4
 
 SHAPE_AT = _FRAME_LENGTH_AT
-"""Byte offset, from the start of the serialised message, of the frame id and the number of rows,
-whose bytes `MessageCodec.shape_bytes` returns."""
+"""Byte offset, from the start of a serialised message, of the bytes that `MessageCodec.shape_bytes`
+returns: length and text of the frame id, then the number of rows."""
 
 AnyRows = TypeVar("AnyRows", FrequencyRows, StressRows)
 
@@ -130,7 +130,8 @@ class _Layout(NamedTuple):
         record: Structured dtype of numpy that describes a whole message.
         sequences: Names of the fields that are sequences, `frame_id` first.
         counts: Numbers of values that these sequences must have.
-        numbers: Reads seconds and nanoseconds of the header, then these numbers, from a message.
+        numbers: Struct that reads, from a message, the seconds and nanoseconds of the header, then
+            the numbers of values of the `sequences`.
     """
 
     shape: _Shape

@@ -13,11 +13,14 @@ from ..core.compensation.motion import Motion
 from ..core.errors import MessageError
 
 STATES = ("creep", "thermal")
-"""Names of the effects whose states the message holds, each in the field of this name."""
+"""Names of those fields of SkinCompensation.msg that contain the state of a compensated effect
+(viscoelastic creep; temperature of the elastomer)."""
 
 
 def read_motion(message: Any, stamp_ns: int) -> Motion | None:
-    """Return the motion of the skin in a SkinCompensation message; None: weight is not compensated.
+    """Return the specific force over time that a SkinCompensation message contains.
+
+    It is None if the weight of the elastomer is not compensated.
 
     Args:
         message: The message.
@@ -43,6 +46,6 @@ def read_motion(message: Any, stamp_ns: int) -> Motion | None:
 
 
 def read_states(message: Any) -> dict[str, Array]:
-    """Return the states of effects in a SkinCompensation message, by the names of the effects."""
+    """Return the states in a SkinCompensation message, by the `STATES`; empty ones are left out."""
     states = {name: np.asarray(getattr(message, name), float) for name in STATES}
     return {name: state for name, state in states.items() if len(state)}

@@ -131,8 +131,9 @@ def traction_message(
 
 
 def decode_contacts(message: Any) -> list[Contact]:
-    """Return the contacts of a SkinContacts message; of the values of a tracker only `slips`
-    and `is_coarse`.
+    """Return the contacts of a SkinContacts message.
+
+    Values that only tracked contacts have are left out, except those for `slips` and `is_coarse`.
 
     Raises:
         ValueError: The arrays of the message have different lengths.

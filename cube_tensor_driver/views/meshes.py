@@ -59,13 +59,13 @@ def corner_lines(rotation: Array, side: float) -> Array:
         side: Length of the sides of the square.
     """
     corners = side * _SQUARE
-    # From each corner a line goes a quarter of the side towards the next and the last corner.
+    # From each corner, lines go towards both neighbouring corners, each a quarter of the side long.
     towards = [np.roll(corners, step, axis=0) for step in (1, -1)]
     ends = [np.stack([corners, corners + 0.25 * (to - corners)], axis=1) for to in towards]
     return np.asarray(np.concatenate(ends) @ rotation[:, :2].T)
 
 
-def hit(
+def find_hit_cube(
     position: Array,
     pitch: float,
     start: Array,
@@ -85,7 +85,8 @@ def hit(
     """
     direction = direction / np.linalg.norm(direction)
     depth = (position - start) @ direction
-    distance = np.linalg.norm(position - start - depth[:, None] * direction, axis=1)
+    closest = start + depth[:, None] * direction
+    distance = np.linalg.norm(position - closest, axis=1)
     near = distance < pitch
     if not near.any():
         return None
@@ -98,8 +99,8 @@ class SquareLayer:
 
     The squares of one colour are one mesh. A skin then consists of few objects, and a computer
     without a graphics card can draw it often enough. An image would be less data, but browsers
-    decode images asynchronously, so that a slow browser would show the field of an earlier instant
-    than the cubes.
+    decode images asynchronously: a slow browser would show the field of one instant together with
+    the cubes of a later one.
     """
 
     def __init__(
@@ -116,9 +117,10 @@ class SquareLayer:
                 lies, to the scene.
             side: (M,) length of the sides of each square, in units of the scene.
         """
-        # The corners never move, so only the choice of squares has to be made for each picture.
+        # The corners are computed once, because squares change only their colours.
         offset = side[:, None, None] * _SQUARE
-        corners = points[:, None] + np.einsum("mij,mqj->mqi", rotation[:, :, :2], offset)
+        rotated = np.einsum("mij,mqj->mqi", rotation[:, :, :2], offset)
+        corners = points[:, None] + rotated
         self._corners = corners.astype(np.float32)
 
     def paint(
@@ -167,6 +169,9 @@ def colour_steps(
 
 def step_colours(quantity: Quantity) -> NDArray[np.uint8]:
     """Return the colours of a `SquareLayer` (COLOUR_STEPS + 1, 3) in sRGB; the last is for NaN."""
-    middle = (np.arange(COLOUR_STEPS) + 0.5) / COLOUR_STEPS
-    values = np.append(2 * middle - 1 if quantity.signed else middle, np.nan)
-    return np.round(255 * scene.colours(quantity, values, 1.0)).astype(np.uint8)
+    values = (np.arange(COLOUR_STEPS) + 0.5) / COLOUR_STEPS
+    if quantity.signed:
+        values = 2 * values - 1
+    with_unknown = np.append(values, np.nan)
+    colours = scene.colours(quantity, with_unknown, 1.0)
+    return np.round(255 * colours).astype(np.uint8)

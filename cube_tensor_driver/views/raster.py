@@ -36,10 +36,12 @@ class Raster:
             reach: Distance, in metres, to the nearest point above which a pixel is transparent.
         """
         flat = points[:, :2]
-        extent = np.ptp(flat, axis=0) + 1.4 * reach
-        # A whole number of pixels covers the points, so the image is a little larger than they are.
+        low, high = flat.min(axis=0), flat.max(axis=0)
+        # The margin around the outermost points is 0.7 times `reach`. The image is a little larger
+        # than that, because it has whole pixels.
+        extent = high - low + 1.4 * reach
         columns, rows = np.ceil(extent / pixel).astype(int)
-        middle = (flat.min(axis=0) + flat.max(axis=0)) / 2
+        middle = (low + high) / 2
         half = np.array([columns, rows]) * pixel / 2
         self.low, self.high = middle - half, middle + half
         x = self.low[0] + (np.arange(columns) + 0.5) * pixel

@@ -96,11 +96,8 @@ def _component(name: str) -> Callable[[Array, Array], Array]:
     return lambda values, residual: values[:, column]
 
 
-def _length(*names: str) -> Callable[[Array, Array], Array]:
-    """Return a function that computes the magnitude (N,) of a vector of components for N cubes.
-
-    The function takes values (N, 15) in the order of COMPONENTS, and residuals (N,), which it does
-    not use.
+def _magnitude(*names: str) -> Callable[[Array, Array], Array]:
+    """Return a function for `Quantity.of`: the magnitude of the vector of some components.
 
     Args:
         names: Names of the components of the vector, such as "yz" and "zx".
@@ -111,8 +108,9 @@ def _length(*names: str) -> Callable[[Array, Array], Array]:
         parts = values[:, columns]
         is_observed = np.isfinite(parts)
         # An unobserved component counts as 0; if all are unobserved, the magnitude is NaN.
-        length = np.linalg.norm(np.where(is_observed, parts, 0), axis=1)
-        return np.where(is_observed.any(axis=1), length, np.nan)
+        observed_parts = np.where(is_observed, parts, 0)
+        magnitude = np.linalg.norm(observed_parts, axis=1)
+        return np.where(is_observed.any(axis=1), magnitude, np.nan)
 
     return of
 
@@ -134,14 +132,14 @@ def _stress(
 
 QUANTITIES = {
     "pressure": _stress("pressure −σzz", lambda values, residual: -values[:, 2]),
-    "shear": _stress("shear |σzx, σyz|", _length("zx", "yz")),
+    "shear": _stress("shear |σzx, σyz|", _magnitude("zx", "yz")),
     "gradient": Quantity(
         "gradient |∂σzz/∂x, ∂σzz/∂y|",
         unit="kPa/mm",
         size=1e6,
         min_top=1e5,
         signed=False,
-        of=_length("zz_x", "zz_y"),
+        of=_magnitude("zz_x", "zz_y"),
     ),
     **{
         name: _stress(
@@ -169,7 +167,7 @@ range of colours, in SI units.
 """
 
 
-def automatic(
+def automatic_top(
     quantity: Quantity,
     values: Array,
     last_top: float = 0.0,
@@ -211,12 +209,13 @@ class Ranges(NamedTuple):
             values: (N, 15) 6 stress components in Pa and 9 gradients in Pa/m, in the frames of the
                 cubes.
             residual: (N,) residuals of the cubes.
-            colours: Upper end of its colour scale, in SI units.
+            colours: Upper end of the colour scale of the next picture, in SI units.
         """
         # Columns 2 to 4 are the stress components zz, yz and zx, which act on the upper face.
-        traction = automatic(QUANTITIES["shear"], values[:, 2:5], self.traction)
+        traction = automatic_top(QUANTITIES["shear"], values[:, 2:5], self.traction)
         gradient = QUANTITIES["gradient"]
-        longest_gradient = automatic(gradient, gradient.of(values, residual), self.gradient)
+        magnitude = gradient.of(values, residual)
+        longest_gradient = automatic_top(gradient, magnitude, self.gradient)
         return Ranges(colours, traction, longest_gradient)
 
 
@@ -234,9 +233,10 @@ def colours(
             is signed.
     """
     share = np.nan_to_num(values) / top
+    table = _colour_table(SEQUENTIAL)
     if quantity.signed:
         share = share / 2 + 0.5
-    table = _colour_table(DIVERGING if quantity.signed else SEQUENTIAL)
+        table = _colour_table(DIVERGING)
     entries = np.linspace(0, 1, len(table))
     mixed = np.stack([np.interp(share, entries, channel) for channel in table.T], axis=1)
     return np.where(np.isfinite(values)[:, None], mixed, GREY)
@@ -385,7 +385,8 @@ def heads(arrows: Array, normal: Array) -> Array:
     back = BARB_LENGTH * (tail - tip)
     # For an arrow along the normal the cross product would be 0. A small vector in another
     # direction, added to the normal, prevents that.
-    across = np.cross(back, normal + 1e-3 * np.roll(normal, 1, axis=1))
+    tilted = normal + 1e-3 * np.roll(normal, 1, axis=1)
+    across = np.cross(back, tilted)
     size = np.linalg.norm(across, axis=1, keepdims=True)
     half_width = 0.5 * np.linalg.norm(back, axis=1, keepdims=True)
     across *= half_width / np.where(size > 0, size, 1)
@@ -402,11 +403,13 @@ def ring(centre: Array, normal: Array, radius: float, corners: int) -> Array:
         radius: Radius of the circle, in the unit of the centre.
         corners: Number of corners of the polygon.
     """
-    # The cross product with the coordinate axis that is least parallel to the normal is the most
-    # accurate.
-    first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    # `first` and `second` span the plane of the circle. The cross product is taken with the
+    # coordinate axis that is least parallel to the normal, so that its length is not close to 0.
+    axis = np.eye(3)[np.abs(normal).argmin()]
+    first = np.cross(normal, axis)
     first /= np.linalg.norm(first)
     second = np.cross(normal, first)
     angle = 2 * np.pi * np.arange(corners) / corners
-    points = centre + radius * (np.outer(np.cos(angle), first) + np.outer(np.sin(angle), second))
+    unit_circle = np.outer(np.cos(angle), first) + np.outer(np.sin(angle), second)
+    points = centre + radius * unit_circle
     return np.stack([points, np.roll(points, -1, axis=0)], axis=1)

@@ -79,10 +79,12 @@ def test_the_parameter_quantity_allows_what_can_be_drawn():
 
 def test_automatic_range_rises_at_once_and_falls_slowly():
     quantity = QUANTITIES["pressure"]
-    top = scene.automatic(quantity, np.array([np.nan, 9e3, -2e3]))
+    top = scene.automatic_top(quantity, np.array([np.nan, 9e3, -2e3]))
     assert top == 9e3
-    assert scene.automatic(quantity, np.array([1.0]), top) == pytest.approx(9e3 * scene.RANGE_DECAY)
-    assert scene.automatic(quantity, np.array([np.nan])) == quantity.min_top
+    assert scene.automatic_top(quantity, np.array([1.0]), top) == pytest.approx(
+        9e3 * scene.RANGE_DECAY
+    )
+    assert scene.automatic_top(quantity, np.array([np.nan])) == quantity.min_top
 
 
 def test_health_says_doubtful_no_tensor_and_stale():
@@ -320,18 +322,20 @@ def test_the_head_of_an_arrow_is_at_its_tip_and_flat_to_the_viewer():
 
 
 def test_a_click_finds_the_cube_in_front():
-    from cube_tensor_driver.views.meshes import hit
+    from cube_tensor_driver.views.meshes import find_hit_cube
 
     around = 2 * np.pi * np.arange(24) / 24
     ring = np.stack([0 * around, np.cos(around), np.sin(around)], axis=1)
     pitch = 2 * np.sin(np.pi / 24)
     for cube in range(24):
         aside = 0.1 * pitch * np.array([1.0, 0, 0])
-        assert hit(ring, pitch, 5 * ring[cube] + aside, -2 * ring[cube]) == cube
-    assert hit(ring, pitch, np.array([1.01 * pitch, 5, 0]), np.array([0, -1.0, 0])) is None
+        assert find_hit_cube(ring, pitch, 5 * ring[cube] + aside, -2 * ring[cube]) == cube
+    assert (
+        find_hit_cube(ring, pitch, np.array([1.01 * pitch, 5, 0]), np.array([0, -1.0, 0])) is None
+    )
     flat = np.stack(
         [*(a.ravel() for a in np.meshgrid(np.arange(6.0), np.arange(5.0))), np.zeros(30)], axis=1
     )
     eye = np.array([2.5, -8, 6.0])  # as the page looks at a skin
     for cube in range(30):
-        assert hit(flat, 1.0, eye, flat[cube] + [0.2, -0.2, 0] - eye) == cube
+        assert find_hit_cube(flat, 1.0, eye, flat[cube] + [0.2, -0.2, 0] - eye) == cube

@@ -53,7 +53,7 @@ class Markers(SkinSubscriberNode):
         values, residual = skin.newest.usable_values(health), skin.newest.residual
         shown = self._quantity.of(values, residual)
         fixed, last = float(self.value("range")), self._ranges.colours
-        top = fixed or scene.automatic(self._quantity, shown, last)
+        top = fixed or scene.automatic_top(self._quantity, shown, last)
         ranges = self._ranges = self._ranges.follow(values, residual, top)
         canvas = self._canvas
         canvas.draw_cubes(scene.colours(self._quantity, shown, ranges.colours))

@@ -47,7 +47,8 @@ def draw_layout(layout: Layout) -> Figure:
     ):
         _draw_pad(axes, name, centre, normal, layout.pad_size)
     # matplotlib needs the direction of view as two angles.
-    elevation = np.degrees(np.arctan2(_VIEW[2], np.hypot(*_VIEW[:2])))
+    horizontal = np.hypot(*_VIEW[:2])
+    elevation = np.degrees(np.arctan2(_VIEW[2], horizontal))
     azimuth = np.degrees(np.arctan2(_VIEW[1], _VIEW[0]))
     axes.view_init(elev=elevation, azim=azimuth)
     axes.set(
@@ -137,7 +138,8 @@ def draw_fit(fit: Fit, measured: Array) -> Figure:
     pads = fit.structure.layout.pads
     for pad, name in enumerate(pads):
         is_used = ~fit.outliers[:, pad]
-        x, y = fit.fitted[is_used, pad] * 1e-3, measured[is_used, pad] * 1e-3
+        x = fit.fitted[is_used, pad] * 1e-3
+        y = measured[is_used, pad] * 1e-3
         style: dict[str, Any] = {
             "marker": MARKERS[pad % len(MARKERS)],
             "color": str(0.7 * pad / max(1, len(pads) - 1)),
@@ -150,7 +152,8 @@ def draw_fit(fit: Fit, measured: Array) -> Figure:
 
     outliers = fit.outliers
     if outliers.any():
-        x, y = fit.fitted[outliers] * 1e-3, measured[outliers] * 1e-3
+        x = fit.fitted[outliers] * 1e-3
+        y = measured[outliers] * 1e-3
         left.plot(
             x,
             y,
@@ -184,12 +187,13 @@ def draw_thermal_fit(fit: ThermalFit) -> Figure:
     """Draw temperatures, and the pad stresses without load before and after the compensation.
 
     Args:
-        fit: Result of the fit to N blocks of an unloaded cube.
+        fit: Result of the fit to the means of N successive blocks of samples of an unloaded cube.
     """
     data = fit.data
     figure = Figure(figsize=(7, 6))
     warm, before, after = figure.subplots(3, 1)
-    # The bags follow one another.
+    # The times of the blocks begin at 0 in each bag. Their numbers, which are seconds because a
+    # block is 1 s long, put the bags one after the other.
     time = np.arange(len(data.seconds)) / 60
     warm.plot(time, data.temperature, "k-", label="thermometer of the hub")
     elastomer = fit.level + float(fit.model.reference)
@@ -199,9 +203,11 @@ def draw_thermal_fit(fit: ThermalFit) -> Figure:
     warm.legend(fontsize=7)
     _draw_pads(before, after, time, data.stress - fit.offset, fit.residual)
     if fit.model.ramp is not None:
-        # Deviation of a typical pad, because the elastomer lags behind.
-        size = float(np.sqrt((fit.model.ramp**2).sum(axis=1).mean()))
-        bound = size * np.abs(data.temperature - elastomer)
+        # Predicted deviation of a typical pad (rms of all) while the temperature changes, because
+        # the elastomer follows the thermometer with a lag.
+        squared_slope = (fit.model.ramp**2).sum(axis=1)
+        typical_slope = float(np.sqrt(squared_slope.mean()))
+        bound = typical_slope * np.abs(data.temperature - elastomer)
         after.fill_between(time, -bound, bound, color="C0", alpha=0.25, label="deviation")
         after.legend(fontsize=7)
     before.set_title(f"stress of the {data.stress.shape[1]} pads without load", fontsize=9)

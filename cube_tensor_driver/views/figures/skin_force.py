@@ -15,7 +15,7 @@ _AXIS_STYLES = (("x", "o", "C0", "--"), ("y", "s", "C1", ":"), ("z", "D", "black
 """Name, marker, colour and line style of each coordinate axis; they can be distinguished in grey,
 too."""
 
-MM = 1e3
+MM_PER_M = 1e3
 """Number of millimetres in a metre."""
 
 
@@ -49,8 +49,8 @@ def draw_forces(
     _draw_components(
         panels["centre"],
         times,
-        MM * centre,
-        MM * measured_centre,
+        MM_PER_M * centre,
+        MM_PER_M * measured_centre,
     )
     handles, labels = panels["force"].get_legend_handles_labels()
     panels["force"].legend(
@@ -73,7 +73,7 @@ def draw_forces(
         (centre, {"color": "black", "lw": 1}),
         (measured_centre, {"marker": "o", "ls": "", "color": "C3", "mfc": "none"}),
     ):
-        path.plot(MM * points[:, 1], MM * points[:, 0], ms=3, **style)
+        path.plot(MM_PER_M * points[:, 1], MM_PER_M * points[:, 0], ms=3, **style)
     path.set(
         xlabel="$y$ / mm",
         ylabel="$x$ / mm",

@@ -36,8 +36,8 @@ class TimeSeries:
         seconds: (N,) time after the start of the bag, in seconds.
         frequency: (N, P) frequencies of the pads, in Hz.
         rest: (P,) frequencies of the pads without load, in Hz.
-        values: (N, 15) 6 stress components in Pa and 9 gradients in Pa/m, in the frames of the
-            cubes; NaN where it is not observed.
+        values: (N, 15) 6 stress components in Pa and 9 gradients in Pa/m, in the frame of the
+            cube; NaN where they are not observed.
         residual: (N,) misfit between pads and tensor relative to the noise; 1 for noise alone.
         status: (N,) status bits, as in core/status.py.
     """

@@ -22,7 +22,8 @@ from ...processes.stop_signals import INTERRUPTED
 GRACE_S = 0.3
 """Time, in seconds, from Ctrl-C until the process is ended without running `finally` blocks.
 
-Outside of C code, the main thread ends by KeyboardInterrupt within this time and runs them.
+A main thread that executes Python code gets KeyboardInterrupt at once, and has this time to run its
+`finally` blocks. In the middle of a long call of C code it cannot get the exception.
 """
 
 _SHOW_CURSOR = b"\x1b[?25h"
@@ -64,7 +65,8 @@ def _end_on_interrupt(watched: int) -> None:
     while number := os.read(watched, 1):
         if number[0] != signal.SIGINT:
             continue
-        # If the main thread leaves `ends_at_once`, it closes the pipe, which makes it readable.
+        # When the main thread leaves the `with` block, it closes the other end of the pipe, and
+        # `select` returns before the time is over.
         has_ended, _, _ = select.select([watched], [], [], GRACE_S)
         if not has_ended:
             # A progress bar hides the cursor, and the code that would show it again does not run.

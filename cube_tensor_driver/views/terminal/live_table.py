@@ -45,8 +45,8 @@ BAR_WIDTH = 12
 """Width, in characters, of the longest bar in the column for the pressure."""
 
 PEAK_DECAY = 0.99
-"""Ratio of the pressure of a full bar to that in the drawing before, while the pressures on the
-skin are smaller: the scale of the bars shrinks by 1 % per drawing."""
+"""Factor by which the pressure that a full bar stands for shrinks from one drawing of the table to
+the next, while all pressures on the skin are smaller."""
 
 MIN_PEAK = 1.0
 """Minimum pressure, in Pa, of a full bar; it avoids a division by zero without load."""
@@ -148,9 +148,9 @@ class LiveTable:
     def draw(self, max_rows: int, width: int) -> Table:
         """Make the table for a terminal.
 
-        In a skin of more than `max_rows` cubes, those with the largest absolute σzz are shown. If
-        the table is too wide, the lines, then the bars, then components from the last one on, and
-        at last the residual are left out.
+        In a skin of more than `max_rows` cubes, those with the largest absolute σzz are shown. A
+        table that is too wide loses, one after the other until it fits: the lines between columns,
+        the bars, the components (the last one first), and the residual.
 
         Args:
             max_rows: Maximum number of cubes in the table.
@@ -162,7 +162,8 @@ class LiveTable:
         shown = np.arange(len(pressure))
         notes = []
         if len(shown) > max_rows:
-            by_size = np.argsort(-np.abs(pressure), kind="stable")
+            size = np.abs(pressure)
+            by_size = np.argsort(-size, kind="stable")
             # Sorting the indices keeps the rows in the order of the skin file.
             shown = np.sort(by_size[:max_rows])
             notes.append(
@@ -226,7 +227,7 @@ class LiveTable:
             table.add_column(
                 heading,
                 justify="left" if heading in ("cube", PRESSURE, "state") else "right",
-                # The bars have different lengths in each drawing, the column always the same.
+                # The width is fixed, because otherwise it would follow the longest bar.
                 width=BAR_WIDTH if heading == PRESSURE else None,
             )
         for cells in zip(*columns.values(), strict=True):
