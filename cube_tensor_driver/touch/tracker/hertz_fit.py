@@ -150,6 +150,15 @@ class HertzFit:
         return self.last_step > MAX_UNFOLLOWED_STEP
 
     @property
+    def inflation(self) -> float:
+        """Factor by which all variances grow, because the values deviate more than by their noise.
+
+        It is the larger misfit, that of all cubes or that of the nearest ones: the edge of a flat
+        punch, where the pressure is infinite, shows in the nearest cubes alone.
+        """
+        return max(self.misfit, self.shape_misfit)
+
+    @property
     def score(self) -> float:
         """-2 ln of the evidence (probability of the values, in Laplace approximation).
 
@@ -329,7 +338,7 @@ class HertzFit:
         forces[:, :, 0] += self.found.forces.T
 
         n = _N_PARAMETERS * count
-        covariance = self.misfit * self.covariance[:n, :n]
+        covariance = self.inflation * self.covariance[:n, :n]
         root = slopes.reshape(3, -1, n) @ np.linalg.cholesky(covariance)
         return ContactSum(places.reshape(-1, 2), sizes.ravel(), forces.reshape(3, -1), root)
 
@@ -338,7 +347,7 @@ class HertzFit:
         estimates = []
         for j, log_size in enumerate(self.found.log_sizes.tolist()):
             own = slice(_N_PARAMETERS * j, _N_PARAMETERS * (j + 1))
-            covariance = self.misfit * self.covariance[own, own]
+            covariance = self.inflation * self.covariance[own, own]
             area = float(np.pi * np.exp(2 * log_size))
             estimates.append(
                 ContactEstimate(
