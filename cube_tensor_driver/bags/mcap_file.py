@@ -40,9 +40,11 @@ RECORD_HEAD = struct.Struct("<BQ")
 type, and the length of the record's content in bytes."""
 
 MESSAGE_HEAD = struct.Struct("<BQHIQQ")
-"""Layout of the 31 bytes in front of the serialised message in a message record: those of
-`RECORD_HEAD`, channel (number of the topic in the file), sequence number, and the times of
-recording and of publication, in ns."""
+"""Layout of the 31 bytes in front of the serialised message in a message record of an MCAP file.
+
+The fields are: opcode and length (`RECORD_HEAD`), channel (number of the topic in the file),
+sequence number, time of recording and time of publication (both in ns since the Unix epoch).
+"""
 
 CHUNK_BYTES = 1 << 18
 """Size, in bytes, at which the writer completes a chunk (block of messages) of an MCAP file.
@@ -61,9 +63,9 @@ file that states a size beyond this limit is treated as damaged, before memory i
 CACHED_CHUNKS = 8
 """Number of chunks (blocks of messages) of a file that stay in memory after they were read.
 
-The topics of frequencies and of stress are read in turn by two iterators, whose messages lie in
-the same chunks. Without this cache each chunk would be read and decompressed twice. What is decoded
-together (`read.MAX_BATCH_ROWS`) takes up to five chunks of `CHUNK_BYTES`.
+Frequencies and stress are read alternately by two iterators, but their messages lie in the same
+chunks. Without this cache each chunk would be read and decompressed twice. One batch of messages
+that are decoded together (`read.MAX_BATCH_ROWS`) lies in up to five chunks.
 """
 
 ROSBAG2_RECORD = "rosbag2"
@@ -75,8 +77,8 @@ _FOOTER_BYTES = RECORD_HEAD.size + 20
 stands just before the closing `MCAP_MAGIC` bytes and states where the summary begins."""
 
 CHECKSUM_BYTES = 4
-"""Size, in bytes, of the checksum (CRC-32) of the summary (topics and offsets of chunks), with
-which the footer record of an MCAP file ends."""
+"""Size, in bytes, of the checksum (CRC-32) at the end of an MCAP file's footer record. It covers
+the summary (topics and offsets of chunks)."""
 
 StoredMessage = tuple[int, int, int, bytes]
 """A message of an MCAP file: time of recording in ns since the Unix epoch, byte offset of its chunk
@@ -139,7 +141,7 @@ class McapReader:
         Args:
             topics: Names of the topics to read.
             start_ns: Earliest time of recording that is read, in ns since the Unix epoch.
-            stop_ns: Time of recording, in ns, from which on nothing is read.
+            stop_ns: Time of recording, in ns since the Unix epoch, before which messages are read.
 
         Yields:
             The topic, the time of recording in ns, and the serialised message.
@@ -153,21 +155,21 @@ class McapReader:
         if not self._index.chunk_indexes:
             yield from self._unindexed_messages(channels, start_ns, stop_ns)
             return
-        for stored in self._in_order(channels, start_ns, stop_ns):
+        for stored in self._read_sorted(channels, start_ns, stop_ns):
             for time_ns, _, channel, data in stored:
                 # A chunk also contains messages of other topics, and of times outside the span.
                 if channel in channels and start_ns <= time_ns < stop_ns:
                     yield channels[channel], time_ns, data
 
-    def _in_order(
+    def _read_sorted(
         self,
         channels: Collection[int],
         start_ns: int,
         stop_ns: int,
     ) -> Iterator[Sequence[StoredMessage]]:
-        """Read the chunks (blocks of messages) that can contain wanted messages, in order of time.
+        """Read the chunks (blocks of messages) that can contain wanted messages, sorted by time.
 
-        Messages of chunks whose times overlap are merged.
+        If the time spans of chunks overlap, their messages are merged.
 
         Args:
             channels: Wanted channels (numbers of topics in the file).
@@ -175,8 +177,7 @@ class McapReader:
             stop_ns: End of the wanted span of time, in ns since the Unix epoch.
 
         Yields:
-            All messages of these chunks, including unwanted ones, in groups that follow each other
-            in the order of time.
+            Groups of successive messages, which include the unwanted messages of these chunks.
         """
         chunks = [
             chunk
@@ -192,8 +193,8 @@ class McapReader:
         pending: Sequence[StoredMessage] = ()
         chunks.sort(key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset))
         for chunk in chunks:
-            # The chunks are sorted by their first times, so messages before that of this chunk can
-            # be delivered: no later chunk has an earlier message.
+            # The chunks are sorted by the times of their first messages, so waiting messages that
+            # are older than this chunk are delivered: no message that follows is older.
             ready = bisect_left(pending, chunk.message_start_time, key=itemgetter(0))
             yield pending[:ready]
             loaded = self._load_chunk(chunk.chunk_start_offset, chunk.chunk_length)
@@ -220,8 +221,8 @@ class McapReader:
         # stops at the end of the record instead of allocating any amount of memory.
         record = BytesIO(self._stream.read(length - RECORD_HEAD.size))
         data = unpack_chunk(Chunk.read(ReadDataStream(record)))
-        # The reader of the library mcap takes several times as long, because it reads field by
-        # field. The zeros at the end let each record be read as if it were a message.
+        # The records are parsed here, because the library mcap takes several times as long. Zeros
+        # are appended so that the head of a message can be unpacked from short records, too.
         padded = data + bytes(MESSAGE_HEAD.size)
         messages = []
         begin = 0
@@ -244,12 +245,12 @@ class McapReader:
     ) -> Iterator[tuple[Connection, int, bytes]]:
         """Read a file without an index of chunks (rosbag2's preset ``fastwrite``).
 
-        The messages come in the order of writing, because only an index allows to sort them.
+        Messages are read in the order of writing, because sorting them requires an index.
 
         Args:
             channels: Topic of each channel (number of a topic in the file) that is read.
             start_ns: Earliest time of recording that is read, in ns since the Unix epoch.
-            stop_ns: Time of recording, in ns, from which on nothing is read.
+            stop_ns: Time of recording, in ns since the Unix epoch, before which messages are read.
         """
         self._stream.seek(0)
         reader = NonSeekingReader(
@@ -290,7 +291,8 @@ class McapWriter:
         Args:
             topic: Name of the topic.
             msgtype: Type of its messages, such as ``std_msgs/msg/String``.
-            definition: Text of the type's definition, with those of the types in it.
+            definition: Text of the type's definition, with the definitions of the types of its
+                fields.
             qos: Quality of service profiles that its publishers offered.
 
         Returns:
@@ -387,7 +389,7 @@ def read_connections(index: Summary) -> dict[int, Connection]:
     """Return the topics of an MCAP file by their channels (numbers of the topics in the file)."""
     counts = index.statistics.channel_message_counts if index.statistics else {}
     found = {}
-    # Channels are numbered in the order in which the recorder added the topics.
+    # Sorting by channel gives the topics in the order in which the recorder added them.
     for number, channel in sorted(index.channels.items()):
         schema = index.schemas.get(channel.schema_id)
         has_text = schema is not None and schema.encoding == "ros2msg"

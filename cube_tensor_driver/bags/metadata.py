@@ -53,8 +53,8 @@ class Connection:
     Attributes:
         topic: Name of the topic.
         msgtype: Type of its messages, such as ``std_msgs/msg/String``.
-        definition: Text of the type's definition, with those of the types in it; "" if the bag does
-            not contain it.
+        definition: Text of the type's definition, with the definitions of the types of its fields;
+            "" if the bag does not contain it.
         qos: Quality of service profiles that its publishers offered.
         msgcount: Number of messages on the topic.
     """
@@ -167,7 +167,7 @@ def typestore() -> Typestore:
     for path in sorted(folder.glob("*.msg")):
         name = f"{PACKAGE}/msg/{path.stem}"
         types |= get_types_from_msg(path.read_text("utf-8"), name)
-    # They are registered in one call, because messages of this package contain each other.
+    # All types are registered in one call, because messages of this package contain each other.
     store.register(types)
     return store
 
@@ -177,12 +177,12 @@ def type_hash(msgtype: str, definition: str) -> str:
 
     Args:
         msgtype: Name of the type, such as ``std_msgs/msg/String``.
-        definition: Text of its definition, with those of the types in it.
+        definition: Text of its definition, with the definitions of the types of its fields.
 
     Returns:
         The hash, such as ``RIHS01_…``; "" if the definition cannot be read.
     """
-    # A new, empty store is used, because the definition in a bag may differ from the installed one.
+    # The type is registered in a separate store, because the installed definition may differ.
     store = get_typestore(Stores.EMPTY)
     try:
         store.register(get_types_from_msg(definition, msgtype))
@@ -204,7 +204,8 @@ def read_metadata(folder: Path) -> BagFiles:
             f"{folder}: no {FILE_NAME}: no bag, or a recording that was cut off; "
             f"./cube bag repair {folder} makes the latter readable"
         )
-    # Only file names and compression are used: the storage files state topics and times, too.
+    # Only file names and compression are taken from metadata.yaml. Topics and times are taken from
+    # the storage files, which also state them.
     reason = "damaged"
     try:
         about = read_yaml(path)["rosbag2_bagfile_information"]

@@ -44,9 +44,8 @@ the call is already negligible."""
 MAX_BATCH_ROWS = 1 << 13
 """Largest number of rows (samples of cubes) decoded by one call of numpy.
 
-This many rows of stress (82 bytes each) fit the processor's cache. Frequencies and stress have the
-same limit in rows, not in bytes, so that their batches contain the same samples. Then the stress of
-the samples in the n-th batch of frequencies is in the n-th batch of stress.
+This many rows of stress (82 bytes each) fit the processor's cache. The limit is in rows, not in
+bytes, so that the n-th batch of frequencies and the n-th batch of stress contain the same samples.
 """
 
 MAX_MESSAGE_BYTES = 64 << 20
@@ -88,10 +87,10 @@ def is_bag(path: Path) -> bool:
 
 @contextmanager
 def report_damage(path: Path) -> Iterator[None]:
-    """Turn errors of reading in the enclosed block into a BagError of one line.
+    """Turn errors of reading in the `with` block into a BagError of one line.
 
     Args:
-        path: Bag or file that the block reads, which the error names.
+        path: Bag or file that the block reads, for the error message.
     """
     try:
         yield
@@ -208,7 +207,7 @@ class Bag:
         self.connections: list[Connection] = []
         self.start_ns = self.end_ns = 0
         self.skipped: Counter[str] = Counter()
-        # A single storage file is also a bag. Without metadata.yaml it counts as not compressed.
+        # A single storage file is also a bag. Only metadata.yaml could state that it is compressed.
         self._bag_files = BagFiles([path], "")
         if path.is_dir():
             self._bag_files = read_metadata(path)
@@ -261,11 +260,11 @@ class Bag:
         names = {one.topic for one in self.connections if one.msgtype == msgtype}
         return sorted(names)
 
-    def skin(self) -> str:
-        """Return the common prefix of the names of the skin's topics, which ends in "/".
+    def skin_prefix(self) -> str:
+        """Return the prefix, ending in "/", of the topics of the only skin in the bag.
 
         Raises:
-            BagError: The bag has no topic of frequencies, or those of several skins.
+            BagError: The bag has no topic of frequencies, or has topics of several skins.
         """
         names = [topic.removesuffix("frequencies") for topic in self.topics(FREQUENCIES)]
         if not names:
@@ -288,7 +287,7 @@ class Bag:
         Args:
             topics: Names of the topics; None: all topics.
             start_ns: Earliest time of recording that is read, in ns since the Unix epoch.
-            stop_ns: Time of recording, in ns, from which on nothing is read.
+            stop_ns: Time of recording, in ns since the Unix epoch, before which messages are read.
 
         Raises:
             BagError: A file of the bag is damaged, or has another number of messages than its
@@ -313,8 +312,8 @@ class Bag:
                             continue
                     yield Entry(connection.topic, connection.msgtype, time_ns, data)
 
-        # If the name of a topic or the number of a channel is damaged, no library raises an error:
-        # messages are only missing. Therefore their number is compared with the one stated.
+        # A damaged topic name or channel number raises no error in the libraries, but its messages
+        # are missing. Therefore the number of messages is compared with the one in the summary.
         promised = sum(one.msgcount for one in self.connections if one.topic in wanted)
         if (start_ns, stop_ns) == (0, MAX_TIME_NS) and count != promised:
             raise BagError(
@@ -379,8 +378,8 @@ class Bag:
                 f"{self.path}: no message on {topic} that can be read: the bag does not say what "
                 f"its frequencies mean; record {topic} too"
             )
-        # Comparing definitions is not enough: the version also changes when a field gets another
-        # meaning but keeps its type.
+        # Equal message definitions are not sufficient: the version also changes when a field gets
+        # another meaning but keeps its type.
         others = {time_ns: info.version for time_ns, info in read if info.version != VERSION}
         if len(others) == len(read):
             self._refuse_version(f"{topic} has version {read[0][1].version}")
@@ -433,12 +432,12 @@ class Bag:
         codec: MessageCodec[Any],
         decode: Callable[..., Any],
     ) -> Iterator[tuple[Any, Times]]:
-        """Decode successive messages of one shape (frame id and number of rows) together.
+        """Decode successive messages of equal shape (frame id, number of rows) in batches.
 
         Args:
             topic: Topic of the messages.
-            codec: Codec of their type, which determines the shape of a message.
-            decode: Function that decodes serialised messages, which are its arguments.
+            codec: Codec of the message type, which determines the shape of a message.
+            decode: Function whose arguments are serialised messages and which decodes them.
 
         Yields:
             The result of `decode` for M messages, and an array (M,) of the times at which they were
@@ -455,7 +454,7 @@ class Bag:
             try:
                 yield decode(*waiting), np.array(times_ns)
             except MessageError:
-                # The others of these messages are in order, so each is decoded alone.
+                # One message is damaged, but the others are not, so each is decoded alone.
                 for time_ns, data in zip(times_ns, waiting, strict=True):
                     try:
                         yield decode(data), np.array([time_ns])
@@ -515,7 +514,11 @@ class Bag:
                 self._refuse_version(f"{one.topic} has another definition of {different}")
 
     def _refuse_version(self, difference: str) -> None:
-        """Raise a BagError that states which message of the bag has another version, and how."""
+        """Raise a BagError for a bag that was recorded with another version of the messages.
+
+        Args:
+            difference: How its messages differ, as part of the error message.
+        """
         raise BagError(
             f"{self.path}: {difference}; this package reads version {VERSION} of its messages: "
             "use the version of the package that recorded the bag"
@@ -535,12 +538,13 @@ def message_fields(msgtype: str) -> list[tuple[str, Any]]:
 def _differing_type(msgtype: str, definition: str) -> str:
     """Return the first type of this package that a bag defines with other fields; "" if none is.
 
-    Parsing a definition takes longer than reading a bag of a few seconds, and all bags of one
-    version have the same, so the result is cached.
+    Parsing a definition takes longer than reading a bag of a few seconds. Bags of the same version
+    have the same definition, so the result is cached.
 
     Args:
         msgtype: Type of the messages of a topic.
-        definition: Text of its definition in the bag, with those of the types in it.
+        definition: Text of the type's definition in the bag, with the definitions of the types of
+            its fields.
     """
     # Only fields are compared; constants of a definition do not change a message's bytes.
     for name, (_, fields) in get_types_from_msg(definition, msgtype).items():

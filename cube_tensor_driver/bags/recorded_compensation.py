@@ -24,15 +24,19 @@ from ..messages.types import COMPENSATION
 from .read import Bag, stamp_ns
 
 MAX_DISORDER_NS = SECOND
-"""Largest time, in ns, by which messages in a bag may be out of the order of their stamps."""
+"""Maximum time, in ns, by which a message may be recorded after one with a later stamp."""
 
 
 class RecordedCompensation(NamedTuple):
-    """What one message of `compensation` states; the defaults are for a bag without any.
+    """Compensation of weight, creep and temperature that applied to one message of frequencies.
+
+    The default values apply if the bag has no messages on the topic `compensation`.
 
     Attributes:
-        motion: Motion of the skin; None: weight is not compensated.
-        states: States of effects before the first row of the message of frequencies, by name.
+        motion: Motion of the skin, which the effect of its weight depends on; None: weight is not
+            compensated.
+        states: Name of an effect (creep, thermal) -> its state before the first sample of the
+            message.
     """
 
     motion: Motion | None = None
@@ -40,24 +44,26 @@ class RecordedCompensation(NamedTuple):
 
 
 class CompensationReader:
-    """Reads what a bag states about compensation for messages of frequencies.
+    """Reads from a bag how weight, creep and temperature were compensated during the recording.
 
-    Calls in the order of recording are fastest. For messages that are more than `MAX_DISORDER_NS`
-    older than those of the call before, the bag is read again from its beginning.
+    Calls of `find` in the order of recording are fastest. For a stamp that is more than
+    `MAX_DISORDER_NS` older than that of the previous call, the bag is read again from its start.
 
     Attributes:
         is_recorded: Whether the bag has messages of `compensation`.
     """
 
     def __init__(self, bag: Bag, topic: str, poses: CubePoses) -> None:
-        """Prepare to read the messages of `compensation` that were recorded with frequencies.
+        """Prepare to read the topic `compensation` of one skin.
 
         Args:
             bag: Open bag.
-            topic: Topic of the frequencies. The name of the topic of compensation follows from it.
+            topic: Topic of the skin's frequencies, which has the same prefix as `compensation`.
             poses: Poses of the cubes in the SkinInfo messages.
         """
-        self._bag, self._topic = bag, topic.removesuffix("frequencies") + "compensation"
+        skin = topic.removesuffix("frequencies")
+        self._bag = bag
+        self._topic = f"{skin}compensation"
         self.is_recorded = self._topic in bag.topics(COMPENSATION)
         self._forces = ForcesAtCubes(poses)
         self._restart()
@@ -65,66 +71,73 @@ class CompensationReader:
     def _restart(self) -> None:
         self._unread = self._read()
         self._known: dict[int, RecordedCompensation] = {}
-        # What holds for a message of frequencies whose message of compensation is missing.
-        self._missing = RecordedCompensation()
+        # Result for a message of frequencies without a message on the topic `compensation`.
+        self._default = RecordedCompensation()
         self._newest_ns = 0
         self._wanted_ns = 0
 
-    def at(self, wanted_ns: int) -> RecordedCompensation:
-        """Return the compensation that the bag has recorded for one message of frequencies.
+    def find(self, wanted_ns: int) -> RecordedCompensation:
+        """Return the recorded compensation of one message of frequencies.
 
         Args:
             wanted_ns: Stamp in the header of the message of frequencies, in ns since the Unix
                 epoch.
 
         Returns:
-            Motion of the skin and states of effects (creep, temperature) from the message of
-            `compensation` with this stamp. If the bag has none: unknown motion if an earlier
-            message has one, else no compensation.
+            Content of the message on the topic `compensation` with the same stamp. If there is no
+            such message: unknown motion if a message read before states a motion, otherwise no
+            compensation.
         """
         if wanted_ns < self._wanted_ns - MAX_DISORDER_NS:
             self._restart()
         self._wanted_ns = wanted_ns
-        # Without a message of compensation there is nothing to read, and the loop ends at once.
-        while wanted_ns not in self._known and self._newest_ns < wanted_ns + MAX_DISORDER_NS:
+        # A message that is missing is only known to be so when later stamps have been read.
+        last_ns = wanted_ns + MAX_DISORDER_NS
+        while wanted_ns not in self._known and self._newest_ns < last_ns:
             item = next(self._unread, None)
             if item is None:
                 break
             self._newest_ns, recorded = item
             self._known[self._newest_ns] = recorded
             if recorded.motion is not None:
-                self._missing = RecordedCompensation(UNKNOWN_MOTION)
-            # Messages come nearly in the order of their stamps, so the first is the oldest.
+                self._default = RecordedCompensation(UNKNOWN_MOTION)
+            # Messages are read nearly in the order of their stamps, so the first one that is kept
+            # is the oldest.
             oldest_ns = next(iter(self._known))
             if oldest_ns < wanted_ns - MAX_DISORDER_NS:
                 del self._known[oldest_ns]
-        return self._known.get(wanted_ns, self._missing)
+        return self._known.get(wanted_ns, self._default)
 
     def add_forces(
         self, messages: Decoded[FrequencyRows], recorded: Sequence[RecordedCompensation]
     ) -> Decoded[FrequencyRows]:
-        """Return messages whose rows have specific forces.
+        """Return messages of frequencies with the specific force on each cube added to their rows.
+
+        The specific force (acceleration minus gravity) determines the effect of weight.
 
         Args:
             messages: M messages of frequencies.
-            recorded: What is stated for each of them. If weight is not compensated in the first,
-                the messages are returned as they are.
+            recorded: Compensation of each message, as `find` returns it. If the first one does not
+                compensate weight, the messages are returned unchanged.
         """
         if recorded[0].motion is None:
             return messages
         parts = []
-        for k, one in enumerate(recorded):
-            rows = messages.select(slice(k, k + 1)).rows
-            motion = one.motion or UNKNOWN_MOTION
+        for number, compensation in enumerate(recorded):
+            rows = messages.select(slice(number, number + 1)).rows
+            motion = compensation.motion or UNKNOWN_MOTION
             parts.append(self._forces.add_to(rows, motion))
         return replace(messages, rows=concatenate(parts))
 
     def _read(self) -> Iterator[tuple[int, RecordedCompensation]]:
-        """Yield stamp and content of the messages in the order of recording."""
+        """Yield the stamp (in ns) and content of each message on `compensation`, as recorded."""
         topics = {self._topic} if self.is_recorded else set()
         for time_ns, message in self._bag.decoded(topics):
+            at_ns = stamp_ns(message)
             try:
-                motion = read_motion(message, stamp_ns(message))
-                yield stamp_ns(message), RecordedCompensation(motion, read_states(message))
+                motion = read_motion(message, at_ns)
+                states = read_states(message)
             except MessageError as error:
                 self._bag.skip(self._topic, time_ns, error)
+            else:
+                yield at_ns, RecordedCompensation(motion, states)

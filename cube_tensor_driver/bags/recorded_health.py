@@ -26,9 +26,9 @@ from ..messages.types import STRESS
 from .read import Bag
 
 MAX_DISORDER_NS = SECOND
-"""Largest time, in ns, by which messages in a bag may be out of the order of their samples' stamps.
+"""Maximum time, in ns, by which a sample may be recorded after one with a later stamp.
 
-To find the stress that belongs to given frequencies, stress is read up to this long after them.
+To find the stress of a sample of frequencies, the bag is read up to stamps this much later.
 """
 
 HEALTH_BITS = np.uint16(sum(WORDS))
@@ -45,7 +45,7 @@ class _StressBatch(NamedTuple):
         cube: (N,) index of the cube in the skin.
         sequence: (N,) sequence number of the sample.
         stamp_ns: (N,) stamp of the sample, in ns since the Unix epoch.
-        left_out: (N,) bit p is set if pad p was not used.
+        left_out: (N,) bit masks of pads; bit p is set if pad p of the cube was not used.
         status: (N,) status bits, restricted to `HEALTH_BITS`.
         first_ns: Earliest of the stamps, in ns since the Unix epoch.
         last_ns: Latest of the stamps, in ns since the Unix epoch.
@@ -63,8 +63,8 @@ class _StressBatch(NamedTuple):
 class RecordedHealthReader:
     """Reads the health of pads for rows of frequencies from the recorded stress of the same skin.
 
-    Calls in the order of recording are fastest. For rows that are more than `MAX_DISORDER_NS` older
-    than those of the call before, the bag is read again from its beginning.
+    Calls of `health_at` in the order of recording are fastest. For rows that are more than
+    `MAX_DISORDER_NS` older than those of the previous call, the bag is read again from its start.
     """
 
     def __init__(self, bag: Bag, topic: str) -> None:
@@ -74,8 +74,9 @@ class RecordedHealthReader:
             bag: Open bag.
             topic: Topic of the frequencies.
         """
+        skin = topic.removesuffix("frequencies")
         self._bag = bag
-        self._topic = topic.removesuffix("frequencies") + "stress"
+        self._topic = f"{skin}stress"
         self._has_stress = self._topic in bag.topics(STRESS)
         self._last_wanted_ns = 0
         self._newest_ns = 0
@@ -88,28 +89,30 @@ class RecordedHealthReader:
         The row of stress that belongs to a row of frequencies has the same cube, sequence number
         and stamp. Where none was recorded, `known` is false.
         """
+        count = len(rows)
         health = RecordedHealth(
-            known=np.zeros(len(rows), bool),
-            left_out=np.zeros(len(rows), np.uint32),
-            status=np.zeros(len(rows), np.uint16),
+            known=np.zeros(count, bool),
+            left_out=np.zeros(count, np.uint32),
+            status=np.zeros(count, np.uint16),
         )
-        if not self._has_stress or not len(rows):
+        if not self._has_stress or not count:
             return health
-        begin_ns, end_ns = int(rows.stamp_ns.min()), int(rows.stamp_ns.max())
+        begin_ns = int(rows.stamp_ns.min())
+        end_ns = int(rows.stamp_ns.max())
         for batch in self._batches_between(begin_ns, end_ns):
             # Usually a batch of stress has exactly the rows of the batch of frequencies, so that no
             # search is needed.
             has_same_stamps = np.array_equal(batch.stamp_ns, rows.stamp_ns)
             if has_same_stamps and np.array_equal(batch.cube, rows.cube):
-                everything = np.ones(len(rows), bool)
-                return RecordedHealth(everything, batch.left_out, batch.status)
+                known = np.ones(count, bool)
+                return RecordedHealth(known, batch.left_out, batch.status)
             _copy_matching(batch, rows, health)
             if health.known.all():
                 break
         return health
 
     def _batches_between(self, begin_ns: int, end_ns: int) -> Iterator[_StressBatch]:
-        """Yield the batches of stress that can have rows in a span of time.
+        """Yield the batches of recorded stress that can contain rows with stamps in a span of time.
 
         Batches already in memory come first. The bag is read further only while the caller takes
         more batches, and at most `MAX_DISORDER_NS` beyond the span.
@@ -133,7 +136,7 @@ class RecordedHealthReader:
                 yield batch
 
     def _read_until(self, limit_ns: int) -> Iterator[_StressBatch]:
-        """Read further batches into the memory until one has a stamp from `limit_ns` on.
+        """Read further batches of stress into the memory until a stamp of `limit_ns` is reached.
 
         Args:
             limit_ns: Stamp, in ns since the Unix epoch.
@@ -155,9 +158,15 @@ class RecordedHealthReader:
         for columns in self._bag.stress_columns(self._topic, names):
             stamp_ns, cube, sequence, left_out, status = columns
             if len(cube):
-                first_ns, last_ns = int(stamp_ns.min()), int(stamp_ns.max())
-                health = status & HEALTH_BITS
-                yield _StressBatch(cube, sequence, stamp_ns, left_out, health, first_ns, last_ns)
+                yield _StressBatch(
+                    cube,
+                    sequence,
+                    stamp_ns,
+                    left_out,
+                    status=status & HEALTH_BITS,
+                    first_ns=int(stamp_ns.min()),
+                    last_ns=int(stamp_ns.max()),
+                )
 
 
 def _copy_matching(

@@ -48,7 +48,7 @@ class Recording:
         infos: SkinInfo messages (cubes, calibrations and rest frequencies) in the order of their
             stamps; there is at least one.
         settings: Calibrations and rest frequencies in each of the SkinInfo messages.
-        compensation: Reader of the motion of the skin and of states of what is compensated.
+        compensation: Reader of the recorded compensation of weight, creep and temperature.
     """
 
     def __init__(self, bag: Bag, topic: str) -> None:
@@ -75,27 +75,29 @@ class Recording:
                 self.settings.append(settings)
         if not self.infos:
             raise BagError(f"{bag.path}: {reason}") from None
-        stamps = [stamp_ns(info) for info in self.infos]
-        self._since_ns = np.array(stamps)
+        since_ns = [stamp_ns(info) for info in self.infos]
+        self._since_ns = np.array(since_ns)
         # The recorded stress, which states the health, is read only when `health_at` is called.
         self._health = RecordedHealthReader(bag, topic)
-        self.compensation = CompensationReader(bag, topic, cube_poses(self.infos[-1]))
+        poses = cube_poses(self.infos[-1])
+        self.compensation = CompensationReader(bag, topic, poses)
 
     def __repr__(self) -> str:
-        return f"Recording({self.infos[-1].name!r} of {self._bag.path}: {len(self.infos)} infos)"
+        name, count = self.infos[-1].name, len(self.infos)
+        return f"Recording({name!r} of {self._bag.path}: {count} infos)"
 
     @property
     def skin(self) -> Skin:
         """The skin (cubes, their poses and calibrations) in the last SkinInfo message."""
         return recorded_skin(self.infos[-1], self.settings[-1].calibrations)
 
-    def number_at(self, newest_ns: Any) -> Any:
+    def info_index_at(self, newest_ns: Any) -> Any:
         """Return the index in `infos` of the SkinInfo that applies to a message of frequencies.
 
         A SkinInfo message contains the cubes' poses, calibrations and rest frequencies.
 
-        A SkinInfo applies to rows whose stamps are not before its own: the reconstruction node
-        stamps it just after the last row that it reconstructed with the previous one.
+        A SkinInfo applies to rows with its stamp or later ones: the reconstruction node stamps it
+        just after the last row that it reconstructed with the previous SkinInfo.
 
         Args:
             newest_ns: Stamp of the newest row of the message, in ns since the Unix epoch; or an
@@ -104,27 +106,27 @@ class Recording:
         Returns:
             An index, or an array (M,) of indices.
         """
-        number = np.searchsorted(self._since_ns, newest_ns, side="right") - 1
-        # For messages before the first SkinInfo nothing better is known than that first one.
-        return np.maximum(number, 0)
+        n_earlier = np.searchsorted(self._since_ns, newest_ns, side="right")
+        # The first SkinInfo is the best known one for messages before it, too.
+        return np.maximum(n_earlier - 1, 0)
 
     def settings_at(self, rows: FrequencyRows) -> Settings:
         """Return the calibrations and rest frequencies that applied to the rows of one message.
 
-        A rest frequency is the frequency of a pad without load, a row one sample of one cube.
+        A rest frequency is the frequency of a pad without load; a row is one sample of one cube.
         """
         newest_ns = rows.stamp_ns.max(initial=0)
-        number = int(self.number_at(newest_ns))
+        number = int(self.info_index_at(newest_ns))
         return self.settings[number]
 
     def health_at(self, rows: FrequencyRows) -> RecordedHealth:
-        """Return the health of the pads that the reconstruction found when rows were recorded.
+        """Return the health of the pads that was found when these rows were recorded.
 
         The health states which pads were left out as faulty, and why. Calls in the order of
         recording are fastest, because the bag is then read only once.
 
         Args:
-            rows: Rows of frequencies (samples of cubes) for whose pads the health is wanted.
+            rows: Rows of frequencies (samples of cubes).
         """
         return self._health.health_at(rows)
 
@@ -134,9 +136,11 @@ class Recording:
         Raises:
             BagError: The calibration of a cube changes from one SkinInfo message to another.
         """
-        first = self.settings[0].calibrations
-        expected = [one.id for one in first]
-        if any([one.id for one in other.calibrations] != expected for other in self.settings):
+        ids = {
+            tuple(calibration.id for calibration in settings.calibrations)
+            for settings in self.settings
+        }
+        if len(ids) > 1:
             raise BagError(
                 f"{self._bag.path}: the calibrations change within the recording: "
                 "reprocess it instead"
@@ -146,25 +150,25 @@ class Recording:
 def skin_infos(bag: Bag, topic: str) -> list[Any]:
     """Return the SkinInfo messages of the skin whose frequencies are on a topic.
 
-    Those of the reconstruction node are preferred, because they contain the rest frequencies after
-    a tare (measurement without load). The driver's messages on `driver/info` contain only those of
-    the calibration, and are used only if no reconstruction was recorded.
+    The messages of the reconstruction node are preferred, because they contain the rest frequencies
+    that the last tare (measurement without load) found. The driver's messages on `driver/info`
+    contain those of the calibration, and are used only if no reconstruction was recorded.
 
     Args:
         bag: Open bag.
-        topic: Topic of the frequencies; its prefix is that of the skin's topics.
+        topic: Topic of the frequencies, whose prefix all topics of the skin share.
 
     Raises:
         BagError: The bag has no SkinInfo message of this skin.
     """
     skin = topic.removesuffix("frequencies")
-    own, of_driver = f"{skin}info", f"{skin}driver/info"
+    driver_topic = f"{skin}driver/info"
     try:
-        infos = bag.infos(own)
+        infos = bag.infos(f"{skin}info")
     except BagError:
-        if of_driver not in bag.topics(INFO):
+        if driver_topic not in bag.topics(INFO):
             raise
-        infos = bag.infos(of_driver)
+        infos = bag.infos(driver_topic)
     reconstructed = [info for info in infos if info.sender == "reconstruction"]
     return reconstructed or infos
 
@@ -181,8 +185,8 @@ def reconstruct_rows(
         rows: Rows of frequencies.
         health: Health of the pads as recorded; None: it is determined from the frequencies alone.
     """
-    # If the recording states the health of every row, it is not determined again, which saves two
-    # fifths of the time.
+    # If the health of every row is recorded, it is not determined again, which makes the
+    # reconstruction two fifths faster.
     if health is not None and health.known.all():
         return reconstructor.process_known(rows, health)
     return reconstructor.process(rows, health)
@@ -196,7 +200,7 @@ def settings_of(info: Any) -> Settings:
             that is not the number of the cube's pads, or one that is not above 0.
     """
     calibrations = cube_calibrations(info)
-    # A skin without cubes cannot be reconstructed; the table of rest frequencies would be empty.
+    # A skin without cubes cannot be reconstructed, and the steps below require at least one cube.
     if not calibrations:
         raise MessageError(f"info of the skin {info.name}: it has no cubes")
     rest = []
@@ -234,7 +238,8 @@ def recorded_skin(info: Any, calibrations: tuple[Calibration, ...]) -> Skin:
     links = tuple(SkinLink(name, "recorded", 0, None) for name in names)
     cubes = []
     for cube, calibration in zip(info.cubes, calibrations, strict=True):
-        position, q = cube.pose.position, cube.pose.orientation
+        position = cube.pose.position
+        q = cube.pose.orientation
         quaternion = np.array([q.x, q.y, q.z, q.w])
         roll, pitch, yaw = rpy_from_quaternion(quaternion).tolist()
         cubes.append(
@@ -248,8 +253,9 @@ def recorded_skin(info: Any, calibrations: tuple[Calibration, ...]) -> Skin:
                 calibration=calibration,
             )
         )
-    # A frame id is the prefix of the launch file, and the names of skin and cube.
-    frame_prefix = info.cubes[0].frame_id.removesuffix(f"{info.name}_{cubes[0].name}")
+    # A frame id consists of a prefix, which the launch file sets, and the names of skin and cube.
+    unprefixed = f"{info.name}_{cubes[0].name}"
+    frame_prefix = info.cubes[0].frame_id.removesuffix(unprefixed)
     return Skin(
         name=info.name,
         parent_frame=info.header.frame_id,

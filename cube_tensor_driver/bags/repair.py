@@ -70,8 +70,8 @@ storage file."""
 
 
 METADATA_ROOM = 1 << 16
-"""Space, in bytes, that the repair of an MCAP file leaves free on a disk that is full. The bag's
-metadata.yaml, which is written after it, needs a few kB."""
+"""Space, in bytes, that the repair of an MCAP file leaves free on the disk for the bag's
+metadata.yaml, which is written afterwards and needs a few kB."""
 
 
 class Repaired(NamedTuple):
@@ -93,8 +93,8 @@ def repair(path: Path, keep_rest: bool = True) -> Repaired:
 
     Args:
         path: Folder of the bag, or one of its files.
-        keep_rest: Whether the bytes that are cut off are kept in a file beside the storage file,
-            whose name ends in `REST_SUFFIX`.
+        keep_rest: Whether the bytes that are cut off are saved in another file, with the suffix
+            `REST_SUFFIX`, in the folder of the storage file.
 
     Raises:
         BagError: There is no bag, it has no complete message, it is still being recorded, or it
@@ -118,8 +118,9 @@ def _repair_folder(folder: Path, keep_rest: bool) -> Repaired:
     # lost their ends after the recording.
     cut = damaged = 0
     for path in _storage_files(folder):
-        one_cut, one_damaged = _repair_file(path, keep_rest)
-        cut, damaged = cut + one_cut, damaged + one_damaged
+        cut_here, damaged_here = _repair_file(path, keep_rest)
+        cut += cut_here
+        damaged += damaged_here
     paths = _storage_files(folder)  # files without a complete chunk have been removed
     existing = {path.suffix for path in paths}
     storages = [name for name, suffix in SUFFIXES.items() if suffix in existing]
@@ -131,7 +132,8 @@ def _repair_folder(folder: Path, keep_rest: bool) -> Repaired:
         raise BagError(f"{folder}: .mcap beside .db3 files; move one kind to another folder")
     summaries = [_summary(path) for path in paths]
     write_metadata(folder, storages[0], summaries)
-    return Repaired(sum(summary.msgcount for summary in summaries), cut, damaged)
+    messages = sum(summary.msgcount for summary in summaries)
+    return Repaired(messages, cut, damaged)
 
 
 def _storage_files(folder: Path) -> list[Path]:
@@ -144,24 +146,23 @@ def _storage_files(folder: Path) -> list[Path]:
     with suppress(BagError):
         listed = [path.name for path in read_metadata(folder).paths]
 
-    def place(path: Path) -> tuple[int, int, str]:
+    def sort_key(path: Path) -> tuple[int, int, str]:
         """Return the position in metadata.yaml, the number in the name, and the name of a file."""
         position = listed.index(path.name) if path.name in listed else len(listed)
         return position, file_number(path.stem), path.name
 
     paths = (path for path in folder.iterdir() if path.suffix in SUFFIXES.values())
-    return sorted(paths, key=place)
+    return sorted(paths, key=sort_key)
 
 
 def file_number(stem: str) -> int:
     """Return the number that rosbag2 gave a storage file of a bag, counted from 0.
 
     Args:
-        stem: Name of the file without suffix: number, prefix and time since ROS 2 Lyrical, as in
-            ``10_run_2026_05_01-10_30_00``; prefix and number before, as in ``run_10``. The result
-            for any other name is 0.
+        stem: Name of the file without suffix. From ROS 2 Lyrical on it is number, prefix and time,
+            such as ``10_run_2026_05_01-10_30_00``; in older versions it is prefix and number, such
+            as ``run_10``. The result for any other name is 0.
     """
-    # Numbers are compared, because text would sort _10 before _2.
     dated = _DATED_NAME.fullmatch(stem)
     digits = dated[1] if dated else stem.rpartition("_")[2]
     return int(digits) if digits.isdecimal() else 0
@@ -183,8 +184,8 @@ def _repair_file(path: Path, keep_rest: bool) -> tuple[int, int]:
         _check_not_recorded(path)
         if path.suffix == SUFFIXES["mcap"]:
             return _repair_mcap(path, keep_rest)
-        # SQLite undoes an unfinished transaction by itself when a database is read that was opened
-        # with write permission.
+        # SQLite itself rolls back an unfinished transaction at the first read of a database that is
+        # opened with write permission.
         with closing(sqlite3.connect(path)) as database:
             database.execute("SELECT count(*) FROM messages")
         return 0, 0
@@ -197,8 +198,8 @@ def _repair_mcap(path: Path, keep_rest: bool) -> tuple[int, int]:
 
     Args:
         path: The MCAP file; it is removed if it has no complete chunk.
-        keep_rest: Whether the bytes that are cut off are kept in a file beside it, whose name ends
-            in `REST_SUFFIX`.
+        keep_rest: Whether the bytes that are cut off are saved in another file, with the suffix
+            `REST_SUFFIX`, in the same folder.
 
     Returns:
         Number of bytes that were cut off, and number of damaged chunks that were left out.
@@ -206,27 +207,30 @@ def _repair_mcap(path: Path, keep_rest: bool) -> tuple[int, int]:
     size = path.stat().st_size
     is_complete = _has_summary(path)
     # An intact summary does not prove that the chunks are intact, so all of them are read.
-    salvaged = _Salvaged(path)
+    salvaged = _SalvagedChunks(path)
     if is_complete and not salvaged.damaged:
         return 0, 0
     if keep_rest and not is_complete and size > salvaged.end:
-        # The rest is copied before the file is cut, so that a full disk cannot lose it.
+        # The bytes after the last complete chunk are copied before they are cut off, so that they
+        # are not lost if the disk is full.
         rest_path = path.with_name(path.name + REST_SUFFIX)
         with path.open("rb") as stream, rest_path.open("wb") as rest:
             stream.seek(salvaged.end)
             shutil.copyfileobj(stream, rest)
-    while salvaged.index.chunk_indexes and (missing := _complete(path, salvaged)):
+    while salvaged.index.chunk_indexes and (missing := _write_summary(path, salvaged)):
         if keep_rest:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        # The last messages are given up to make room for the summary, without which none is read.
-        os.truncate(path, max(len(MCAP_MAGIC), salvaged.end - missing))
-        salvaged = _Salvaged(path)
+        # The disk is full. The last messages are cut off to make room for the summary, because no
+        # message can be read without it.
+        kept = max(len(MCAP_MAGIC), salvaged.end - missing)
+        os.truncate(path, kept)
+        salvaged = _SalvagedChunks(path)
     if not salvaged.index.chunk_indexes:
         path.unlink()
     return 0 if is_complete else size - salvaged.end, salvaged.damaged
 
 
-def _complete(path: Path, salvaged: _Salvaged) -> int:
+def _write_summary(path: Path, salvaged: _SalvagedChunks) -> int:
     """Replace everything in an MCAP file after its last complete chunk by a new summary.
 
     A chunk is a block of messages; the summary lists topics and offsets of chunks.
@@ -238,7 +242,8 @@ def _complete(path: Path, salvaged: _Salvaged) -> int:
     Returns:
         0 if the summary is written; otherwise the free space, in bytes, that the disk lacks for it.
     """
-    # Without a buffer, a write that fails leaves nothing behind that would be written later.
+    # The stream is unbuffered. Otherwise bytes of a failed write would stay in the buffer and be
+    # written again when the stream is closed.
     with path.open("r+b", buffering=0) as stream:
         stream.truncate(salvaged.end)
         stream.seek(salvaged.end)
@@ -247,21 +252,22 @@ def _complete(path: Path, salvaged: _Salvaged) -> int:
         with suppress(OSError):
             if stream.write(summary + bytes(METADATA_ROOM)) == needed:
                 needed = 0
-        stream.truncate(salvaged.end + (0 if needed else len(summary)))
+        written = 0 if needed else len(summary)
+        stream.truncate(salvaged.end + written)
     return needed
 
 
 def _check_not_recorded(path: Path) -> None:
-    """Raise BagError if a process has a storage file open for writing, because it records into it.
+    """Raise BagError if a process has a storage file open for writing, as a recorder has.
 
-    A repair would cut off what that process writes next.
+    A repair would cut off what this process writes next.
     """
     try:
         import fcntl
 
         lease = fcntl.F_SETLEASE
     except (ImportError, AttributeError):
-        return  # only Linux tells who has a file open
+        return  # only Linux has leases, which tell whether another process has a file open
     with path.open("rb") as stream:
         # The kernel grants a read lease (fcntl(2)) only if nobody has the file open for writing.
         try:
@@ -284,7 +290,7 @@ def _has_summary(path: Path) -> bool:
     return True
 
 
-class _Salvaged:
+class _SalvagedChunks:
     """The complete chunks (blocks of messages) of an MCAP file that was cut off or damaged.
 
     Attributes:
@@ -315,8 +321,8 @@ class _Salvaged:
                     self.end = stream.tell()
                 elif opcode in (Opcode.DATA_END, Opcode.FOOTER):
                     break
-                # A damaged record is left out. The records after it are still used, because their
-                # offsets do not depend on its content.
+                # A damaged record is left out. The records after it can still be read, because the
+                # length in front of its content states where the next record begins.
                 try:
                     self._read_record(opcode, start, content)
                 except READ_ERRORS:
@@ -389,8 +395,8 @@ class _Salvaged:
         if chunk is None or len(index.records) != counts[index.channel_id]:
             raise ValueError("an index has another number of messages than its chunk")
         chunk.message_index_offsets[index.channel_id] = start
-        # Readers need the index records of all channels (topics) of a chunk. So the chunk is
-        # complete, and its messages count, only when the last index record has been read.
+        # Readers need the index records of all channels (topics) of a chunk, so the chunk only
+        # counts as complete when the last of them has been read.
         if chunk.message_index_offsets.keys() == counts.keys():
             self.end = start + RECORD_HEAD.size + len(content)
             chunk_end = chunk.chunk_start_offset + chunk.chunk_length
@@ -416,15 +422,16 @@ class _Salvaged:
             self.index.channels.setdefault(channel.id, channel)
 
 
-def _summary_bytes(salvaged: _Salvaged, name: str) -> bytes:
+def _summary_bytes(salvaged: _SalvagedChunks, name: str) -> bytes:
     """Return the records that follow the chunks of a complete MCAP file, up to its end.
 
     Args:
         salvaged: The complete chunks (blocks of messages) of the file.
         name: Name of the file in the bag's folder.
     """
-    index, chunks = salvaged.index, salvaged.index.chunk_indexes
-    index.statistics = statistics = Statistics(
+    index = salvaged.index
+    chunks = index.chunk_indexes
+    statistics = Statistics(
         attachment_count=0,
         channel_count=len(index.channels),
         channel_message_counts=dict(sorted(salvaged.counts.items())),
@@ -435,6 +442,7 @@ def _summary_bytes(salvaged: _Salvaged, name: str) -> bytes:
         metadata_count=1,
         schema_count=len(index.schemas),
     )
+    index.statistics = statistics
     # rosbag2 reads no messages from a file without this metadata record, although it takes the
     # topics from the summary.
     about = rosbag2_metadata(summarise(name, index))
@@ -470,9 +478,9 @@ def _summary_bytes(salvaged: _Salvaged, name: str) -> bytes:
 
 
 def _records(stream: BinaryIO) -> Iterator[tuple[int, int, bytes]]:
-    """Yield the complete records of an MCAP file from the current position on.
+    """Yield the complete records of an MCAP file, beginning at the stream's position.
 
-    It stops at a record that would end after the end of the file.
+    Reading stops at a record whose length exceeds the rest of the file.
 
     Yields:
         Opcode (type of the record), byte offset of the record from the start of the file, and its

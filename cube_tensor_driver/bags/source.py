@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -12,12 +12,13 @@ from typing import NamedTuple
 import numpy as np
 
 from ..config.skin import Skin
-from ..core.arrays import Array, Times
+from ..core.arrays import AnyArray, Array, Mask, Times
 from ..core.errors import BagError
 from ..core.rows import FrequencyRows
 from ..messages.codec import Decoded
 from ..messages.types import FREQUENCIES
 from .read import Bag
+from .recorded_compensation import RecordedCompensation
 from .recording import Recording
 
 
@@ -30,7 +31,7 @@ class Segment(NamedTuple):
         number: Index in `Recording.infos` of the SkinInfo message (calibrations and rest
             frequencies) with which these frequencies were reconstructed.
         states: States of creep and temperature, by name, that the reconstruction had before the
-            first of these messages; empty: it went on from the message before.
+            first of these messages; empty: it continued with its states after the message before.
     """
 
     messages: Decoded[FrequencyRows]
@@ -93,8 +94,11 @@ class BagSource:
 
     def statistics(self) -> dict[str, object]:
         """Return the numbers of messages and rows delivered so far, and of damaged messages."""
-        skipped = self.bag.skipped[self.topic]
-        return {"messages": self.messages, "rows": self.rows, "skipped": skipped}
+        return {
+            "messages": self.messages,
+            "rows": self.rows,
+            "skipped": self.bag.skipped[self.topic],
+        }
 
     def skip(self, segment: Segment, error: Exception) -> None:
         """Count the messages of a segment as left out instead of delivered.
@@ -111,47 +115,82 @@ class BagSource:
     def segments(self) -> Iterator[Segment]:
         """Yield all messages in the order of recording, with their rows (samples of cubes).
 
-        Each segment has successive messages of the same cubes to which one SkinInfo (calibrations
-        and rest frequencies) applies.
+        Each segment has successive messages with the same cubes, SkinInfo (calibrations and rest
+        frequencies) and compensation (removal of weight, creep and temperature).
 
         Raises:
             BagError: The bag is damaged.
         """
         for messages, recorded_ns in self.bag.frequencies(self.topic):
-            cube = messages.by_message(messages.rows.cube)
-            times_ns = messages.by_message(messages.rows.stamp_ns)
-            # A message without rows has no newest row, so its own stamp is used.
-            newest_ns = times_ns.max(axis=1) if times_ns.size else messages.stamp_ns
-            number = self.recording.number_at(newest_ns)
-            compensation = self.recording.compensation
-            recorded = [compensation.at(stamp_ns) for stamp_ns in messages.stamp_ns.tolist()]
+            yield from self._divide(messages, recorded_ns)
 
-            # A segment (messages reconstructed together) ends where the next message has other
-            # cubes, a newer SkinInfo message (calibrations, rest frequencies) applies, or the next
-            # message states what is compensated, or from which state on.
-            has_other_cubes = (cube[1:] != cube[:-1]).any(axis=1)
-            has_other_info = number[1:] != number[:-1]
-            has_motion = np.array([one.motion is not None for one in recorded])
-            has_other_effects = has_motion[1:] != has_motion[:-1]
-            has_states = np.array([bool(one.states) for one in recorded[1:]], bool)
-            is_end = has_other_cubes | has_other_info | has_other_effects | has_states
-            ends = np.flatnonzero(is_end) + 1
-            for begin, end in pairwise([0, *ends.tolist(), len(messages)]):
-                # A scan ends where the cube number does not rise. Messages are reconstructed
-                # together only if their scans stay apart, so that the health finds the same scans.
-                are_apart = len(cube[begin]) and cube[begin, 0] <= cube[begin, -1]
-                step = end - begin if are_apart else 1
-                for first in range(begin, end, step):
-                    chosen = slice(first, first + step)
-                    part = compensation.add_forces(messages.select(chosen), recorded[chosen])
-                    self.messages += len(part)
-                    self.rows += len(part.rows)
-                    yield Segment(
-                        messages=part,
-                        recorded_ns=recorded_ns[chosen],
-                        number=int(number[first]),
-                        states=recorded[first].states,
-                    )
+    def _divide(
+        self,
+        messages: Decoded[FrequencyRows],
+        recorded_ns: Times,
+    ) -> Iterator[Segment]:
+        """Divide successive messages of frequencies into segments.
+
+        Args:
+            messages: M messages of frequencies.
+            recorded_ns: (M,) time at which each was recorded, in ns since the Unix epoch.
+        """
+        cube = messages.by_message(messages.rows.cube)
+        info_index = self._find_infos(messages)
+        compensation = self.recording.compensation
+        recorded = [compensation.find(stamp_ns) for stamp_ns in messages.stamp_ns.tolist()]
+
+        begins = np.flatnonzero(_begins_segment(cube, info_index, recorded)) + 1
+        bounds = [0, *begins.tolist(), len(messages)]
+        for begin, end in pairwise(bounds):
+            # A scan (one row per cube, by rising cube index) ends where the index does not rise.
+            # If it rises into the next message, joining the messages would join their scans, which
+            # would change the health of the pads. Such messages become one segment each.
+            order = cube[begin]
+            can_join = len(order) and order[0] <= order[-1]
+            step = end - begin if can_join else 1
+            for first in range(begin, end, step):
+                chosen = slice(first, first + step)
+                part = compensation.add_forces(messages.select(chosen), recorded[chosen])
+                self.messages += len(part)
+                self.rows += len(part.rows)
+                yield Segment(
+                    messages=part,
+                    recorded_ns=recorded_ns[chosen],
+                    number=int(info_index[first]),
+                    states=recorded[first].states,
+                )
+
+    def _find_infos(self, messages: Decoded[FrequencyRows]) -> AnyArray:
+        """Return the indices (M,) in `Recording.infos` of the SkinInfo for each of M messages."""
+        times_ns = messages.by_message(messages.rows.stamp_ns)
+        # A message without rows has no newest row, so the stamp in its header is used.
+        newest_ns = times_ns.max(axis=1) if times_ns.size else messages.stamp_ns
+        return self.recording.info_index_at(newest_ns)
+
+
+def _begins_segment(
+    cube: AnyArray,
+    info_index: AnyArray,
+    recorded: Sequence[RecordedCompensation],
+) -> Mask:
+    """Return whether a new segment begins at each message, so that it is reconstructed separately.
+
+    Args:
+        cube: (M, N) cube index of each of N rows in M messages.
+        info_index: (M,) index of the SkinInfo (calibrations and rest frequencies) that applies.
+        recorded: Compensation of each message.
+
+    Returns:
+        (M - 1,) for all messages except the first: whether its cubes, its SkinInfo or the use of
+        weight compensation change, or it begins with recorded states of creep and temperature.
+    """
+    has_motion = np.array([one.motion is not None for one in recorded])
+    has_states = np.array([bool(one.states) for one in recorded])
+    has_other_cubes = (cube[1:] != cube[:-1]).any(axis=1)
+    has_other_info = info_index[1:] != info_index[:-1]
+    has_other_effects = has_motion[1:] != has_motion[:-1]
+    return has_other_cubes | has_other_info | has_other_effects | has_states[1:]
 
 
 def open_bag(path: Path | str, topic: str | None = None) -> BagSource:
@@ -159,7 +198,7 @@ def open_bag(path: Path | str, topic: str | None = None) -> BagSource:
 
     Args:
         path: Folder or file of the bag.
-        topic: Topic of the frequencies; None: that of the only skin in the bag.
+        topic: Topic of the frequencies; None: the topic of the only skin in the bag.
 
     Raises:
         BagError: There is no bag, no such topic, no SkinInfo message for it, or no topic was given
@@ -171,11 +210,10 @@ def open_bag(path: Path | str, topic: str | None = None) -> BagSource:
     try:
         topics = bag.topics(FREQUENCIES)
         if topic is None:
-            topic = f"{bag.skin()}frequencies"
+            topic = f"{bag.skin_prefix()}frequencies"
         elif topic not in topics:
-            raise BagError(
-                f"{path}: no frequencies on {topic}; there are {', '.join(topics) or 'none'}"
-            )
+            found = ", ".join(topics) or "none"
+            raise BagError(f"{path}: no frequencies on {topic}; there are {found}")
         return BagSource(bag, topic)
     except BaseException:
         bag.close()

@@ -109,7 +109,7 @@ class SqliteReader:
         Args:
             topics: Names of the topics to read.
             start_ns: Earliest time of recording that is read, in ns since the Unix epoch.
-            stop_ns: Time of recording, in ns, from which on nothing is read.
+            stop_ns: Time of recording, in ns since the Unix epoch, before which messages are read.
 
         Yields:
             The topic, the time of recording in ns, and the serialised message.
@@ -192,7 +192,8 @@ class SqliteWriter:
         Args:
             topic: Name of the topic.
             msgtype: Type of its messages, such as ``std_msgs/msg/String``.
-            definition: Text of the type's definition, with those of the types in it.
+            definition: Text of the type's definition, with the definitions of the types of its
+                fields.
             qos: Quality of service profiles that its publishers offered.
 
         Returns:

@@ -17,7 +17,7 @@ import pyarrow.parquet
 from ..core.arrays import AnyArray
 from ..core.errors import BagError, LayoutError
 from ..core.modes import GRADIENT, STRESS
-from ..core.rows import StressRows, concatenate
+from ..core.rows import FrequencyRows, StressRows, concatenate
 
 ROWS_PER_GROUP = 1 << 16
 """Number of rows (samples of cubes) that are written together, as one row group (independent block)
@@ -47,11 +47,12 @@ STRESS_SCHEMA = pyarrow.schema(
 def as_column(values: AnyArray) -> pyarrow.Array:
     """Return an array (N, …) as an Arrow column of N numbers, or of N nested lists of numbers."""
     column = pyarrow.array(np.ascontiguousarray(values).reshape(-1))
-    # Lists are nested from the last dimension to the first: each step joins `size` successive
-    # numbers or lists to one list.
+    # The innermost lists are made first: each step joins `size` successive numbers or lists to one
+    # list.
     for size in reversed(values.shape[1:]):
-        ends = size * np.arange(len(column) // size + 1, dtype=np.int32)
-        column = pyarrow.ListArray.from_arrays(ends, column)
+        n_lists = len(column) // size
+        offsets = size * np.arange(n_lists + 1, dtype=np.int32)
+        column = pyarrow.ListArray.from_arrays(offsets, column)
     return column
 
 
@@ -66,15 +67,27 @@ def as_array(column: pyarrow.Array) -> AnyArray:
     shape: list[int] = []
     while pyarrow.types.is_nested(column.type):
         column = column.drop_null()
-        lengths = pyarrow.compute.list_value_length(column).unique().to_pylist()
+        list_lengths = pyarrow.compute.list_value_length(column)
+        lengths = list_lengths.unique().to_pylist()
         if len(lengths) > 1:
             raise LayoutError(
                 f"lists of {lengths} numbers in one column; they must be equally long"
             )
         shape += lengths
         column = column.flatten()
-    values: AnyArray = column.to_numpy(zero_copy_only=False).reshape(-1, *shape)
-    return values
+    values: AnyArray = column.to_numpy(zero_copy_only=False)
+    return values.reshape(-1, *shape)
+
+
+def cube_column(rows: FrequencyRows | StressRows, cubes: pyarrow.Array) -> pyarrow.Array:
+    """Return the Arrow column with the name of the cube of each row (sample of a cube).
+
+    Args:
+        rows: N rows.
+        cubes: Names of the cubes by their indices, then a name for every index beyond them.
+    """
+    index = np.minimum(rows.cube, len(cubes) - 1)
+    return pyarrow.DictionaryArray.from_arrays(index.astype(np.int32), cubes)
 
 
 def stress_batch(rows: StressRows, cubes: pyarrow.Array) -> pyarrow.RecordBatch:
@@ -82,13 +95,11 @@ def stress_batch(rows: StressRows, cubes: pyarrow.Array) -> pyarrow.RecordBatch:
 
     Args:
         rows: N rows.
-        cubes: Names of the cubes by their indices. A row whose index is beyond the last name gets
-            the last name, for which callers pass "unknown".
+        cubes: Names of the cubes by their indices, then a name for every index beyond them.
     """
-    numbers = np.minimum(rows.cube, len(cubes) - 1).astype(np.int32)
     columns = [
         pyarrow.array(rows.stamp_ns),
-        pyarrow.DictionaryArray.from_arrays(numbers, cubes),
+        cube_column(rows, cubes),
         pyarrow.array(rows.sequence),
         *map(pyarrow.array, rows.stress.T),
         *map(pyarrow.array, rows.gradient.T),
@@ -113,7 +124,7 @@ def report_write_errors(path: Path) -> Iterator[None]:
 
 
 class BufferedTable:
-    """Base class of tables of stress, which collects rows (samples of cubes) to large parts."""
+    """Base class of tables of stress; it collects rows (samples of cubes) until a part is large."""
 
     def __init__(self, path: Path) -> None:
         """Begin an empty table of stress; `path` is the file or folder that errors name."""
@@ -157,8 +168,7 @@ class TableWriter(BufferedTable):
 
         Args:
             path: File to create; the format is CSV if its suffix is ``.csv``, otherwise Parquet.
-            cubes: Names of the cubes by their indices. A row whose index is beyond the last name
-                gets the last name, for which callers pass "unknown".
+            cubes: Names of the cubes by their indices, then a name for every index beyond them.
 
         Raises:
             BagError: The file cannot be written.
@@ -173,7 +183,8 @@ class TableWriter(BufferedTable):
                 self._schema = STRESS_SCHEMA.set(1, plain)
                 self._writer = pyarrow.csv.CSVWriter(str(path), self._schema)
             else:
-                # Measured values rarely repeat, so that dictionaries of them cost time and space.
+                # Measured values rarely repeat, so encoding them as a dictionary of distinct values
+                # would cost time and space.
                 self._writer = pyarrow.parquet.ParquetWriter(
                     str(path),
                     self._schema,

@@ -52,9 +52,8 @@ class ZarrWriter(BufferedTable):
 
         Args:
             path: Folder of the group, which is created or replaced.
-            cubes: Names of the cubes by their indices, stored as an attribute of the column `cube`.
-                An index beyond the last name is replaced by the last index, whose name is
-                "unknown" by convention.
+            cubes: Names of the cubes by their indices, then a name for every index beyond them.
+                They are stored as an attribute of the column `cube`.
 
         Raises:
             BagError: The installed library zarr is older than version 3.

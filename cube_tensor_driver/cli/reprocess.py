@@ -16,7 +16,7 @@ from ..core.defaults import CONTACT_METHODS
 from .parser import Parser, number
 
 if TYPE_CHECKING:
-    from ..bags.reprocess.contacts import ContactsOverTime
+    from ..bags.reprocess.contacts import ContactOptions
     from ..bags.reprocess.job import Overrides, ReprocessResult
 
 
@@ -165,14 +165,14 @@ def overrides_of(options: argparse.Namespace) -> Overrides:
     return Overrides(calibration, skin, tare)
 
 
-def contacts_of(options: argparse.Namespace) -> ContactsOverTime | None:
+def contacts_of(options: argparse.Namespace) -> ContactOptions | None:
     """Return the settings for computing contacts, or None without the option --contacts.
 
     Raises:
         ConfigError: The output format cannot contain contacts, or the node `contacts` would refuse
             the method or the value of a parameter.
     """
-    from ..bags.reprocess.contacts import ContactsOverTime
+    from ..bags.reprocess.contacts import ContactOptions
     from ..config.parameters import CONTACTS
     from ..core.errors import ConfigError
     from ..touch.contact_finder import ContactSettings
@@ -202,4 +202,4 @@ def contacts_of(options: argparse.Namespace) -> ContactsOverTime | None:
     rate = values.pop("rate")
     settings = ContactSettings(method, **values)
     settings.check()
-    return ContactsOverTime(settings, rate)
+    return ContactOptions(settings, rate)

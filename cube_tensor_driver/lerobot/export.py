@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..bags.read import Bag
-from ..bags.reprocess.job import reconstruct, settings_with
+from ..bags.reprocess.job import choose_settings, reconstruct
 from ..bags.source import open_bag
 from ..config.skin import Skin
 from ..core.arrays import AnyArray
@@ -328,7 +328,7 @@ def _stress_rows(
     """
     noted = data_set.calibrations
     with open_bag(plan.path, choices.frequencies) as source:
-        settings = settings_with(source, choices.overrides)
+        settings = choose_settings(source, choices.overrides)
         for segment, rows in reconstruct(source, choices.overrides):
             is_known = rows.cube < len(source.skin.cubes)
             known = rows.select(is_known)

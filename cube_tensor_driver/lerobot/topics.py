@@ -157,7 +157,7 @@ def find_topics(
     wanted = {topic for topic in chosen if topic}
     for path in paths:
         with Bag(path) as bag:
-            frequencies = choices.frequencies or f"{bag.skin()}frequencies"
+            frequencies = choices.frequencies or f"{bag.skin_prefix()}frequencies"
             prefix = frequencies.removesuffix("frequencies")
             for name, msgtype in _stamped_topics(bag, prefix):
                 existing.add(name)

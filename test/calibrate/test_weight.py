@@ -15,7 +15,7 @@ pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 from bag_maker import START_NS, header, info_of, message
 
 from cube_tensor_driver.bags.metadata import quality, typestore
-from cube_tensor_driver.bags.reprocess.job import Overrides, settings_with
+from cube_tensor_driver.bags.reprocess.job import Overrides, choose_settings
 from cube_tensor_driver.bags.source import open_bag
 from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.calibrate.weight import fit_weight
@@ -136,7 +136,7 @@ def test_a_tare_from_a_bag_is_that_of_a_cube_without_weight(tmp_path):
     folder = make_bag(tmp_path / "bag", [[0, 0, G], [G, 0, 0]], cubes=1, **heavy)
     with open_bag(folder) as source:
         first, second = (
-            settings_with(source, Overrides(tare=span))[0].rest_frequency
+            choose_settings(source, Overrides(tare=span))[0].rest_frequency
             for span in ((0.0, 4.0), (5.0, 9.0))
         )
     np.testing.assert_allclose(first, second, rtol=4e-5)

@@ -19,7 +19,7 @@ pytest.importorskip("pyarrow", reason="needs pyarrow: pip install pyarrow")
 pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 
 from cube_tensor_driver.bags.read import Bag
-from cube_tensor_driver.bags.reprocess.contacts import ContactsOverTime
+from cube_tensor_driver.bags.reprocess.contacts import ContactOptions
 from cube_tensor_driver.bags.reprocess.job import ReprocessJob, reprocess
 from cube_tensor_driver.bags.source import open_bag
 from cube_tensor_driver.bags.write import BagWriter
@@ -207,12 +207,12 @@ def test_contacts_and_traction_of_a_pressed_skin_live_and_out_of_a_bag(ros, tmp_
     with open_bag(bag) as source:
         assert source.skin.elastomer == ELASTOMER
     result = tmp_path / "out"
-    wanted = ContactsOverTime(ContactSettings(), rate=50.0)
+    wanted = ContactOptions(ContactSettings(), rate=50.0)
     reprocess(ReprocessJob(bag, result, "bag", contacts=wanted))
     stress = messages(result, "/stress")
     expected = [messages(result, topic) for topic in ("/contacts", "/traction")]
     stated = ContactSettings("inverse", depth=ELASTOMER.depth, poisson=ELASTOMER.poisson)
-    wanted = ContactsOverTime(stated, rate=50.0)
+    wanted = ContactOptions(stated, rate=50.0)
     reprocess(ReprocessJob(bag, tmp_path / "stated", "bag", contacts=wanted))
     assert messages(tmp_path / "stated", "/contacts") == expected[0]
     assert [len(one) for one in expected] == [SCANS, SCANS] and len(stress) == SCANS

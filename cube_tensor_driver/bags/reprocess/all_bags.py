@@ -15,7 +15,7 @@ from typing import Any
 
 from ...config.yaml import read_yaml, write_yaml
 from ...core.errors import BagError, CubeError
-from .contacts import ContactsOverTime
+from .contacts import ContactOptions
 from .job import PARTIAL_FOLDER, Overrides, ReprocessJob, ReprocessResult, reprocess
 
 SUFFIXES = {
@@ -24,7 +24,7 @@ SUFFIXES = {
     "csv": ".csv",
     "zarr": ".zarr",
 }
-"""Suffix of a reprocessed result for each output format."""
+"""Output format -> suffix of the file or folder with the reprocessed data."""
 
 RECIPE_NAME = "reprocess.yaml"
 """Name of the file in the folder of the results that states their format, calibrations, tare and
@@ -36,7 +36,7 @@ def make_jobs(
     folder: Path,
     form: str,
     overrides: Overrides,
-    contacts: ContactsOverTime | None = None,
+    contacts: ContactOptions | None = None,
 ) -> list[ReprocessJob]:
     """Return one job per bag, whose result has the name of the bag and the suffix of the format.
 
@@ -45,7 +45,7 @@ def make_jobs(
         folder: Folder of the results.
         form: Format of the results, a key of `SUFFIXES`.
         overrides: Calibrations and tare that replace those of the recordings.
-        contacts: Settings with which contacts are computed; None: no contacts are computed.
+        contacts: Options with which contacts are computed; None: no contacts are computed.
 
     Raises:
         BagError: Two bags have the same name, so that their results would be the same file.
@@ -70,17 +70,17 @@ def write_recipe(
     folder: Path,
     form: str,
     overrides: Overrides,
-    contacts: ContactsOverTime | None = None,
+    contacts: ContactOptions | None = None,
 ) -> None:
-    """Create the folder of the results and write into it how they are made (`RECIPE_NAME`).
+    """Create the folder of the results, with a file `RECIPE_NAME` that states their options.
 
-    With it, an interrupted run is only continued with the same options.
+    The file prevents that an interrupted run is continued with other options.
 
     Args:
         folder: Folder of the results.
         form: Format of the results, a key of `SUFFIXES`.
         overrides: Calibrations and tare that replace those of the recordings.
-        contacts: Settings with which contacts are computed; None: no contacts are computed.
+        contacts: Options with which contacts are computed; None: no contacts are computed.
 
     Raises:
         BagError: The folder has results that were made with other options, or cannot be written.
@@ -96,7 +96,7 @@ def write_recipe(
         settings = asdict(contacts.settings)
         recipe["contacts"] = {**settings, "rate": contacts.rate}
     path = folder / RECIPE_NAME
-    # A recipe without results was left by a run that failed before its first result, so it may be
+    # A recipe without results comes from a run that failed before its first result. It may be
     # replaced.
     if path.exists() and has_results(folder):
         if read_yaml(path) != recipe:

@@ -27,12 +27,12 @@ from ..write import BagWriter
 
 
 @dataclass(frozen=True)
-class ContactsOverTime:
-    """Settings with which the contacts of a bag are computed.
+class ContactOptions:
+    """Options with which contacts are computed from the stress of a bag.
 
     Attributes:
         settings: Method of contact estimation and its parameters.
-        rate: Largest number of messages of contacts per second, in Hz.
+        rate: Maximum rate of the computed messages of contacts, in Hz.
     """
 
     settings: ContactSettings
@@ -50,18 +50,20 @@ class ContactWriter:
         self,
         writer: BagWriter,
         topics: str,
-        wanted: ContactsOverTime,
+        options: ContactOptions,
     ) -> None:
         """Add the topics of contacts and traction to a bag.
 
         Args:
             writer: The bag that is being written.
             topics: Common prefix of the names of the skin's topics, which ends in "/".
-            wanted: Settings with which contacts are computed.
+            options: Method of contact estimation, and rate of the messages.
         """
-        self._writer, self._wanted = writer, wanted
-        self._period_ns = 1e9 / wanted.rate
-        self._contacts, self._traction = f"{topics}contacts", f"{topics}traction"
+        self._writer = writer
+        self._settings = options.settings
+        self._period_ns = 1e9 / options.rate
+        self._contacts = f"{topics}contacts"
+        self._traction = f"{topics}traction"
         writer.add_topic(self._contacts, CONTACTS, [quality()])
         writer.add_topic(self._traction, TRACTION, [quality(depth=2)])
         self._geometry: list[object] | None = None
@@ -72,9 +74,9 @@ class ContactWriter:
     def set_up(self, info: Any) -> None:
         """Use a SkinInfo message (poses and calibrations of the cubes) for the stress that follows.
 
-        If frame, elastomer, and names, poses and sizes of the cubes are those of the message
-        before, the tracked contacts continue. Otherwise contact estimation begins anew. The ROS
-        node `contacts` does the same.
+        If the frame, the elastomer, and the names, poses and sizes of the cubes are the same as in
+        the previous SkinInfo, the tracked contacts continue. Otherwise contact estimation starts
+        without contacts, as in the ROS node `contacts`.
 
         Raises:
             CubeError: Contacts cannot be computed on a skin with these cubes.
@@ -82,13 +84,14 @@ class ContactWriter:
         if self._geometry == geometry(info):
             return
         self._finder = contact_finder(
-            self._wanted.settings,
+            self._settings,
             cube_poses(info),
             cube_calibrations(info),
             skin_elastomer(info),
         )
         self._latest = LatestStress(len(info.cubes))
-        self._geometry, self._frame_id = geometry(info), info.header.frame_id
+        self._geometry = geometry(info)
+        self._frame_id = info.header.frame_id
 
     def write(
         self,
@@ -113,33 +116,34 @@ class ContactWriter:
             self._write(stamp_ns, int(recorded_ns[number]))
 
     def _is_due(self, stamp_ns: int) -> bool:
-        """Return whether contacts are due: a period has passed since the last, or time jumped back.
+        """Return whether one period has passed since contacts were due, or time has jumped back.
 
         Args:
-            stamp_ns: Stamp of the message of frequencies, in ns since the Unix epoch. If contacts
-                are due, it is remembered as the start of the next period.
+            stamp_ns: Stamp of the message of frequencies, in ns since the Unix epoch. If the result
+                is true, the next period starts at this stamp.
         """
-        last = self._last_ns
-        if last is not None and 0 <= stamp_ns - last < self._period_ns:
-            return False
+        if self._last_ns is not None:
+            elapsed_ns = stamp_ns - self._last_ns
+            if 0 <= elapsed_ns < self._period_ns:
+                return False
         self._last_ns = stamp_ns
         return True
 
     def _write(self, stamp_ns: int, recorded_ns: int) -> None:
-        """Compute contacts and traction from the newest stress of each cube and write them.
+        """Write the contacts and traction of the newest stress of each cube, if they are due.
 
-        They are written if they are due. Otherwise, the contacts are written with their new states
-        if one has begun to slip.
+        Between two due times, only the contacts are written, and only when one begins to slip.
 
         Args:
             stamp_ns: Stamp of the messages, in ns since the Unix epoch.
-            recorded_ns: Time of recording that the bag states for them, in ns.
+            recorded_ns: Time of recording of the messages, in ns since the Unix epoch.
         """
         if self._finder is None:
             raise BagError(f"{self._contacts}: no info says where the cubes are; record info")
-        health = self._latest.health(stamp_ns * 1e-9, STALE_S)
+        finder = self._finder
+        time_s = stamp_ns * 1e-9
+        health = self._latest.health(time_s, STALE_S)
         values = self._latest.usable_values(health)
-        finder, time_s = self._finder, stamp_ns * 1e-9
         is_due = self._is_due(stamp_ns)
         begins_to_slip = finder.follow(time_s, values)
         if is_due:
@@ -147,7 +151,11 @@ class ContactWriter:
         elif not begins_to_slip:
             return
         message = contacts_message(
-            make_message, stamp_ns, self._frame_id, finder.contacts, finder.slip
+            make_message,
+            stamp_ns,
+            self._frame_id,
+            finder.contacts,
+            finder.slip,
         )
         self._writer.write(self._contacts, recorded_ns, serialise(message))
         cloud = finder.cloud(values) if is_due else None

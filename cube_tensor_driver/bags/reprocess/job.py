@@ -34,14 +34,14 @@ from ..recording import Settings, reconstruct_rows
 from ..source import BagSource, Segment
 from ..tables import TableWriter
 from ..write import BagWriter
-from .contacts import ContactsOverTime, ContactWriter
+from .contacts import ContactOptions, ContactWriter
 
 if TYPE_CHECKING:
     from ..zarr_table import ZarrWriter
 
 PARTIAL_FOLDER = ".partial"
-"""Name of the folder, beside the results, in which incomplete results lie. After an interruption
-they are made again from the start."""
+"""Name of the folder, beside the results, for incomplete results. After an interruption, incomplete
+results are computed again from the start."""
 
 WORKING_BLOCK_BYTES = 30 << 20
 """Size, in bytes, of a memory block that is allocated and freed once before reprocessing.
@@ -93,7 +93,7 @@ class ReprocessJob:
         output: Folder or file to write.
         form: Format of the output: bag, parquet, csv or zarr.
         overrides: Calibrations and tare that replace those of the recording.
-        contacts: Settings with which contacts are computed and written into an output bag; None: no
+        contacts: Options with which contacts are computed and written into an output bag; None: no
             contacts are computed.
     """
 
@@ -101,7 +101,7 @@ class ReprocessJob:
     output: Path
     form: str
     overrides: Overrides = AS_RECORDED
-    contacts: ContactsOverTime | None = None
+    contacts: ContactOptions | None = None
 
 
 class ReprocessResult(NamedTuple):
@@ -127,9 +127,9 @@ def reprocess(job: ReprocessJob) -> ReprocessResult:
         BagError: The bag is damaged, the overrides do not fit its cubes, or the output cannot be
             written.
     """
-    # Freeing this block makes the allocator keep the memory of one batch for the next.
+    # Freeing this block makes the allocator reuse the memory of each batch for the next one.
     np.empty(WORKING_BLOCK_BYTES, np.uint8)
-    # The incomplete output must lie in the same file system as the final one to be renamed.
+    # Renaming the complete output requires that both names are in the same file system.
     partial = job.output.parent / PARTIAL_FOLDER / job.output.name
     try:
         partial.parent.mkdir(parents=True, exist_ok=True)
@@ -183,11 +183,11 @@ def reconstruct(
     Raises:
         BagError: The bag is damaged, or the overrides do not fit its cubes.
     """
-    settings = settings_with(source, overrides)
+    settings = choose_settings(source, overrides)
     return _reconstruct(source, settings, use_health=not overrides.any)
 
 
-def settings_with(source: BagSource, overrides: Overrides) -> list[Settings]:
+def choose_settings(source: BagSource, overrides: Overrides) -> list[Settings]:
     """Return the calibrations and rest frequencies to use for each SkinInfo message of a bag.
 
     A rest frequency is the frequency of a pad without load, as a tare measures it.
@@ -221,7 +221,7 @@ def _reprocess(
 
     Args:
         bag: The open bag.
-        job: Format, overrides and settings of contacts.
+        job: Output format, overrides and options of contacts.
         output: Folder or file to write, which is renamed when it is complete.
     """
     topics = bag.topics(FREQUENCIES)
@@ -256,18 +256,18 @@ def _write_skin(
     job: ReprocessJob,
     writer: BagWriter,
 ) -> None:
-    """Write SkinInfo messages, stress and, if the job has settings for them, contacts of one skin.
+    """Write the SkinInfo messages, stress and, if the job has options for them, contacts of a skin.
 
     Args:
         source: The recorded frequencies of the skin.
-        job: Overrides and settings of contacts.
+        job: Overrides and options of contacts.
         writer: The bag to write into.
     """
     bag, skin = source.bag, source.topic.removesuffix("frequencies")
-    settings = settings_with(source, job.overrides)
+    settings = choose_settings(source, job.overrides)
     writer.add_topic(f"{skin}info", INFO, [quality(latched=True)])
     writer.add_topic(f"{skin}stress", STRESS, [quality()])
-    infos = list(_infos_with(source.recording.infos, settings))
+    infos = list(_replace_settings(source.recording.infos, settings))
     for info in infos:
         # A SkinInfo message can be stamped before or after the recording. It is written at a time
         # within the recording, so that the output has the same start and end.
@@ -314,9 +314,11 @@ def _reconstruct(
         if segment.number != number:
             number = segment.number
             current = settings[number]
-            # A new reconstructor forgets the health of the pads. A tare changes only rest
-            # frequencies, so the health continues; other calibrations require a new start.
-            if ids != (ids := [one.id for one in current.calibrations]):
+            new_ids = [one.id for one in current.calibrations]
+            # A tare changes only rest frequencies and must not reset the tracked health of the
+            # pads. Therefore only other calibrations require a new reconstructor.
+            if new_ids != ids:
+                ids = new_ids
                 reconstructor = Reconstructor(current.calibrations)
             reconstructor.rest_frequency = current.rest_frequency
         if use_health:
@@ -324,7 +326,8 @@ def _reconstruct(
         try:
             stress = reconstruct_rows(reconstructor, rows, health)
         except CubeError as error:
-            # The node refused these messages, too, as those with another number of pads.
+            # These messages do not fit the skin, for example in the number of pads. The ROS node
+            # leaves them out, too.
             refused = error
             source.skip(segment, error)
             continue
@@ -344,7 +347,7 @@ def _recalibrate(
     Rest frequencies that a tare (measurement without load) found are kept.
 
     Args:
-        source: The recorded frequencies, whose bag errors name.
+        source: The recorded frequencies. Errors name the bag that they come from.
         info: SkinInfo message with the names and uids of the cubes.
         recorded: Calibrations and rest frequencies in this message.
         overrides: Calibration of all cubes, or a skin with calibrations of the same cubes.
@@ -357,9 +360,9 @@ def _recalibrate(
         by_name = {cube.name: cube.calibration for cube in overrides.skin.cubes}
         missing = [cube.name for cube in info.cubes if cube.name not in by_name]
         if missing:
+            names = ", ".join(missing[:MAX_NAMED_CUBES])
             raise BagError(
-                f"{path}: the skin file {overrides.skin.name} has no cubes "
-                f"{', '.join(missing[:MAX_NAMED_CUBES])}; the bag has"
+                f"{path}: the skin file {overrides.skin.name} has no cubes {names}; the bag has"
             )
         calibrations = [by_name[cube.name] for cube in info.cubes]
     else:
@@ -413,7 +416,8 @@ def _measure_rest(
     count = np.zeros(exists.shape)
     begin_ns = bag.start_ns + round(begin_s * 1e9)
     end_ns = bag.start_ns + round(end_s * 1e9)
-    # Weight is no load: a tare holds in every pose. Creep follows loads, of which there are none.
+    # Weight is compensated, so that the rest frequencies are valid in every pose of the skin.
+    # Creep is not, because it only follows a load, and a tare requires that there is none.
     compensation = Compensation(pipeline)
     for rows in BagSource(bag, source.topic):
         rows = rows.select(rows.cube < len(exists))
@@ -422,13 +426,16 @@ def _measure_rest(
         out = pipeline.make_rows(rows)
         compensation.process(rows, None, watch=None, known=None, out=out, offset=offset)
         inside = (rows.stamp_ns >= begin_ns) & (rows.stamp_ns < end_ns)
-        rows, cube, offset = rows.select(inside), cube[inside], offset[inside]
+        rows = rows.select(inside)
         if not len(rows):
             continue
-        frequency = rows.frequency / pipeline.unloaded_factor(cube, rows.temperature, offset)
+        cube = cube[inside]
+        factor = pipeline.unloaded_factor(cube, rows.temperature, offset[inside])
+        frequency = rows.frequency / factor
         pads = np.arange(frequency.shape[1])
         is_faulty = rows.pad_fault[:, np.newaxis] >> pads & 1 > 0
-        is_usable = np.isfinite(frequency) & (frequency > 0) & ~is_faulty
+        is_valid = np.isfinite(frequency) & (frequency > 0)
+        is_usable = is_valid & ~is_faulty
         usable = np.where(is_usable, frequency, 0)
         np.add.at(total, cube, usable)
         np.add.at(count, cube, is_usable)
@@ -447,8 +454,8 @@ def _measure_rest(
     return np.where(exists, mean, np.nan)
 
 
-def _infos_with(infos: list[Any], settings: list[Settings]) -> Iterator[Any]:
-    """Yield the recorded SkinInfo messages with other calibrations and rest frequencies.
+def _replace_settings(infos: list[Any], settings: list[Settings]) -> Iterator[Any]:
+    """Yield the recorded SkinInfo messages with replaced calibrations and rest frequencies.
 
     A rest frequency is the frequency of a pad without load.
 
@@ -458,8 +465,8 @@ def _infos_with(infos: list[Any], settings: list[Settings]) -> Iterator[Any]:
     """
     covariances: dict[str, Array] = {}
     for info, current in zip(infos, settings, strict=True):
-        # A SkinInfo message contains each calibration once, even if several cubes share it. Its
-        # text and covariance are taken from the first cube that has the calibration.
+        # A SkinInfo message contains each calibration once, even if several cubes share it. The
+        # calibration's text and covariance are taken from the first of these cubes.
         numbered = reversed(list(enumerate(current.calibrations)))
         first_cube = {calibration.id: number for number, calibration in numbered}
         if not first_cube.keys() <= covariances.keys():

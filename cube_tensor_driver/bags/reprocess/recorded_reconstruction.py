@@ -47,8 +47,8 @@ class RecordedReconstruction:
     def health_at(self, rows: FrequencyRows, reconstructor: Reconstructor) -> RecordedHealth:
         """Return the recorded health (which pads were left out, and why) for rows of one message.
 
-        The rest frequencies (without load) that applied when these rows were recorded are also set
-        in the reconstructor.
+        The rest frequencies (without load) that applied when these rows were recorded are set in
+        the reconstructor.
 
         Args:
             rows: Rows (samples of cubes) of one message of frequencies.
@@ -65,14 +65,17 @@ class RecordedReconstruction:
         return self._source.recording.health_at(rows)
 
     def compensation_at(self, stamp_ns: int, reconstructor: Reconstructor) -> Motion | None:
-        """Return the recorded motion of the skin for a message; None: weight is not compensated.
+        """Return the recorded motion of the skin, which the compensation of its weight requires.
 
-        States of creep and temperature that are recorded for it are set in the reconstructor.
+        The recorded states of creep and temperature are set in the reconstructor.
 
         Args:
             stamp_ns: Stamp of the message of frequencies, in ns since the Unix epoch.
-            reconstructor: The reconstructor that will process its rows.
+            reconstructor: The reconstructor that will process the rows of this message.
+
+        Returns:
+            The motion; None: weight was not compensated.
         """
-        recorded = self._source.recording.compensation.at(stamp_ns)
+        recorded = self._source.recording.compensation.find(stamp_ns)
         reconstructor.compensation.restore(recorded.states)
         return recorded.motion

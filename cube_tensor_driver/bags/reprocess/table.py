@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Arrow tables of frequencies, and the function that computes tables of stress from them.
 
-Engines for many recordings (Ray, Dask, Daft, DuckDB) pass Arrow tables between their workers.
+Frameworks that process many recordings in parallel (Ray, Dask, Daft, DuckDB) pass Arrow tables
+between their worker processes.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from ...core.reconstructor import CalibratedSkin, Reconstructor, RecordedHealth
 from ...core.rows import FrequencyRows
 from ..recording import reconstruct_rows
 from ..source import BagSource
-from ..tables import STRESS_SCHEMA, as_array, as_column, stress_batch
+from ..tables import STRESS_SCHEMA, as_array, as_column, cube_column, stress_batch
 
 COLUMNS = {
     "cube": "cube",
@@ -32,27 +33,35 @@ COLUMNS = {
     "status": "status",
     "specific_force_m_per_s2": "specific_force",
 }
-"""Column of a table of frequencies -> attribute of `FrequencyRows` that it contains. Frequencies
-(one per pad) and specific forces (x, y, z) are lists. A cube is its name."""
+"""Column of a table of frequencies -> attribute of `FrequencyRows` that it contains.
+
+Frequencies (one per pad) and specific forces (x, y, z) are lists. The column `cube` contains names.
+"""
 
 REQUIRED = {"stamp_ns", "cube", "frequency_Hz"}
 """Columns that a table of frequencies must have; the others may be missing or null."""
+
+NUMBER_LIST = pyarrow.list_(pyarrow.float64())
+"""Arrow type of the columns with one list of numbers per row."""
 
 
 def frequency_table(source: BagSource) -> pyarrow.Table:
     """Read the frequencies of a whole bag into an Arrow table, one row per sample of a cube.
 
-    Beside the columns of `COLUMNS`, the table has what the stress also depends on:
+    Besides the columns of `COLUMNS`, the table has columns with everything else that determines the
+    stress:
 
     - `part` (int32): number of the group of consecutive rows that are computed together.
     - `recorded_left_out`, `recorded_status`: pads that were left out and the conditions of the pads
       (bits of `status.py`) as the recorded stress states them; null where none was recorded.
-    - `recorded_rest_frequency`: frequencies without load of all pads of all cubes, in Hz, in the
-      first row to which they apply; null elsewhere. `recorded_creep` and `recorded_thermal`, where
-      these effects are compensated: likewise their states before the row.
+    - `recorded_rest_frequency`: frequencies without load of all pads of all cubes, in Hz. The value
+      is in the first row to which it applies; the rows after it are null.
+    - `recorded_creep`, `recorded_thermal`: states of creep and of the lagging temperature before
+      the row; null where no state was recorded. The table has them only if the recording
+      compensated these effects.
 
     Args:
-        source: An open bag, of which nothing was read yet.
+        source: An open bag from which no frequencies have been read yet.
 
     Raises:
         BagError: The bag is damaged, or the calibration of a cube changes within it.
@@ -61,6 +70,7 @@ def frequency_table(source: BagSource) -> pyarrow.Table:
     recording.check_calibrations_stay()
     cubes = pyarrow.array([*source.skin.names, "unknown"])
     number = -1
+    # Values that apply from the next row on: rest frequencies, states of creep and temperature.
     changes: dict[str, Array] = {}
     parts: list[pyarrow.Table] = []
     for segment in source.segments():
@@ -69,45 +79,48 @@ def frequency_table(source: BagSource) -> pyarrow.Table:
         if segment.number != number:
             number = segment.number
             changes["rest_frequency"] = recording.settings[number].rest_frequency
-        # A change that came with messages without rows applies to the next row.
+        # Changes that come with messages without rows are kept until there is a row.
         if not len(rows):
             continue
 
         health = recording.health_at(rows)
         unknown = ~health.known
+        part = np.full(len(rows), len(parts), np.int32)
         columns = {
-            "part": pyarrow.array(np.full(len(rows), len(parts), np.int32)),
+            "part": pyarrow.array(part),
             "recorded_left_out": pyarrow.array(health.left_out, mask=unknown),
             "recorded_status": pyarrow.array(health.status, mask=unknown),
         }
         values = rows.columns()
-        columns |= {name: as_column(values[key]) for name, key in COLUMNS.items() if key in values}
-        numbers = np.minimum(rows.cube, len(cubes) - 1).astype(np.int32)
-        columns["cube"] = pyarrow.DictionaryArray.from_arrays(numbers, cubes)
+        for name, attribute in COLUMNS.items():
+            if attribute in values:
+                columns[name] = as_column(values[attribute])
+        columns["cube"] = cube_column(rows, cubes)
         for name, change in changes.items():
-            lists = [change.ravel(), *[None] * (len(rows) - 1)]
-            columns[f"recorded_{name}"] = pyarrow.array(lists, pyarrow.list_(pyarrow.float64()))
+            others = [None] * (len(rows) - 1)
+            lists = pyarrow.array([change.ravel(), *others], NUMBER_LIST)
+            columns[f"recorded_{name}"] = lists
         changes = {}
         parts.append(pyarrow.table(columns))
     if not parts:
         raise BagError(f"{source.bag.path}: no frequencies on {source.topic}; record them")
-    # Columns that only some parts have are null in the others.
+    # A part that lacks a column of the other parts gets null in it.
     return pyarrow.concat_tables(parts, promote_options="default")
 
 
 def reprocess_table(frequencies: pyarrow.Table, skin: CalibratedSkin) -> pyarrow.Table:
     """Compute the stress of one recording of one skin, from an Arrow table to an Arrow table.
 
-    The function reads and changes nothing else, so that engines can call it in any process. With a
-    table of `frequency_table` and the bag's skin, the values are those of `./cube reprocess`, bit
-    by bit. Without the columns of recorded health and rest frequencies (frequencies without load),
-    pads are checked from the frequencies alone and rest frequencies are those of the skin, as is
-    right for a skin with other calibrations.
+    The result depends on the arguments only, so frameworks such as Ray or Dask can call this
+    function in any process. With a table of `frequency_table` and the skin of the bag, the values
+    equal those of `./cube reprocess` bit by bit. For a skin with other calibrations, leave out the
+    columns of recorded health and rest frequencies (frequencies without load): then faulty pads are
+    detected from the frequencies, and the rest frequencies are those of the skin.
 
-    The table must be a whole recording in the order of time, because the state of a row depends on
-    the rows before: the health of the pads, the last tare, creep and lagging temperature. A batch
-    that begins within a recording starts as after a restart of the node: with the calibrations'
-    rest frequencies, healthy pads and no creep.
+    The table must be a whole recording in the order of time, because the stress of a row depends on
+    the rows before it through the health of the pads, the last tare, creep and temperature lag. A
+    table that begins within a recording is computed as after a restart of the node: with the rest
+    frequencies of the calibrations, healthy pads and no creep.
 
     Args:
         frequencies: Rows (samples of cubes) with the columns that `frequency_table` states, of
@@ -129,7 +142,7 @@ def reprocess_table(frequencies: pyarrow.Table, skin: CalibratedSkin) -> pyarrow
         begins = np.flatnonzero(np.diff(part)) + 1
         bounds[1:1] = begins.tolist()
 
-    names = pyarrow.array(skin.names, pyarrow.string())
+    known_names = pyarrow.array(skin.names, pyarrow.string())
     cubes = pyarrow.array([*skin.names, "unknown"])
     batches = []
     for begin, end in pairwise(bounds):
@@ -141,12 +154,11 @@ def reprocess_table(frequencies: pyarrow.Table, skin: CalibratedSkin) -> pyarrow
         }
         missing = REQUIRED - columns.keys()
         if missing:
-            raise LayoutError(
-                f"no {', '.join(sorted(missing))} in the table; frequency_table makes one of a bag"
-            )
+            names = ", ".join(sorted(missing))
+            raise LayoutError(f"no {names} in the table; frequency_table makes one of a bag")
         cube = columns["cube"].cast(pyarrow.string())
-        number = pyarrow.compute.index_in(cube, value_set=names)
-        columns["cube"] = number.fill_null(len(names)).cast(pyarrow.uint16())
+        number = pyarrow.compute.index_in(cube, value_set=known_names)
+        columns["cube"] = number.fill_null(len(known_names)).cast(pyarrow.uint16())
         _restore(reconstructor, columns)
         attributes = {
             attribute: as_array(columns[name])
@@ -161,7 +173,7 @@ def reprocess_table(frequencies: pyarrow.Table, skin: CalibratedSkin) -> pyarrow
 
 
 def _recorded_health(columns: dict[str, Any]) -> RecordedHealth | None:
-    """Return the health of the pads that Arrow columns state; None: they state none."""
+    """Return the recorded health of the pads from Arrow columns; None if they are missing."""
     if not columns.keys() >= {"recorded_left_out", "recorded_status"}:
         return None
     left_out = columns["recorded_left_out"]
@@ -174,10 +186,14 @@ def _recorded_health(columns: dict[str, Any]) -> RecordedHealth | None:
 
 
 def _restore(reconstructor: Reconstructor, columns: dict[str, Any]) -> None:
-    """Set the rest frequencies and states of effects that Arrow columns state for their first row.
+    """Set recorded rest frequencies and states of creep and temperature in a reconstructor.
+
+    Args:
+        reconstructor: The reconstructor that will process the rows.
+        columns: Arrow columns of one part of a table, with these values in the first row only.
 
     Raises:
-        LayoutError: A later row states some, or they are those of another skin.
+        LayoutError: A later row has such values, or they do not fit the skin.
     """
     for name, column in columns.items():
         key = name.removeprefix("recorded_")
