@@ -52,8 +52,8 @@ def damaged_frames(size: int) -> bytes:
 
 
 LATE_FAILURE = b"\1" * 14 + b"\2\0"
-"""Shortest sequence of bytes that looks like a frame until its last byte, which shows that it is
-none."""
+"""Shortest byte sequence (with the closing 0) whose COBS code is found to be invalid only at its
+last byte, so that a decoder has done the work of a whole frame in vain."""
 
 INTACT_COBS = b"\2\7" * 7 + b"\1\0"
 """Bytes of the same length as `LATE_FAILURE` that are correctly stuffed (COBS), but no frame."""
@@ -69,14 +69,15 @@ NOISE: dict[str, Callable[[int], bytes]] = {
     "late failures, sound ones between": lambda size: (LATE_FAILURE + INTACT_COBS) * (size // 32),
     "zeros and ones in turn": lambda size: b"\0\1" * (size // 2),
 }
-"""Functions that return a number of bytes with no frames, or few, by the name that is printed."""
+"""Printed name -> function that returns about a given number of bytes that contain no or few intact
+frames."""
 
 
 def bench_decode() -> dict[str, Any]:
-    """Time clean frames and each noise in turn, in GB of wire bytes per second of one core.
+    """Measure how fast each decoder decodes clean frames and noise, in GB per second of one core.
 
-    The decoders are `c`, in C, which makes no Python objects except the bytes of each frame;
-    `frames`, the driver's decoder with its frames; and `python`, the one in Python.
+    The decoders are `c` (in C, gives only the bytes of each frame), `frames` (the driver's decoder,
+    which makes Python objects from them) and `python` (the one in pure Python).
     """
     decoders: dict[str, Callable[[], Any]] = {"frames": Decoder, "python": PythonDecoder}
     # Without a compiler there is no decoder in C.
@@ -87,7 +88,7 @@ def bench_decode() -> dict[str, Any]:
     fastest = {name: dict.fromkeys(decoders, 0.0) for name in data}
     for _ in range(ROUNDS):
         for name, chunk in data.items():
-            # In turn, so that whatever else the machine does slows down all decoders.
+            # The decoders alternate, so that other load of the machine slows down all of them.
             for kind, make_decoder in decoders.items():
                 gb_per_s = len(chunk) / _time_decoding_ns(make_decoder(), chunk)
                 fastest[name][kind] = max(fastest[name][kind], gb_per_s)

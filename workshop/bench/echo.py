@@ -42,7 +42,7 @@ class BareSource(CubeNode):
         super().__init__("source", PARAMETERS)
 
     def configure(self) -> None:
-        """Make the publisher and the arrays that every message has."""
+        """Make the publisher, and the constant arrays of all messages."""
         n = int(self.value("cubes"))
         rate = float(self.value("rate"))
         self._publisher: Any = self.create_lifecycle_publisher(  # type: ignore[no-untyped-call]
@@ -76,7 +76,7 @@ class BareEcho(CubeNode):
         super().__init__("echo", PARAMETERS)
 
     def configure(self) -> None:
-        """Subscribe, and make the arrays that every answer has."""
+        """Subscribe to `frequencies`, and make the constant arrays of all answers."""
         n = int(self.value("cubes"))
         quality = batch_profile(float(self.value("rate")))
         self._publisher: Any = self.create_lifecycle_publisher(  # type: ignore[no-untyped-call]

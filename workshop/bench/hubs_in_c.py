@@ -33,8 +33,8 @@ MAX_CUBES_PER_HUB = 80
 """Largest number of cubes on one simulated hub."""
 
 START_TIME_BYTES = 8
-"""Length, in bytes, of the head of the hubs' log, which is the wall clock at device time 0, in
-ns."""
+"""Length, in bytes, of the first number in the hubs' log: the wall clock, in ns since the Unix
+epoch, at which the clocks of the hubs were 0."""
 
 SAMPLE_RECORD = np.dtype(
     [
@@ -62,8 +62,7 @@ class HubLoad:
 
     @classmethod
     def of(cls, cubes: int, pads: int = 8) -> HubLoad:
-        """Choose hubs for `cubes` cubes, or a few more: all hubs have the same number."""
-        # As few hubs as possible, with the cubes shared out evenly.
+        """Choose the smallest number of equal hubs that have at least `cubes` cubes together."""
         hubs = math.ceil(cubes / MAX_CUBES_PER_HUB)
         return cls(hubs, math.ceil(cubes / hubs), pads)
 

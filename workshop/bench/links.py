@@ -39,9 +39,9 @@ def bench_links(
     rate: float,
     duration: float,
 ) -> dict[str, Any]:
-    """Measure the processor time of reading, with hubs in C (`firmware/`) as the load.
+    """Measure the processor time of reading the links, with samples from hubs in C (`firmware/`).
 
-    The figure `lost` counts rows that the hubs took and that did not become rows here.
+    The figure `lost` is the number of rows that the hubs sampled and that were not delivered.
 
     Args:
         cubes: Number of cubes, rounded up so that all hubs have the same number.
@@ -72,7 +72,7 @@ def bench_links(
                 cube_addresses(skin),
                 on_rows,
                 rate=rate,
-                # A node fills the same messages again and again, too.
+                # The arrays for rows are used again, as a node does with the memory of messages.
                 make_rows=lru_cache(maxsize=8)(empty_rows),
             )
 

@@ -34,7 +34,7 @@ PERIOD_NS = 1_000_000
 
 
 def bench_pipeline(cubes: int) -> dict[str, Any]:
-    """Time a reconstruction and the same pad law and matrix product in bare numpy, in turn.
+    """Time the reconstruction of one scan, and the equations alone (pad law, matrix) in numpy.
 
     Args:
         cubes: Number of cubes.
@@ -47,7 +47,7 @@ def bench_pipeline(cubes: int) -> dict[str, Any]:
 
 
 def _make_functions(cubes: int) -> dict[str, Function]:
-    """Return functions that compute one scan: with health, without, and the bare equations."""
+    """Return functions that reconstruct a scan with health, without, and by bare equations."""
     calibration = illustrative(LAYOUT)
     rng = np.random.default_rng(0)
     modes = rng.normal(0, LOAD_PA, (cubes, 7))

@@ -15,7 +15,7 @@ CPU_LINES = (
     ("reconstruction", "cpu_reconstruction_percent", "s-", "black"),
     ("echo: the same messages, no work", "echo_cpu_percent", "^:", "0.55"),
 )
-"""Label, name of the figure, line style and colour of each drawn processor time."""
+"""Label, key in the result of `./cube bench skin`, line style and colour of each processor time."""
 
 MARKER: dict[str, Any] = {"mfc": "white", "ms": 5}
 """Style of the markers of all drawn lines."""
@@ -24,14 +24,14 @@ LATENCY_LINES = (
     ("median", "latency_p50_ms", "o-"),
     ("99th percentile", "latency_p99_ms", "s--"),
 )
-"""Label, name of the figure and line style of each drawn latency."""
+"""Label, key in the result of `./cube bench skin` and line style of each drawn latency."""
 
 
 @print_style()
 def draw_scale(rows: list[dict[str, Any]]) -> Figure:
     """Draw processor time per scan and latency over the number of cubes.
 
-    The echo is the floor: the same messages are sent and received, without any work on them.
+    The time of the echo is a lower bound: it sends and receives the same messages, without work.
 
     Args:
         rows: Figures of `./cube bench skin`, one table for each number of cubes.

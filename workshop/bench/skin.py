@@ -59,7 +59,8 @@ DRAIN_S = 1.0
 """Time, in seconds, after the measurement in which its last tensors arrive."""
 
 MAX_ECHO_S = 15.0
-"""Longest duration, in seconds, of one measurement of the echo, which is the floor."""
+"""Longest duration, in seconds, of one measurement of the echo: two nodes that only exchange the
+messages of the chain, so that their processor time is a lower bound."""
 
 MEMORY_PERIOD_S = 0.5
 """Time, in seconds, between two measurements of the memory of the processes."""
@@ -111,16 +112,16 @@ class Measurement:
 
 
 def bench_echo(cubes: int, bench: Bench) -> dict[str, Any]:
-    """Measure the bare floor alone: a source of messages, an echo and a receiver."""
+    """Measure only the echo: nodes that exchange messages of the same size without work on them."""
     settings = {"cubes": cubes, "rate_hz": bench.rate, "duration_s": bench.duration}
     with _prepared() as progress:
         return settings | _measure_echo(cubes, bench, progress)
 
 
 def bench_skin(cubes: int, bench: Bench) -> dict[str, Any]:
-    """Measure the whole chain, and the floor before and after it.
+    """Measure the driver and the reconstruction, and the echo (only messages) before and after.
 
-    The load are hubs in C (`firmware/`), or the simulator where they cannot be built.
+    Hubs in C (`firmware/`) send the samples, or the simulator where they cannot be built.
 
     Args:
         cubes: Number of cubes, rounded up so that all hubs have the same number.
@@ -131,9 +132,9 @@ def bench_skin(cubes: int, bench: Bench) -> dict[str, Any]:
 
 
 def bench_touch(cubes: int, bench: Bench) -> dict[str, Any]:
-    """Measure the latency of `touch`, and the processor time that it adds to the chain.
+    """Measure the latency of `touch`, and the processor time that finding touches costs.
 
-    The chain runs once without and once with touch. A subscriber gets `stress` both times.
+    Driver and reconstruction run once without and once with it, both with a subscriber of `stress`.
     """
     with _prepared() as progress:
         without = _measure_skin(cubes, bench, progress)
@@ -154,7 +155,7 @@ def bench_scale(
     bench: Bench,
     figure: Path,
 ) -> dict[str, Any]:
-    """Measure the whole chain for several numbers of cubes, and draw a picture."""
+    """Run `bench_skin` for several numbers of cubes, and draw a picture of the results."""
     with _prepared() as progress:
         rows = [_measure_both(cubes, bench, progress) for cubes in counts]
     save(draw_scale(rows), figure)
@@ -165,7 +166,7 @@ def bench_scale(
 def _prepared() -> Iterator[Progress]:
     """Set a DDS domain and show a progress bar.
 
-    The bar is drawn once a second only, because the receiver cannot receive meanwhile.
+    The bar is drawn only once a second, because this process receives no messages meanwhile.
     """
     progress = Progress(console=Console(stderr=True), refresh_per_second=1)
     with own_domain(), progress:
@@ -193,7 +194,8 @@ def _measure_both(
         "duration_s": bench.duration,
         **skin,
         "echo_cpu_percent": round(echo, 1),
-        # A run of a fraction of a second can cost less than the clock of CPU time resolves.
+        # In a measurement of a fraction of a second, the echo can take less processor time than the
+        # system resolves. Its time is then 0.
         "ratio_to_echo": round(sum(used) / echo, 3) if echo else None,
     }
 
@@ -224,7 +226,8 @@ def _measure_skin(
             name = f"skin of {load.cubes} cubes"
             measured = _measure(processes, children, bench, receive, progress, name, receive_touch)
             taken, skipped = _end_load(processes[0].executable, children, log, load)
-    # Rows of the first cube of each hub stand for all: keeping all would delay the receiver.
+    # Only rows of the first cube of each hub were stored, because storing all would delay this
+    # process. They are counted for all cubes of the hub.
     comparison = compare(taken, arrivals, measured.start_ns, measured.end_ns)
     cpu = measured.cpu_percent
     seconds = 1e-9 * (measured.end_ns - measured.start_ns)
@@ -298,7 +301,7 @@ def _end_load(
     log: Path,
     load: HubLoad,
 ) -> tuple[SampleTable, int]:
-    """End the load and return its samples, and the number of samples it had no room for."""
+    """End the hubs; return their samples, and the number that they dropped from full queues."""
     if executable == "simulator":
         sample_log = end_simulator(children, log)
         return sample_log.table, sample_log.dropped
@@ -379,7 +382,7 @@ def _measure(
         if not n_messages:
             logs = "\n".join(children.log(name)[-800:] for name in names)
             raise CubeError(f"{description}: no tensor after {MAX_START_S:g} s\n{logs}")
-        # From here on, discovery and imports do not count.
+        # The measurement begins later, so that discovery and imports do not count.
         first_tensor_s = time.monotonic() - began_s
         observer.spin(SETTLE_S)
         usage = Usage(children, names)
@@ -397,11 +400,13 @@ def _measure(
 
 
 def summarise_memory(memory_mb: dict[str, list[float]]) -> dict[str, float]:
-    """Return the largest memory of any process but the load, in MB.
+    """Return the largest memory of any process except the hubs, in MB.
 
-    After a minute or more, also the growth of the process that grows fastest, with its standard
-    error. The growth is the slope of a line through the means of blocks after the first fifth of
-    the time: allocators grow in steps, so values that are close in time are not independent."""
+    If the measurement took a minute or more, the growth of the process that grows fastest is
+    returned as well, with its standard error. It is the slope of a line through the means of blocks
+    of time after the first fifth. Means are used because allocators grow in steps, so values that
+    are close in time are not independent.
+    """
     nodes = [np.array(values) for name, values in memory_mb.items() if name not in LOADS]
     result = {"rss_mb": round(float(np.max(nodes)), 1)}
     n_values = len(nodes[0])

@@ -30,11 +30,11 @@ sample and its stamp."""
 
 
 def check_all(record: Record, log: SampleLog) -> dict[str, Any]:
-    """Compute all figures. Counts are rows: one cube, one sample."""
+    """Run all checks and return their figures; counts are rows (one sample of one cube each)."""
     run = Run(record, log)
     frequencies = check_frequencies(run)
     tensors = check_tensors(run)
-    # A row of stress that was made from no known row of frequencies has no sample either.
+    # A row of stress whose source is `NO_MATCH`, the index -1, gets the appended `NO_MATCH`.
     samples = np.append(run.sample, NO_MATCH)
     health = check_health(run, samples[tensors.source])
     counters = check_counters(run, frequencies, tensors)

@@ -14,10 +14,10 @@ from .run import Findings, Run, count, find_matched
 from .tensors import TensorFindings
 
 WRAPPED_NUMBER = 1 << 20
-"""Number of the first sample of a hub above which the hub did not begin to count at 0.
+"""Threshold for the number of a hub's first sample: a hub above it did not begin to count at 0.
 
-A fault makes hubs begin shortly before 2**32. The driver cannot know of losses before their first
-sample.
+The fault "wrap" makes a hub begin shortly before 2**32. The driver then cannot know how many
+samples were lost before the first one that arrived.
 """
 
 REPORT_PERIOD_S = 1.5
@@ -34,8 +34,9 @@ def check_counters(
 
     A row is one cube at one sampling time. The driver cannot know the last samples of a hub before
     the hub lost its power or restarted, nor samples around its own end. All other rows that did not
-    arrive must be counted, and no more. The reconstruction must not state that it lost messages
-    whose tensors arrived."""
+    arrive must be counted, each once. The reconstruction must not state that it lost messages
+    whose tensors arrived.
+    """
     record, counters = run.record, run.record.counters
     cubes_per_link = len(record.skin.cubes) // len(record.skin.links)
     counted = (
@@ -43,11 +44,13 @@ def check_counters(
         + counters["rows of unknown cubes"]
         + counters["rows with another number of pads"]
     )
-    # These rows may be of the time before the record, so more of them than are missing is no error.
+    # Some of these rows may have been dropped before the record began. So the counter may be larger
+    # than the number of missing rows, but not smaller.
     dropped = counters[DROPPED_BY_HOST]
     is_countable = frequencies.is_checked & ~_is_between_drivers(run)
     missing = int(frequencies.missing[is_countable].sum())
-    # The driver goes on counting after the span of time that is checked.
+    # The counters include samples after the checked span of time, so `counted` is compared with all
+    # missing rows.
     missing_at_end = int(frequencies.missing.sum())
     is_lost_with_power = _is_lost_with_power(run)
     lost_with_power = int(run.samples.row_count[is_lost_with_power].sum())
@@ -58,7 +61,8 @@ def check_counters(
     reported = arrived - count(is_unreported)
 
     wrong = counters["rows unaccounted"] + counters["rows lost by errors"]
-    # A message that did not arrive here had an unknown number of rows.
+    # If a message did not reach this process, the number of its rows is unknown, so the counters
+    # cannot be checked.
     if not record.frequencies.missed:
         # Each of these differences is at most 0 when all counters are right.
         excesses = (
@@ -80,17 +84,17 @@ def check_counters(
 
 
 def _is_between_drivers(run: Run) -> Mask:
-    """Find the samples (S,) that no driver can count.
+    """Find the samples (S,) around the kill of a driver, which no driver can count as lost.
 
-    These are the last ones before a driver was killed, up to the first one of the same hub that
-    reached the next driver.
+    For each hub, they begin `REPORT_PERIOD_S` before the driver was killed, and end with the first
+    sample that reached the next driver.
     """
     samples, sent_ns = run.samples, run.record.frequencies.sent_ns
     between = np.zeros(len(samples), bool)
     for action in run.record.actions_of(*DRIVER_KILLS):
         later = find_matched(run.sample)
         arrived = run.sample[later[sent_ns[later] > action.begin_ns]]
-        # A late row of the driver that was killed does not count for the next one.
+        # Rows that were sampled before the kill came from the killed driver, although late.
         arrived = arrived[samples.time_ns[arrived] > action.begin_ns]
         last_ns = action.begin_ns - round(NS_PER_S * REPORT_PERIOD_S)
         first_ns = np.full(len(samples.log.links), LATEST_NS)
@@ -105,10 +109,10 @@ def _is_between_drivers(run: Run) -> Mask:
 
 
 def _is_lost_with_power(run: Run) -> Mask:
-    """Find the samples (S,) of which the driver cannot know, because the hub restarted.
+    """Find the samples (S,) that the driver cannot count as lost, because the hub restarted.
 
-    These are the ones after the last that arrived before a restart and, where the hub did not
-    begin at 0, those before the first that arrived.
+    They are the samples between the last one that arrived and a restart. After a restart at which
+    the hub did not begin to count at 0, they are also those before the first one that arrived.
     """
     samples = run.samples
     arrived = np.zeros(len(samples), bool)
@@ -121,7 +125,7 @@ def _is_lost_with_power(run: Run) -> Mask:
             # Samples are in the order of time, so the order of indices is that of time.
             mine = np.flatnonzero(of_link & (samples.boot == boot))
             mine_arrived = mine[arrived[mine]]
-            # Only a restart ends the reports of a hub about the samples that it has dropped.
+            # A hub that was not restarted still reports the samples that it has dropped.
             if boot != boots[-1]:
                 last = mine_arrived.max(initial=-1)
                 lost[mine[mine > last]] = True

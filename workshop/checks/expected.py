@@ -26,8 +26,8 @@ from cube_tensor_driver.simulation.load import Load, default_script
 from .record import LATEST_NS, HubFault, Samples, Span
 
 EDGE_NS = 5_000_000
-"""Time, in nanoseconds, before and after the begin and the end of a fault of a pad or hub in which
-a sample may have the fault or not, because the simulator carries faults out late now and then."""
+"""Time, in nanoseconds, around the begin and around the end of a fault of a pad or hub. A sample
+within it may have the fault or not, because the simulator sometimes carries faults out late."""
 
 MIN_EQUAL_SHARE = 0.5
 """Smallest share of the pads of a row (one cube at one sampling time) that must have the expected
@@ -46,9 +46,10 @@ class Readings:
 
     Attributes:
         frequency: Frequency of each pad (N, P), in Hz; NaN where nothing is measured.
-        is_certain: Whether the frequency is certain (N, P); not near the begin or end of a fault.
+        is_certain: Whether the frequency is certain (N, P); it is not near begin or end of a fault.
         temperature: Temperature (N,), in °C; NaN where it is unknown.
-        pad_fault: Bit p is set if the hub reports pad p (N,), as far as it is certain.
+        pad_fault: Bits (N,), of which bit p is set if the hub reports that pad p is broken; only
+            those of pads with `is_certain` must agree.
         is_sound: Whether no pad is broken and the temperature is that of the calibration (N,).
         instant: Index of the instant of the load, which repeats (N,).
     """
@@ -63,8 +64,14 @@ class Readings:
 
 @dataclass(frozen=True)
 class _SoundReadings:
-    """Readings (N, P) that pads without faults would give, in mHz; warming (N,) of the hub, in K;
-    the others as in `Readings`."""
+    """Readings of pads without faults.
+
+    Attributes:
+        millihertz: Frequency that each pad would have (N, P), in mHz.
+        warming: Temperature of the hub above that of the calibration (N,), in K.
+        instant: As in `Readings`.
+        is_certain: As in `Readings`.
+    """
 
     millihertz: Any
     warming: Array
@@ -122,7 +129,7 @@ class ExpectedReadings:
         # A hub sends 0 for a pad whose oscillator has stopped.
         frequency[millihertz == 0] = np.nan
         celsius = centi_celsius(sound.warming)
-        # The float32 product is that of the decoder, so that it can be compared to the bit.
+        # The decoder computes the same float32 product, so that the results must have equal bits.
         temperature = celsius.astype(np.float32) * np.float32(0.01)
         temperature[celsius == TEMPERATURE_UNKNOWN] = np.nan
         return Readings(frequency, certain, temperature, pad_fault, is_sound, sound.instant)
@@ -145,7 +152,7 @@ class ExpectedReadings:
 
         warmer = np.zeros(len(cube))
         for fault in samples.faults("temperature"):
-            # A temperature lasts until the next one, so the end of the fault does not matter.
+            # A hub keeps its temperature until the next such fault, so the end does not matter.
             since = (link == fault.link) & (time_us >= fault.start_us)
             warmer[since] = warming(fault.fault, fault.start_us, time_us[since])
             is_edge = np.abs(time_ns - fault.begin_ns) < EDGE_NS
@@ -183,15 +190,17 @@ class ExpectedReadings:
         ]
 
     def find_held(self, cubes: list[int], span: Span) -> Array | None:
-        """Return the readings (cubes, P), in Hz, of cubes of one link whose load is held.
+        """Return the constant readings of cubes of one link in a span of time.
 
         Returns:
-            None if the load was not the same all the time, or if nothing was sampled.
+            Readings (cubes, P), in Hz; None if the fault "hold" did not keep the load of the hub
+            constant for all of the span, or if nothing was sampled.
         """
         samples = self._samples
         link = samples.table.link_of_cube[cubes[0]]
         mine = (samples.link == link) & span.contains(samples.time_ns)
-        # The load is held at an instant of the hub's table, whose numbers depend on the period.
+        # The load is held at one row of the hub's table of readings. The index of this row depends
+        # on the sampling period.
         instants = {
             fault.start_us // period_us % len(self._millihertz)
             for fault in samples.faults("hold")
@@ -203,10 +212,11 @@ class ExpectedReadings:
         return self._millihertz[instants.pop(), cubes] * MILLIHERTZ
 
     def find_samples(self, rows: FrequencyRows) -> Index:
-        """Find the sample of each row (N,), or `NO_MATCH` for what no hub took.
+        """Find the sample of each row (N,); `NO_MATCH` if no hub took such a sample.
 
-        A hub that restarts gives its numbers again, and after a long cut the stamp of a row may be
-        nearer to the wrong sample of that number. So the readings decide, where they differ.
+        A hub that restarts uses the same sample numbers again, and after a long cut the stamp of a
+        row may be nearer to the wrong sample with its number. If the readings of that sample differ
+        from the row, a sample with this number and the right readings is taken instead.
         """
         table, boot = self._samples.table, self._samples.boot
         sample = table.match(rows)

@@ -35,7 +35,8 @@ class FrequencyFindings(Findings):
 
     Attributes:
         is_checked: Whether each of the S samples was taken in the span of the record (S,).
-        missing: Number of rows of each sample that did not arrive (S,), also after that span.
+        missing: Number of rows of each sample that did not arrive (S,), including samples after the
+            span of the record.
     """
 
     is_checked: Mask
@@ -58,13 +59,13 @@ def check_frequencies(run: Run) -> FrequencyFindings:
         expected = run.expected.of(chosen.cube, sample[part])
         is_wrong[part] = _differs(chosen, expected)
 
-    # One number for sample and cube tells which rows arrived more than once.
+    # Rows with the same key are the same row, which arrived more than once.
     n_cubes = len(record.skin.cubes)
     keys = sample[known] * n_cubes + rows.cube[known]
     arrived = np.unique(keys)
     received = np.bincount(arrived // n_cubes, minlength=len(samples))
     is_checked = record.contains(samples.time_ns)
-    # The driver was not active before the record begins.
+    # Samples before the begin of the record are not missing: the driver was not active.
     is_recorded = samples.time_ns >= record.begin_ns
     missing = np.where(is_recorded, samples.row_count - received, 0)
     is_lost = is_checked & (missing > 0) & ~_may_be_missing(run)
@@ -83,7 +84,8 @@ def check_frequencies(run: Run) -> FrequencyFindings:
 
 
 def _differs(rows: FrequencyRows, readings: Readings) -> Mask:
-    """Find the rows (N,) of which a field is not what it must be."""
+    """Find the rows (N,) with a frequency, temperature or pad fault that is certain and differs, or
+    with a wrong status."""
     certain = readings.is_certain
     changed_bits = (rows.pad_fault ^ readings.pad_fault)[:, np.newaxis]
     bit = np.arange(certain.shape[1])

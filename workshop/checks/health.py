@@ -66,8 +66,8 @@ RESTART_S = 2.0
 """Time, in seconds, before and after a start of a node in which its statistics are not complete."""
 
 NOMINAL_PERIOD_S = 1.5
-"""Time, in seconds, before and after the begin of a fault in which the periods of the hubs are
-looked up."""
+"""Time, in seconds, before and after the begin of a fault. The longest sampling period of the hubs
+within it gives the number of rows that are expected."""
 
 WINDOW_STEP_NS = 100_000_000
 """Time, in nanoseconds, between the begins of two windows in which movement of pads is looked
@@ -143,7 +143,7 @@ def _is_flagged(
 
 
 class _Evidence:
-    """Decides whether enough arrived for a fault to be found, and until when it may be flagged."""
+    """Decides whether enough rows arrived to detect a pad's fault, and when it may be flagged."""
 
     def __init__(self, run: Run) -> None:
         self._run = run
@@ -178,8 +178,8 @@ class _Evidence:
         return fault.kind != "stuck" or self._moves(fault, span)
 
     def _is_disturbed(self, span: Span) -> bool:
-        """Return whether the statistics of the pads began again in a span of time, as after a cut
-        of any link."""
+        """Return whether the statistics of the pads were disturbed in a span of time: by a cut of
+        any link, or by the start of a node."""
         cuts = self._run.samples.faults(*CUT_FAULTS)
         starts = self._run.record.actions_of(*NODE_STARTS)
         is_cut = any(cut.overlaps(span, DISTURBANCE_S) for cut in cuts)
@@ -192,7 +192,7 @@ class _Evidence:
         has_arrived = (rows.cube == cube) & span.contains(rows.stamp_ns)
         begin = Span(span.begin_ns, span.begin_ns)
         is_near = begin.contains(samples.time_ns, NOMINAL_PERIOD_S, NOMINAL_PERIOD_S)
-        # The rate may change meanwhile, so the longest period counts.
+        # If the rate changes in this time, the longest period gives the smallest number of rows.
         period_us = int(samples.period_us[is_near].max(initial=1))
         expected = (span.end_ns - span.begin_ns) / (1000 * period_us)
         return count(has_arrived) >= MIN_COMPLETENESS * expected
@@ -212,7 +212,7 @@ class _Evidence:
             frequency = readings.frequency[is_within]
             if not len(frequency):
                 return False
-            # The lower median is a movement that half of the pads have at least.
+            # At least half of the pads move as much as the lower median, or more.
             movement = np.ptp(frequency, axis=0) / self._noise[fault.cube]
             movement.sort()
             if movement[(len(movement) - 1) // 2] < MIN_MOVEMENT:

@@ -39,13 +39,13 @@ DRIVER_KILLS = ("restart driver",)
 """Names of the actions that kill the driver and start it again."""
 
 DRIVER_STOPS = ("cycle driver", *DRIVER_KILLS)
-"""Names of the actions during which nobody takes what the hubs send."""
+"""Names of the actions during which the driver does not read what the hubs send."""
 
 RECONSTRUCTION_STOPS = ("restart reconstruction", "reconfigure reconstruction")
 """Names of the actions during which there is no reconstruction."""
 
 NODE_STARTS = (*RECONSTRUCTION_STOPS, *DRIVER_KILLS)
-"""Names of the actions after which a node has forgotten everything before them."""
+"""Names of the actions after which a node has lost its state, such as the statistics of pads."""
 
 DROPPED_BY_HOST = "rows dropped by a slow host"
 """Name of the driver's counter of rows (one cube at one sampling time) that it dropped because the
@@ -89,7 +89,12 @@ class Span:
         return (time_ns >= begin_ns) & (time_ns < end_ns)
 
     def overlaps(self, other: Span, margin_s: float) -> bool:
-        """Return whether another span is less than a margin away."""
+        """Return whether another span overlaps this one, or would if it were longer by a margin.
+
+        Args:
+            other: The other span.
+            margin_s: Time, in s, that is added before and after.
+        """
         margin_ns = round(NS_PER_S * margin_s)
         begins_before = self.begin_ns - margin_ns < other.end_ns
         return begins_before and self.end_ns + margin_ns > other.begin_ns
@@ -187,7 +192,13 @@ class Samples:
         before_s: float,
         after_s: float,
     ) -> Mask:
-        """Find the samples (S,) whose link had such a fault, or less than a margin away."""
+        """Find the samples (S,) whose link had a fault of some kinds, or nearly so.
+
+        Args:
+            kinds: Kinds of faults.
+            before_s: Time, in s, before the begin of a fault in which samples count, too.
+            after_s: Time, in s, after its end in which samples count, too.
+        """
         near = np.zeros(len(self), bool)
         for fault in self.faults(*kinds):
             is_close = fault.contains(self.time_ns, before_s, after_s)
@@ -215,8 +226,8 @@ class Received(Generic[AnyRows]):
     Attributes:
         rows: All rows (N).
         sent_ns: Wall clock at which the message of each row was sent (N,), as DDS states it.
-        gaps: Pairs (next row, number of messages) where messages were sent that did not arrive
-            here, by the numbers that DDS gives to messages. Their rows cannot be checked.
+        gaps: For each gap in the numbers that DDS gives to messages: index of the row that arrived
+            after it, and number of messages that did not arrive. Their rows cannot be checked.
         unreadable: Number of messages that could not be decoded, or had a wrong frame.
     """
 
@@ -240,11 +251,10 @@ class Received(Generic[AnyRows]):
             before = stamps[first:row].min(initial=LATEST_NS)
             after = stamps[row : row + ROWS_AROUND_GAP].max(initial=EARLIEST_NS)
             begin_ns = min(int(before), int(after))
-            # Everything before the first row that arrived belongs to a gap at the beginning.
+            # A gap before the first row that arrived has no beginning.
             if not row:
-                begin_ns = (
-                    EARLIEST_NS // 2
-                )  # Half of the earliest time, because a margin is subtracted from it.
+                # It is half of the earliest time, because a margin is subtracted from it.
+                begin_ns = EARLIEST_NS // 2
             gap = Span(begin_ns, int(after))
             inside |= gap.contains(stamp_ns, GAP_MARGIN_S, GAP_MARGIN_S)
         return inside
@@ -277,7 +287,7 @@ class Record(Span):
         frequencies: Rows of the topic `frequencies`.
         stress: Rows of the topic `stress`.
         actions: What was done to the nodes, in order.
-        counters: Newest counters of the driver, summed over all links and all of its lives.
+        counters: Last counters of the driver, summed over all links and all of its processes.
         messages_lost: Number of messages that the reconstruction states to have lost.
     """
 
@@ -300,7 +310,8 @@ class Record(Span):
         before_s: float = 0.0,
         after_s: float = 0.0,
     ) -> Mask:
-        """Find the times (N,) within actions of some kinds, or less than a margin away."""
+        """Find the times (N,) within actions of some kinds, or less than a margin before or after
+        one."""
         during = np.zeros(len(time_ns), bool)
         for action in self.actions_of(*kinds):
             during |= action.contains(time_ns, before_s, after_s)

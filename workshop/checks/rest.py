@@ -26,14 +26,15 @@ TRANSPORT_S = 0.1
 frequencies is requested and after it is answered, the old or the new values may be in force."""
 
 RESTORE_S = 2.0
-"""Time, in seconds, after a restart until the tare is restored. The reconstruction waits until
-the driver has stated which cubes there are."""
+"""Longest time, in seconds, after a restart of the reconstruction until it has restored the tare,
+for which it must have received the cubes of the skin from the driver."""
 
 AVERAGED_S = 2.5
 """Age, in seconds, of the oldest data that a tare (measurement of the rest frequencies) averages.
 
-A tare averages 1 s in whole windows of 0.5 s and the one that is not over, of data that may be 1 s
-old. """
+It is the sum of 1 s that a tare averages, up to 0.5 s because it averages whole windows of 0.5 s,
+and 1 s by which the newest data may be late.
+"""
 
 
 @dataclass(frozen=True)
@@ -49,8 +50,12 @@ class RestFrequencies:
     is_known: Mask
 
     def tare(self, cubes: list[int], held: Array | None) -> RestFrequencies:
-        """Return the rest frequencies after a tare of cubes that read `held` (len(cubes), P), in
-        Hz; None if their reading is unknown."""
+        """Return the rest frequencies after a tare.
+
+        Args:
+            cubes: Indices of the cubes that were tared.
+            held: Their readings (len(cubes), P) during the tare, in Hz; None if they are unknown.
+        """
         values = self.values.copy()
         is_known = self.is_known.copy()
         is_known[cubes] = held is not None
@@ -73,7 +78,7 @@ class RestHistory:
         self._epochs = [(Span(0, LATEST_NS), current)]
         for action in self._changes():
             current = self._apply(action, current)
-            # The change ends the span of the values before.
+            # Until now the span of the earlier values had no end. The change ends it.
             last, rest = self._epochs[-1]
             shortened = replace(last, end_ns=action.end_ns)
             self._epochs[-1] = (shortened, rest)
@@ -87,7 +92,7 @@ class RestHistory:
     def _apply(self, action: NodeAction, current: RestFrequencies) -> RestFrequencies:
         if action.kind == "clear":
             return self._calibrated
-        # The load must have been held for all data that the tare averages.
+        # A tare has a known result only if the load was constant in all data that it averages.
         first_ns = action.begin_ns - round(NS_PER_S * AVERAGED_S)
         averaged = Span(first_ns, action.end_ns)
         cubes = list(action.cubes)
@@ -98,7 +103,7 @@ class RestHistory:
         self,
         sent_ns: Times,
     ) -> Iterator[tuple[Mask, RestFrequencies]]:
-        """Yield all rest frequencies, with the rows (N,) that they may be in force for.
+        """Yield all rest frequencies of the run, each with the rows (N,) that may result from them.
 
         Args:
             sent_ns: Wall clock at which the tensor of each row was sent (N,).
@@ -117,7 +122,8 @@ class RestHistory:
             is_tared |= ~rest.is_known
             applies |= is_candidate & ~is_tared[cube]
             ever_tared |= is_tared
-        # While old or new values may be in force, a cube that is ever tared is not certain.
+        # Around a change, the old or the new values may be in force, so cubes that are tared at any
+        # time in the run are excluded.
         return applies & ~(self._is_unclear(sent_ns) & ever_tared[cube])
 
     def _is_unclear(self, sent_ns: Times) -> Mask:

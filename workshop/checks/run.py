@@ -31,7 +31,7 @@ def find_matched(index: Index) -> Index:
 
 
 def agree(found: Real, wanted: Real, allowed: Real | float = 0.0) -> Mask:
-    """Compare with a tolerance, 0 for equal bits; NaN (not known) agrees with NaN alone."""
+    """Return where two arrays differ by at most a tolerance; NaN (unknown) agrees only with NaN."""
     near = np.abs(found - wanted) <= allowed
     return near | (np.isnan(found) & np.isnan(wanted))
 
@@ -64,7 +64,14 @@ class Run:
         time_ns: Index,
         is_found: Mask,
     ) -> list[str]:
-        """Return lines about the first rows (N,) that are found, with a number (N,) of each."""
+        """Return lines that describe the first findings.
+
+        Args:
+            finding: Text of the finding.
+            number: Number that each line shows, such as the index of the cube (N,).
+            time_ns: Times (N,), in ns since the Unix epoch.
+            is_found: Which of the N rows or samples are findings (N,).
+        """
         rows = np.flatnonzero(is_found)[:EXAMPLES]
         return [self.describe(f"{finding} {number[row]}", time_ns[row]) for row in rows]
 

@@ -26,16 +26,16 @@ from .rest import RestFrequencies, RestHistory
 from .run import Findings, Run, agree, count, find_matched
 
 MAX_ERROR = 1e-4
-"""Largest error of a component (stress or gradient) against the reference, as a share of the range
-of the component under the load.
+"""Largest difference of a component (stress or gradient) from the pipeline in double precision, as
+a share of the range of the component under the load.
 
-float32 leaves 1e-6, rounding to mHz 1e-5 and more where few pads are left. A tare that is wrong by
-20 ppm gives 4e-4.
+Computing in float32 causes 1e-6, and rounding of frequencies to mHz 1e-5, or more if few pads are
+left. A tare that is wrong by 20 ppm causes 4e-4, so it is found.
 """
 
 MAX_ERROR_OF_LOAD = 1e-3
-"""Largest error of a component (stress or gradient) against the load, as a share of the range of
-the component under the load."""
+"""Largest difference of a component (stress or gradient) from that of the simulated load, as a
+share of the range of the component under the load."""
 
 MAX_NOISE_SHARE = 0.1
 """Error of a component that is allowed in addition to `MAX_ERROR`, as a share of its standard
@@ -62,7 +62,7 @@ class TensorFindings(Findings):
 
     Attributes:
         source: Row of frequencies that each row of stress was made from (M,), or `NO_MATCH`.
-        messages_without: Number of messages of frequencies of which no row has a tensor.
+        messages_without: Number of messages of `frequencies` whose rows all have no tensor.
     """
 
     source: Index
@@ -98,7 +98,7 @@ def check_tensors(run: Run) -> TensorFindings:
         measured = frequencies.select(source[part])
         sent_ns = record.stress.sent_ns[part]
         agrees = np.zeros(len(part), bool)
-        # Where two changes are close, a row may agree with any of several rest frequencies.
+        # Around a change of the rest frequencies, a row may be made with the old or the new ones.
         for is_candidate, rest in history.candidates(sent_ns):
             has_no_reference = ~rest.is_known[made.cube]
             is_right = reference.agrees(made, measured, rest)
@@ -141,9 +141,9 @@ def _find_sources(frequencies: FrequencyRows, stress: StressRows) -> Index:
 def _find_missing(run: Run, has_tensor: Mask) -> Mask:
     """Find the rows of frequencies (N,) without a tensor and without an explanation.
 
-    Explanations are: messages that did not arrive here; a node that was down, for everything sent
-    since the last message before that had its tensor; and as many messages as the reconstruction
-    states to have lost.
+    There are three explanations. A message of `stress` did not reach this process. A node was down;
+    this includes what was sent after the last message that got a tensor before. The reconstruction
+    reports lost messages; as many messages may be without tensors.
     """
     record = run.record
     stamp_ns, sent_ns = record.frequencies.rows.stamp_ns, record.frequencies.sent_ns
@@ -153,7 +153,7 @@ def _find_missing(run: Run, has_tensor: Mask) -> Mask:
         was_up = has_tensor & (sent_ns <= action.begin_ns)
         before_ns = sent_ns[was_up].max(initial=0)
         is_missing &= (sent_ns <= before_ns) | (sent_ns > action.end_ns)
-    # The rows of one message were sent at one time.
+    # All rows of a message have the same time of sending, so different times count messages.
     messages = np.unique(sent_ns[is_missing])
     if len(messages) <= record.messages_lost:
         is_missing[:] = False
@@ -167,7 +167,8 @@ class _Reference:
         self._pipeline = Pipeline(run.record.skin.calibrations, np.float64)
         self._expected = run.expected
         self._range = np.ptp(run.expected.truth, axis=(0, 1))
-        # One limit for each possible number of degrees of freedom.
+        # The limit of the residual depends on its degrees of freedom, which are at most the number
+        # of pads.
         degrees = range(1, self._pipeline.n_pads + 1)
         chi2_limits = [chi2_limit(degree, FALSE_ALARM) for degree in degrees]
         self._limits = np.sqrt(np.array(chi2_limits) / degrees)
@@ -228,7 +229,7 @@ class _Reference:
 
     def _deviation(self, made: StressRows) -> Array:
         """Return the standard deviation of each component (N, 15), 0 where it is not observed."""
-        # One integer for cube and mask is sorted much faster than pairs are.
+        # `np.unique` sorts one integer, made of the cube and the mask, much faster than pairs.
         key = made.cube.astype(np.int64) << 32 | made.left_out
         distinct, which = np.unique(key, return_inverse=True)
         rows = [

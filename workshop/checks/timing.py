@@ -36,11 +36,12 @@ BEFORE_CUT_S = 1.0
 
 
 def measure_stamp_errors(run: Run) -> Array:
-    """Compute the time from each sample to its stamp (K,), in ms.
+    """Compute the difference of stamp and sampling time (K,), in ms.
 
-    Hubs answer TIME, so what remains is half the difference of the smallest delays of both
-    directions. How late single samples arrive does not matter. Only samples are used whose hub's
-    clock has been undisturbed for a while, and no stamps that the driver marks as doubtful.
+    The driver finds the offset of a hub's clock from requests (TIME) and their answers. Its error
+    is half the difference of the smallest delays in both directions, however late single samples
+    arrive. Only samples are used whose hub's clock has been undisturbed for `CLOCK_SETTLE_S`, and
+    whose stamps the driver does not mark as doubtful.
     """
     record, samples = run.record, run.samples
     settled = samples.time_ns > record.begin_ns + NS_PER_S * CLOCK_SETTLE_S
@@ -63,7 +64,7 @@ def measure_reconnects(run: Run, frequencies: FrequencyFindings) -> list[float]:
     """Compute the time, in seconds, from the end of each unplugging to the first sample after it
     that arrived."""
     samples = run.samples
-    # A link delivers if one row of a sample arrived.
+    # A sample has arrived if at least one of its rows has.
     arrived = frequencies.missing < samples.row_count
     arrived &= samples.time_ns < run.record.end_ns
     gaps_s = []
