@@ -246,8 +246,8 @@ class SlipEstimator:
         is_new = slips & ~contacts["is_fitted"]
         contacts["sums"][is_new] = 0.0
         contacts["is_fitted"] |= slips
-        ratio = np.linalg.norm(after[:, 3:6], axis=1)
-        _add_ratio(contacts, slips, ratio, contacts["ratio_deviation"])
+        ratios = _lengths(after[:, 3:6])
+        _add_ratio(contacts, slips, ratios, contacts["ratio_deviation"])
 
     def update(self, time_s: float, values: Array) -> bool:
         """Estimate `slip` from the values of a scan.
@@ -277,7 +277,7 @@ class SlipEstimator:
         begins = slipped & ~contacts["slips"]
         contacts["slips"] = slipped
 
-        ratio = np.linalg.norm(newest[:, 3:6], axis=1)
+        ratio = _lengths(newest[:, 3:6])
         deviation = np.hypot(contacts["ratio_deviation"], FOLLOWED_DEVIATION * ratio)
         is_followed = slipped & ~contacts["is_fitted"]
         _add_ratio(contacts, is_followed, ratio, deviation)
@@ -323,15 +323,15 @@ class SlipEstimator:
         """
         moved = change[..., :3]
         turned = change[..., 3:6]
-        distance = np.linalg.norm(moved, axis=2)
+        distance = _lengths(moved)
         ratio = newest[:, 3:6]
-        size = np.linalg.norm(ratio, axis=1)[:, None]
+        size = _lengths(ratio)[:, None]
 
         divisor = np.maximum(distance, 1e-12)
         growth = np.einsum("nlk,nlk->nl", moved, turned) / divisor
         lever = LEVER_M / (1 + 2 * size)
         tilt = lever * np.maximum(growth, 0)
-        leak = LEAK_M * np.linalg.norm(change[..., 3:], axis=2)
+        leak = LEAK_M * _lengths(change[..., 3:])
         # The force may have changed and returned within a lag.
         explained = np.maximum.accumulate(tilt + leak, axis=1)
         noise = SIGNIFICANCE * np.sqrt(2) * self._contacts["noise"]
@@ -345,7 +345,7 @@ class SlipEstimator:
         is_along = along > MIN_COSINE * distance * size
         largest = MIN_SHARE_OF_LARGEST * self._contacts["largest_ratio"]
         min_ratio = np.maximum(MIN_RATIO, largest)
-        ratio_change = np.linalg.norm(turned, axis=2)
+        ratio_change = _lengths(turned)
         slips = moves & is_along
         slips &= size > min_ratio[:, None]
         slips &= ratio_change < MAX_RATIO_CHANGE * size
@@ -386,10 +386,10 @@ class SlipEstimator:
         """
         contacts = self._contacts
         change = loads - contacts["linearised"]
-        force = np.linalg.norm(loads[:, :3], axis=1)
+        force = _lengths(loads[:, :3])
         force = np.maximum(force, MIN_FORCE_N)
-        force_change = np.linalg.norm(change[:, :3], axis=1)
-        shift = np.linalg.norm(change[:, 3:], axis=1)
+        force_change = _lengths(change[:, :3])
+        shift = _lengths(change[:, 3:])
         has_changed = force_change > MAX_FORCE_CHANGE * force
         has_changed |= shift > MAX_SHIFT_DEPTHS * self._inverse.depth
 
@@ -420,7 +420,7 @@ class SlipEstimator:
         poses = inverse.poses
         contact = self._contacts[row]
         place = loads[row, 3:]
-        distance = np.linalg.norm(self._above_cubes - place, axis=1)
+        distance = _lengths(self._above_cubes - place)
         is_turned_away = poses.rotation[:, :, 2] @ contact["normal"] < MIN_FACING
         distance[is_turned_away] = np.inf
         n_cubes = len(contact["cubes"])
@@ -432,7 +432,7 @@ class SlipEstimator:
 
         # All derivatives are in the frame of the home cube. Those of this contact come first.
         rotation = poses.rotation[home]
-        apart = np.linalg.norm(loads[:, 3:] - place, axis=1)
+        apart = _lengths(loads[:, 3:] - place)
         n_near = np.sum(apart < NEIGHBOUR_PITCHES * inverse.pitch)
         near = np.argsort(apart)[:n_near]
         forces = loads[near, :3] @ rotation
@@ -455,6 +455,12 @@ class SlipEstimator:
         contact["values"] = scaled[cubes].ravel()
         contact["load"] = loads[row]
         contact["linearised"] = loads[row]
+
+
+def _lengths(vectors: Array) -> Array:
+    """Return the lengths (...) of vectors (..., n)."""
+    lengths: Array = np.linalg.norm(vectors, axis=-1)
+    return lengths
 
 
 def _describe(loads: Array, normal: Array) -> Array:

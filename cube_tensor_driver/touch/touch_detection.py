@@ -122,10 +122,14 @@ class Touches(NamedTuple):
     force_uncertainty: Array
 
 
-_NOTHING = np.zeros(0)
-_NO_FORCES = np.zeros((0, 3))
-
-NO_TOUCHES = Touches(0, np.zeros(0, np.intp), _NOTHING, _NOTHING, _NO_FORCES, _NO_FORCES)
+NO_TOUCHES = Touches(
+    stamp_ns=0,
+    cube=np.zeros(0, np.intp),
+    pressure=np.zeros(0),
+    pressure_uncertainty=np.zeros(0),
+    force=np.zeros((0, 3)),
+    force_uncertainty=np.zeros((0, 3)),
+)
 """Touches of a scan in which nothing touches, with the time 0."""
 
 
@@ -206,9 +210,11 @@ class Touch:
         Returns:
             The touches of each scan, the same in one call and in one call for each scan.
         """
-        ends = np.flatnonzero(rows.cube[1:] <= rows.cube[:-1]) + 1
-        bounds = sorted({0, *ends.tolist(), len(rows)})
-        return [self._update_scan(rows.select(slice(*pair))) for pair in pairwise(bounds)]
+        is_first = rows.cube[1:] <= rows.cube[:-1]
+        starts = np.flatnonzero(is_first) + 1
+        bounds = sorted({0, *starts.tolist(), len(rows)})
+        scans = [slice(*pair) for pair in pairwise(bounds)]
+        return [self._update_scan(rows.select(scan)) for scan in scans]
 
     __call__ = update
 
@@ -224,7 +230,11 @@ class Touch:
         elapsed_s = (1e-9 * elapsed_ns).clip(0, TIME_CONSTANT_S)
         self._stamp_ns[cube] = rows.stamp_ns
 
-        values = np.concatenate((rows.stress, rows.gradient), axis=1, dtype=np.float64)
+        values = np.concatenate(
+            [rows.stress, rows.gradient],
+            axis=1,
+            dtype=np.float64,
+        )
         slow = self._slow[cube]
         is_unknown = np.isnan(slow)
         if is_unknown.any():
@@ -243,8 +253,10 @@ class Touch:
         stale = self._stamp_ns < rows.stamp_ns.max() - STALE_NS
         if stale.any():
             self._slow[stale] = np.nan
-            for state in (self._change, self._count, self._sum, self._touched):
-                state[stale] = 0
+            self._change[stale] = 0
+            self._count[stale] = 0
+            self._sum[stale] = 0
+            self._touched[stale] = False
         return self._locate(int(rows.stamp_ns.min()))
 
     def _restart(self, cubes: Index) -> None:
@@ -375,7 +387,8 @@ class Touch:
         near = self._near[:, cube].T
         kind = estimate.kind[cube]
         n_values = near.shape[1] * len(COMPONENTS)
-        values = np.nan_to_num(self._change[near]).reshape(len(cube), n_values, 1)
+        values = np.nan_to_num(self._change[near])
+        values = values.reshape(len(cube), n_values, 1)
         terms = values * estimate.weights[kind]
         force = terms.sum(axis=1)
         square = force**2
