@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,9 +21,7 @@ from cube_tensor_driver.config.calibration import (
     find_calibration,
     read_calibration,
 )
-from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.core.arrays import Array, PadMasks
-from cube_tensor_driver.core.calibration import Calibration
 from cube_tensor_driver.core.defaults import (
     CONTACT_PRESSURE,
     FREQUENCY_NOISE,
@@ -168,7 +167,8 @@ class TractionBench:
         """
         self.setting = setting
         self.poses = _place_cubes(setting)
-        self.calibration = _shipped_calibration(setting)
+        layout = "cube" if setting.cubes == CUBES[0] else "planar"
+        self.calibration = read_calibration(find_calibration(layout, Path()))
         calibrations = [self.calibration] * len(self.poses.position)
         self._pipeline = Pipeline(calibrations)
 
@@ -304,21 +304,33 @@ class TractionBench:
         """Return the errors for random loads of this width; a seed gives the same loads."""
         random = np.random.default_rng(seed)
         results = [self._case_errors(width, random) for _ in range(cases)]
-        square, force, position, ratio, field_squares, found = zip(*results, strict=True)
-        # The errors at the cubes' depth and on the surface, joined over all loads.
-        below, surface = (np.concatenate(one) for one in zip(*field_squares, strict=True))
+        field, found, below, surface, is_single = zip(*results, strict=True)
+        force, force_deviation, position, position_deviation = np.moveaxis(np.array(found), 2, 0)
+        ratio = [force / force_deviation, position / position_deviation]
+        field_ratio = [np.concatenate(squares).mean() for squares in (below, surface)]
         return Errors(
             width=width,
-            field=np.sqrt(np.mean(square, axis=0)),
-            force=np.sqrt(np.mean(np.square(force), axis=0)),
+            field=np.sqrt(np.mean(field, axis=0)),
+            force=np.sqrt(np.mean(force**2, axis=0)) / FORCE,
             position=np.percentile(position, 95, axis=0),
-            ratio=np.sqrt(np.nanmean(np.square(ratio), axis=0)),
-            field_ratio=np.sqrt([below.mean(), surface.mean()]),
-            found=float(np.mean(found)),
+            ratio=np.sqrt(np.nanmean(np.square(ratio), axis=1)).T,
+            field_ratio=np.sqrt(field_ratio),
+            found=float(np.mean(is_single)),
         )
 
-    def _case_errors(self, width: float, random: np.random.Generator) -> _CaseErrors:
-        """Return the errors for one random load."""
+    def _case_errors(
+        self,
+        width: float,
+        random: np.random.Generator,
+    ) -> tuple[Array, list[ContactErrors], Array, Array, bool]:
+        """Return the errors for one random load.
+
+        Returns:
+            Mean square error of the pressure over its mean square, by `METHODS`. Errors of the
+            contacts of interpolation, and of the inverse. Squares of the errors of the pressure
+            with contacts over the predicted variance, at the cubes' depth, and on the surface.
+            Whether the inverse found one contact.
+        """
         force, centre = self.load(random)
         # Near the edge of the skin there are cubes on one side only, so it does not count.
         points = self.inverse.points[self.window, :2]
@@ -326,35 +338,21 @@ class TractionBench:
         values = self.values(width, force, centre, random)
         interpolated = self.surface.contacts(values, CONTACT_PRESSURE)
         tracker, tracked, pressures = self._solve(values)
-        fields = [pressure[self.window] for pressure in pressures]
-        size = (true**2).mean()
-        square = [((field - true) ** 2).mean() / size for field in fields]
+        errors = np.array(pressures)[:, self.window] - true
+        field = (errors**2).mean(axis=1) / (true**2).mean()
 
         predicted = tracker.deviation(values)
         on_surface = self.surface_truth(width, force, centre)
-        below_error = (fields[-1] - true) / predicted.depth_pressure[self.window]
-        surface_error = (tracker.field.pressure - on_surface) / predicted.pressure
-        field_squares = [
-            below_error[true > MIN_PRESSURE_SHARE * true.max()] ** 2,
-            surface_error[on_surface > MIN_PRESSURE_SHARE * on_surface.max()] ** 2,
-        ]
-
-        # Without a contact the force is off by all of it, and no deviation was predicted.
-        force_error = np.full(2, -1.0)
-        position_error = np.full(2, WINDOW)
-        ratio = np.full((2, 2), np.nan)
-        both: list[list[Any]] = [list(interpolated), list(tracked)]
-        for k, contacts in enumerate(both):
-            if contacts:
-                total = sum_contacts(contacts)
-                difference = total.force - FORCE
-                force_error[k] = difference / FORCE
-                position_error[k] = np.linalg.norm(total.position - centre)
-                # The deviation is that of each of two coordinates, while the error is a distance.
-                ratio[k, 0] = difference / total.force_deviation
-                ratio[k, 1] = position_error[k] / (total.position_deviation * np.sqrt(2))
-        is_single = len(tracked) == 1
-        return _CaseErrors(square, force_error, position_error, ratio, field_squares, is_single)
+        below = errors[-1] / predicted.depth_pressure[self.window]
+        surface = (tracker.field.pressure - on_surface) / predicted.pressure
+        found = [contact_errors(contacts, centre) for contacts in (interpolated, tracked)]
+        return (
+            field,
+            found,
+            below[true > MIN_PRESSURE_SHARE * true.max()] ** 2,
+            surface[on_surface > MIN_PRESSURE_SHARE * on_surface.max()] ** 2,
+            len(tracked) == 1,
+        )
 
     def _solve(self, values: Array) -> tuple[ContactTracker, list[TrackedContact], list[Array]]:
         """Return the contact tracker after one update, the contacts, and the pressure (M,) at the
@@ -403,40 +401,48 @@ class TractionBench:
         return [self.errors(width, cases, seed) for width in widths]
 
 
-class _CaseErrors(NamedTuple):
-    """Errors for one load; the attributes of `Errors` before the mean over all loads."""
+class ContactErrors(NamedTuple):
+    """Errors of the contacts of one load, which count together.
 
-    square: list[float]
-    force: Array
-    position: Array
-    ratio: Array
-    field_squares: list[Array]
-    is_single: bool
-
-
-class TotalContact(NamedTuple):
-    """Normal force of all contacts in N and where it acts (2,) in m, with standard deviations."""
+    Attributes:
+        force: Error of the normal force in N.
+        force_deviation: Predicted standard deviation of the normal force in N.
+        position: Distance of the centre of pressure from the true one in m.
+        position_deviation: Predicted standard deviation of this distance in m.
+    """
 
     force: float
     force_deviation: float
-    position: Array
+    position: float
     position_deviation: float
 
 
-def sum_contacts(contacts: Sequence[Any]) -> TotalContact:
-    """Add up contacts as if they were independent of each other."""
+def contact_errors(contacts: Sequence[Any], centre: Array) -> ContactErrors:
+    """Return the errors of contacts that are summed as if they were independent of each other.
+
+    Args:
+        contacts: The contacts. Without any, the whole force is missing, `WINDOW` away.
+        centre: (2,) true centre of pressure in m.
+    """
+    if not contacts:
+        return ContactErrors(-FORCE, np.nan, WINDOW, np.nan)
     forces = np.array([one.normal_force for one in contacts])
     force_deviations = np.array([one.force_uncertainty for one in contacts])
     positions = np.array([one.position[:2] for one in contacts])
-    position_deviations = np.array([one.position_uncertainty for one in contacts])
+    # The deviation is that of each of two coordinates, while the error is a distance.
+    coordinates = np.array([one.position_uncertainty for one in contacts])
+    position_deviations = np.sqrt(2) * coordinates
     total = float(forces.sum())
-    centre = forces @ positions / total
-    # The uncertain force of a contact moves the centre along the line to the contact; the two
-    # coordinates share that deviation.
-    lever = np.linalg.norm(positions - centre, axis=1) / np.sqrt(2)
-    moment_variance = (forces * position_deviations) ** 2 + (lever * force_deviations) ** 2
-    deviation = float(np.sqrt(moment_variance.sum())) / total
-    return TotalContact(total, float(np.linalg.norm(force_deviations)), centre, deviation)
+    found = forces @ positions / total
+    # The uncertain force of a contact moves the centre along the line to the contact.
+    lever = np.linalg.norm(positions - found, axis=1)
+    moments = np.hypot(forces * position_deviations, lever * force_deviations)
+    return ContactErrors(
+        force=total - FORCE,
+        force_deviation=float(np.linalg.norm(force_deviations)),
+        position=float(np.linalg.norm(found - centre)),
+        position_deviation=float(np.linalg.norm(moments)) / total,
+    )
 
 
 def _place_cubes(setting: Setting) -> CubePoses:
@@ -448,12 +454,6 @@ def _place_cubes(setting: Setting) -> CubePoses:
     quarter = rotation_from_rpy(0, 0, np.pi / 2)
     rotation = np.where(is_turned[:, None, None], quarter, np.eye(3))
     return skin._replace(rotation=rotation)
-
-
-def _shipped_calibration(setting: Setting) -> Calibration:
-    name = "cube.yaml" if setting.cubes == "24-pad" else "planar.yaml"
-    folder = package_data() / "config" / "calibration"
-    return read_calibration(find_calibration(name, folder))
 
 
 def traction_example() -> FieldExample:

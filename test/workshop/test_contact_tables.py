@@ -13,7 +13,8 @@ pytest.importorskip("skfem", reason="needs skfem: pip install scikit-fem")
 
 from conftest import ROOT
 from cube_tensor_design.studies.pads_study import FORMS, THIN
-from cube_tensor_design.studies.traction_study import Errors
+from cube_tensor_design.studies.traction_study import ContactErrors, Errors
+from workshop.bench.contacts import SHAPES, SKINS, Outcome
 from workshop.pictures import contact_tables
 
 SHIPPED = ROOT / "docs" / "pictures" / "contacts.json"
@@ -48,12 +49,15 @@ def test_tables_are_those_of_the_shipped_file(studies, tmp_path):
     """Other tables of the file stay, and each row is one line."""
     path = tmp_path / "contacts.json"
     path.write_text(SHIPPED.read_text())
-    contact_tables.write_contact_tables(path, None)
+    outcome = Outcome(ContactErrors(0.03, 0.02, 1e-4, 2e-4), 1, 9.0, 2.0)
+    outcomes = {(skin, shape): [outcome] for skin in SKINS for shape in SHAPES}
+    contact_tables.write_contact_tables(path, None, outcomes)
     shipped, written = json.loads(SHIPPED.read_text()), json.loads(path.read_text())
     assert list(written) == list(shipped)
     for name, table in written.items():
         assert table["columns"] == shipped[name]["columns"], name
-        assert [row[:2] for row in table["rows"]] == [row[:2] for row in shipped[name]["rows"]]
+        n = 1 if name == "shapes" else 2
+        assert [row[:n] for row in table["rows"]] == [row[:n] for row in shipped[name]["rows"]]
         assert all(len(row) == len(table["columns"]) for row in table["rows"])
     rows = sum(len(table["rows"]) for table in written.values())
     assert sum(line.startswith("   [") for line in path.read_text().splitlines()) == rows
@@ -66,5 +70,7 @@ def test_tables_are_those_of_the_shipped_file(studies, tmp_path):
         [1.3, 1.01],
         [0.8, 0.7],
     ]
+    shape = written["shapes"]["rows"][0]
+    assert shape == ["ball 5 mm, 24-pad, pitch 8 mm", 1.0, 1.5, 0.1, 0.5, 100.0, 9.0, 2.0]
     form = written["cubes as points and as pads"]["rows"][0]
     assert form[2:] == [[0.012] * 2, [1.0] * 2, [0.04] * 2, [0.99] * 2, [1.01] * 2]

@@ -78,6 +78,12 @@ def arguments(parser: Parser) -> None:
         metavar="N",
         help="number of loads of each shape (default: %(default)s)",
     )
+    contacts.add_output(
+        "--figure",
+        kind="picture",
+        default=Path("contacts.png"),
+        help="picture to write (default: %(default)s)",
+    )
 
 
 def _add(
@@ -158,9 +164,14 @@ def _measure(options: argparse.Namespace) -> dict[str, Any]:
 
         return bench_pipeline(options.cubes)
     if options.what == "contacts":
-        from ..bench.contacts import bench_contacts
+        from cube_tensor_driver.views.figures.style import save
 
-        return bench_contacts(options.loads)
+        from ..bench.contacts import bench_moving_balls, bench_shapes, summarise
+        from ..bench.contacts_figure import draw_shapes
+
+        outcomes = bench_shapes(options.loads)
+        save(draw_shapes(outcomes), options.figure)
+        return summarise(outcomes) | bench_moving_balls()
     if options.what == "links":
         from ..bench.links import bench_links
 

@@ -24,6 +24,8 @@ from cube_tensor_design.studies.traction_study import (
 from cube_tensor_driver.config.output_files import atomic_write
 from cube_tensor_driver.mechanics.influence import Influence
 
+from ..bench.contacts import SCANS, Outcomes, summarise
+
 Table = dict[str, Any]
 """A table: what it is about, its columns, its rows."""
 
@@ -65,15 +67,17 @@ FORM_DIGITS = (3, 1, 2, 2, 2)
 """Number of decimals of each quantity in `FORM_COLUMNS` after the width."""
 
 
-def write_contact_tables(path: Path, true_pads: Influence) -> None:
+def write_contact_tables(path: Path, true_pads: Influence, shapes: Outcomes) -> None:
     """Run the studies and write their tables; other tables of the file stay as they are.
 
     Args:
         path: The JSON file.
         true_pads: True influence functions of the pads in a layer.
+        shapes: Outcomes of loads of each shape.
     """
     tables = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     tables |= contact_tables(true_pads)
+    tables["shapes"] = shape_table(shapes)
     text = json.dumps(tables, indent=1, ensure_ascii=False)
     # One line for each row: the indents of what is in a row are deeper than three.
     text = re.sub(r"\n(?: {4,}| {3}(?=\]))", " ", text)
@@ -111,6 +115,21 @@ def contact_tables(true_pads: Influence) -> dict[str, Table]:
             "columns": ["cubes", *FORM_COLUMNS],
             "rows": _form_rows(forms),
         },
+    }
+
+
+def shape_table(outcomes: Outcomes) -> Table:
+    """Return the table of the errors of each shape on each skin."""
+    summary = summarise(outcomes)
+    loads = max(map(len, outcomes.values()))
+    rows = []
+    for name, figures in summary.items():
+        rows.append([name, *(float(f"{value:.2g}") for value in figures.values())])
+    return {
+        "about": f"3 N normal, 0.9 N tangential, {loads} loads for each line, after {SCANS} scans. "
+        "Contacts of one load count together. CPU times are those of one machine.",
+        "columns": ["load, cubes and pitch", *next(iter(summary.values()))],
+        "rows": rows,
     }
 
 

@@ -35,6 +35,8 @@ from cube_tensor_driver.simulation.mujoco.scene import MujocoLoad, scene_skin
 from cube_tensor_driver.simulation.mujoco.source import load_mujoco
 from cube_tensor_driver.views.figures.style import save
 
+from ..bench.contacts import bench_shapes
+from ..bench.contacts_figure import draw_shapes
 from ..bench.skin import Bench, bench_scale
 from .contact_tables import write_contact_tables
 from .fingers import draw_fingers
@@ -64,6 +66,8 @@ SHAKEN_S = 2.62
 """Time at which the acceleration of the gripper's box is largest, in s."""
 CAMERA_TARGET = (0.0, 0.0, 0.1)
 """Position, in m in the world of the gripper's scene, at the centre of its picture."""
+SHAPE_LOADS = 40
+"""Number of random loads of each shape in contacts.png."""
 COUNTS = [1, 4, 16, 64, 256, 1024, 4096]
 """Numbers of cubes in the scale plot."""
 RATE = 100.0
@@ -120,7 +124,9 @@ def make_pictures(folder: Path) -> None:
         draw_methods(layer_example(true_pads), "cubes as "),
         folder / "thin_layer.png",
     )
-    write_contact_tables(folder / "contacts.json", true_pads)
+    shapes = bench_shapes(SHAPE_LOADS)
+    save(draw_shapes(shapes), folder / "contacts.png")
+    write_contact_tables(folder / "contacts.json", true_pads, shapes)
     written = ", ".join(sorted(path.name for path in folder.iterdir()))
     print(f"wrote {written} to {folder}")
 
