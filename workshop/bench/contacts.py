@@ -34,7 +34,10 @@ from cube_tensor_driver.mechanics import contact
 from cube_tensor_driver.touch.tracker.contact_tracker import ContactTracker
 
 SCANS = 12
-"""Number of scans of each load. The errors are those of the last one."""
+"""Number of scans (samples of all cubes) with which the tracker is called under each load.
+
+Errors are those after the last scan. CPU times are given for the first and for the last scan.
+"""
 
 MOVING_SCANS = 120
 """Number of scans while balls move over the skin."""
@@ -76,20 +79,35 @@ class Shape(NamedTuple):
 
 
 def ellipse(length: float, width: float, order: int = 16) -> Array:
-    """Return Hertz's pressure on an ellipse along x, as `Shape.forces` in `order` rings."""
+    """Return Hertz's pressure on an ellipse with 1 N, as point forces (see `Shape.forces`).
+
+    Args:
+        length: Axis of the ellipse along x, in m.
+        width: Axis of the ellipse along y, in m.
+        order: Number of rings on which the point forces lie.
+    """
     sources, forces = contact.hertz(1.0, (0, 0, 1), order=order)
     scaled = sources[:, :2] * np.array([length, width]) / 2
     return np.column_stack([scaled, forces[:, 2]])
 
 
 def punch(width: float) -> Array:
-    """Return the pressure of a rigid flat punch, as `Shape.forces`."""
+    """Return the pressure under a rigid flat punch with 1 N, as point forces.
+
+    Args:
+        width: Diameter of the punch, in m.
+    """
     sources, forces = flat_punch(width / 2, np.array([0, 0, 1.0]), np.zeros(2), 14)
     return np.column_stack([sources[:, :2], forces[:, 2]])
 
 
 def bar(length: float, width: float) -> Array:
-    """Return a pressure that is uniform along x and semi-elliptic across, as `Shape.forces`."""
+    """Return a pressure that is uniform along x and semi-elliptic along y, as point forces of 1 N.
+
+    Args:
+        length: Length along x, in m.
+        width: Width along y, in m.
+    """
     nodes, along = np.polynomial.legendre.leggauss(int(length / 0.5e-3))
     angle = np.arange(1, 9) * np.pi / 9
     across = np.sin(angle) ** 2
@@ -216,8 +234,8 @@ def _summarise(name: str, loads: list[Outcome]) -> dict[str, float]:
     return {
         "force_error_percent": 100 * _rms(force) / FORCE,
         "force_ratio": _rms(force / force_deviation),
-        "place_error_mm": 1e3 * _rms(place),
-        "place_ratio": _rms(place / place_deviation),
+        "position_error_mm": 1e3 * _rms(place),
+        "position_ratio": _rms(place / place_deviation),
         "right_number_percent": 100 * float(is_right.mean()),
         "first_scan_cpu_ms": float(np.mean(first_ms)),
         "scan_cpu_ms": float(np.mean(last_ms)),
