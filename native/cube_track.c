@@ -64,7 +64,7 @@ bool cube_follow(
     int64_t *stamps_ns) {
     cube_track_head head = track->head;
     int64_t pause_ns = arrival_ns - head.last_arrival_ns;
-    if (!head.is_usual || count == 0 || pause_ns < 0 || pause_ns > MAX_PAUSE_NS)
+    if (!head.is_native_allowed || count == 0 || pause_ns < 0 || pause_ns > MAX_PAUSE_NS)
         return false;
     for (size_t i = 0; i < count; i++) {
         const cube_sample *sample = &samples[i];
@@ -91,7 +91,7 @@ bool cube_follow(
         seen[0] = number;
         seen[1] = (int64_t)samples[i].device_us;
     }
-    head.usual += (int64_t)count;
+    head.n_native += (int64_t)count;
     track->head = head;
     return true;
 }

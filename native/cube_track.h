@@ -16,8 +16,8 @@
 
 /* Names, units and origins are explained in track.py. */
 typedef struct {
-    int64_t is_usual;
-    int64_t usual;
+    int64_t is_native_allowed;
+    int64_t n_native;
     int64_t n_cubes, n_pads;
     int64_t next, newest_us;
     int64_t reference, reference_us;

@@ -276,7 +276,7 @@ static void decode_link(Link *link, int64_t arrival_ns, bool is_late) {
         at += sizeof length + length;
         link->has_frames = true;
         if (count == MAX_USUAL || !cube_parse_sample(&frame)) {
-            link->track->head.is_usual = false;
+            link->track->head.is_native_allowed = false;
             return;
         }
         samples[count] = frame.as.sample;
@@ -286,7 +286,7 @@ static void decode_link(Link *link, int64_t arrival_ns, bool is_late) {
     if (cube_follow(link->track, samples, count, arrival_ns, is_late, link->stamps_ns))
         link->count = count;
     else /* what follows must wait until the interpreter has handled this read */
-        link->track->head.is_usual = false;
+        link->track->head.is_native_allowed = false;
 }
 
 /* Reserves the decoders of a list of tuples (Decoder, file descriptor, address of a cube_track) for

@@ -22,7 +22,7 @@ from ..core.rows import FrequencyRows
 from ..core.status import STAMP
 from .clock.hub_clock import HubClock
 from .clock.steps import HostClockWatch
-from .links.intake import UsualSamples
+from .links.intake import NativeSamples
 from .links.link import Link, LinkConfig, LinkState
 from .links.link_log import LinkLogger, Log
 from .links.reader import LOGGED_ERRORS, LinkFrames, Reader
@@ -36,21 +36,20 @@ from .wire.native import NOT_COMPILED, wire
 from .wire.protocol import VERSION, Ack, Command, Hello, Sample, Stats, Time
 
 MAX_SCANS = 4
-"""Largest number of scans (one sample of every cube) whose rows one callback receives. If the
-caller asks for n scans per call and n + 1 is larger, n + 1 is the limit. After a pause of the
-process many scans wait; the limit keeps the memory of one callback small."""
+"""Default limit of the number of scans (one sample of every cube) per callback. If the caller
+requests n scans per callback, the limit is at least n + 1. After a pause of the process many scans
+wait; the limit keeps the memory that one callback needs small."""
 MAX_EVENTS = 100
 """Number of changes of state (open, silent, closed …) of one link that are kept for the next
 `LiveLinks.report`. If there are more, the oldest are discarded."""
 MIN_LAG_S = 0.05
-"""Minimum time, in s, for which received bytes must have waited without a break to be read by this
-process before samples lost since the last report are attributed to this host. The kernel's buffer
-of a serial port holds about what a hub with many cubes sends in this time."""
+"""Minimum delay, in s, of this process in reading received bytes, above which lost samples are
+attributed to a host that is too slow. The kernel's buffer of a serial port holds about what a hub
+with many cubes sends in this time, so a shorter delay loses nothing."""
 OVERLOAD_S = 0.5
-"""Time, in s, for which received bytes must have waited without a break to be read, while samples
-were lost, before this process drops whole scans (one sample of every cube) because the host is too
-slow. After a shorter pause it catches up without loss. Dropping ends when no scan had to be dropped
-for this time."""
+"""Delay, in s, of this process in reading received bytes, above which it drops whole scans (one
+sample of every cube) if samples are lost at the same time: the host is too slow. After a shorter
+delay it catches up without loss. Dropping ends when no scan had to be dropped for this time."""
 
 
 @dataclass(frozen=True)
@@ -158,14 +157,14 @@ class LiveLinks:
         if wire is None:
             self._log.warning(NOT_COMPILED)
         self._records = [_LinkRecord(config.name, self._log) for config in self._configs]
-        # The reader's thread holds this lock while it changes sample counters and clocks, and
-        # `report` holds it while it reads them from another thread.
+        # This lock protects the sample counters and clocks, which the reader's thread changes and
+        # `report` reads from another thread.
         self._lock = threading.RLock()
         self._was_clock_set = False  # whether the host's clock was set since the last `receive`
         self._errors = 0
-        self._overloaded_until = 0.0  # monotonic time, in s
-        # Number of missing samples at the last callback if received bytes have always been waiting
-        # for OVERLOAD_S; otherwise None.
+        # Monotonic time, in s, until which scans are dropped because the host is too slow.
+        self._overloaded_until = 0.0
+        # Number of samples lost until the last callback; None while this process reads in time.
         self._missing_before: int | None = None
         self._reader: Reader | None = None
 
@@ -250,7 +249,7 @@ class LiveLinks:
     def receive(
         self,
         received: Sequence[LinkFrames],
-        usual: UsualSamples | None = None,
+        native: NativeSamples | None = None,
     ) -> None:
         """Handle what the links have sent, and call `on_rows` with the rows of complete scans.
 
@@ -260,33 +259,37 @@ class LiveLinks:
 
         Args:
             received: Frames of the links.
-            usual: Samples that came before these frames and that the module in C has counted and
+            native: Samples that came before these frames and that the module in C has counted and
                 stamped already; None if there are none.
         """
-        if usual is not None and usual.links and not self._deliver_whole(usual):
-            samples = unpack_all(usual.raws)
-            for link, sample, stamp_ns in zip(usual.links, samples, usual.stamps_ns, strict=True):
-                if isinstance(sample, Sample):
-                    self._rows.received += sample.n_cubes
-                    self._scans.add(link, [sample], [stamp_ns])
+        if native is not None and native.links and not self._deliver_whole(native):
+            self._add_native(native)
         if received:
             self._handle_received(received)
         self._was_clock_set = False
         self._deliver()
         self._rows.check(self._scans.rows_waiting())
 
-    def _deliver_whole(self, usual: UsualSamples) -> bool:
+    def _add_native(self, native: NativeSamples) -> None:
+        """Add samples that the module in C has counted and stamped to the scans."""
+        samples = unpack_all(native.raws)
+        for link, sample, stamp_ns in zip(native.links, samples, native.stamps_ns, strict=True):
+            if isinstance(sample, Sample):
+                self._rows.received += sample.n_cubes
+                self._scans.add(link, [sample], [stamp_ns])
+
+    def _deliver_whole(self, native: NativeSamples) -> bool:
         """Call `on_rows` at once if these samples are whole scans of all links that deliver.
 
         A whole scan holds one sample of every such link with all cubes of its hub.
 
         Args:
-            usual: Samples that are counted and stamped already.
+            native: Samples that the module in C has counted and stamped already.
 
         Returns:
             Whether they are whole scans. If not, the caller must add the samples to the scans.
         """
-        scans = self._scans.order_whole(usual, self._scans_per_call, self._max_scans)
+        scans = self._scans.order_whole(native, self._scans_per_call, self._max_scans)
         self._rows.received += sum(len(part.cubes) for part in scans)
         if self._is_overloaded():
             self._count_overload(sum(len(part.cubes) for part in scans[:-1]))
@@ -325,21 +328,20 @@ class LiveLinks:
             self._overloaded_until = time.monotonic() + OVERLOAD_S
 
     def _handle_received(self, received: Sequence[LinkFrames]) -> None:
-        """Handle reads of links that the module in C has left to Python, such as those with HELLO.
+        """Handle frames that the module in C does not handle itself, for example HELLO.
 
         Args:
-            received: Frames of each read.
+            received: Frames of each read of a link.
         """
         with self._lock:
             now_ns = self._read_clock()
             for read in received:
                 if self._was_clock_set:
-                    # The host's clock was set, so that the arrival may be a time of the old clock.
-                    # A question for the hub's time that was asked before the step and answered
-                    # after it says nothing about the hub's clock (asked_ns = 0: not used).
+                    # The arrival may have been measured before the host's clock was set, and an
+                    # answer to TIME would compare host times before and after the step.
                     read = read._replace(arrival_ns=now_ns, asked_ns=0)
-                # All rows are counted before any frame is handled, so that rows of the frames
-                # behind a frame that raises an error are counted, too.
+                # All rows are counted before any frame is handled, because an error in one frame
+                # loses the rows of all later ones.
                 for frame in read.frames:
                     if isinstance(frame, Sample):
                         self._rows.received += frame.n_cubes
@@ -349,7 +351,10 @@ class LiveLinks:
                     self._count_error(error)
 
     def _read_clock(self) -> int:
-        """Return the time of the host's clock, in ns; move the clocks of all hubs if it was set."""
+        """Return the time of the host's clock, in ns.
+
+        If the clock was set since the last call, all stored host times are moved by the step.
+        """
         now_ns, step_ns = self._clock_watch.look()
         if not step_ns or not self._is_host_clock():
             return now_ns
@@ -413,7 +418,7 @@ class LiveLinks:
         stamps_ns = clock.update(device_us, read.arrival_ns, numbers, read.is_late)
         status = STAMP if clock.in_doubt else 0
         self._scans.add(read.link, samples, stamps_ns, status)
-        record.track.is_usual = record.account.is_usual and clock.is_usual
+        record.track.is_native_allowed = record.account.has_whole_samples and clock.is_steady
 
     def _deliver(self) -> None:
         """Call `on_rows` with the rows (samples of cubes) of all complete scans.
@@ -479,17 +484,16 @@ class LiveLinks:
         record = self._records[link]
         record.was_open |= state is LinkState.OPEN
         if state is not LinkState.OPEN:
-            record.track.is_usual = False
+            record.track.is_native_allowed = False
             record.account.expect_restart()
-            # A link that is WAITING without an error is about to be opened for the first time,
-            # which is no event to report.
+            # A link that is WAITING without an error was just started, which is not reported.
             if error is not None or state is LinkState.CLOSED:
                 record.events.append((state, str(error or state.value)))
             self._scans.forget(link)
             self._deliver()
 
-        # A simulator may make the port after the driver was started. So until the link has been
-        # open once, a missing port is not logged.
+        # A missing port of a simulator is not logged before the link was open for the first time,
+        # because the simulator may make the port later.
         is_expected = self._configs[link].is_simulated and not record.was_open
         if error is None or error.kind != "no_port" or not is_expected:
             record.logger.change(state, error)
@@ -522,8 +526,8 @@ def _report(link: Link, record: _LinkRecord, lag_s: float) -> LinkReport:
             record.logged_version = other
             record.logger.error(notes[-1])
 
-    # The reader's thread may add problems and events at the same time. Replacing the set and
-    # removing single events are atomic in Python, so that nothing is lost.
+    # The reader's thread may add problems and events meanwhile. Nothing is lost, because replacing
+    # the set and removing an event are atomic in Python.
     problems, record.clock.problems = record.clock.problems, set()
     notes += sorted(problems)
     past_states = []
@@ -547,7 +551,11 @@ def _period_us(rate: float | None) -> int | None:
     return None if rate is None else round(1e6 / rate)
 
 
-def _loss_notes(before: dict[str, int], now: dict[str, int], lag_s: float) -> list[str]:
+def _loss_notes(
+    before: dict[str, int],
+    now: dict[str, int],
+    lag_s: float,
+) -> list[str]:
     """Return a text about the samples lost since the last report; none if none were lost.
 
     The text states how many were lost and where: in this host, in the hub, or on the line.
@@ -557,13 +565,14 @@ def _loss_notes(before: dict[str, int], now: dict[str, int], lag_s: float) -> li
         now: The counters now.
         lag_s: Longest time since the last report for which received bytes waited to be read, in s.
     """
-    taken, lost, dropped = (
-        now[name] - before.get(name, 0) for name in ("taken", "lost_on_the_way", "dropped_in_hub")
-    )
+    change = {name: count - before.get(name, 0) for name, count in now.items()}
+    taken = change["taken"]
+    lost = change["lost_on_the_way"]
+    dropped = change["dropped_in_hub"]
     if lost + dropped <= 0:
         if dropped <= 0:
             return []
-        # STATS (counters of the hub) came after the report of the loss.
+        # The hub's counters (STATS) came only now, after these samples were reported as lost.
         return [f"{dropped} of the samples lost before were dropped in the hub"]
     if lag_s > MIN_LAG_S:
         place = f"the host is too slow: it was {lag_s:.1f} s behind: lower the rate"

@@ -40,10 +40,11 @@ class LinkTrack(Structure):
     stated otherwise, times in ns are counted from `first_us` (device) and `first_ns` (host).
 
     Attributes:
-        is_usual: Whether the module in C may take the next samples. It clears this when a read
-            holds anything else; Python sets it after it has handled that.
-        usual: Number of samples that the module in C has taken.
-        n_cubes, n_pads: Shape of usual samples, which hold all cubes of the hub.
+        is_native_allowed: Whether the module in C may count and stamp the next samples. The module
+            clears this at a frame that it leaves to Python (for example after a lost sample), and
+            Python sets it after handling the frame.
+        n_native: Number of samples that the module in C has counted and stamped.
+        n_cubes, n_pads: Shape of the samples that the module in C handles: all cubes of the hub.
         next: Number of the next sample, continued beyond 32 bits.
         newest_us: Device time of the newest sample, in µs.
         reference: Number (32 bits) of the sample from which device times are predicted; -1 if there
@@ -67,8 +68,8 @@ class LinkTrack(Structure):
         seen: Number and device time, in µs, of the newest samples; the place of number n is n % 64.
     """
 
-    is_usual: bool
-    usual: int
+    is_native_allowed: bool
+    n_native: int
     n_cubes: int
     n_pads: int
     next: int

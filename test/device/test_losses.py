@@ -15,7 +15,7 @@ from cube_tensor_driver.core.status import STAMP
 from cube_tensor_driver.device import chain
 from cube_tensor_driver.device.chain import LiveLinks
 from cube_tensor_driver.device.clock.hub_clock import HubClock
-from cube_tensor_driver.device.links.intake import UsualSamples
+from cube_tensor_driver.device.links.intake import NativeSamples
 from cube_tensor_driver.device.links.link import LinkConfig, LinkState
 from cube_tensor_driver.device.links.reader import LinkFrames
 from cube_tensor_driver.device.scans.cube_table import CubeAddress
@@ -304,7 +304,7 @@ class SlowHost:
             return
         decoded = [PythonDecoder().feed(encode(one))[0].raw for one in samples]
         links = [link for link in (0, 1) for _ in samples]
-        self.live.receive([], UsualSamples(links, 2 * decoded, 2 * stamps_ns))
+        self.live.receive([], NativeSamples(links, 2 * decoded, 2 * stamps_ns))
 
 
 @pytest.mark.parametrize("as_usual", [True, False])

@@ -166,8 +166,8 @@ def test_links_are_read_once_each_and_their_errors_told() -> None:
     assert read([here]) == (False, [], [], [], [])
     os.write(far, stats + stats[:9])
     closed = (other, -1, addressof(LinkTrack()))
-    is_late, *usual, [(index, arrival_ns, size, frames)] = read([closed, here])
-    assert (is_late, usual) == (True, [[], [], []]), "data were there before the call"
+    is_late, *handled, [(index, arrival_ns, size, frames)] = read([closed, here])
+    assert (is_late, handled) == (True, [[], [], []]), "data were there before the call"
     assert (index, arrival_ns, size, len(frames)) == (1, 5, len(stats) + 9, 1)
     with pytest.raises(RuntimeError, match="has this decoder"):
         read([here, here])
@@ -203,7 +203,7 @@ class UsualLink:
         numbers = [sample.sequence for sample in samples]
         times_us = [sample.device_us for sample in samples]
         stamps = self.clock.update(times_us, arrival_ns, numbers, is_late)
-        self.track.is_usual = self.account.is_usual and self.clock.is_usual
+        self.track.is_native_allowed = self.account.has_whole_samples and self.clock.is_steady
         return stamps
 
 
@@ -229,7 +229,7 @@ def test_usual_samples_have_the_same_stamps_and_counters_in_c(seed: int) -> None
     near, far = os.pipe()
     wake, waker = os.pipe()
     decoder = native.wire.Decoder()
-    number, step_us, arrival_ns, n_usual, n_late = 2**32 - 1000, 0, 0, 0, 0
+    number, step_us, arrival_ns, n_native, n_late = 2**32 - 1000, 0, 0, 0, 0
     for turn in range(2000):
         step_us += 20_000 if turn % 800 == 600 else 0
         samples = read_of_samples(random, number, step_us)
@@ -245,17 +245,17 @@ def test_usual_samples_have_the_same_stamps_and_counters_in_c(seed: int) -> None
             [(decoder, near, addressof(here.track))], wake, 60.0, 0.0, 1, lambda now=arrival_ns: now
         )
         timer.join()
-        n_usual += len(stamps)
+        n_native += len(stamps)
         n_late += is_late
         if events:
             stamps = here.handle(samples, arrival_ns, is_late)
         assert stamps == there.handle(samples, arrival_ns, is_late)
         assert here.account.counters() == there.account.counters()
         for name in LinkTrack.__annotations__:
-            if name not in ("is_usual", "usual", "seen"):
+            if name not in ("is_native_allowed", "n_native", "seen"):
                 assert getattr(here.track, name) == getattr(there.track, name), name
     assert sorted(map(tuple, here.track.seen)) == sorted(map(tuple, there.track.seen))
-    assert n_usual > 2000 > n_late
+    assert n_native > 2000 > n_late
     assert here.clock.resets == there.clock.resets == 2
     for fd in (near, far, wake, waker):
         os.close(fd)

@@ -26,7 +26,7 @@ from cube_tensor_driver.device.links import reader as reader_module
 from cube_tensor_driver.device.links import session as session_module
 from cube_tensor_driver.device.links import tcp
 from cube_tensor_driver.device.links.link import Link, LinkConfig, LinkState
-from cube_tensor_driver.device.links.reader import LinkFrames, LinkRead, Reader, UsualSamples
+from cube_tensor_driver.device.links.reader import LinkFrames, LinkRead, NativeSamples, Reader
 from cube_tensor_driver.device.wire import cobs, native
 from cube_tensor_driver.device.wire.decoder import Decoder
 from cube_tensor_driver.device.wire.protocol import (
@@ -144,7 +144,7 @@ class Watch:
         self.states: queue.Queue[tuple[int, LinkState, LinkError | None, float]] = queue.Queue()
         self.reader = Reader(configs, self._on_frames, self._on_state, **options)  # type: ignore[arg-type]
 
-    def _on_frames(self, received: list[LinkFrames], _usual: UsualSamples) -> None:
+    def _on_frames(self, received: list[LinkFrames], _native: NativeSamples) -> None:
         self.batches.append(
             [
                 (link, arrival_ns, frame)
@@ -473,7 +473,7 @@ def test_samples_that_are_handled_in_c_are_no_silence(hub: PtyHub) -> None:
     now = time.monotonic()
     assert session.open(now)
     for second in (0.5, 1.0, 1.5):
-        link.track.usual += 1
+        link.track.n_native += 1
         session.check_timers(now + second)
         assert link.state is LinkState.OPEN
     session.check_timers(now + 2.0)
@@ -674,14 +674,14 @@ def test_the_answer_to_the_last_question_for_the_time_is_delivered(
     clock = iter(range(1, 1_000_000))
     watch = start(LinkConfig("a", hub.port), clock_ns=lambda: next(clock))
     asked: list[tuple[int, int]] = []
-    watch.reader._on_frames = lambda received, usual: (
+    watch.reader._on_frames = lambda received, native: (
         asked.extend(
             (batch.asked_ns, batch.arrival_ns)
             for batch in received
             for frame in batch.frames
             if isinstance(frame, Time)
         ),
-        watch._on_frames(received, usual),
+        watch._on_frames(received, native),
     )
     hub.greet()
     hub.sample(1)
@@ -719,7 +719,7 @@ def test_a_hub_that_does_not_know_the_time_is_not_asked_again_until_it_restarts(
 def test_failing_callback_does_not_end_the_reader(start: Start, hub: PtyHub, caplog) -> None:
     seen: queue.Queue[int] = queue.Queue()
 
-    def on_frames(received: list[LinkFrames], _usual: UsualSamples) -> None:
+    def on_frames(received: list[LinkFrames], _native: NativeSamples) -> None:
         for frame in (frame for _, _, frames, *_ in received for frame in frames):
             if isinstance(frame, Sample):
                 seen.put(frame.sequence)
@@ -786,7 +786,7 @@ def test_a_reader_that_is_behind_knows_for_how_long(start: Start, hub: PtyHub) -
     watch.frame(Hello)
     late: dict[int, bool] = {}
 
-    def on_frames(received: list[LinkFrames], usual: UsualSamples) -> None:
+    def on_frames(received: list[LinkFrames], native: NativeSamples) -> None:
         samples = [frame for read in received for frame in read.frames if isinstance(frame, Sample)]
         late.update((sample.sequence, received[0].is_late) for sample in samples)
         if 1 in late and 2 not in late:
@@ -794,7 +794,7 @@ def test_a_reader_that_is_behind_knows_for_how_long(start: Start, hub: PtyHub) -
             until = time.monotonic() + 0.1
             while time.monotonic() < until:
                 select.select([], [], [], 0.01)
-        watch._on_frames(received, usual)
+        watch._on_frames(received, native)
 
     watch.reader.take_lag_s()
     watch.reader._on_frames = on_frames

@@ -34,11 +34,11 @@ MIN_STILL_NS = 200_000_000
 """Time, in ns, for which the device times (hub's clock) of samples must stay the same before the
 hub's clock counts as standing still. `MIN_STILL_READS` must be reached, too."""
 MIN_STILL_READS = 3
-"""Number of successive reads with an unchanged device time before the hub's clock counts as
-standing still. It is more than one, because two reads may give two frames of one sample."""
+"""Number of successive reads with an unchanged device time (hub's clock) before this clock counts
+as standing still. One is not enough, because two reads may give two frames of one sample."""
 MAX_STEPS = 3
-"""Number of steps of a hub's clock within `STEPS_NS` at which its device times are no longer used;
-rows (samples of cubes) then have their arrival times as stamps."""
+"""Number of steps of a hub's clock within `STEPS_NS` (10 s) from which on its times are not used.
+Then the arrival times at the host are the stamps of the samples."""
 STEPS_NS = 10_000_000_000
 """Length, in ns, of the time window in which the steps of a hub's clock are counted. Older steps do
 not count, so that the clock is used again."""
@@ -67,9 +67,8 @@ class HubClock:
         problems: Texts of problems, which the caller reports and removes.
     """
 
-    # Inside, device times are in ns since track.first_us, and arrival times in ns since
-    # track.first_ns, because a float would round absolute times to 256 ns. When one of the clocks
-    # was set, its origin (first_us or first_ns) is moved by the step, so that the line still holds.
+    # Times are stored relative to track.first_us (device) and track.first_ns (host), because a
+    # float would round absolute times to 256 ns.
 
     def __init__(self, track: LinkTrack | None = None) -> None:
         self._track = LinkTrack() if track is None else track
@@ -85,22 +84,22 @@ class HubClock:
         self._n_bad_answers = 0
         self._track.last_arrival_ns = NEVER
         self._track.last_stamp_ns = NEVER
-        # Last stamp before the latest step of the hub's clock was confirmed; it may be too late.
+        # Last stamp given while a step of the hub's clock was suspected that was confirmed later.
+        # It was computed without the step and may be later than the true time.
         self._doubtful_stamp = NEVER
         self._restart()
 
     @property
-    def is_usual(self) -> bool:
-        """Whether the module in C may convert the device times of the next samples.
+    def is_steady(self) -> bool:
+        """Whether the hub's clock runs regularly, so that the module in C may convert its times.
 
-        It may if the newest sample was the reference of the sample period, and no step of the hub's
-        clock is suspected.
+        The sample period must be known up to the newest sample, and no step of the clock suspected.
         """
         track = self._track
         is_newest = 1000 * (track.newest_us - track.first_us) == track.newest_ns
         in_step = is_newest and track.reference_us == track.newest_us and track.period_us > 0
-        is_open = self.in_doubt or self._decision is not None or self._n_still > 0
-        return in_step and not is_open and len(self._steps_ns) < MAX_STEPS
+        is_suspected = self.in_doubt or self._decision is not None or self._n_still > 0
+        return in_step and not is_suspected and len(self._steps_ns) < MAX_STEPS
 
     @property
     def drift_ppm(self) -> float:
@@ -123,10 +122,10 @@ class HubClock:
         """Host time minus hub's time at the newest sample, in ns; 0 before the first sample."""
         if self._is_fresh:
             return 0
-        at_first = self._track.first_ns - 1000 * self._track.first_us
-        return at_first + round(
-            self._track.bounded_offset + self._track.drift * self._track.newest_ns
-        )
+        track = self._track
+        between_origins = track.first_ns - 1000 * track.first_us
+        since_origins = track.bounded_offset + track.drift * track.newest_ns
+        return between_origins + round(since_origins)
 
     @property
     def delay_ns(self) -> float:
@@ -268,8 +267,8 @@ class HubClock:
         if not times:
             return []
         track = self._track
-        # Of samples that arrive together the newest one has the smallest delay. Only the smallest
-        # delays determine the line, so the others need not be added to it.
+        # The clock line is determined by the smallest delays. Of samples that arrive together, only
+        # the newest one can have the smallest delay.
         is_usable = self._learn(max(times), arrival_ns)
         offset, drift = track.bounded_offset, track.drift
         stamps = []
@@ -278,8 +277,8 @@ class HubClock:
             stamp = track.first_ns + device_ns + round(offset + drift * device_ns)
             if not is_usable or not 0 <= arrival_ns - stamp <= MAX_DELAY_NS:
                 stamp = arrival_ns
-            # Stamps must not decrease with increasing device time. A sample with an older device
-            # time, which came late, must not have a later stamp than the newest one.
+            # Stamps must be in the order of the device times, so a sample that came out of order
+            # must not get a later stamp than the newest one.
             if device_ns <= track.newest_ns and is_usable:
                 stamp = min(stamp, track.last_stamp_ns)
             else:
@@ -311,8 +310,8 @@ class HubClock:
         )
         track.last_arrival_ns = arrival_ns
         if goes_back:
-            # The arrival time went back although no step of the host's clock was reported: either
-            # the step was missed, or the host time is a simulated time that was restarted.
+            # Host time went back without a reported step of the host's clock: the step was missed,
+            # or a simulated time was restarted.
             track.last_stamp_ns = NEVER
             self.reset()
         elif pause_ns > MAX_PAUSE_NS and not self._is_fresh:
@@ -332,8 +331,8 @@ class HubClock:
             track.first_us, track.first_ns = newest_us, arrival_ns
             device_ns = 0
 
-        # Until it is decided whether the hub's clock was set, the delay of a sample is unknown, so
-        # the line is not fitted to it.
+        # The line is not fitted while a step of the hub's clock is undecided, because the delay of
+        # a sample (arrival minus sampling) is unknown then.
         arrival = arrival_ns - track.first_ns
         if self._decision is None and self._line.add(device_ns, arrival, self._is_late):
             self.problems.add(CLOCK_SET)
@@ -386,7 +385,7 @@ class HubClock:
             )
             return
         step_us += self._decision.step_us
-        # If this step of the hub's clock has undone the one before, nothing is left to decide.
+        # If the two steps of the hub's clock cancel each other, there is nothing to decide.
         self._decision = replace(self._decision, step_us=step_us) if step_us else None
 
     def _decide(self, decision: StepDecision, newest_us: int, arrival_ns: int) -> None:
@@ -403,17 +402,18 @@ class HubClock:
             delay = self._line.height(device_ns, arrival)
             was_set = decision.was_set(device_ns, delay, arrival, self._track.jitter_ns)
         else:
-            # Delays of samples that this host reads late do not tell whether the hub's clock was
-            # set. If it was, the clock line shows that once they are read in time again.
-            was_set = None if arrival - decision.since_ns <= MAX_DECISION_NS else False
+            # The delays of samples that this host reads too late do not show whether the hub's
+            # clock was set. After the time limit, this is left to the check of later delays.
+            is_in_time = arrival - decision.since_ns <= MAX_DECISION_NS
+            was_set = None if is_in_time else False
         if was_set is None:
             return
         self._decision = None
         if not was_set:
             self._track.period_us = 0.0
             return
-        # The origin of device times is moved by the step, so that device times relative to it
-        # continue as before the step, and the line and its points stay valid.
+        # The origin of device times is moved by the step, so that times relative to it continue
+        # without a step and the clock line stays valid.
         self._track.first_us += decision.step_us
         self._track.newest_ns = min(self._track.newest_ns, decision.newest_ns)
         self._doubtful_stamp = self._track.last_stamp_ns

@@ -46,14 +46,13 @@ MAX_DRIFT = 1e-3
 """Largest credible relative drift between hub and host clock, to which the estimated drift is
 limited. A larger value arises when the host pauses and reads many samples late."""
 MAX_RISE_NS = 20e6
-"""Largest credible increase or decrease of the smallest delay of samples, in ns; USB adapters delay
-samples by up to 16 ms. If the delays of all samples of `MIN_BUCKETS_HIGH` successive seconds are
-longer than the smallest one by more, or one delay is shorter by more, the hub's or the host's clock
-was set."""
+"""Largest credible change of the smallest delay of samples (arrival minus sampling), in ns; USB
+adapters delay samples by up to 16 ms. If all delays of `MIN_BUCKETS_HIGH` successive seconds exceed
+the smallest earlier one by more, or one delay falls below it by more, a clock was set."""
 MAX_FALL_NS = 4e6
-"""Largest credible decrease of the smallest delay of samples within one bucket (1 s), in ns. The
-smallest delay is known after the first bucket, so a larger decrease shows that the hub's or the
-host's clock was set. Steps of 5 ms are found, with 1 ms for the error of the estimated line."""
+"""Largest credible decrease of the smallest delay of samples (arrival minus sampling) within 1 s,
+in ns. A larger one, after the first second, shows that the hub's or the host's clock was set.
+Steps of 5 ms shall be found; 1 ms is left for the error of the estimated delay."""
 MIN_BUCKETS_HIGH = 2
 """Number of successive buckets (intervals of 1 s) in which the delays of all samples must exceed
 the smallest delay by more than `MAX_RISE_NS` before the hub's or the host's clock counts as set.
@@ -158,8 +157,8 @@ class ClockLine:
         Args:
             device_ns: Device time of the sample, in ns since the first point.
             arrival_ns: Host time at which it arrived, in ns since the first point.
-            is_late: Whether the host has read the sample late, because it is too slow. Its delay
-                then does not show that a clock was set, but the line is still not above the point.
+            is_late: Whether the host has read the sample too late, because it is too slow. A long
+                delay then does not show that a clock was set.
 
         Returns:
             Whether the points show that the hub's or the host's clock was set.
@@ -216,9 +215,8 @@ class ClockLine:
         Returns:
             Whether this shows that the hub's or the host's clock was set.
         """
-        # In the first second, the line (host time over device time) falls until the smallest delay
-        # is known. Such a fall is not added to _fall, because it does not show that a clock was
-        # set.
+        # In the first second, the line falls because the smallest delay is not known yet. Only a
+        # later fall shows that a clock was set.
         self._fall -= height if self._points else 0.0
         is_known = bool(self._points) or not self._track.is_earliest_late
         was_set = self._fall > MAX_FALL_NS or (-height > MAX_RISE_NS and is_known)
@@ -272,8 +270,8 @@ class ClockLine:
         if len(devices_ns) >= MIN_BUCKETS_FOR_DRIFT:
             slope = _slope_at_centre(devices_ns, delays)
             track.drift = min(max(slope, -MAX_DRIFT), MAX_DRIFT)
-        # The line must not lie above any point, because no delay is negative. With a limited slope
-        # it need not touch two points, so the offset is computed from all of them.
+        # No point (device time, arrival) may lie below the line, because no delay is negative. If
+        # the slope was limited to MAX_DRIFT, any point may be the lowest, so all are compared.
         track.offset = float((delays - track.drift * devices_ns).min())
         return was_set
 
@@ -303,15 +301,15 @@ class ClockLine:
         drift_error = self._drift_error()
         for trip in reversed(self._round_trips):
             drifted = self._track.drift * trip.device_ns
-            # The bounds of the offset from older round trips are widened by the error of the drift
-            # since then.
+            # The bounds of the offset from older round trips (questions for the hub's time) are
+            # wider, because the error of the drift has added up since then.
             age = abs(self._round_trips[-1].device_ns - trip.device_ns)
             tolerance = drift_error * age
             next_low = max(low, trip.low_ns - drifted - tolerance)
             next_high = min(high, trip.high_ns - drifted + tolerance)
             if next_low > next_high:
-                # Bounds of the offset that do not overlap show that a clock was set between two
-                # round trips, so the older round trips are not used.
+                # Bounds of the offset that do not overlap show that a clock was set between the
+                # measurements, so the older ones are not used.
                 break
             low, high = next_low, next_high
             self._trip_offset = (low + high) / 2
@@ -336,8 +334,8 @@ def _slope_at_centre(x: Array, y: Array) -> float:
     is_left = x < x.mean()
     if not is_left.any():
         return 0.0
-    # Of all segments from a point left of the centre to one right of it, the one that passes the
-    # centre lowest is the edge of the hull. Rows are left ends, columns right ends.
+    # The edge of the lower hull is the segment from a point left of the centre (row) to one right
+    # of it (column) that passes the centre lowest.
     left_x, left_y = x[is_left, np.newaxis], y[is_left, np.newaxis]
     slopes = (y[~is_left] - left_y) / (x[~is_left] - left_x)
     heights = left_y + slopes * (x.mean() - left_x)

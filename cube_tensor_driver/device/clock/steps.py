@@ -20,8 +20,8 @@ from ..track import LinkTrack
 
 MIN_STEP_US = 4000.0
 """Smallest deviation, in µs, of the device time (hub's clock) of a sample from the time expected
-from its number and the sample period, at which a step of the hub's clock is suspected. Steps of 5
-ms are found, with 1 ms for the jitter of the hub."""
+from its number and the sample period, at which a step of the hub's clock is suspected. Steps of
+5 ms shall be found; 1 ms is left for the jitter of the hub."""
 PERIOD_TOLERANCE = 1e-3
 """Largest assumed relative error of the estimated sample period. After lost samples, the threshold
 `MIN_STEP_US` is increased by this fraction of the time between the received samples."""
@@ -29,23 +29,23 @@ PERIOD_SAMPLES = 64
 """Time constant, in samples, of the low-pass filter that estimates the sample period of a hub from
 the device times (hub's clock) of its samples."""
 DECISION_NS = 200_000_000
-"""Time, in ns after a suspected step of the hub's clock, at which the step is decided.
+"""Time, in ns, for which delays of samples are collected after a suspected step of a hub's clock.
 
-A delay is the time from the sampling to the arrival of a sample. If the hub sampled late, the
-smallest delay since the step is as before; if its clock was set, it differs by the step. Before
-this time a step is decided only if one of the two would make a delay negative or improbably long.
+A delay is the time from the sampling to the arrival of a sample. If the hub only sampled late, the
+smallest delay is the same as before; if its clock was set, it differs by the step. The decision
+comes earlier if one of the two would make a delay negative or improbably long.
 """
 MAX_DECISION_NS = 1_000_000_000
 """Time limit, in ns after a suspected step of the hub's clock, for deciding whether the clock was
-set or the hub sampled late. Until then it is not decided while the smallest delay of samples lies
-about midway between the values expected for the two."""
+set or the hub only sampled late. Until then the decision waits while the smallest delay of samples
+(arrival minus sampling) is about as far from the value expected in the one case as in the other."""
 MIN_DECISION_READS = 8
 """Number of reads after a suspected step of the hub's clock before the smallest delay decides. The
 samples of a few reads may all be delayed."""
 UNLIKELY_DELAY = 8.0
-"""Ratio of the delay of a sample to the mean delay, both minus the smallest delay, that hardly any
-sample exceeds. A step of the hub's clock that is longer than the mean delay by this factor is not
-confused with a delayed sample. (The delay is the time from sampling to arrival.)"""
+"""Factor by which hardly any delay of a sample (arrival minus sampling) exceeds the mean delay; the
+smallest delay is subtracted from both. A step of the hub's clock that exceeds the mean delay by
+this factor cannot be confused with a delayed sample."""
 MIN_HOST_STEP_NS = 1_000_000
 """Smallest step of the host's clock, in ns, that is detected. The host's and the monotonic clock
 are read one after the other, so that smaller differences of the two are not certain."""
@@ -115,9 +115,8 @@ def find_step(track: LinkTrack, number: int, device_us: int) -> int:
     if track.reference < 0:
         track.reference, track.reference_us = number, device_us
         return 0
-    # The expected time is counted from a reference: the newest earlier sample whose device time
-    # differed from that of the sample before it. A number that is not ahead of it belongs to a
-    # late sample or to a further frame of one sample.
+    # A number that is not ahead of the reference belongs to a sample that came out of order or to
+    # another frame of the same sample, which cannot be checked.
     n_periods = (number - track.reference) % _WRAP
     if not 0 < n_periods < _WRAP // 2:
         return 0
@@ -130,14 +129,14 @@ def find_step(track: LinkTrack, number: int, device_us: int) -> int:
     elif abs(error) > MIN_STEP_US + PERIOD_TOLERANCE * n_periods * period:
         is_step = True
     else:
-        # The change of the period is limited, because otherwise a clock that stands still would
-        # look like a shorter and shorter period.
+        # The change of the period per sample is limited. Otherwise a clock that stands still would
+        # look like an ever shorter period.
         bound = period / PERIOD_SAMPLES
         if abs(error) > bound:
             error = math.copysign(bound, error)
         track.period_us = period + error / PERIOD_SAMPLES
-    # While the hub's clock stands still, the reference sample stays the same, so that the
-    # deviation grows with each sample until it counts as a step.
+    # The reference sample is kept while the hub's clock stands still, so that the deviation from
+    # the expected time grows until it counts as a step.
     if interval or is_step or period <= 0.0:
         track.reference, track.reference_us = number, device_us
     return round(error) if is_step else 0
@@ -194,19 +193,20 @@ class StepDecision:
             return True
         self.n_reads += 1
         self.min_delay_ns = min(self.min_delay_ns, delay_ns)
-        # The shift is the change of the delay in units of the step: 0 if the hub sampled late or
-        # early, 1 if its clock was set. After a step forward, the delay is compared with 0, the
-        # smallest possible one, because the next sample may have a smaller delay than the usual.
-        reference_ns = self.usual_delay_ns if step_ns < 0 else 0.0
+        # The shift is the decrease of the delay divided by the step: 0 if the hub sampled late or
+        # early, 1 if its clock was set.
+        reference_ns = self.usual_delay_ns
+        if step_ns > 0:
+            # The next sample may have a smaller delay than the samples before the step.
+            reference_ns = 0.0
         shift = (reference_ns - delay_ns) / step_ns
         max_shift = (reference_ns - self.min_delay_ns) / step_ns
         if (step_ns > 0) == (max_shift > 0.5):
-            # With the other explanation, the delay of a sample would be negative.
+            # After the opposite decision, the delay of a sample would be negative.
             return step_ns > 0
 
         if abs(step_ns) > UNLIKELY_DELAY * mean_delay_ns:
-            # The step is longer than almost any delay. So a shift near 0 shows that the hub sampled
-            # late or early, and one near 1 that its clock was set.
+            # The step is longer than almost any delay, so the change of a single delay decides.
             if abs(shift) < 0.25:
                 return False
             if abs(shift - 1) < 0.25:

@@ -27,7 +27,7 @@ ASK_PERIOD_S = 1e-3
 (all but Linux). Bytes arrive up to this time late."""
 
 
-class UsualSamples(NamedTuple):
+class NativeSamples(NamedTuple):
     """Samples that the module in C has counted and stamped already, in the order of arrival.
 
     Attributes:
@@ -42,7 +42,7 @@ class UsualSamples(NamedTuple):
 
 
 class LinkRead(NamedTuple):
-    """Result of reading one link once, if it is more than samples that were handled in C.
+    """Frames or error from reading one link once, unless the module in C has handled all frames.
 
     Attributes:
         link: Index of the link.
@@ -90,7 +90,7 @@ class Intake:
         timeout_s: float,
         gather_s: float,
         expected: int,
-    ) -> tuple[bool, UsualSamples, list[LinkRead]]:
+    ) -> tuple[bool, NativeSamples, list[LinkRead]]:
         """Wait for bytes, and read and decode the links that have some.
 
         Args:
@@ -107,36 +107,45 @@ class Intake:
         if wire is None or len(self._targets) < len(self._links):
             return self._read_in_python(timeout_s)
         is_late, links, raws, stamps_ns, reads = wire.read_links(
-            self._targets, self._wake_fd, timeout_s, gather_s, expected, self._clock_ns
+            self._targets,
+            self._wake_fd,
+            timeout_s,
+            gather_s,
+            expected,
+            self._clock_ns,
         )
-        events = []
+        others = []
         for i, arrival_ns, size, frames in reads:
+            # A size that is not positive is the negative errno of a failed read.
             result = unpack_all(frames) if size > 0 else self._links[i].read_error(-size)
-            events.append(LinkRead(i, arrival_ns, result))
-        return is_late, UsualSamples(links, raws, stamps_ns), events
+            others.append(LinkRead(i, arrival_ns, result))
+        return is_late, NativeSamples(links, raws, stamps_ns), others
 
-    def _ask_links(self, timeout_s: float) -> tuple[bool, UsualSamples, list[LinkRead]]:
+    def _ask_links(self, timeout_s: float) -> tuple[bool, NativeSamples, list[LinkRead]]:
         """Read the open links again and again until frames have come; see `read`."""
         until = time.monotonic() + timeout_s
         while True:
             is_open = [i for i, link in enumerate(self._links) if link.is_open]
             reads = [read for read in self._read_ready(is_open) if read.result]
             if reads or time.monotonic() >= until:
-                return False, UsualSamples([], [], []), reads
-            # Windows has no call that waits for serial ports and sockets together.
+                return False, NativeSamples([], [], []), reads
+            # There is no call on Windows that waits for serial ports and sockets together.
             time.sleep(ASK_PERIOD_S)
 
-    def _read_in_python(self, timeout_s: float) -> tuple[bool, UsualSamples, list[LinkRead]]:
+    def _read_in_python(self, timeout_s: float) -> tuple[bool, NativeSamples, list[LinkRead]]:
         """Wait, read and decode in Python; see `read`. It does not wait for the other links."""
-        numbers = {link.fileno(): i for i, link in enumerate(self._links) if link.is_open}
         poll = select.poll()
-        for fd in (self._wake_fd, *numbers):
-            poll.register(fd, select.POLLIN)
+        poll.register(self._wake_fd, select.POLLIN)
+        index_of = {}
+        for i, link in enumerate(self._links):
+            if link.is_open:
+                index_of[link.fileno()] = i
+                poll.register(link.fileno(), select.POLLIN)
         ready = poll.poll(0)
         is_late = bool(ready)
         ready = ready or poll.poll(1000 * timeout_s)
-        reads = self._read_ready([numbers[fd] for fd, _ in ready if fd in numbers])
-        return is_late, UsualSamples([], [], []), reads
+        indices = [index_of[fd] for fd, _ in ready if fd in index_of]
+        return is_late, NativeSamples([], [], []), self._read_ready(indices)
 
     def _read_ready(self, ready: Sequence[int]) -> list[LinkRead]:
         """Read the links with these indices once each, and decode their bytes in Python."""
@@ -146,14 +155,14 @@ class Intake:
                 results.append(self._links[i].read())
             except LinkError as error:
                 results.append(error)
-        # The clock is read after all links, so that no byte arrives after this time, and before the
-        # decoding, which would delay it.
+        # The clock is read after the bytes, so that none of them arrived later, and before the
+        # decoding, which takes time.
         arrival_ns = self._clock_ns()
-        return [
-            LinkRead(
-                i,
-                arrival_ns,
-                self._links[i].decoder.feed(data) if isinstance(data, bytes) else data,
-            )
-            for i, data in zip(ready, results, strict=True)
-        ]
+        reads = []
+        for i, result in zip(ready, results, strict=True):
+            if isinstance(result, LinkError):
+                reads.append(LinkRead(i, arrival_ns, result))
+            else:
+                frames = self._links[i].decoder.feed(result)
+                reads.append(LinkRead(i, arrival_ns, frames))
+        return reads

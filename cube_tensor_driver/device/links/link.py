@@ -423,8 +423,8 @@ def explain_open_error(path: str, error: BaseException) -> LinkError:
     """
     code = getattr(error, "errno", None)
     for source in (error, error.__context__):
-        # Some errors of the terminal, which have no attribute `errno`, come from pyserial
-        # unchanged; others are the context of an error of pyserial.
+        # An error of the terminal (termios.error) has no attribute `errno`. It comes from pyserial
+        # unchanged or as the context of another error.
         if code is None and isinstance(source, _terminal_error()):
             code = source.args[0]
     if code in _OPEN_ERRORS:

@@ -23,7 +23,7 @@ from typing import NamedTuple
 from ...core.errors import LinkError
 from ..track import LinkTrack
 from ..wire.protocol import Command, Frame, Request, encode
-from .intake import Intake, LinkRead, UsualSamples
+from .intake import Intake, LinkRead, NativeSamples
 from .link import Link, LinkConfig, LinkState
 from .session import TICK_S, Session
 
@@ -38,8 +38,8 @@ DRAIN_S = 0.05
 """Longest time, in s, that closing the links waits until the STOP requests (send no more samples)
 have left the serial ports."""
 LOGGED_ERRORS = (1, 10, 100, 1000, 10_000)
-"""The 1st, 10th, 100th … exception of a callback is logged. At a sample rate of 1 kHz, logging all
-of them would fill the log."""
+"""Numbers of the exceptions of callbacks that are logged: the 1st, 10th, 100th … At a sample rate
+of 1 kHz, logging all of them would fill the log."""
 CLOSE_S = 1.5
 """Longest time, in s, for which `Reader.close` waits for the end of the reader's thread. If the
 thread still runs then, an error is logged."""
@@ -65,7 +65,7 @@ class LinkFrames(NamedTuple):
     is_late: bool = False
 
 
-OnFrames = Callable[[list[LinkFrames], UsualSamples], None]
+OnFrames = Callable[[list[LinkFrames], NativeSamples], None]
 OnState = Callable[[int, LinkState, LinkError | None], None]
 
 _log = logging.getLogger(__name__)
@@ -81,7 +81,7 @@ class Reader:
         links: Port of each link, and the hub that is expected there.
         on_frames: Called each time data were read, with a list of `LinkFrames`, and with the
             samples that came before these frames and were counted and stamped in C
-            (`UsualSamples`). The frames of each link are in the order of their arrival.
+            (`NativeSamples`). The frames of each link are in the order of their arrival.
         on_state: Called when the state of a link or its reason changes, with the index of the link,
             the state, and the error that is the reason (None if there is none).
         clock_ns: Clock of the arrival times, in ns. It is read after the bytes, so that no arrival
@@ -111,8 +111,9 @@ class Reader:
         on_end: Callable[[], None] = lambda: None,
         tracks: Sequence[LinkTrack] | None = None,
     ) -> None:
-        tracks = [LinkTrack() for _ in links] if tracks is None else tracks
-        self.links = [Link(config, track) for config, track in zip(links, tracks, strict=True)]
+        if tracks is None:
+            tracks = [LinkTrack() for _ in links]
+        self.links = [Link(*pair) for pair in zip(links, tracks, strict=True)]
         self.callback_errors = 0
         self.behind_s = 0.0
         self.failure: Exception | None = None
@@ -123,7 +124,7 @@ class Reader:
         self._on_frames = on_frames
         self._on_end = on_end
         self._clock_ns = clock_ns
-        # Links and the periods to set on them, from other threads.
+        # Sample periods that other threads have requested: index of the link, period in µs.
         self._periods: deque[tuple[int, int]] = deque()
         self._stopping = False
         self._lag_s = 0.0
@@ -165,11 +166,10 @@ class Reader:
         self._wake()
 
     def take_lag_s(self) -> float:
-        """Return by how much this thread came too late since the last call of this method.
+        """Return the largest delay of this thread in reading received bytes since the last call.
 
         Returns:
-            Largest time, in s, for which received bytes waited in a port before the thread came to
-            read them (largest `behind_s`).
+            Largest value of `behind_s`, in s.
         """
         lag_s, self._lag_s = self._lag_s, 0.0
         return lag_s
@@ -199,8 +199,8 @@ class Reader:
 
     def _wake(self) -> None:
         """Wake up the reader's thread if it waits for data."""
-        # The reader's thread closes the pipe under the same lock. Without the lock, the byte could
-        # be written after that, to another file that has got the same file descriptor.
+        # The lock prevents that the reader's thread closes the pipe meanwhile, and the byte is
+        # written to another file with the same file descriptor.
         with self._wake_lock:
             if self._wake_write >= 0:
                 with contextlib.suppress(BlockingIOError):
@@ -230,23 +230,23 @@ class Reader:
         in_time_at = time.monotonic()
         while not self._stopping:
             now = time.monotonic()
-            is_late, usual, reads = self._intake.read(
+            is_late, native, reads = self._intake.read(
                 max(0.0, tick_at - now), self._gather_s, self._expected
             )
             awake_at = time.monotonic()
             if is_late:
                 self.behind_s = awake_at - in_time_at
             else:
-                # The wait is limited to TICK_S. If it took longer, the machine did not let this
-                # thread run, and bytes may have waited meanwhile.
+                # A wait for longer than its limit TICK_S shows that the machine did not let this
+                # thread run, so received bytes may have waited.
                 self.behind_s = max(0.0, awake_at - now - TICK_S)
                 in_time_at = awake_at
             self._lag_s = max(self._lag_s, self.behind_s)
             received, failed = self._handle_reads(reads, is_late)
-            if received or usual.links:
-                self._call(self._on_frames, received, usual)
-            # Failed links are closed only after the callback, which marks every link whose frames
-            # it receives as delivering; in the other order it would undo the closing.
+            if received or native.links:
+                self._call(self._on_frames, received, native)
+            # Failed links are closed after the callback. In the other order, the callback would
+            # mark a closed link as delivering, because it still receives frames of this link.
             for i, error in failed.items():
                 self._drop(i, error)
             while self._periods:

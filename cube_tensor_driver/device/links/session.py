@@ -83,8 +83,9 @@ class Session:
         self._retry_at = self._check_port_at = self._hello_at = self._ask_time_at = 0.0
         # Whether the hub supports the request TIME. One that does not answers it by an ACK.
         self._knows_time = True
-        # Numbers of received bytes, and of samples handled in C, at the last check of the timers.
-        self._n_bytes = self._n_usual = 0
+        # Numbers of received bytes, and of samples that the module in C has handled, at the last
+        # check of the timers.
+        self._n_bytes = self._n_native = 0
         self._question = 0  # number of the last request TIME
         self._ports: tuple[object, ...] = ()
 
@@ -175,14 +176,14 @@ class Session:
             self._last_sample = self.last_byte
             if link.state is not LinkState.OPEN or link.error is not None:
                 self.set_state(LinkState.OPEN)
-            # After cables were swapped, the port may lead to another hub. Until its HELLO has
-            # come, its samples would be assigned to the cubes of the previous hub.
+            # If cables were swapped, the port leads to another hub, whose samples must not be
+            # assigned to the cubes of the previous hub before its HELLO has come.
             link.before_hello += not self._has_hello
             return self._has_hello
         if isinstance(frame, Hello):
             self._handle_hello(frame)
         elif isinstance(frame, Ack) and frame.request == Command.SET_PERIOD:
-            # Only HELLO states the sample period of a hub that does not know SET_PERIOD (rule R2).
+            # If the hub does not support SET_PERIOD, only HELLO states its sample period.
             actual_us = frame.argument
             if frame.result == Result.UNKNOWN and link.hello is not None:
                 actual_us = link.hello.period_us
@@ -228,9 +229,11 @@ class Session:
         if link.state is LinkState.SILENT or not self._has_hello:
             if now >= self._hello_at:
                 self._ask_hello(now)
-        # The answer to TIME is compared with the device times of the hub's samples, so the first
-        # request TIME follows the first sample.
-        elif self._knows_time and self._last_sample > self._opened_at and now >= self._ask_time_at:
+            return
+        # The request TIME (for the hub's time) follows the first sample, because the answer is
+        # compared with the device times (hub's clock) of samples.
+        has_samples = self._last_sample > self._opened_at
+        if self._knows_time and has_samples and now >= self._ask_time_at:
             self._ask_time(now)
 
     def set_state(self, state: LinkState, error: LinkError | None = None) -> None:
@@ -256,11 +259,11 @@ class Session:
         Args:
             now: Monotonic time, in s.
         """
-        n_bytes, n_usual = self.link.decoder.counters.bytes, self.link.track.usual
+        n_bytes, n_native = self.link.decoder.counters.bytes, self.link.track.n_native
         if n_bytes != self._n_bytes:
             self._n_bytes, self.last_byte = n_bytes, now
-        if n_usual != self._n_usual:
-            self._n_usual, self._last_sample = n_usual, now
+        if n_native != self._n_native:
+            self._n_native, self._last_sample = n_native, now
 
     def _handle_hello(self, frame: Hello) -> None:
         """Check the unique number and the sample period of a hub, and send its settings if needed.
@@ -283,8 +286,8 @@ class Session:
         link.hello = frame
         link.reset_pause()
         self.actual_us = frame.period_us
-        # A hub may round the requested period or refuse it. The period of its answer is then
-        # expected, so that the request is not repeated at every HELLO.
+        # A hub may round or refuse the requested period. The period in its answer is accepted, so
+        # that the request is not repeated at every HELLO.
         expected = (self._period_us, self._answered_us)
         has_other_period = self._period_us is not None and frame.period_us not in expected
         if not self._has_hello or link.state is LinkState.SILENT or has_other_period:
@@ -296,8 +299,8 @@ class Session:
     def _check_silence(self, now: float) -> None:
         """Set the state SILENT if no sample has come for the time limit.
 
-        The limit is `SILENT_S` or three sample periods, whichever is longer, less one period of the
-        timer check.
+        The limit is `SILENT_S` or three sample periods, whichever is longer. One period of this
+        check is subtracted, so that the state never comes later.
 
         Args:
             now: Monotonic time, in s.

@@ -105,7 +105,8 @@ class CubeTable:
         self._addresses = tuple(addresses)
         self._pads = np.array([address.n_pads for address in addresses])
         self._hubs = [_HubCubes() for _ in range(n_links)]
-        self._whole: dict[tuple[int, ...], RowIndex | None] = {}  # last result of `find_all`
+        # Cached result of the last call of `find_all`, by the indices of the links.
+        self._whole: dict[tuple[int, ...], RowIndex | None] = {}
 
     def learn(self, link: int, hello: Hello) -> list[str] | None:
         """Store which cubes the hub of a link has, from its HELLO frame.
@@ -141,11 +142,11 @@ class CubeTable:
         hub.complete = None
         if (is_known & fits).all():
             hub.complete = cubes.astype(np.uint16), shape
+        known_cubes = cubes[is_known].tolist()
         known_uids = hello.cube_uids[is_known].tolist()
-        uids = zip(cubes[is_known].tolist(), known_uids, strict=True)
-        # Other threads read this dictionary at any time, so it is replaced in one step and never
-        # changed in place.
-        self.uids = self.uids | dict(uids)
+        uids = dict(zip(known_cubes, known_uids, strict=True))
+        # The dictionary is replaced, not changed in place, because other threads read it.
+        self.uids = self.uids | uids
         return problems
 
     def forget(self, link: int) -> None:
@@ -167,8 +168,8 @@ class CubeTable:
             Index in the skin of the cube of each kept row, and the sample with only these rows.
         """
         hub = self._hubs[link]
-        # Usually a sample holds all cubes of the hub and all of them are in the skin, so that the
-        # indices stored by `learn` can be returned without a search.
+        # If the sample holds all cubes of the hub and all are in the skin, the indices that `learn`
+        # has stored are returned without a search.
         if hub.complete is not None and sample.first_cube == 0:
             whole, shape = hub.complete
             if sample.shape == shape:
@@ -234,11 +235,12 @@ class CubeTable:
                 claimed.update(hub.cubes.tolist())
 
         cubes = np.full(hello.n_cubes, ABSENT, np.int32)
-        # All cubes with the same problem share one line of the log. The keys are the noun of the
-        # cubes and the text of the problem, the values the names of the cubes.
+        # Cubes with the same problem share one line of the log. This dictionary holds their names
+        # by the noun of the cubes and the text of the problem.
         names: dict[tuple[str, str], list[str]] = {}
         for number, address in enumerate(self._addresses):
-            found, problem = _locate(address, link, hello, index_of_uid, number in claimed)
+            is_claimed = number in claimed
+            found, problem = _locate(address, link, hello, index_of_uid, is_claimed)
             if found is not None:
                 cubes[found] = number
             if problem:
@@ -251,7 +253,9 @@ class CubeTable:
             if index_of_uid[uid] != index:
                 problem = "left out: an earlier one has the same uid"
             names.setdefault(("the hub's cube", problem), []).append(f"{index} (uid {uid:#x})")
-        problems = [_join_names(noun, group, text) for (noun, text), group in names.items()]
+        problems = []
+        for (noun, text), group in names.items():
+            problems.append(_join_names(noun, group, text))
         return cubes, problems
 
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...core.rows import FrequencyRows
-from ..links.intake import UsualSamples
+from ..links.intake import NativeSamples
 from ..wire.native import wire
 from ..wire.protocol import NOT_MEASURED, TEMPERATURE_UNKNOWN, Sample
 from .cube_table import CubeAddress, CubeTable, RowIndex
@@ -23,7 +23,7 @@ from .row_counts import RowCounts
 
 MAX_SCANS_AHEAD = 4
 """Number of scans (one sample of each link) by which one link may be ahead of the slowest one. If
-it is ahead by more, all scans are built without the missing samples."""
+it is ahead by more, the waiting scans are delivered without the missing samples."""
 MAX_SPAN_NS = 2_000_000_000
 """Longest time, in ns, between the earliest and the latest row (sample of a cube) that one call of
 `ScanBuilder.build` returns. These rows become one message, whose 32-bit offsets in ns reach up to
@@ -33,8 +33,7 @@ MAX_PERIODS_EARLIER = 0.75
 earlier than a sample that is put into it. It is less than one period, so that no sample is put into
 the scan before its own, and well above 0, because the hubs do not sample at the same instant."""
 
-# This table holds the temperature, in °C, for each of the 65536 bit patterns that a SAMPLE frame
-# may contain, so that the conversion is one look-up.
+# This table holds the temperature, in °C, for each of the 65536 possible values in a SAMPLE frame.
 _PATTERNS = np.arange(1 << 16, dtype=np.uint16)
 _CELSIUS = _PATTERNS.view(np.int16) * np.float32(0.01)
 _CELSIUS[TEMPERATURE_UNKNOWN] = np.nan
@@ -93,7 +92,6 @@ class ScanBuilder:
     Args:
         n_links: Number of links.
         addresses: For each cube of the skin, the uid, or the link and index, to find it by.
-
         make_rows: Makes the rows to fill, for example in the memory of a message.
 
     Attributes:
@@ -111,17 +109,19 @@ class ScanBuilder:
         self.cubes = CubeTable(n_links, addresses, self.counts)
         self._make_rows = make_rows
         self._live: set[int] = set()
-        # The scans that were not built yet, oldest first. Each has the samples by link in
-        # _pending, and the host time of the sample that was added first in _pending_ns.
+        # Scans that wait for samples, oldest first: the samples of each scan by link.
         self._pending: list[dict[int, _SampleRows]] = []
+        # Host time, in ns, at which the first added sample of each pending scan was taken.
         self._pending_ns: list[int] = []
         # For each link, the number of pending scans up to the one with its newest sample.
         self._n_pending = [0] * n_links
-        # Rows that were too late (MAX_SPAN_NS) for the last call of `build`; the next returns them.
+        # Rows that are left for the next call of `build`, because they are later than the others by
+        # more than MAX_SPAN_NS.
         self._deferred: list[_SampleRows] = []
-        # Whether no scan counts as complete until the next sample is added.
+        # Whether to wait for the next sample before further rows are built. This is set when this
+        # process cannot keep up, so that it builds fewer and larger messages.
         self._holds_back = False
-        # For each link, the host time, in ns, of its newest sample that was built.
+        # For each link, the host time, in ns, of its newest sample that was converted to rows.
         self._built_ns = [0] * n_links
 
     def forget(self, link: int) -> None:
@@ -154,9 +154,8 @@ class ScanBuilder:
         for sample, stamp_ns in zip(samples, stamps_ns, strict=True):
             cubes, kept = self.cubes.find(link, sample)
             part = _SampleRows(cubes, kept, stamp_ns, status)
-            # A link that started later or lost samples has no sample in some scans. Its next sample
-            # joins the scan of its own time, not merely the next scan; otherwise this link would
-            # stay behind the others for good.
+            # After a loss, the next sample of the link joins the scan of its own time. If it joined
+            # the next scan, the link would stay behind the others for good.
             scan = self._n_pending[link]
             if len(self._pending) > 1:
                 scan = max(scan, self._first_scan_at(stamp_ns))
@@ -184,8 +183,7 @@ class ScanBuilder:
             return True
         if len(self._pending) < n_scans:
             return False
-        # These links deliver samples, but have none in the last pending scan (one sample of each
-        # link) yet.
+        # Links that deliver samples, but have none in the newest scan (one sample of each link).
         missing = self._live - self._pending[-1].keys()
         if not missing:
             return True
@@ -207,7 +205,7 @@ class ScanBuilder:
         taken = self._deferred or self._take_scans(max_scans)
         if not taken:
             return None
-        # Rows that are too late for this message are left for the next one.
+        # Rows whose time offset does not fit into one message are left for the next call.
         end_ns = min(part.stamp_ns for part in taken) + MAX_SPAN_NS
         parts = [part for part in taken if part.stamp_ns <= end_ns]
         self._deferred = [part for part in taken if part.stamp_ns > end_ns]
@@ -229,7 +227,7 @@ class ScanBuilder:
 
     def order_whole(
         self,
-        usual: UsualSamples,
+        native: NativeSamples,
         n_scans: int,
         max_scans: int,
     ) -> list[WholeScans]:
@@ -240,21 +238,24 @@ class ScanBuilder:
         missing, the list is empty.
 
         Args:
-            usual: The samples, each with all cubes of its hub.
+            native: The samples, each with all cubes of its hub.
             n_scans: Number of scans to wait for.
             max_scans: Largest number of scans in one item of the list.
         """
         live = sorted(self._live)
         width = len(live)
-        count = len(usual.links) // max(1, width)
+        count = len(native.links) // max(1, width)
         if self._pending or self._deferred or count < n_scans:
             return []
-        raws, stamps_ns = usual.raws, usual.stamps_ns
-        if usual.links != live:
-            by_link = sorted(range(len(raws)), key=usual.links.__getitem__)
-            if [usual.links[i] for i in by_link] != [link for link in live for _ in range(count)]:
+        raws, stamps_ns = native.raws, native.stamps_ns
+        if native.links != live:
+            by_link = sorted(range(len(raws)), key=native.links.__getitem__)
+            links = [native.links[i] for i in by_link]
+            needed = [link for link in live for _ in range(count)]
+            if links != needed:
                 return []
-            order = [i for scan in range(count) for i in by_link[scan::count]]
+            # Samples k, k + count, k + 2 count … of the sorted ones form scan k.
+            order = [i for k in range(count) for i in by_link[k::count]]
             raws = [raws[i] for i in order]
             stamps_ns = [stamps_ns[i] for i in order]
         cubes = self.cubes.find_all(live)
@@ -263,12 +264,13 @@ class ScanBuilder:
         for link, stamp_ns in zip(live, stamps_ns[-width:], strict=True):
             self._built_ns[link] = stamp_ns
         scans = []
-        # The scans are divided from the newest one backwards, because a host that is too slow drops
-        # all items but the last, which should hold as many scans as possible.
+        # The scans are divided from the newest one backwards, so that the last item is full: a host
+        # that is too slow drops all other items.
         for end in range(count, 0, -max_scans):
             begin = max(0, end - max_scans)
             part = slice(begin * width, end * width)
-            scans.append(WholeScans(np.tile(cubes, end - begin), raws[part], stamps_ns[part]))
+            cubes_of_rows = np.tile(cubes, end - begin)
+            scans.append(WholeScans(cubes_of_rows, raws[part], stamps_ns[part]))
         return scans[::-1]
 
     def build_whole(self, scans: WholeScans) -> FrequencyRows:
@@ -289,13 +291,12 @@ class ScanBuilder:
             Number of rows (samples of cubes) dropped.
         """
         n_dropped = max(0, len(self._pending) - n_kept)
-        parts = [part for scan in self._remove_scans(n_dropped) for part in scan.values()]
-        return sum(len(part.cubes) for part in parts)
+        return _count_rows(self._remove_scans(n_dropped))
 
     def rows_waiting(self) -> int:
         """Return how many rows (samples of cubes) were added, but not yet built or left out."""
-        waiting = self._deferred + [part for scan in self._pending for part in scan.values()]
-        return sum(len(part.cubes) for part in waiting)
+        n_deferred = sum(len(part.cubes) for part in self._deferred)
+        return n_deferred + _count_rows(self._pending)
 
     def _take_scans(self, max_scans: int | None) -> list[_SampleRows]:
         """Remove the oldest scans (one sample of each link); return their samples that have rows.
@@ -308,8 +309,8 @@ class ScanBuilder:
             self._holds_back = True
         n_scans = len(self._pending)
         n_reached = self._n_reached()
-        # The scans that a delivering link has not reached wait for its samples, unless it has given
-        # none at all, or another link is too far ahead.
+        # Only scans to which no sample can be added any more are taken. If a link has no sample in
+        # any pending scan, or another one is too far ahead, all scans are taken.
         if n_reached and n_scans - n_reached <= MAX_SCANS_AHEAD:
             n_scans = n_reached
         if max_scans is not None and n_scans > max_scans:
@@ -318,7 +319,10 @@ class ScanBuilder:
 
         parts: list[_SampleRows] = []
         for scan in self._remove_scans(n_scans):
-            parts += (scan[link] for link in sorted(scan) if len(scan[link].cubes))
+            for link in sorted(scan):
+                part = scan[link]
+                if len(part.cubes):
+                    parts.append(part)
         return parts
 
     def _remove_scans(self, n_scans: int) -> list[dict[int, _SampleRows]]:
@@ -352,8 +356,7 @@ class ScanBuilder:
             last_ns = self._built_ns[link]
             limit_ns = (part.stamp_ns + last_ns) / 2
             if part.stamp_ns <= last_ns:
-                # A hub with many cubes sends a sample in several frames. This frame belongs to the
-                # same sample as one that was built before, so it is late.
+                # This frame is another part of a sample whose first part was converted before.
                 limit_ns = 0
             if first_missing_ns > limit_ns:
                 return True
@@ -374,15 +377,14 @@ class ScanBuilder:
         more messages, which cost even more time. With this step the process keeps up with 1260
         cubes at 1 kHz; without it, a third of their rows were lost.
         """
-        scans = self._pending
-        queues = [
-            [scan[link] for scan in scans if link in scan] for link in range(len(self._n_pending))
-        ]
-        self._n_pending = [len(queue) for queue in queues]
-        self._pending = [
-            {link: queue[k] for link, queue in enumerate(queues) if k < len(queue)}
-            for k in range(max(self._n_pending))
-        ]
+        n_links = len(self._n_pending)
+        scans: list[dict[int, _SampleRows]] = [{} for _ in self._pending]
+        self._n_pending = [0] * n_links
+        for scan in self._pending:
+            for link, part in scan.items():
+                scans[self._n_pending[link]][link] = part
+                self._n_pending[link] += 1
+        self._pending = scans[: max(self._n_pending)]
         self._pending_ns = [min(part.stamp_ns for part in scan.values()) for scan in self._pending]
 
     def _first_scan_at(self, stamp_ns: int) -> int:
@@ -399,6 +401,11 @@ class ScanBuilder:
         period = (times[-1] - times[0]) / n_periods
         tolerance = MAX_PERIODS_EARLIER * period
         return bisect_left(times, stamp_ns - tolerance)
+
+
+def _count_rows(scans: list[dict[int, _SampleRows]]) -> int:
+    """Return the number of rows (samples of cubes) in scans (samples by link)."""
+    return sum(len(part.cubes) for scan in scans for part in scan.values())
 
 
 def _place(

@@ -18,10 +18,9 @@ MIN_PERIOD_US = 100
 """Shortest sample period of a hub, in µs, because the highest sample rate that can be requested is
 10 kHz (`MAX_RATE` in live.py)."""
 RESTART_US = 1_000_000
-"""Largest difference of device time (the hub's clock), in µs, between the newest sample of a hub
-and a sample whose number is below that of the first counted one. With a smaller difference the
-sample is only late; with a larger one it is taken for the first sample after a restart of the
-hub."""
+"""Largest age, in µs by the hub's clock, of a sample that was taken before the first counted one
+but came after it. If its time differs by more from that of the newest sample, it is taken for the
+first sample after a restart of the hub."""
 MAX_REPEAT_US = 60_000_000
 """Longest time, in µs of device time (the hub's clock), by which a repeated sample may be older
 than the newest one. No line holds samples for longer, so an older sample shows that the hub has
@@ -86,8 +85,7 @@ class SequenceTracker:
         first: Number of the first counted sample since the start or the last restart of the hub.
     """
 
-    # The 32-bit numbers of samples wrap to 0. In the attributes below they are unwrapped, so that
-    # they continue beyond 2**32.
+    # All attributes hold unwrapped numbers of samples, which continue where 32-bit ones wrap to 0.
 
     def __init__(self, track: LinkTrack | None = None) -> None:
         self.counters = SequenceCounters()
@@ -115,15 +113,15 @@ class SequenceTracker:
         if ahead >= 0:
             if ahead > MAX_GAP and device_us - track.newest_us < MIN_PERIOD_US * ahead:
                 return self._restart(sequence, device_us)
-            # An earlier device time than that of the sample before shows that the hub's clock was
-            # set back.
+            # If the next sample has an earlier device time, the hub's clock was set back.
             self.counters.resets += device_us < track.newest_us
             self.counters.missing += ahead
             track.next = number + 1
             track.newest_us = device_us
             return self._deliver(number, device_us, Arrival.NEW)
 
-        # The number is smaller than that of the next sample.
+        # The sample has a smaller number than expected: it is late, repeated, or the first one
+        # after a restart of the hub.
         if self._restart_at == track.next and device_us < track.newest_us:
             return self._restart(sequence, device_us)
         if (number, device_us) in self._seen() or self._is_old_repeat(number, device_us):
@@ -133,8 +131,8 @@ class SequenceTracker:
             return self._restart(sequence, device_us)
 
         if number < self.first:
-            # This late sample is older than the first one that was counted. It becomes the first,
-            # and the samples between the two count as missing.
+            # A late sample that is older than the first counted one becomes the first, and the
+            # samples between the two count as missing.
             self.counters.missing += self.first - number - 1
             self.first, self._first_us = number, device_us
         else:
@@ -168,9 +166,10 @@ class SequenceTracker:
         return distance if distance < half else distance - _WRAP
 
     def _is_old_repeat(self, number: int, device_us: int) -> bool:
-        """Return whether a sample older than the kept ones lies in the past of the hub's run.
+        """Return whether a sample is a repeated one that is older than the kept samples.
 
-        The run is all samples since the last restart of the hub, or since the first one received.
+        By its number and time it must lie between the first sample since the last restart of the
+        hub and the newest one; otherwise the hub has restarted.
 
         Args:
             number: Unwrapped number of the sample.
@@ -197,13 +196,18 @@ class SequenceTracker:
         time_of = dict(self._seen())
         if number in time_of:
             return False
-        # Without a smaller or larger number, any time fits on that side.
-        below = max((other for other in time_of if other < number), default=None)
-        above = min((other for other in time_of if other > number), default=None)
-        below_us = 0 if below is None else time_of[below]
-        above_us = MAX_DEVICE_US if above is None else time_of[above]
-        fits_below, fits_above = below_us <= device_us, device_us <= above_us
-        return fits_below and fits_above if below_us <= above_us else fits_below or fits_above
+        # The time is not limited on a side without a sample.
+        below_us, above_us = 0, MAX_DEVICE_US
+        smaller = [other for other in time_of if other < number]
+        larger = [other for other in time_of if other > number]
+        if smaller:
+            below_us = time_of[max(smaller)]
+        if larger:
+            above_us = time_of[min(larger)]
+        fits_below = below_us <= device_us
+        fits_above = device_us <= above_us
+        was_set_back = below_us > above_us
+        return fits_below or fits_above if was_set_back else fits_below and fits_above
 
     def _restart(self, sequence: int, device_us: int) -> Arrival:
         """Begin to count the samples anew with the first one after a restart of the hub.
@@ -274,10 +278,9 @@ class SampleAccount:
         self._track.n_cubes = _MAX_CUBES  # until HELLO states the number
         self._received = 0
         self.stats_frame: Stats | None = None
-        # A sample of many cubes comes in several frames (parts). There is one tracker for each
-        # part, by the index of the first cube in its frame. The counters of parts that the hub no
-        # longer sends are added to _ended.
+        # Trackers by the first cube of the frame: a sample of many cubes comes in several frames.
         self._trackers: dict[int, SequenceTracker] = {}
+        # Sums of the counters of frames that the hub no longer sends, after its cubes changed.
         self._ended = SequenceCounters()
         self._dropped = 0
         self._dropped_before = 0
@@ -297,7 +300,7 @@ class SampleAccount:
     def announce(self, n_cubes: int, n_pads: int) -> None:
         """Store the numbers of cubes and of pads per cube that the hub has reported by HELLO.
 
-        Frames (parts of samples) whose first cube does not exist any more are no longer missed.
+        Frames (parts of samples) whose first cube does not exist any more do not count as missing.
 
         Args:
             n_cubes: Number of cubes of the hub.
@@ -350,8 +353,8 @@ class SampleAccount:
         first = frame.first_cube
         self._end_parts(first + 1, first + frame.n_cubes)
         if first not in self._trackers:
-            # The module in C counts only samples that come whole in one frame, which begins with
-            # cube 0. Only the tracker of such frames shares its memory with C (`self._track`).
+            # Only the tracker of frames from cube 0 on shares its memory with the module in C,
+            # which counts only samples that come whole in one frame.
             self._trackers[first] = SequenceTracker(None if first else self._track)
         tracker = self._trackers[first]
         tracker.n_cubes = frame.n_cubes
@@ -368,7 +371,7 @@ class SampleAccount:
             self._ended.add(self._trackers.pop(first).counters)
 
     @property
-    def is_usual(self) -> bool:
+    def has_whole_samples(self) -> bool:
         """Whether each sample comes in one frame, which holds all cubes of the hub."""
         tracker = self._trackers.get(0)
         if tracker is None or len(self._trackers) > 1:
@@ -388,9 +391,9 @@ class SampleAccount:
         """
         total = asdict(self._total())
         missing = total.pop("missing")
-        total["delivered"] += self._track.usual
-        # The hub reports the number of samples that it has dropped only in STATS frames. Until then
-        # they count as lost on the way; a sample that was lost on the way never counts as dropped.
+        total["delivered"] += self._track.n_native
+        # Missing samples count as lost on the way until a STATS frame reports that the hub has
+        # dropped them.
         dropped = min(self._dropped, missing)
         return {
             "taken": total["delivered"] + missing,

@@ -111,7 +111,7 @@ class PythonDecoder:
     def _decode(self, run: bytes) -> Frame | None:
         """Return the frame of one run (bytes between two zeros); None if it is invalid.
 
-        The run increases the counter `frames`, or the one of its defect.
+        The counter `frames` is increased, or the counter of the defect.
         """
         counters = self.counters
         if len(run) < MIN_RUN:
@@ -128,8 +128,8 @@ class PythonDecoder:
             counters.crc += 1
             return None
 
-        # The checksum is correct, so these bytes are as they were sent. What is wrong from here on
-        # was sent like that, for example by a hub with another protocol version.
+        # The checksum is correct, so a mistake that is found below was not made on the line but by
+        # the sender, for example a hub with another protocol version.
         code, version, size = HEADER.unpack_from(raw)
         if version != VERSION:
             counters.version += 1

@@ -17,8 +17,8 @@ try:
 except ImportError:
     wire = None  # type: ignore[assignment]
 else:
-    # A module that was built from other sources may place the fields of LinkTrack, which it
-    # changes in memory, elsewhere.
+    # The module changes the fields of LinkTrack in memory, so it is not used if it was built for
+    # another layout of them.
     if getattr(wire, "TRACK_SIZE", 0) != sizeof(LinkTrack):
         wire = None  # type: ignore[assignment]
 
