@@ -30,8 +30,8 @@ from .simulator import Simulator, StopRequest
 class BackgroundHubs:
     """Simulates all hubs of a skin on pseudo-terminals, in real time in a thread, until `close`.
 
-    Each sample is computed from the last load that was set before the previous sample was taken.
-    Before the first `set_load`, the skin is without load.
+    The load of each sample is read in advance, just after the previous sample. So a new load acts
+    from the second sample after `set_load` on. Before the first `set_load`, there is no load.
     """
 
     def __init__(
@@ -89,8 +89,8 @@ class BackgroundHubs:
         needed = [part.shape for part in self._load.field]
         if shapes != needed:
             raise ConfigError(f"stress and gradient have the shapes {shapes}; allowed: {needed}")
-        # A single assignment of both arrays is atomic in Python, so the thread of the simulator,
-        # which reads them, needs no lock and never mixes two loads.
+        # The thread of the simulator, which reads both arrays, never mixes two loads, because this
+        # assignment is atomic in Python.
         self._load.field = new
 
     def close(self) -> None:

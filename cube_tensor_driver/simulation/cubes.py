@@ -94,7 +94,7 @@ class SimulatedCubes:
 
         Returns:
             Frequencies (cubes, pads) in mHz. A pad has `NOT_MEASURED` if its oscillator does not
-            run, or if no frequency belongs to the stress on it.
+            run, or if its stress is outside the range of the pad law (stress to frequency).
         """
         pad_stress = np.empty((len(stress), self.n_pads))
         for calibration, rows in self._groups:
@@ -116,7 +116,7 @@ class SimulatedCubes:
             )
         if self._is_noisy:
             hertz *= 1 + self._noise * self._random.standard_normal(hertz.shape)
-        # The pad law (stress to frequency) returns NaN for a stress that no frequency belongs to.
+        # The frequency is NaN if the stress is outside the range of the pad law.
         millihertz = np.rint(hertz * 1e3)
         return np.nan_to_num(millihertz, nan=NOT_MEASURED).astype("<u4")
 
@@ -158,10 +158,15 @@ class HubCubes:
             Frequencies (cubes of the hub, pads) in mHz; `NOT_MEASURED` for the pads of cubes that
             are not in the skin.
         """
-        frequency = np.full((len(self.members), self.cubes.n_pads), NOT_MEASURED, "<u4")
-        cubes = self.skin_cubes
+        shape = (len(self.members), self.cubes.n_pads)
+        frequency = np.full(shape, NOT_MEASURED, "<u4")
         in_skin = self.members != ABSENT
-        frequency[in_skin] = self.cubes.frequency(stress[cubes], gradient[cubes], seconds)
+        cubes = self.skin_cubes
+        frequency[in_skin] = self.cubes.frequency(
+            stress[cubes],
+            gradient[cubes],
+            seconds,
+        )
         return frequency
 
 
@@ -287,11 +292,10 @@ def true_state(
     Returns:
         Amplitudes (N, modes) in Pa.
     """
-    # Amplitudes of modes (linear stress fields) with a gradient are in Pa: the change of the stress
-    # over half the side of the cube.
     by_axis = to_matrix(np.moveaxis(gradient, -1, -2))  # (N, axis, i, j)
-    scaled = np.moveaxis(by_axis, -3, -1) * calibration.half_side
-    return calibration.modes.state(stress, scaled)
+    # The modes take gradients in Pa, as the change of the stress over half the side of a cube.
+    change = np.moveaxis(by_axis, -3, -1) * calibration.half_side
+    return calibration.modes.state(stress, change)
 
 
 def skin_components(
@@ -313,8 +317,8 @@ def skin_components(
     shape = (len(skin.cubes), len(COMPONENTS))
     components = np.empty(shape)
     for calibration, rows in calibration_groups(skin.calibrations):
-        # Amplitudes of modes (linear stress fields) with a gradient are in Pa: the change of the
-        # stress over half the side of a cube. Components of the gradient are in Pa/m.
+        # The modes give gradients in Pa, as the change of the stress over half the side of a cube.
+        # They are converted to Pa/m.
         scale = np.where(is_stress, 1.0, 1 / calibration.half_side)
         state = true_state(calibration, stress[rows], gradient[rows])
         components[rows] = state @ calibration.modes.components.T * scale

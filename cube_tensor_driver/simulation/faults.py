@@ -119,10 +119,13 @@ class Fault:
         """
         for _, mistake in _SCHEMA.mistakes(data):
             raise ConfigError(f"{place}: {mistake}")
-        # The values are converted to the types of the attributes, because YAML may contain 2 where
-        # a float is needed, and 2.0 where an integer is needed.
         defaults: dict[str, Any] = {"kind": "", **vars(cls)}
-        return cls(**{key: type(defaults[key])(value) for key, value in data.items()})
+        values = {}
+        for key, value in data.items():
+            # YAML may contain 2 where a float is needed, and 2.0 where an integer is needed.
+            to_type = type(defaults[key])
+            values[key] = to_type(value)
+        return cls(**values)
 
 
 def parse_faults(data: Any, place: str) -> list[Fault]:

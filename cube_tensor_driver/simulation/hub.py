@@ -118,7 +118,7 @@ class SimulatedHub:
         return self.boot_us + now_us + gained
 
     def _positive_device_us(self, now_us: int) -> int:
-        """Return the value of the hub's clock in µs, or 0 if it is negative, as in frames."""
+        """Return the hub's clock in µs for a frame, which has 0 instead of negative values."""
         return max(0, self.device_us(now_us))
 
     def set_clock(

@@ -51,9 +51,9 @@ MAX_DEVIATIONS = 6
 occur once in 10^9 pads, are cut to it."""
 
 POWER_LAW_TIMES = np.geomspace(1e-4, 1e10, 51)
-"""Time constants (51,), in s, of the terms that replace a power law of creep.
+"""Time constants (51,), in s, of the exponential terms whose sum replaces a power law of creep.
 
-Their ratio of 1.9 makes the sum differ from the integral by less than 1e-5 of the load. Loads of
+With their ratio of 1.9, the sum differs from the power law by less than 1e-5 of the load. Loads of
 0.01 s to some hours lie far within their range.
 """
 
@@ -115,15 +115,16 @@ class Imperfections:
         dead: Fraction of the pads whose oscillators do not run, 0 to 1.
         creep: Terms (c, tau) of the creep: in addition to the stress, a pad reports c times the
             stress after a low-pass filter with the time constant tau, in s.
-        creep_growth: Mean growth of the reported stress under a steady load by creep with a power
-            law, from 1 s to `GROWTH_S` after the load began, divided by the reported stress at
-            1 s, which is the true one (calibrations are made at about 1 s).
+        creep_growth: Mean relative growth of the reported stress under a steady load, from 1 s to
+            `GROWTH_S` (600 s) after its begin, by creep with a power law. At 1 s the reported
+            stress is the true one, because pads are calibrated at about 1 s.
         creep_exponent: Exponent alpha of the power law, 0 to 1.
         creep_spread: Standard deviation of a pad's `creep_growth` divided by the mean.
         temperature: Times in s and temperatures in °C of the ground below the skin, which the
             thermometers of the hubs measure; in between they are linear. Empty: the temperature is
             unknown and has no effect.
-        air: The same for the air above the skin; empty: as the ground in the beginning.
+        air: The same for the air above the skin; empty: it keeps the first temperature of the
+            ground.
         heat_exchange: Heat exchange of the surface with the air, in W/(m² K).
         thermal_stress: File of `./cube fem --temperature -o` with the layer and the stress of its
             pads, or the name of a shipped one.
@@ -153,7 +154,7 @@ class Imperfections:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        # The schema describes the values of a file, in which a term is a list.
+        # The pairs are tuples here, but lists in a file, which the schema describes.
         values = asdict(self)
         for name in _PAIRS:
             values[name] = [list(pair) for pair in getattr(self, name)]
@@ -163,8 +164,11 @@ class Imperfections:
             times = [time for time, _ in getattr(self, name)]
             if times != sorted(set(times)):
                 raise ConfigError(f"{name}: found the times {times} s, allowed: rising times")
-        # With more growth, the power law through 1 at 1 s would be negative at the begin.
-        limit = (GROWTH_S**self.creep_exponent - 1) / (1 + MAX_DEVIATIONS * self.creep_spread)
+        # With more growth, a pad would report a negative stress at the begin of a load, because the
+        # reported stress is the true one at 1 s.
+        max_growth = GROWTH_S**self.creep_exponent - 1
+        max_spread = 1 + MAX_DEVIATIONS * self.creep_spread
+        limit = max_growth / max_spread
         if self.creep_growth >= limit:
             raise ConfigError(
                 f"creep_growth: found {self.creep_growth:g}, allowed: below {limit:.3g} with this "
@@ -206,18 +210,19 @@ class PadBehaviour:
             shape: Number of cubes and of pads per cube.
             seed: Seed that differs between the hubs of a skin.
         """
-        # Gains and dead pads (pads that do not work) are always drawn in this order, so that the
-        # same seeds give the same dead pads whatever the spread of the gains and the creep are.
+        # All numbers are drawn in the same order for all parameters, so that a seed always gives
+        # the same dead pads (pads that do not work).
         random = np.random.default_rng([imperfections.seed, seed])
         self._gain = 1 + imperfections.gain_spread * random.standard_normal(shape)
         self._dead = random.random(shape) < imperfections.dead
 
-        # The reshape gives the right shape (0, 2) if there are no terms.
+        # Without terms, the array must have the shape (0, 2).
         terms = np.array(imperfections.creep, float)
         terms = terms.reshape(-1, 2)
         self._creep_time = terms[:, 1]
         self._creep_size = np.ones(shape) * terms[:, 0, None, None]
-        self._at_once: Array = np.ones(shape)  # reported at once, per stress
+        # Fraction (cubes, pads) of the stress that a pad reports without delay.
+        self._at_once: Array = np.ones(shape)
         if imperfections.creep_growth:
             deviation = random.standard_normal(shape).clip(-MAX_DEVIATIONS, MAX_DEVIATIONS)
             spread = np.maximum(1 + imperfections.creep_spread * deviation, 0)
@@ -233,11 +238,12 @@ class PadBehaviour:
             growth: Growth of the reported stress from 1 s to `GROWTH_S` (cubes, pads).
             exponent: Exponent alpha of the power law.
         """
-        # J(t) = 1 + a (t^alpha - 1), so J is 1 at 1 s and 1 + growth at GROWTH_S.
+        # Reported stress per true stress after the time t: 1 + a (t^alpha - 1), with the factor a.
         factor = growth / (GROWTH_S**exponent - 1)
         step = math.log(POWER_LAW_TIMES[1] / POWER_LAW_TIMES[0])
         weight = exponent / math.gamma(1 - exponent) * POWER_LAW_TIMES**exponent
-        # Terms faster than the first one act at once: the integral from 0 to its lower limit.
+        # t^alpha is an integral of terms 1 - exp(-t / tau) over tau. Its part below the first time
+        # constant is reported without delay.
         fastest = weight[0] / exponent * math.exp(-exponent * step / 2)
         self._at_once = 1 - factor * (1 - fastest)
         self._creep_time = np.append(self._creep_time, POWER_LAW_TIMES)
@@ -274,7 +280,7 @@ def make_thermal_pads(
     shape: tuple[int, int],
     seed: int,
 ) -> ThermalPads | None:
-    """Return what temperature does to the pads of some cubes; None: nothing.
+    """Return the effect of temperature on the pads of some cubes; None if there is none.
 
     Args:
         imperfections: Temperatures and the spread of their effects.
@@ -286,16 +292,17 @@ def make_thermal_pads(
     """
     if imperfections is None or not imperfections.temperature:
         return None
-    wanted = imperfections
-    random = np.random.default_rng([wanted.seed, seed, 1])
-    height = 1 + wanted.layer_spread * random.standard_normal(shape[0]).clip(-3, 3)
-    spread = 1 + wanted.pad_drift_spread * random.standard_normal(shape)
-    first = ((0.0, wanted.temperature[0][1]),)
+    n_cubes, n_pads = shape
+    random = np.random.default_rng([imperfections.seed, seed, 1])
+    deviation = random.standard_normal(n_cubes).clip(-3, 3)
+    height = 1 + imperfections.layer_spread * deviation
+    spread = 1 + imperfections.pad_drift_spread * random.standard_normal(shape)
+    _, first_ground = imperfections.temperature[0]
     return ThermalPads(
-        read_thermal_stress(wanted.thermal_stress, shape[1]),
+        read_thermal_stress(imperfections.thermal_stress, n_pads),
         height,
-        wanted.heat_exchange,
-        wanted.pad_drift * spread,
-        wanted.temperature,
-        wanted.air or first,
+        imperfections.heat_exchange,
+        imperfections.pad_drift * spread,
+        imperfections.temperature,
+        imperfections.air or ((0.0, first_ground),),
     )

@@ -44,10 +44,9 @@ _MAX_INSERTED_BYTES = 20
 _FALSE_UID_BITS = 0xBAD
 """Bits of a hub's uid (unique number) that the fault `uid` inverts."""
 
-_LASTING_STATES = ("stall", "burst", "temperature")
-"""Kinds of faults whose end needs no action of the injector. The line ends a stall and a burst at
-their times by itself; a changed temperature stays until the next fault of the kind
-`temperature`."""
+_FAULTS_WITHOUT_END = ("stall", "burst", "temperature")
+"""Kinds of faults whose end is not scheduled. The line itself ends a stall and a burst; a changed
+temperature stays until the next fault of the kind `temperature`."""
 
 
 @dataclass
@@ -134,9 +133,8 @@ class Injector:
         self.records: list[FaultRecord] = []
         self._links = {link.name: link for link in links}
         self._random = np.random.default_rng(seed)
-        # Heap of begins and ends of faults: simulated time in µs, whether the fault begins, serial
-        # number, fault. At the same time, faults end before others begin, because a fault may begin
-        # when another one on the same pad ends.
+        # Heap (priority queue) of begins and ends of faults: simulated time in µs, whether the
+        # fault begins (at the same time, ends come first), serial number, fault.
         self._schedule: list[tuple[int, bool, int, Fault]] = []
         self._numbers = itertools.count()
         for fault in faults:
@@ -190,9 +188,9 @@ class Injector:
         frequency = frequency.copy()
         if state.warming is not None:
             begin_us, fault = state.warming
-            warmer = warming(fault, begin_us, now_us)
-            hub.celsius = int(centi_celsius(warmer))
-            frequency = warmed(frequency, warmer)
+            rise = warming(fault, begin_us, now_us)
+            hub.celsius = int(centi_celsius(rise))
+            frequency = warmed(frequency, rise)
         for broken in state.pads:
             pad = broken.fault.cube, broken.fault.pad
             sound = int(frequency[pad])
@@ -309,7 +307,7 @@ class Injector:
                 hub.version = VERSION + 1
 
         self.records.append(FaultRecord(now_us, end_us, fault))
-        if end_us > now_us and fault.kind not in _LASTING_STATES:
+        if end_us > now_us and fault.kind not in _FAULTS_WITHOUT_END:
             self._push(end_us, False, fault)
 
     def _restart(
@@ -430,29 +428,29 @@ def warming(
     return fault.value * np.minimum(1.0, fraction)
 
 
-def warmed(millihertz: Millihertz, warmer: Any) -> Millihertz:
-    """Return the frequencies in mHz after a temperature rise of `warmer` °C above room temperature.
+def warmed(millihertz: Millihertz, rise: Any) -> Millihertz:
+    """Return the frequencies in mHz of pads that are warmer than room temperature.
 
     Args:
         millihertz: Frequencies in mHz at room temperature.
-        warmer: Temperature rise in °C, a number or an array that broadcasts.
+        rise: Temperature rise in °C above room temperature, a number or an array that broadcasts.
     """
-    factor = 1 + RELATIVE_CHANGE_PER_CELSIUS * warmer
+    factor = 1 + RELATIVE_CHANGE_PER_CELSIUS * rise
     changed: Millihertz = np.rint(millihertz * factor).astype("<u4")
     return changed
 
 
-def centi_celsius(warmer: Any) -> Any:
+def centi_celsius(rise: Any) -> Any:
     """Return the temperature in 0.01 °C that a hub reports.
 
     Args:
-        warmer: Temperature rise in °C above room temperature. At 0, no fault acts, and the hub
+        rise: Temperature rise in °C above room temperature. At 0, no fault acts, and the hub
             reports an unknown temperature.
     """
-    warmer = np.asarray(warmer)
-    hundredths = 100 * (ROOM_CELSIUS + warmer)
+    rise = np.asarray(rise)
+    hundredths = 100 * (ROOM_CELSIUS + rise)
     known = np.rint(hundredths).astype(int)
-    return np.where(warmer != 0, known, TEMPERATURE_UNKNOWN)
+    return np.where(rise != 0, known, TEMPERATURE_UNKNOWN)
 
 
 def _report_pads(link: SimulatedLink) -> None:

@@ -117,7 +117,7 @@ class SimulatedLine:
                 del self._queue[:written]
 
     def is_waiting(self, now_us: int) -> bool:
-        """Return whether bytes wait for room in the line, and for no stall or burst to end."""
+        """Return whether bytes wait to be sent although no fault (stall or burst) delays them."""
         return self.plugged and bool(self._queue) and self.due_us(now_us) is None
 
     def due_us(self, now_us: int) -> int | None:

@@ -193,14 +193,21 @@ class Load:
         stress = np.zeros((n, 6))
         gradient = np.zeros((n, 6, 3))
         below = np.array([[0.0, 0.0, -self.depth]])
+        outward = rotation[:, :, 2]
         for load in self.contact_loads(seconds):
-            local = np.einsum("nij,ni->nj", rotation, load.position - position)
-            distance = np.hypot(local[:, 0], local[:, 1])
-            outward = rotation[:, :, 2]
+            # Position of the contact and force, in the frame of each cube.
+            offset = load.position - position
+            local = np.einsum("nij,ni->nj", rotation, offset)
             facing = np.maximum(outward @ load.normal, 0.0)
             force = np.einsum("nij,i->nj", rotation, load.force)
             force *= facing[:, None]
-            orders = _choose_orders(load.shape, load.radius, self.depth, distance)
+            distance = np.hypot(local[:, 0], local[:, 1])
+            orders = _choose_orders(
+                load.shape,
+                load.radius,
+                self.depth,
+                distance,
+            )
 
             # Cubes with the same quadrature order are computed together.
             is_facing = facing > 0
@@ -285,7 +292,8 @@ class Load:
             velocity = path.velocity(progress) / duration
             velocity -= normal * (velocity @ normal)
             speed = float(np.linalg.norm(velocity))
-            shear = indenter.friction * size * velocity / math.hypot(speed, FRICTION_SPEED)
+            shear = indenter.friction * size * velocity
+            shear /= math.hypot(speed, FRICTION_SPEED)
         else:
             if len(action.shear) == 1:
                 # A single shear value is that at the largest normal force; in between, shear is
@@ -379,9 +387,10 @@ def total(loads: Sequence[ContactLoad]) -> Resultant:
     if not loads:
         unknown = np.full(3, np.nan)
         return np.zeros(3), unknown, unknown
-    # The centre of pressure is the mean of the contacts' centres, weighted with their forces along
-    # the normal into the skin.
-    _, positions, normals, forces, _ = (np.array(column) for column in zip(*loads, strict=True))
+    # The weight of a contact is its force along the normal into the skin.
+    positions = np.array([load.position for load in loads])
+    normals = np.array([load.normal for load in loads])
+    forces = np.array([load.force for load in loads])
     weight = -(forces * normals).sum(axis=1)
     centre = weight @ positions / weight.sum()
     normal = weight @ normals
@@ -407,8 +416,8 @@ class LoadMemory:
         field = self._fields.get(time_us)
         if field is None:
             field = self._load.at(time_us * 1e-6)
-            # If the fields of a whole period do not fit into memory, keeping some of them is of no
-            # use, so all are removed at once.
+            # If the memory is full, all fields are removed: kept ones would not be used before the
+            # memory is full again.
             field_bytes = sum(part.nbytes for part in field)
             if (len(self._fields) + 1) * field_bytes > MAX_CACHED_BYTES:
                 self._fields.clear()
@@ -425,8 +434,7 @@ def _choose_orders(
     """Return the number of rings of point forces (cubes,) that represent a contact for each cube.
 
     It is lower for cubes far from the contact. The errors of stress and gradient are at most 1e-3
-    of their largest values. The stress is exactly in equilibrium with the force, because that of
-    every point force is.
+    of their largest values. With any number of rings, the stress is in equilibrium with the force.
 
     Args:
         shape: Shape of the contact, `disc` or `sphere`.
@@ -436,9 +444,11 @@ def _choose_orders(
     """
     to_rim = np.maximum(distance - radius, 0.0)
     ratio = radius / np.hypot(depth, to_rim)
-    # Numerical tests gave these factors. With them, the errors are at most 1e-3 of the largest
-    # stress and gradient.
-    wanted = 5 * ratio + 1 if shape == "sphere" else 3.3 * ratio + 0.5
+    # With these factors, the errors are at most 1e-3 of the largest stress and gradient, as
+    # numerical tests have shown.
+    wanted = 3.3 * ratio + 0.5
+    if shape == "sphere":
+        wanted = 5 * ratio + 1
     orders = _ORDERS[np.searchsorted(_ORDERS, wanted)]
     return np.where(ratio < _FAR_RATIO, 1, orders)
 

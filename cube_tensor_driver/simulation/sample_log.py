@@ -155,10 +155,11 @@ class SampleLog:
             )
             for link in data["links"]
         )
-        faults = tuple(
-            FaultRecord(**record | {"fault": Fault(**record["fault"])}) for record in data["faults"]
-        )
-        return cls(data["start_time_ns"], links, faults)
+        faults = []
+        for record in data["faults"]:
+            fault = Fault(**record["fault"])
+            faults.append(FaultRecord(**record | {"fault": fault}))
+        return cls(data["start_time_ns"], links, tuple(faults))
 
     @property
     def dropped(self) -> int:
@@ -168,9 +169,11 @@ class SampleLog:
     @cached_property
     def table(self) -> SampleTable:
         """All samples of the log, link after link, in the order of time."""
-        # The runs (samples at equal intervals) of the log become columns with one row per sample.
-        # An empty array in front gives the columns their type even if there are no runs.
-        links, numbers, times_us = [[np.empty(0, np.int64)] for _ in range(3)]
+        # The empty array gives the columns their type even if there are no runs.
+        empty = np.empty(0, np.int64)
+        links = [empty]
+        numbers = [empty]
+        times_us = [empty]
         rows_per_sample = []
         link_of_cube = np.full(CUBE_RANGE, NO_LINK, np.int64)
         for index, link in enumerate(self.links):

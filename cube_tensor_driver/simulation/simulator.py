@@ -36,8 +36,8 @@ FIRST_UID = 0xC0BE_0000_0000_0001
 following cube without a uid gets this number plus its index in the skin."""
 
 ABSENT_UID = FIRST_UID + 0xFFFF
-"""Uid (unique number of a device) of a cube that is on a simulated hub but not in the skin. The
-cube's index on its hub is subtracted."""
+"""Highest uid (unique number of a device) of cubes that are on a simulated hub but not in the skin.
+Such a cube gets this number minus its index on the hub."""
 
 FIRST_BOOT_US = 1_000_003
 """Value of the first hub's clock at simulated time 0, in µs. The clock of hub n starts at n times
@@ -52,7 +52,7 @@ MAX_WAIT_S = 1.0
 """Maximum time, in seconds, from SIGINT until the simulator ends. It ends earlier if all drivers
 have asked the hubs to send no more samples (STOP)."""
 
-SECOND_US = 1_000_000
+REPORT_PERIOD_US = 1_000_000
 """Period, in µs, at which a hub sends the HELLO frame (its description) and the STATS frame (its
 counters)."""
 
@@ -74,8 +74,8 @@ class PlayedLink(SimulatedLink):
 
     Attributes:
         carried: Cubes on the hub.
-        prepared: Frequencies (hub cubes, pads) in mHz at a number of times of the load that repeat;
-            empty if the load is computed for each sample.
+        prepared: Frequencies (hub cubes, pads) in mHz that were computed in advance and that
+            successive samples use again and again; empty if the load is computed for each sample.
     """
 
     carried: HubCubes
@@ -131,8 +131,8 @@ class Simulator:
         """
         self._ports = ports
         self._load = LoadMemory(load)
-        # Both clocks are read at the same time, because the log converts simulated times to wall
-        # clock times.
+        # Both clocks are read together, because simulated times (by the monotonic clock) are
+        # converted to wall clock times in the log.
         self._start_ns = time.monotonic_ns()
         self.start_time_ns = time.time_ns()
         self._links: list[PlayedLink] = []
@@ -161,7 +161,10 @@ class Simulator:
             link.line.send(link.hub.hello(), 0)
 
     def _make_line(self, link: SkinLink) -> SimulatedLine:
-        """Create the line of a hub to the host: a pseudo-terminal, unless a subclass differs."""
+        """Create the line of a hub to the host, a pseudo-terminal.
+
+        Subclasses may create another kind of line.
+        """
         return SimulatedLine(self._ports / link.name)
 
     def _prepare(self, load: Fields, instants: int) -> None:
@@ -186,7 +189,7 @@ class Simulator:
 
         They send HELLO and STATS at 1 Hz, and samples after the host has requested them (START).
         """
-        report_us = SECOND_US
+        report_us = REPORT_PERIOD_US
         while not stop.is_due(self._is_needed()):
             readers: dict[int, Callable[[], object]] = {
                 stop.fd: partial(os.read, stop.fd, 64),
@@ -200,8 +203,9 @@ class Simulator:
             # A pseudo-terminal takes some 10 kB at a time; large frames wait until the host reads.
             writers = [link.line.fd for link in self._links if link.line.is_waiting(now)]
             wait_us = self._due_us(report_us) - now
+            wait_s = max(0.0, wait_us * 1e-6)
             # `select` is used, because epoll rounds waiting times to milliseconds.
-            readable, _, _ = select.select(readers, writers, [], max(0.0, wait_us * 1e-6))
+            readable, _, _ = select.select(readers, writers, [], wait_s)
             for fd in readable:
                 readers[fd]()
 
@@ -211,12 +215,12 @@ class Simulator:
             for link in self._links:
                 link.line.flush(now)
                 if link.computes_load:
-                    # The load of the next sample is computed and kept before the sample is due,
-                    # because a real hub spends no time on computing a load.
+                    # The load of the next sample is computed in advance, so that the sample is not
+                    # late.
                     self._load.at(link.hub.next_us)
             self._injector.step(now)
             if now >= report_us:
-                report_us += SECOND_US
+                report_us += REPORT_PERIOD_US
                 self._report(now)
 
     def _report(self, now_us: int) -> None:
@@ -259,7 +263,8 @@ class Simulator:
     def _due_us(self, report_us: int) -> int:
         """Return the simulated time in µs at which the simulator has to act next.
 
-        It is that of the next sample, report, begin or end of a fault, or delayed sending.
+        It is the time of the next sample, of the next report (HELLO and STATS), of the next begin
+        or end of a fault, or at which delayed bytes can be sent, whichever is earliest.
 
         Args:
             report_us: Simulated time in µs of the next HELLO and STATS.
@@ -291,8 +296,7 @@ class Simulator:
             is_behind = False
             for link in self._links:
                 if link.hub.started and link.hub.next_us <= now_us:
-                    # Faults that are due before this sample are carried out first, so that they
-                    # affect the right samples even if this loop is late.
+                    # Faults that are due before this sample come first, also if this loop is late.
                     self._injector.step(link.hub.next_us)
                     if link.hub.started:
                         self._take_sample(link, now_us)
@@ -327,7 +331,7 @@ class Simulator:
     def _answer(self, link: PlayedLink) -> None:
         """Read the requests of the host on a link and send the hub's answers."""
         request = link.line.read()
-        # The clock is read after the last byte of a request for the time (TIME) has come.
+        # A hub that is asked for its time (TIME) must read its clock after the request has come.
         now = self.now_us()
         link.line.send(link.hub.receive(request, now), now)
 
@@ -353,8 +357,7 @@ class StopRequest:
     """
 
     def __init__(self) -> None:
-        # Monotonic time, in s, at which the simulator ends at the latest. It is infinite until the
-        # stop is requested.
+        # Latest monotonic time, in s, at which the simulator ends; infinite before a request.
         self._until_s = math.inf
         self.fd, self._write = os.pipe()
 
@@ -425,6 +428,6 @@ def _open_pipe(path: Path) -> int:
     """Create a named pipe, open it without blocking and return the file descriptor."""
     path.unlink(missing_ok=True)
     os.mkfifo(path)
-    # The pipe is also opened for writing. Otherwise, it would be at its end, and always readable,
-    # after a writer has closed it.
+    # The pipe is also opened for writing. Otherwise it would always be readable (at its end) after
+    # another process has written to it and closed it.
     return os.open(path, os.O_RDWR | os.O_NONBLOCK)

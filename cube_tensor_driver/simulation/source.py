@@ -87,12 +87,11 @@ def simulate(
 class SimulatedSource:
     """A source (`core.rows.Source`) of simulated frequencies. Each iteration starts at time 0.
 
-    One scan has a row (sample) of every cube, in the order in which the driver delivers them: link
-    by link.
-    All rows of scan k have the sequence number k and stamp_ns = k × period; simulated time 0 is the
-    start of the load script. Frequencies are rounded as those of a real hub: whole mHz, in Hz as
-    float32. They are NaN for pads that a cube does not have or whose oscillator stopped. The
-    temperature is unknown (NaN) unless the imperfections state it.
+    One scan has a row (sample) of every cube. The rows are sorted link by link, as the driver
+    delivers them. All rows of scan k have the sequence number k and the stamp k × period, in ns
+    since the start of the load script. Frequencies are rounded as those of a real hub: whole mHz,
+    in Hz as float32. They are NaN for pads that a cube does not have or whose oscillator stopped.
+    The temperature is unknown (NaN) unless the imperfections state it.
 
     Attributes:
         skin: Skin to simulate.
@@ -113,7 +112,7 @@ class SimulatedSource:
     drift: float = 0.0
     imperfections: Imperfections | None = None
     scans: int = 0
-    is_live: ClassVar[bool] = False  # the rows are there at once
+    is_live: ClassVar[bool] = False  # rows are computed on request, not measured
 
     def statistics(self) -> dict[str, object]:
         """Return how much the latest iteration over this source has simulated.

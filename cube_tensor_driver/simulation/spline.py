@@ -34,7 +34,7 @@ class CubicSpline:
                 Otherwise the velocity is 0 at both ends.
         """
         points = np.asarray(points, float)
-        # The last point of a closed curve is the first one.
+        # The last point of a closed curve equals the first one and is left out.
         knots = points[:-1] if closed else points
         identity = np.eye(len(knots))
         before = np.roll(identity, 1, axis=0)
@@ -50,9 +50,11 @@ class CubicSpline:
             slopes = np.append(slopes, slopes[:1], axis=0)
 
         step = np.diff(points, axis=0)
-        m, n = slopes[:-1], slopes[1:]
-        # Coefficients (K - 1, 4, D) of the powers of t (0 to 1 from a point to the next).
-        powers = [points[:-1], m, 3 * step - 2 * m - n, m + n - 2 * step]
+        first, last = slopes[:-1], slopes[1:]
+        square = 3 * step - 2 * first - last
+        cube = first + last - 2 * step
+        # Coefficients (K - 1, 4, D) of the powers of t, which runs from 0 to 1 between two points.
+        powers = [points[:-1], first, square, cube]
         self._coefficients = np.stack(powers, axis=1)
 
     def position(self, time: float) -> Array:

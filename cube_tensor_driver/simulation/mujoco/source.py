@@ -266,7 +266,8 @@ class MujocoSkin:
         place, force = place[is_felt], force[is_felt]
         total = force.sum(axis=0)
         if len(place) > 1:
-            # The round contact with the same area is used where a single position is needed.
+            # A round contact of the same area also describes the flat one, for uses that need only
+            # its centre and force.
             min_width = MIN_WIDTH_DEPTHS * self.depth
             polygon = flat_contact(place, force, normal, min_width)
             area = total @ normal / (polygon.traction @ normal)
