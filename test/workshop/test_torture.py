@@ -50,7 +50,7 @@ def test_a_tortured_skin_loses_nothing_uncounted_and_says_nothing_wrong(tmp_path
     tail = {"stamp_error_p90_ms", "stamp_error_p99_ms"} if effort == 1 else set()
     assert set(failures(result)) <= tail, output
     assert result["samples_sent"] > 32 * 300 * duration and result["counted"] > 0
-    assert result["faults_to_flag"] >= 3 and result["deeds"]["tare"]
+    assert result["faults_to_flag"] >= 3 and result["actions"]["tare"]
 
 
 @pytest.mark.alone

@@ -147,7 +147,7 @@ def _add_chain(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the benchmark and report its figures. Only its own modules are imported."""
+    """Run a benchmark and report its figures; the modules of other benchmarks are not imported."""
     from cube_tensor_driver.demo.running import report
 
     report(_measure(options), options.json)

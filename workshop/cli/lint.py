@@ -14,9 +14,9 @@ from cube_tensor_driver.cli.parser import Parser
 STRICT_MYPY = [
     "mypy",
     "--strict",
-    # Some comments are needed with the rclpy of one distribution only.
+    # Some `type: ignore` comments are needed only with the rclpy of one ROS distribution.
     "--no-warn-unused-ignores",
-    # Results of other options would replace each other in a common cache.
+    # In a common cache, the results of this check and of the other one would replace each other.
     "--cache-dir=.mypy_cache/strict",
     "cube_tensor_driver",
 ]

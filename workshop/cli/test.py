@@ -26,7 +26,8 @@ def run(options: argparse.Namespace) -> int:
     if not words:
         words = ["test"]
         if importlib.util.find_spec("xdist") is not None:
-            # Half of the time, a test waits for processes that it started.
+            # Tests wait half of the time, for processes that they started. So there are two workers
+            # for each processor.
             workers = 2 * len(os.sched_getaffinity(0))
             words += ["-n", str(workers), "--dist", "loadgroup"]
     os.chdir(ROOT)

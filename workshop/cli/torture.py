@@ -35,7 +35,7 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Torture a skin, or a mutated one."""
+    """Run a simulated skin under faults, with or without deliberate errors in its nodes."""
     from ..torture.torture import run_mutations, run_torture
 
     if options.mutate is not None:

@@ -32,7 +32,7 @@ Table = dict[str, Any]
 WIDTHS = [2e-3, 5e-3, 10e-3, 20e-3]
 """Widths of the simulated contacts, in m; each table has one line for each width."""
 WRONG_WIDTHS = [5e-3, 15e-3]
-"""Widths of the contacts for the table of wrong assumptions, in m."""
+"""Widths, in m, of the contacts for the table about assumptions (such as depth) that are wrong."""
 BALL_LOADS = 100
 """Number of random loads by a ball from which one line of a table is computed."""
 PAD_LOADS = 40
@@ -53,7 +53,10 @@ METHOD_COLUMNS = [
     "pressure field of the inverse with contacts, rms error / predicted deviation: at the depth of "
     "the cubes, on the surface",
 ]
-"""Columns of one setting under loads of one width, with all methods."""
+"""Columns of the tables that compare methods: interpolation, inverse, inverse with contacts.
+
+Each row of a table is one width of the contact.
+"""
 FORM_COLUMNS = [
     "contact width, mm",
     "pressure field, relative rms error: points, pads",
@@ -62,7 +65,10 @@ FORM_COLUMNS = [
     "force, rms error / predicted deviation: points, pads",
     "position, rms error / predicted deviation: points, pads",
 ]
-"""Columns of one setting under loads of one width, with cubes taken for points and for pads."""
+"""Columns of the tables that compare two models of a cube: stress at a point, or the real pads.
+
+Each row of a table is one width of the contact.
+"""
 FORM_DIGITS = (3, 1, 2, 2, 2)
 """Number of decimals of each quantity in `FORM_COLUMNS` after the width."""
 
@@ -79,7 +85,8 @@ def write_contact_tables(path: Path, true_pads: Influence, shapes: Outcomes) -> 
     tables |= contact_tables(true_pads)
     tables["shapes"] = shape_table(shapes)
     text = json.dumps(tables, indent=1, ensure_ascii=False)
-    # One line for each row: the indents of what is in a row are deeper than three.
+    # Each row of a table is written on one line: line breaks within a row, which are followed by
+    # more than three blanks, become single blanks.
     text = re.sub(r"\n(?: {4,}| {3}(?=\]))", " ", text)
     with atomic_write(path) as partial:
         partial.write_text(text + "\n", encoding="utf-8")

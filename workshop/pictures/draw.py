@@ -61,7 +61,8 @@ indenters:
 """Load script of the browser view's picture. It presses beside the cube c05, whose numbers the view
 shows at first, and stays there."""
 ERROR_LEVELS = (0.1, 0.2, 0.3, 0.5)
-"""Relative errors of the pressure for which field.json tells how many cubes gradients save."""
+"""Relative errors of the pressure for which field.json states how many fewer cubes are needed if
+they also measure gradients."""
 SHAKEN_S = 2.62
 """Time at which the acceleration of the gripper's box is largest, in s."""
 CAMERA_TARGET = (0.0, 0.0, 0.1)
@@ -71,7 +72,7 @@ SHAPE_LOADS = 40
 COUNTS = [1, 4, 16, 64, 256, 1024, 4096]
 """Numbers of cubes in the scale plot."""
 RATE = 100.0
-"""Rate of the cubes in the scale plot, in Hz; most machines can do that."""
+"""Sampling rate of the cubes in the scale plot, in Hz, which most computers can process."""
 MEASURE_S = 6.0
 """Duration of each measurement of the scale plot, in s."""
 
@@ -112,7 +113,7 @@ def make_pictures(folder: Path) -> None:
     table: dict[str, Any] = {name: column.tolist() for name, column in vars(study).items()}
     for level in ERROR_LEVELS:
         saved = study.cubes_saved(level)
-        # JSON knows no NaN, which stands for an error that no pitch reaches.
+        # NaN means that no pitch reaches the error. JSON has no NaN, so null is written.
         rows = [[value if value == value else None for value in row] for row in saved.tolist()]
         table[f"cubes saved at an error of {level}"] = rows
     with atomic_write(folder / "field.json") as partial:

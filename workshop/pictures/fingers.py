@@ -80,7 +80,7 @@ def _draw_pressure(
     limits: tuple[float, float],
 ) -> Any:
     """Draw the pressure (M,) in kPa at points (M, 3) in m, in a colour scale with these limits."""
-    # The points are a grid in the order of the cubes' patches, not of rows.
+    # The points form a grid, but are ordered cube by cube and not row by row.
     across = points[:, 0].round(6)
     up = points[:, 2].round(6)
     order = np.lexsort((across, up))

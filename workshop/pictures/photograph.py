@@ -40,7 +40,7 @@ return found ? -Number(found[1]) : 0"""
 """JavaScript: the pressure on the chosen cube, in kPa."""
 
 MIN_PRESSURE_KPA = 6.0
-"""Pressure on the chosen cube, in kPa, above which the load counts as pressing it."""
+"""Minimum pressure on the chosen cube, in kPa, at which the load counts as in contact."""
 
 MAX_CHANGE_KPA = 0.3
 """Maximum change of the pressure, in kPa, within `STEADY_S` of a load that rests.

@@ -36,7 +36,7 @@ MAX_ANSWER_S = 10.0
 
 ANSWER_TRIES = 4
 """Maximum number of requests to a node that does not answer. An answer is lost if the node has not
-yet discovered our client."""
+yet discovered the client in this process."""
 
 MAX_TARE_S = 3.0
 """Time, in seconds, for which a tare (measurement of the rest frequencies) is requested again after
@@ -50,20 +50,20 @@ MIN_TARED_S = 1.0
 also where this process is late."""
 
 MIN_RATE_S = 1.1
-"""Time, in seconds, for which a sampling rate that was set late stays in force. A rate can only be
-checked if the next change does not follow at once."""
+"""Minimum time, in seconds, for which a sampling rate that was set late stays in force. The check
+of a rate needs this time before the next change."""
 
 MAX_RATE_DELAY_S = 0.05
-"""Largest delay, in seconds, of a change of the sampling rate after which the next change is not
-too early for the check."""
+"""Largest delay, in seconds, of a change of the sampling rate with which the rate still stays in
+force long enough for its check. After a longer delay, the next action waits for `MIN_RATE_S`."""
 
 MAX_STRESS_AGE_S = 0.5
 """Age, in seconds, of the newest stress above which the host is too busy for a tare, which may be
 refused then."""
 
 MAX_DELAY_S = 0.5
-"""Largest delay, in seconds, of an action with which a tare certainly comes while the load is
-held."""
+"""Largest delay, in seconds, with which a tare still comes while the load is held constant. A tare
+with a longer delay may be refused."""
 
 FLUSH_S = 0.3
 """Time, in seconds, within which messages arrive that a process sent just before its end."""
@@ -90,7 +90,7 @@ class Actions:
 
     Attributes:
         done: All actions so far.
-        refused: Answers of tares that the host was too busy for.
+        refused: Answers to tares that were refused because the host was too busy.
     """
 
     def __init__(
@@ -225,7 +225,8 @@ class Actions:
         return all(self._change("driver", transition) for transition in both), ""
 
     def _restart_driver(self) -> ActionResult:
-        # DDS notices only after seconds that the publishers of a killed process are gone.
+        # DDS lists the publishers of a killed process for some seconds. They are remembered to
+        # distinguish them from those of the new process.
         dead = self._find_publishers("frequencies")
         dead_transitions = self._find_publishers(TRANSITIONS)
         self._children.kill("driver")
@@ -240,11 +241,20 @@ class Actions:
         return self._wait_for_stress()
 
     def _activate_driver(self, dead: set[bytes], is_ready: Callable[[], bool]) -> bool:
-        """Configure and activate the driver; `dead` are publishers of a driver that was killed."""
+        """Configure the driver, and activate it when all of its subscribers have discovered it.
+
+        Args:
+            dead: Publishers of `frequencies` of a driver that was killed, which do not count.
+            is_ready: Further condition for the activation.
+
+        Returns:
+            Whether the driver has become active.
+        """
         node = self._observer.node
 
         def is_connected() -> bool:
-            # The node `markers` subscribes to stress as well.
+            # `stress` has two subscribers: this process and the node `markers`. `frequencies` has
+            # this process and the reconstruction.
             return (
                 node.count_publishers("stress") > 0
                 and node.count_subscribers("stress") > 1
@@ -253,7 +263,8 @@ class Actions:
                 and is_ready()
             )
 
-        # Whether this succeeded shows at the activation: a request that is sent again is refused.
+        # The result is ignored: if an answer was lost, the request is repeated, and the driver
+        # refuses to be configured twice. A real failure makes the activation fail.
         self._change("driver", Transition.TRANSITION_CONFIGURE)
         self._observer.spin(MAX_START_S, is_connected)
         self._observer.spin(DISCOVERY_S)

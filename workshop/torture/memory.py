@@ -29,7 +29,8 @@ class MemoryMonitor:
     def __init__(self, children: Children, names: tuple[str, ...]) -> None:
         self._children, self._names = children, names
         self._next_s = 0.0
-        # Columns of times in s and sizes in MB, by process: one that is started again has a new id.
+        # Process id -> pairs of time in s and memory in MB. A process that is started again has a
+        # new id, so that its memory is not compared with that of the earlier one.
         self._sizes: dict[int, list[tuple[float, float]]] = {}
 
     def measure(self) -> None:

@@ -41,17 +41,19 @@ FIRST_ROUND_ONLY = ("restart reconstruction", "restart driver")
 memory is measured."""
 
 HELD_HUB = 0
-"""Hub whose load is held for the tare. It has no other fault meanwhile."""
+"""Index of the hub whose load is kept constant ("hold") during a tare. It has no other faults near
+that time."""
 
 HELD_CUBES = tuple(range(HELD_HUB * CUBES_PER_HUB, (HELD_HUB + 1) * CUBES_PER_HUB))
 """Cubes of the hub whose load is held; these are tared."""
 
 QUIET_BEFORE_S = 4.0
-"""Time, in seconds, before the load of a hub is held in which the hub has no other fault."""
+"""Time, in seconds, before a "hold" (the load of a hub is kept constant) in which the hub has no
+other fault."""
 
 QUIET_AFTER_S = 7.0
-"""Time, in seconds, after the begin of holding the load of a hub in which the hub has no other
-fault."""
+"""Time, in seconds, after the begin of a "hold" (the load of a hub is kept constant) in which the
+hub has no other fault."""
 
 OPENING_HUB = 2
 """Hub on which each fault of a pad occurs once at the beginning, before the first cut."""
@@ -93,7 +95,8 @@ class _Mix:
         self.events: list[tuple[float, Event]] = []
         self._random = np.random.default_rng(seed)
         self._duration, self._end = duration, duration - LAST_EVENT_S
-        # Every kind of cut in turn, so that a short torture has them all.
+        # Kinds of the cuts to come. Each kind occurs once before any is repeated, so that a short
+        # torture has all kinds.
         self._cuts: list[str] = []
 
     def _add(self, at: float, **event: Any) -> None:
@@ -108,11 +111,11 @@ class _Mix:
 
     def add_rounds(self) -> None:
         """Add the actions on the nodes, and the times at which the load of a hub is held."""
-        # A torture that is shorter than its last quiet seconds has one round without events.
+        # `np.arange` needs an end above 0 to give one round, also for a very short torture.
         starts = np.arange(0.0, max(self._end, 0.1), ROUND_S)
         for start in starts.tolist():
             for after, event in ROUND.items():
-                # Rounds after the first leave out what would end the life of a process.
+                # Rounds after the first do not end processes, see `FIRST_ROUND_ONLY`.
                 is_due = start == 0 or event.get("action") not in FIRST_ROUND_ONLY
                 if start + after < self._end and is_due:
                     self._add(start + after, **event)
@@ -131,20 +134,25 @@ class _Mix:
             pad = int(self._random.integers(PADS))
             self._add_fault(0.5, OPENING_HUB, kind=kind, cube=cube, pad=pad, seconds=1.8)
         self._add_fault(1.5, 1, kind="temperature", value=5.0, seconds=1.0)
-        # A temperature lasts until the next one.
+        # A hub keeps its temperature until the next fault of this kind, here back to normal.
         self._add_fault(4.5, 1, kind="temperature", value=0.0)
         rounds = range(1 + int(self._duration))
-        # More than enough: a cut is always followed by seconds without one.
+        # These are more kinds than needed, because several seconds pass between two cuts.
         self._cuts = [
             kind for _ in rounds for kind in self._random.permutation(CUT_FAULTS).tolist()
         ]
 
     def add_cuts(self, hub: int) -> None:
-        """Cut the link of a hub, or its clock, again and again."""
+        """Add faults of `CUT_FAULTS`, which interrupt or restart a hub or disturb its clock.
+
+        Args:
+            hub: Index of the hub.
+        """
         random = self._random
         at = random.uniform(FIRST_CUT_S, FIRST_CUT_S + 3.0)
         while at < self._end:
-            kind, seconds = self._cuts.pop(), random.uniform(0.3, 2.0)
+            kind = self._cuts.pop()
+            seconds = random.uniform(0.3, 2.0)
             fault = {"kind": kind, "seconds": round(seconds, 3)}
             if kind == "drift":
                 # A drift stands for a hub that was replaced by one with another crystal, so the
@@ -158,7 +166,7 @@ class _Mix:
                 # The sample numbers of the hub begin again at 0 after this number of samples.
                 fault["count"] = int(random.integers(100, 3000))
             self._add_fault(at, hub, **fault)
-            # A link that was cut delivers for a while before the next cut.
+            # Between two cuts, the link delivers for at least 4 s.
             at += seconds + random.uniform(4.0, 20.0)
 
     def add_pad_faults(self) -> None:

@@ -74,7 +74,7 @@ def edit_source(source: str, edit: Edit) -> str:
 
 
 def import_mutated(edits: Sequence[Edit]) -> None:
-    """Import the edited modules of the driver, so that all others import these.
+    """Import modules of the driver from edited sources, so that later imports get these modules.
 
     Raises:
         ConfigError: The text to find does not occur exactly once.

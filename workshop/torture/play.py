@@ -149,10 +149,10 @@ def _describe(actions: Actions, log: SampleLog) -> dict[str, Any]:
     failed = [f"{action.kind}: {action.answer}" for action in actions.done if not action.succeeded]
     return {
         "faults": _count_sorted(record.fault.kind for record in log.faults),
-        "deeds": _count_sorted(action.kind for action in actions.done),
+        "actions": _count_sorted(action.kind for action in actions.done),
         "timeline": [span(action) for action in actions.done],
-        # A busy host may refuse a tare.
-        "deeds_failed": len(failed) - len(actions.refused),
+        # A tare that was refused because the host was too busy is no failure.
+        "actions_failed": len(failed) - len(actions.refused),
         "failed": failed,
         "refused": [f"tare: {answer}" for answer in actions.refused],
     }
@@ -189,10 +189,9 @@ def _make_processes(
 
 
 def _write_skin(folder: Path, ports: Path) -> Path:
-    """Write the file of a skin whose hubs are identified by their uid alone, as every link of the
-    skin may be behind every port.
+    """Write the file of a skin whose hubs are found by their uid, whatever port they are at.
 
-    The last hub is behind a TCP bridge and has the same faults there.
+    The last hub is connected by TCP instead of a port, and has the same faults.
     """
     rows = HUBS * CUBES_PER_HUB // CUBES_PER_ROW
     data = grid(

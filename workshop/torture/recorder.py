@@ -57,8 +57,11 @@ QUIET_S = 1.0
 """Time, in seconds, without a new message after which everything has arrived."""
 
 QUEUE_DEPTH = 20_000
-"""Number of messages that the queues of this process hold, more than those of all other processes.
-So nothing is lost here, for which the driver would be blamed, when this process is delayed."""
+"""Number of messages that the queues of this process hold.
+
+It is larger than in all other processes. If this process is delayed, its queues must lose nothing,
+because the loss would be taken for an error of the driver.
+"""
 
 LINK_COUNTERS = ("lost_on_the_way", "dropped_in_hub", "taken", "delivered", "duplicate", "resets")
 """Names of those counters of the driver for each link that are shown or checked."""
@@ -115,11 +118,11 @@ class TopicLog(Generic[AnyRows]):
         """Take what has arrived; to be called again and again."""
         for message in self._take_raw():
             self.count += 1
-            # A publisher whose start was not noticed begins at 1 again.
+            # If the number is not larger than the last one, a new publisher has started at 1.
             expected = self._last_number + 1 if message.number > self._last_number else 1
             self._last_number = message.number
             if message.number > expected:
-                # The place of a gap is counted in rows, so all rows before it must be decoded.
+                # A gap is stored as the number of rows before it, so these are decoded first.
                 self._decode()
                 self._gaps.append((self._n_rows, message.number - expected))
             self._waiting.append(message)
@@ -232,9 +235,11 @@ class TortureRecorder:
 
         self._links: dict[str, dict[str, str]] = {}
         self._totals: dict[str, str] = {}
-        self._earlier_counts: Counter[str] = Counter()  # Of the drivers that were killed.
+        # Sum of the counters of all drivers that were killed.
+        self._earlier_counts: Counter[str] = Counter()
         self._counted_ns = 0
-        self._messages_lost = [0]  # By the reconstruction, in each of its lives.
+        # Messages that each process of the reconstruction reported to have lost.
+        self._messages_lost = [0]
         self._n_messages, self._last_message_s = 0, time.monotonic()
         observer.node.create_subscription(
             DiagnosticArray, "/diagnostics", self._on_diagnostics, 1000

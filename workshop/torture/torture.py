@@ -44,7 +44,7 @@ FORBIDDEN = (
     "unflagged",
     "false_alarms",
     "wrong_periods",
-    "deeds_failed",
+    "actions_failed",
     "crashes",
     "threads_leaked",
 )
@@ -114,7 +114,8 @@ def run_mutations(
     names = list(MUTATIONS) if name == "all" else [name]
     if not set(names) <= set(MUTATIONS):
         raise ConfigError(f"--mutate {name!r}, allowed: all, {', '.join(MUTATIONS)}")
-    # A signal ends the process of the torture, whose error arrives here.
+    # Ctrl-C must not end this process at once: it ends the child process of the torture, whose
+    # error `result` raises here.
     stop_event()
     results: dict[str, dict[str, Any]] = {}
     with progress_bar() as progress:
