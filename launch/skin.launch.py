@@ -146,7 +146,8 @@ def make_node(executable: str, parameters: Any, condition: Any) -> Node:
         parameters: Parameters of the node, as a file or a mapping.
         condition: Condition under which the node starts.
     """
-    # A name would be given to both nodes of the process `composed`; they keep their own names.
+    # The executable `composed` contains two nodes. If the launch action had a name, both of them
+    # would get it.
     name = None if executable == "composed" else executable
     return Node(
         package=PACKAGE,
@@ -164,10 +165,10 @@ def make_node(executable: str, parameters: Any, condition: Any) -> Node:
 
 
 def make_state_publisher() -> Node:
-    """Return the action that starts robot_state_publisher, which publishes the cubes' frames.
+    """Return the action that starts a robot_state_publisher for the frames of the cubes.
 
-    The names of its node and topic differ from those of the robot's own robot_state_publisher,
-    which may run in the same namespace.
+    Its node and its topic have names of their own, because the robot's own robot_state_publisher
+    may run in the same namespace.
     """
     urdf = ParameterValue(FromSkin(skin_urdf), value_type=str)
     return Node(
@@ -183,7 +184,7 @@ def make_state_publisher() -> Node:
 
 
 def make_simulator() -> ExecuteProcess:
-    """Return the launch action of the simulator of the hubs, a process that is no ROS node."""
+    """Return the launch action that starts the simulator of the hubs, which is not a ROS node."""
     return ExecuteProcess(
         cmd=[
             ExecutableInPackage("simulator", PACKAGE),

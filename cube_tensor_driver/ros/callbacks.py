@@ -17,7 +17,8 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 
 Callback = Callable[..., Any]
-"""Callback of a subscription, timer or service: rclpy decides on its arguments."""
+"""Function that rclpy calls for a message, timer or service request, with arguments that depend on
+which of these it is."""
 
 MAX_CHARACTERS = 1000
 """Maximum number of characters of a text that a service returns and logs. A longer text is cut: it
@@ -56,10 +57,10 @@ class CallbackErrors:
         return call
 
     def catch_in_service(self, callback: Callback) -> Callback:
-        """Wrap the callback of a service so that its exceptions are caught.
+        """Wrap the callback of a service so that its exceptions are logged, counted and reported.
 
-        After an exception the response is sent with the values that it has by then, and with the
-        exception as the reason of a failure.
+        The client still gets a response after an exception: `explain_failure` writes the text of
+        the exception into it, and the fields that the callback has not set keep their defaults.
         """
 
         @wraps(callback)
@@ -84,16 +85,17 @@ def explain_failure(request: Any, response: Any, reason: str) -> Any:
     """Write into the response of a service why it failed, if its type has a field for that.
 
     Args:
-        request: The request.
-        response: The response, which is changed.
-        reason: The reason.
+        request: Request of the client.
+        response: Response to the client, which is changed.
+        reason: Reason of the failure.
 
     Returns:
-        The response.
+        The changed response.
     """
     if hasattr(response, "message"):
         response.message = reason
-    if hasattr(response, "results"):  # of SetParameters: one result for each parameter
+    # The service SetParameters has a list of results, which needs an entry for each parameter.
+    if hasattr(response, "results"):
         done: list[Any] = list(response.results)
         missing = len(request.parameters) - len(done)
         response.results = done + [SetParametersResult(reason=reason)] * missing
@@ -101,18 +103,18 @@ def explain_failure(request: Any, response: Any, reason: str) -> Any:
 
 
 def shorten(text: str) -> str:
-    """Return a text as it is; of one above `MAX_CHARACTERS` its beginning and its length."""
+    """Return a text, cut to `MAX_CHARACTERS`; a text that was cut ends with its full length."""
     if len(text) <= MAX_CHARACTERS:
         return text
     return f"{text[:MAX_CHARACTERS]}… ({len(text)} characters)"
 
 
 def refuse_on_error(callback: Callback, errors: type[Exception]) -> Callback:
-    """Wrap the callback of a service so that certain exceptions give a response without success.
+    """Wrap the callback of a service so that certain exceptions give a response with success=false.
 
     Args:
         callback: The callback of the service.
-        errors: Type of the exceptions after which `success` of the response is set to false.
+        errors: Type of these exceptions; others are not caught.
     """
 
     @wraps(callback)

@@ -77,14 +77,17 @@ def on_matched(callback: Callable[[int], None]) -> PublisherEventCallbacks | Non
 
 
 def with_number(callback: Callable[[Any, int | None], None]) -> Callable[..., None]:
-    """Make the callback of a subscription that also gets the sequence number of each message.
+    """Wrap a function of a message and its sequence number so that a subscription can call it.
 
     Args:
-        callback: Called with a message and its number. DDS numbers the messages of each publisher
-            consecutively. The number is None if this rclpy or this DDS does not report it.
+        callback: Called with each message and its sequence number. DDS numbers the messages of each
+            publisher consecutively. The number is None if this rclpy or DDS does not report it.
+
+    Returns:
+        The argument `callback` of `create_subscription`.
     """
     if not hasattr(Subscription, "CallbackType"):
-        # This rclpy passes no MessageInfo, which contains the number, to callbacks.
+        # This release of rclpy passes only the message and no sequence number to callbacks.
         return lambda message: callback(message, None)
 
     def call(*arguments: Any) -> None:
@@ -92,7 +95,8 @@ def with_number(callback: Callable[[Any, int | None], None]) -> Callable[..., No
         message, info = arguments if len(arguments) == 2 else arguments[0]
         callback(message, info.get("publication_sequence_number"))
 
-    # rclpy passes the MessageInfo only to callbacks whose signature has two parameters.
+    # rclpy passes the MessageInfo, which contains the sequence number, only to callbacks whose
+    # signature has two parameters.
     call.__signature__ = inspect.signature(lambda message, info: None)  # type: ignore[attr-defined]
     return call
 
@@ -101,8 +105,9 @@ def after_parameters_are_set(node: Node, callback: Callable[[list[Parameter]], N
     """Register a callback that is called after parameters of a node have been set.
 
     This function must be called before callbacks that may refuse a change are added to the node.
-    rclpy calls the one added last first, so the replacement for older releases runs only if the
-    others have accepted the change.
+    ROS 2 Humble calls callbacks only before parameters are set, the one that was added last first.
+    There this callback must be the last one, so that it is called only after all others have
+    accepted the change.
 
     Args:
         node: The node.
@@ -113,8 +118,8 @@ def after_parameters_are_set(node: Node, callback: Callable[[list[Parameter]], N
         return
 
     def before_change(parameters: list[Parameter]) -> SetParametersResult:
-        # rclpy also calls this while a parameter is declared. The node does not have the parameter
-        # yet, so it is left out.
+        # rclpy also calls this function when a parameter is declared. That is not a change of a
+        # value, so parameters that the node does not have yet are left out.
         known = [parameter for parameter in parameters if node.has_parameter(parameter.name)]
 
         def after_change() -> None:
@@ -122,7 +127,8 @@ def after_parameters_are_set(node: Node, callback: Callable[[list[Parameter]], N
             callback(known)
 
         if known:
-            # The executor runs the timer only after the parameter has its new value.
+            # The timer calls `callback` in the next step of the executor. By then the parameters
+            # have their new values.
             timer = node.create_timer(0.0, after_change)
         return SetParametersResult(successful=True)
 

@@ -98,7 +98,7 @@ def declare_switch(
         default: "true" or "false". An empty text allows an empty value, too, which leaves the
             decision to the parameter of the same name.
     """
-    # Launch files in Python pass the texts "True" and "False".
+    # Launch files that are written in Python often pass str(True), which is "True".
     choices = ["true", "false", "True", "False"]
     return DeclareLaunchArgument(
         name,
@@ -109,7 +109,8 @@ def declare_switch(
 
 
 class FromSkin(Substitution):  # type: ignore[misc]
-    """A launch substitution whose text is made from the skin file in the argument `config`."""
+    """A launch substitution whose text is computed from the skin file that the launch argument
+    `config` names."""
 
     def __init__(self, make: Callable[[Skin], str]) -> None:
         """Store `make`, which returns the text of this substitution for the skin that was read."""
@@ -129,10 +130,10 @@ class FromSkin(Substitution):  # type: ignore[misc]
 
 
 class GivenParameters(Substitution):  # type: ignore[misc]
-    """A launch substitution that writes launch arguments into a parameter file.
+    """A launch substitution that writes launch arguments into a file with parameters of nodes.
 
-    Its text is the path of the file. Arguments that are empty are left out, because a value that a
-    node gets from a file overrides the value that an including launch file sets with SetParameter.
+    Its text is the path of the file. Arguments that are empty are left out, so that a value that an
+    including launch file sets with SetParameter is kept: a value in the file would override it.
     """
 
     def __init__(self, *names: str) -> None:
@@ -212,16 +213,17 @@ def _recorded_topics(surroundings: dict[str, Any], namespace: str) -> dict[str, 
         name = remaps.get(name, name)
         prefix = f"/{namespace}" if namespace else ""
         full_name = name if name.startswith("/") else f"{prefix}/{name}"
-        # The nodes publish these two topics with the reliability of the parameter qos_reliability.
+        # The parameter qos_reliability of the nodes sets the reliability of these two topics.
         is_batch = topic in ("/frequencies", "/stress")
         qualities[full_name] = quality | ({"reliability": reliability} if is_batch else {})
     return qualities
 
 
 def stay_ended(event: ProcessExited, context: LaunchContext) -> Action | None:
-    """Return the action that prevents a new start of a node that ended with `EX_CONFIG`.
+    """Return the action that prevents a restart (`respawn`) of a node that ended with `EX_CONFIG`.
 
-    The exit code says that a parameter or a file cannot be used, so that the node would end again.
+    The exit code `EX_CONFIG` (78) means that a parameter or a file cannot be used. After a restart
+    the node would end in the same way.
 
     Args:
         event: The end of the process of the node.
@@ -263,13 +265,14 @@ def check_arguments(context: LaunchContext, declared: Iterable[str]) -> list[Act
         refusal = PARAMETERS[name].refusal(PARAMETERS[name].parse(text)) if text else ""
         if refusal:
             raise ConfigError(f"{name}:={text}: {refusal}")
-    link_configs(skin, _argument(context, "port"))  # refuses one port for several links
+    # This call raises an error if the argument `port` is set for a skin with several links.
+    link_configs(skin, _argument(context, "port"))
     for name, packages in NEEDED_PACKAGES.items():
         if _is_true(context, name):
             _check_installed(name, packages)
 
-    # The folder is a new one for each launch, so that two simulated skins on one host do not make
-    # pseudo-terminals with the same path.
+    # Each launch makes a new folder for the pseudo-terminals of its simulated hubs, so that two
+    # simulated skins on one host do not use the same paths.
     ports = str(temporary_folder("cube_ports_")) if is_simulated else ""
     return [
         SetLaunchConfiguration("config", str(path)),

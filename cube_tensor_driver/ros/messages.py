@@ -63,11 +63,11 @@ def log_refused_message(
 
 
 class CheckedSubscription:
-    """A subscription that decodes at most one bad message per `LOG_PERIOD_S`.
+    """A subscription that decodes at most one damaged message per `LOG_PERIOD_S`.
 
     The libraries of ROS print a line about each message that they cannot decode, so that a faulty
-    publisher would fill the log. After a bad message, the newest one waits until the period is
-    over.
+    publisher would fill the log. After a damaged message no message is decoded for this period.
+    Then the newest message that arrived during the period is decoded.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class CheckedSubscription:
         self._node, self._kind, self._topic = node, kind, topic
         self._callback = callback
         self._waiting: bytes | None = None
-        # The timer runs only during a pause after a bad message.
+        # The timer runs only during the pause that follows a damaged message.
         self._pause = node.create_timer(LOG_PERIOD_S, self._end_pause)
         self._pause.cancel()
         self._subscription = node.create_subscription(kind, topic, self._receive, profile, raw=True)
@@ -109,7 +109,8 @@ class CheckedSubscription:
     def _decode(self, data: bytes) -> None:
         try:
             message = deserialize_message(data, self._kind)
-        except RuntimeError as error:  # RMWError
+        # rclpy raises RMWError, which derives from RuntimeError, if the bytes cannot be decoded.
+        except RuntimeError as error:
             self._pause.reset()
             log_refused_message(self._node, self._topic, error)
         else:
@@ -147,11 +148,11 @@ def make_message(type_name: str, **fields: Any) -> Any:
 
     Args:
         type_name: Full name of the type, as in std_msgs/msg/Header.
-        fields: Values of the fields. Fields that are arrays of numbers or truth values may be
-            numpy arrays.
+        fields: Values of the fields. The value of a field that is an array of numbers or of bool
+            may be a numpy array.
     """
-    # numpy and the module `array` use the same letters for types, such as "d" for float64; `array`
-    # has no truth values.
+    # numpy and the module `array` have the same type codes, such as "d" for float64. Only for bool
+    # the module `array` has none, so these values become a list.
     arrays = {
         name: value.tolist() if value.dtype == bool else pack_array(value.dtype.char, value)
         for name, value in fields.items()
@@ -163,14 +164,15 @@ def make_message(type_name: str, **fields: Any) -> Any:
 def compensation_message(
     frame_id: str, stamp_ns: int, motion: Motion | None, states: Mapping[str, Array]
 ) -> SkinCompensation:
-    """Return a SkinCompensation message.
+    """Return a SkinCompensation message: what a recording must contain to repeat a compensation.
 
     Args:
         frame_id: Parent frame of the skin.
-        stamp_ns: Stamp of the messages of frequencies and stress to which it belongs, in ns since
-            the Unix epoch.
+        stamp_ns: Stamp of the messages of frequencies and stress to which the message belongs, in
+            ns since the Unix epoch.
         motion: Motion of the skin; None: weight is not compensated.
-        states: States of effects by name, see `Compensation.states`.
+        states: Name of a compensated effect ("creep" or "thermal") -> its state, as
+            `Compensation.states` returns it.
     """
     known = motion or UNKNOWN_MOTION
     return SkinCompensation(
@@ -216,8 +218,8 @@ def tensor_message(
 
     Args:
         header: Header of the message.
-        rows: Rows of stress.
-        row: Index of the row that the message contains.
+        rows: Rows of stress; a row is the stress of one cube at one instant.
+        row: Index of the row that the message is to contain.
         covariance: Covariance of the 6 stress components and 9 gradients, (15, 15), in SI units.
     """
     xx, yy, zz, yz, zx, xy = rows.stress[row].tolist()
@@ -271,8 +273,8 @@ def info_message(
 
     Args:
         skin: The skin.
-        pipeline: Computation of the stress, which has the present rest frequencies (frequencies
-            without load) and the covariances.
+        pipeline: Computes the stress, and provides the present rest frequencies (frequencies
+            without load) and the covariances of the stress.
         stamp_ns: Time from which on the content is valid, in ns since the Unix epoch.
         uids: Index of a cube in the skin -> the uid that its hub reports. It is used for cubes
             whose uid is not in the skin file.
@@ -313,8 +315,8 @@ def _cube_info(cube: SkinCube, frame_id: str) -> CubeInfo:
     calibration = cube.calibration
     px, py, pz = cube.xyz
     x, y, z, w = quaternion_from_rpy(*cube.rpy).tolist()
-    # Fields of a message cannot be None. A link or index that the skin file leaves out is sent as
-    # an empty text or 0.
+    # Fields of a message cannot be None, so a link that the skin file leaves out is sent as an
+    # empty text, and an index as 0.
     return CubeInfo(
         name=cube.name,
         frame_id=frame_id,

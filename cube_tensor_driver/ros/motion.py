@@ -30,30 +30,39 @@ from .node import CubeNode
 from .qos import NEWEST
 
 MAX_SAMPLES = 2048
-"""Number of newest samples of an IMU that are kept: enough for the longest message of rows, 1 s."""
+"""Number of newest samples of an IMU that are kept. A message of frequencies covers up to 1 s, in
+which an IMU with 1 kHz sends half as many."""
 
 MAX_TRANSFORM_AGE_NS = SECOND
-"""Age of a transform, relative to the newest row (sample of a cube), in ns, above which the
-direction of gravity counts as unknown. A static transform does not age."""
+"""Maximum difference, in ns, between the time of a transform and the time of the newest row (sample
+of a cube). With an older transform the direction of gravity counts as unknown. The limit does not
+apply to static transforms."""
 
 
 class MissingMotion(CubeError):
-    """The motion of the skin is unknown; the text says why, and how to mend it."""
+    """The motion of the skin is unknown. The text of the error states the reason and the remedy."""
 
 
 class MotionSource(Protocol):
-    """A source of the motion of a skin."""
+    """A source of the motion of a skin, such as an IMU."""
 
     def motion(self, first_ns: int, last_ns: int) -> Motion:
-        """Return the motion at instants around a span of time, in ns since the Unix epoch.
+        """Return the motion at one or more instants, from which it can be interpolated in a span.
+
+        Args:
+            first_ns: Begin of the span of time, in ns since the Unix epoch.
+            last_ns: End of the span of time, in ns since the Unix epoch.
 
         Raises:
-            MissingMotion: Nothing is known about the span.
+            MissingMotion: The motion in this span is unknown.
         """
 
 
 def make_motion_source(node: CubeNode, parent_frame: str) -> MotionSource | None:
-    """Return the source that the parameters `imu` and `gravity` of a node name; None: neither does.
+    """Return the source of the motion that a parameter of a node selects.
+
+    The parameter `imu` selects an IMU by its topic, and the parameter `gravity` selects TF by the
+    name of a frame whose z axis points up. If both are empty, the result is None.
 
     Args:
         node: The node, which is being configured.
@@ -74,7 +83,7 @@ class Transforms:
     """Transforms between frames, from the topics /tf and /tf_static."""
 
     def __init__(self, node: CubeNode) -> None:
-        # Robots that do not use TF need not install it.
+        # The import is here and not at the top, so that robots without TF need not install tf2_ros.
         try:
             import tf2_ros
         except ModuleNotFoundError:
@@ -112,7 +121,11 @@ class Transforms:
 
 
 class GravityMotion:
-    """The motion of a skin that moves so slowly that only its direction to gravity counts."""
+    """The motion of a skin that moves so slowly that its acceleration is negligible.
+
+    The specific force is then opposite to gravity, whose direction in the parent frame of the skin
+    is taken from TF.
+    """
 
     def __init__(self, node: CubeNode, frame: str, parent_frame: str) -> None:
         """Listen to TF.
@@ -126,7 +139,7 @@ class GravityMotion:
         self._transforms = Transforms(node)
 
     def motion(self, first_ns: int, last_ns: int) -> Motion:
-        """Return the motion at the newest transform; see `MotionSource.motion`."""
+        """Return the motion that follows from the newest transform; see `MotionSource.motion`."""
         rotation, _, time_ns = self._transforms.newest(self._parent_frame, self._frame)
         age_ns = last_ns - time_ns
         if time_ns and abs(age_ns) > MAX_TRANSFORM_AGE_NS:
@@ -139,19 +152,21 @@ class GravityMotion:
 
 
 class _Sample(NamedTuple):
-    """One sample of an IMU, in the parent frame of the skin.
+    """One sample of an IMU, with its vectors in the parent frame of the skin.
 
     Attributes:
         time_ns: Time of the sample, in ns since the Unix epoch.
         angular_velocity: Angular velocity (3,), in rad/s.
-        change: Its change since the sample before (3,), in rad/s².
-        specific_force: Specific force at the origin of the frame (3,), in m/s².
-        gradient: Its derivatives with respect to position (3, 3), in 1/s².
+        mean_acceleration: Mean angular acceleration (3,) since the sample before, in rad/s²; 0 if
+            there is none.
+        specific_force: Specific force (acceleration minus gravity) at the origin of the frame (3,),
+            in m/s².
+        gradient: Derivatives of the specific force with respect to position (3, 3), in 1/s².
     """
 
     time_ns: int
     angular_velocity: Array
-    change: Array
+    mean_acceleration: Array
     specific_force: Array
     gradient: Array
 
@@ -175,53 +190,70 @@ class ImuMotion:
         node.call_at_cleanup(subscription.close)
 
     def on_imu(self, message: Imu) -> None:
-        """Take a sample of the IMU."""
+        """Store a message of the IMU as a sample in the parent frame of the skin.
+
+        A message that cannot be used is ignored; the reason is stored as the text of the error that
+        `motion` raises.
+        """
+        imu_frame = message.header.frame_id
         try:
-            rotation, position, _ = self._transforms.newest(
-                self._parent_frame, message.header.frame_id
-            )
+            rotation, position, _ = self._transforms.newest(self._parent_frame, imu_frame)
         except MissingMotion as error:
             self._problem = str(error)
             return
         a, w = message.linear_acceleration, message.angular_velocity
-        force, velocity = rotation @ [a.x, a.y, a.z], rotation @ [w.x, w.y, w.z]
-        # By REP 145 and sensor_msgs, -1 states that the IMU does not measure the quantity.
-        if (
-            message.linear_acceleration_covariance[0] == -1
-            or not np.isfinite([force, velocity]).all()
-        ):
+        force = rotation @ [a.x, a.y, a.z]
+        velocity = rotation @ [w.x, w.y, w.z]
+        # According to sensor_msgs/Imu, -1 means that the IMU does not measure the acceleration.
+        is_unmeasured = message.linear_acceleration_covariance[0] == -1
+        if is_unmeasured or not np.isfinite([force, velocity]).all():
             self._problem = f"{self._topic} states no acceleration: name an IMU that measures it"
             return
         time_ns = to_ns(message.header.stamp)
         before = self._samples[-1] if self._samples else None
         if before is not None and time_ns <= before.time_ns:
-            # A replay has jumped, or a clock was set; the older samples are of another time.
+            # Time went back, because a replay has jumped or a clock was set. Older samples cannot
+            # be compared with new ones any more.
             self._samples.clear()
             before = None
-        change = acceleration = np.zeros(3)
+        mean_acceleration = acceleration = np.zeros(3)
         if before is not None and time_ns - before.time_ns <= MAX_INTERVAL_NS:
-            seconds = (time_ns - before.time_ns) / SECOND
-            change = (velocity - before.angular_velocity) / seconds
-            # The change is that of the middle between the samples, so it is extrapolated by half.
-            acceleration = 1.5 * change - 0.5 * before.change
-        # alpha x r + omega x (omega x r) = G r
+            interval_s = (time_ns - before.time_ns) / SECOND
+            mean_acceleration = (velocity - before.angular_velocity) / interval_s
+            # The mean acceleration is that in the middle of the interval. It is extrapolated
+            # linearly by half an interval to the time of the sample.
+            acceleration = 1.5 * mean_acceleration - 0.5 * before.mean_acceleration
+        # The acceleration of a rigid body at the position r, relative to its origin, is
+        # alpha x r + omega x (omega x r) = G r, with angular acceleration alpha, angular velocity
+        # omega, and the gradient G.
         turning = _cross_matrix(velocity)
         gradient = _cross_matrix(acceleration) + turning @ turning
-        at_origin = force - gradient @ position
-        self._samples.append(_Sample(time_ns, velocity, change, at_origin, gradient))
+        force_at_origin = force - gradient @ position
+        sample = _Sample(
+            time_ns,
+            velocity,
+            mean_acceleration,
+            force_at_origin,
+            gradient,
+        )
+        self._samples.append(sample)
 
     def motion(self, first_ns: int, last_ns: int) -> Motion:
         """Return the motion at the samples around a span of time; see `MotionSource.motion`."""
-        # A copy, because a driver in the same process calls this in another thread than `on_imu`.
+        # The samples are copied, because `on_imu` may change them in another thread meanwhile.
         samples = tuple(self._samples)
         if len(samples) < 2:
             raise MissingMotion(self._problem)
-        # From the last sample not after the span to the first not before it, and two at least.
-        first = bisect_right(samples, first_ns, 1, len(samples) - 1, key=_time_ns) - 1
-        last = bisect_left(samples, last_ns, first + 1, len(samples) - 1, key=_time_ns)
+        # The chosen samples enclose the span of time if possible. At least two are chosen, so that
+        # the motion can be extrapolated.
+        newest = len(samples) - 1
+        first = bisect_right(samples, first_ns, 1, newest, key=_time_ns) - 1
+        last = bisect_left(samples, last_ns, first + 1, newest, key=_time_ns)
         chosen = samples[first : last + 1]
-        late_ns, early_ns = last_ns - chosen[-1].time_ns, chosen[0].time_ns - first_ns
-        limit_ns = max(MAX_EXTRAPOLATION_NS, 2 * (chosen[1].time_ns - chosen[0].time_ns))
+        late_ns = last_ns - chosen[-1].time_ns
+        early_ns = chosen[0].time_ns - first_ns
+        interval_ns = chosen[1].time_ns - chosen[0].time_ns
+        limit_ns = max(MAX_EXTRAPOLATION_NS, 2 * interval_ns)
         if max(late_ns, early_ns) > limit_ns:
             side, off_ns = ("older", late_ns) if late_ns > early_ns else ("newer", early_ns)
             raise MissingMotion(
@@ -240,6 +272,6 @@ def _time_ns(sample: _Sample) -> int:
 
 
 def _cross_matrix(vector: Array) -> Array:
-    """Return the matrix (3, 3) of the cross product with a vector (3,) from the left."""
+    """Return the matrix (3, 3) whose product with any vector r is the cross product vector x r."""
     x, y, z = vector
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

@@ -49,7 +49,8 @@ from .qos import SERVICES, batch_profile, scans_per_message
 from .session import spin_until, start_ros
 
 MAX_BUFFERS = 4
-"""Number of different message sizes for which a publisher keeps a buffer to use it again."""
+"""Number of different message sizes for each of which a publisher keeps a buffer. The buffer of a
+size is used again for every message of this size."""
 
 STEP_S = 0.2
 """Maximum duration, in seconds, of one step of the executor, which calls callbacks of a node. A
@@ -59,15 +60,16 @@ THREAD_SWITCH_S = 1e-3
 """Time, in seconds, after which a thread must release Python's global interpreter lock (GIL) if
 another thread waits for it (`sys.setswitchinterval`).
 
-The thread that reads the links releases the lock at each read. With the default of 5 ms it would
-have to wait that long for the lock whenever the main thread computes.
+The thread that reads the links (connections to the hubs) releases the lock at each read. With
+Python's default of 5 ms it would have to wait that long for the lock whenever the main thread
+computes.
 """
 
 GC_THRESHOLDS = (20_000, 20, 20)
 """Thresholds of the three generations of Python's garbage collector (`gc.set_threshold`).
 
 Processing a scan (one sample of every cube) leaves no cyclic garbage. With the default threshold of
-700 new objects the collector would run at every scan or every second one without finding any.
+700 new objects the collector would run at every scan or every second scan without finding garbage.
 """
 
 Entity = TypeVar("Entity", Publisher, Subscription, Timer, Service)
@@ -109,7 +111,7 @@ class CubeNode(LifecycleNode):
         for parameter in parameters:
             self._declare(parameter)
 
-    # Methods that subclasses override.
+    # The following methods are overridden by subclasses.
 
     def configure(self) -> None:
         """Make the publishers, subscriptions and other objects of the node; open no device.
@@ -129,9 +131,9 @@ class CubeNode(LifecycleNode):
         """End the work that `activate` started. It may also be called without `activate`."""
 
     def on_parameter_change(self, name: str) -> None:
-        """Take over the new value of a live parameter.
+        """Apply the new value of a parameter that may change while the node is configured.
 
-        Called only while the node is configured, for parameters that may change in this state.
+        It is called only while the node is configured.
 
         Args:
             name: Name of the parameter; `value` returns its new value.
@@ -139,11 +141,11 @@ class CubeNode(LifecycleNode):
 
     @property
     def failure(self) -> Exception | None:
-        """Error after which the node cannot work any more, so that `run` ends the process; None:
+        """Error after which the node cannot continue its work; `run` then ends the process. None:
         there was no such error."""
         return None
 
-    # Methods that subclasses call.
+    # The following methods are called by subclasses.
 
     def own(self, entity: Entity) -> Entity:
         """Register an object of the node to be destroyed at clean-up.
@@ -155,7 +157,7 @@ class CubeNode(LifecycleNode):
             The same object.
         """
         destroyers: tuple[tuple[type, Callable[[Any], object]], ...] = (
-            # LifecyclePublisher derives from Publisher, so it must be tested first.
+            # A LifecyclePublisher is also a Publisher, so its type must be tested first.
             (LifecyclePublisher, self.destroy_lifecycle_publisher),
             (Publisher, self.destroy_publisher),
             (Subscription, self.destroy_subscription),
@@ -171,7 +173,8 @@ class CubeNode(LifecycleNode):
     def call_at_cleanup(self, function: Callable[[], object]) -> None:
         """Register a function to be called at clean-up.
 
-        Functions and the objects of `own` are handled in the reverse order of their registration.
+        Clean-up calls these functions, and destroys the objects that were passed to `own`, in the
+        reverse order of their registration.
         """
         self._resources.callback(function)
 
@@ -210,7 +213,7 @@ class CubeNode(LifecycleNode):
         message_rate = None if rate_hz is None else rate_hz / scans
         return batch_profile(message_rate, self.value("qos_reliability"), scans * n_cubes)
 
-    # Methods of rclpy that register callbacks; here they catch the callbacks' exceptions.
+    # These methods of rclpy register callbacks. They are overridden to catch exceptions in them.
 
     def create_subscription(
         self, msg_type: type, topic: str, callback: Callback, *others: Any, **options: Any
@@ -242,7 +245,7 @@ class CubeNode(LifecycleNode):
                 service.callback = refuse_on_error(service.callback, RuntimeError)
             service.callback = self.callback_errors.catch_in_service(service.callback)
 
-    # Parameters.
+    # The following methods declare, check and apply parameters.
 
     def _declare(self, parameter: Parameter) -> None:
         choices = parameter.choices
@@ -258,7 +261,8 @@ class CubeNode(LifecycleNode):
                 step=0.0,
             )
             descriptor.floating_point_range = [bounds]
-        # Values of the command line, which rclpy keeps until the parameter is declared.
+        # rclpy stores the values of the command line and of parameter files here. It uses them when
+        # the parameter is declared.
         given = self._parameter_overrides
         if parameter.name in given:
             given[parameter.name] = self._as_declared(given[parameter.name])
@@ -270,9 +274,9 @@ class CubeNode(LifecycleNode):
         return super().set_parameters_atomically(list(map(self._as_declared, parameter_list)))
 
     def _as_declared(self, parameter: RclpyParameter) -> RclpyParameter:
-        """Return a parameter in the type of its declaration if it is an integer for a real number.
+        """Return a parameter, converted from int to float if its declared type is double.
 
-        rclpy refuses `rate: 250` for a parameter whose type is double.
+        rclpy would refuse `rate: 250` for a parameter of type double.
 
         Args:
             parameter: Name and value.
@@ -290,14 +294,15 @@ class CubeNode(LifecycleNode):
         return SetParametersResult(successful=True)
 
     def _refusal(self, name: str, value: Any) -> str:
-        """Return why a parameter must not get a value now, or "" if it may.
+        """Return the reason why a parameter must not get a value now, or "" if it may.
 
         Args:
             name: Name of the parameter.
             value: The requested value.
         """
         known = self._parameters_by_name.get(name)
-        # rclpy also calls this for its own parameters, such as use_sim_time, which have no entry.
+        # rclpy also asks about its own parameters, such as use_sim_time, which have no entry. They
+        # are not checked here.
         if known is None:
             return ""
         refusal = known.refusal(value)
@@ -314,13 +319,14 @@ class CubeNode(LifecycleNode):
             if self.is_configured and known is not None and known.live:
                 self.on_parameter_change(parameter.name)
 
-    # Transitions of the lifecycle.
+    # rclpy calls the following methods at the transitions of the lifecycle.
 
     def on_configure(self, state: State) -> TransitionCallbackReturn:
         result = self._attempt(self.configure)
         self.is_configured = result == TransitionCallbackReturn.SUCCESS
         if not self.is_configured:
-            self._resources.close()  # destroys the objects that were made before the error
+            # The objects that `configure` made before it failed must be destroyed.
+            self._resources.close()
         return result
 
     def on_activate(self, state: State) -> TransitionCallbackReturn:
@@ -338,7 +344,9 @@ class CubeNode(LifecycleNode):
 
     def on_cleanup(self, state: State) -> TransitionCallbackReturn:
         self.end()
-        gc.collect()  # explicitly, because the thresholds that `run` sets make it rare
+        # The garbage collector rarely runs by itself because of GC_THRESHOLDS, so it is called here
+        # to free the memory of the destroyed objects.
+        gc.collect()
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, state: State) -> TransitionCallbackReturn:
@@ -354,10 +362,8 @@ class CubeNode(LifecycleNode):
         self._resources.close()
 
     def _attempt(self, work: Callable[[], None]) -> TransitionCallbackReturn:
-        """Call the function of a transition, and return FAILURE if it raises an exception.
-
-        The exception is logged.
-        """
+        """Call a function, and return the result of a lifecycle transition: SUCCESS, or FAILURE if
+        the function raised an exception, which is logged."""
         try:
             work()
         except CubeError as error:
@@ -371,10 +377,10 @@ class CubeNode(LifecycleNode):
 
 
 class NodeClock:
-    """The clock of a node, with a faster way to read it.
+    """Reads the time of a node's clock faster than rclpy.
 
-    Unless time is simulated (`use_sim_time`), the clock of a node is the system clock. Reading that
-    directly takes a tenth of the time of a call of rclpy.
+    Unless time is simulated (`use_sim_time`), the clock of a node is the system clock. Reading the
+    system clock directly takes a tenth of the time of reading the node's clock with rclpy.
 
     Attributes:
         is_simulated: Whether time was simulated when `update` was called last.
@@ -390,7 +396,7 @@ class NodeClock:
         self.is_simulated = isinstance(clock, ROSClock) and clock.ros_time_is_active
 
     def now_ns(self) -> int:
-        """Return the time of the node's clock, in ns since the Unix epoch or of simulated time."""
+        """Return the time of the node's clock, in ns since the Unix epoch, or simulated time."""
         if self.is_simulated:
             return int(self._node.get_clock().now().nanoseconds)
         return time.time_ns()
@@ -441,8 +447,8 @@ def _run_nodes(nodes: Sequence[CubeNode], stopping: threading.Event) -> int:
             code = os.EX_CONFIG if node.is_misconfigured else 1
             stopping.set()
 
-    # The objects that exist now live until the end of the process. Frozen, they are not visited by
-    # the garbage collector, which saves 20 ms per collection.
+    # The objects that exist now live until the end of the process. After `freeze` the garbage
+    # collector does not examine them any more, which saves 20 ms per collection.
     gc.collect()
     gc.freeze()
     gc.set_threshold(*GC_THRESHOLDS)

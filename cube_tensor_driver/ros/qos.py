@@ -16,8 +16,8 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from ..core.errors import ConfigError
 
 MAX_PAUSE_S = 2.0
-"""Longest pause, in seconds, of a subscriber after which it has lost no message of a batch topic (a
-topic whose messages hold all cubes, such as `stress`).
+"""Longest pause, in seconds, that a subscriber of a batch topic may make without losing a message.
+A batch topic is one whose messages hold all cubes, such as `stress`.
 
 The depth of a queue is this time multiplied by the rate of messages, unless `MAX_QUEUE_BYTES`
 limits it.
@@ -26,9 +26,9 @@ limits it.
 MAX_QUEUE_BYTES = 64_000_000
 """Maximum size, in bytes, of the queue of a batch topic (a topic whose messages hold all cubes).
 
-A full queue is the largest part of the memory of a process, which stays below 200 MB. On the
-largest skins this limit is reached before the queue holds `MAX_PAUSE_S` (longest pause of a
-subscriber without loss) of messages, so a shorter pause already loses messages there.
+A full queue is the largest part of the memory of a process; with this limit a process stays below
+200 MB. On the largest skins a queue of this size holds the messages of less than `MAX_PAUSE_S`, so
+a subscriber loses messages in a shorter pause already.
 """
 
 MIN_BATCH_DEPTH = 10
@@ -36,13 +36,14 @@ MIN_BATCH_DEPTH = 10
 """
 
 ROW_BYTES = 78
-"""Size of the row of one cube in a message of `stress`, in bytes.
+"""Size of a row (the stress of one cube at one instant) in a message of `stress`, in bytes.
 
-It is used for all batch topics, because a row of `frequencies` of a cube with 8 pads is smaller.
+The sizes of the queues of all batch topics are computed with it. For `frequencies` the result is
+too large rather than too small, because its row of a cube with 8 pads is smaller.
 """
 
 DEFAULT_RATE_HZ = 1000.0
-"""Rate, in Hz, that is assumed for samples or messages if the rate is not known."""
+"""Sampling rate or rate of messages, in Hz, that is assumed if the skin file does not state it."""
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """Profile (quality of service) of the topics `info` and `driver/info`, which describe the skin. A
@@ -84,7 +85,8 @@ def batch_profile(
         allowed = ", ".join(_RELIABILITIES)
         raise ConfigError(f"parameter qos_reliability is {reliability!r}, allowed: {allowed}")
     wanted_depth = (rate_hz or DEFAULT_RATE_HZ) * MAX_PAUSE_S
-    # The messages of a large skin are so large that the wanted depth might exceed the memory.
+    # The messages of a large skin are so large that a queue of the wanted depth would take too much
+    # memory.
     affordable_depth = MAX_QUEUE_BYTES / (rows * ROW_BYTES)
     depth = max(MIN_BATCH_DEPTH, math.ceil(min(wanted_depth, affordable_depth)))
     return QoSProfile(depth=depth, reliability=_RELIABILITIES[reliability])
@@ -94,7 +96,8 @@ def scans_per_message(publish_period_s: float, rate_hz: float | None) -> int:
     """Return the number of scans (samples of all cubes) that one message holds, at least one.
 
     Args:
-        publish_period_s: Time, in seconds, whose scans are sent in one message.
+        publish_period_s: Time, in seconds, between two messages. A message holds the scans of this
+            time.
         rate_hz: Rate of scans, in Hz; None: not known, `DEFAULT_RATE_HZ` is assumed.
     """
     return max(1, round(publish_period_s * (rate_hz or DEFAULT_RATE_HZ)))

@@ -35,13 +35,17 @@ def start_ros() -> None:
     try:
         # The signal handlers of rclpy would shut down the context while a thread still publishes.
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    except RuntimeError as error:  # RCLError, from a wrong variable or argument of ROS
+    # rclpy raises RCLError, a RuntimeError, for a wrong environment variable or ROS argument.
+    except RuntimeError as error:
         reason = " ".join(str(error).split())
         raise ConfigError(f"ROS 2 does not start: {reason}; correct ROS_* and RMW_*") from None
 
 
 class Session(NamedTuple):
-    """The node of a command, and the executor that contains it, which the main thread must spin."""
+    """The node of a command, and the executor to which it was added.
+
+    The main thread must spin the executor.
+    """
 
     node: Node
     executor: Executor
@@ -95,7 +99,8 @@ def spin_until(
     """
     until = time.monotonic() + seconds
     while not is_done():
-        # The monotonic clock is used because the system clock may be set during the loop.
+        # The time is taken from the monotonic clock, because somebody may set the system clock
+        # during the loop.
         left = until - time.monotonic()
         if left <= 0:
             return False

@@ -39,7 +39,8 @@ class FollowedSkin:
         poses: Poses of the cubes in the parent frame of the skin.
         newest: The newest stress of each cube.
         messages: Number of messages of `stress` received so far.
-        stamp_ns: Stamp of the newest message of `stress`, in ns since the Unix epoch; 0: none came.
+        stamp_ns: Stamp of the newest message of `stress`, in ns since the Unix epoch; 0 before the
+            first message.
     """
 
     info: SkinInfo
@@ -68,7 +69,8 @@ class SkinSubscriber:
             node: The node that subscribes.
             on_skin: Called at the first `info` message, and whenever names or poses of the cubes
                 have changed.
-            on_stress: Called at each `stress` message with its stamp, in ns, and its rows.
+            on_stress: Called at each `stress` message with its stamp, in ns since the Unix epoch,
+                and its rows (the stress of one cube at one instant each).
         """
         self.skin: FollowedSkin | None = None
         self._node = node
@@ -85,12 +87,12 @@ class SkinSubscriber:
         self._node.destroy_subscription(self._stress)
 
     def now(self) -> float:
-        """Return the time of the node's clock, in s. `LatestStress` uses it as arrival time."""
+        """Return the time of the node's clock, in s. It is the arrival time of stress in `skin`."""
         return 1e-9 * float(self._node.get_clock().now().nanoseconds)
 
     def _receive_info(self, info: SkinInfo) -> None:
-        # After a tare only the rest frequencies of the new `info` differ, so that `on_skin` need
-        # not be called.
+        # After a tare the new `info` differs from the old one only in the rest frequencies. Then
+        # the names and poses have not changed, and `on_skin` is not called.
         if self.skin is not None and geometry(self.skin.info) == geometry(info):
             self.skin.info = info
             return
@@ -103,7 +105,7 @@ class SkinSubscriber:
         self.skin = skin
 
     def _receive_stress(self, data: bytes) -> None:
-        # Before the first `info` the number of cubes is unknown, so rows cannot be stored.
+        # Before the first `info` the number of cubes is unknown, so stress cannot be stored yet.
         if self.skin is None:
             return
         try:
@@ -141,16 +143,18 @@ class SkinSubscriberNode(CubeNode):
         self._depth = depth
 
     def prepare(self, skin: FollowedSkin) -> None:
-        """Prepare for messages about a skin.
+        """Prepare for computing messages from the stress of a skin; subclasses override it.
 
-        Called at the first `info` message, and when names or poses of the cubes have changed.
+        It is called at the first `info` message, and when names or poses of cubes have changed.
 
         Args:
             skin: The state of the skin, as received on its topics.
         """
 
     def compute_message(self, skin: FollowedSkin, health: Index) -> Any:
-        """Return the message to publish now, or its serialised bytes; None: none is published.
+        """Return the message to publish now, or its serialised bytes; subclasses override it.
+
+        It is called `rate` times per second. If it returns None, nothing is published.
 
         Args:
             skin: The state of the skin.
@@ -159,7 +163,9 @@ class SkinSubscriberNode(CubeNode):
         """
 
     def follow_stress(self, skin: FollowedSkin, health: Index) -> Any:
-        """Return a message to publish at once; called at each `stress` message if overridden.
+        """Return a message to publish at once, without waiting for the next regular one, or None.
+
+        If a subclass overrides this method, it is called at each `stress` message.
 
         Args:
             skin: The state of the skin.
@@ -178,17 +184,17 @@ class SkinSubscriberNode(CubeNode):
 
         subscriber = SkinSubscriber(self, self.prepare, receive if is_followed else None)
         self.call_at_cleanup(subscriber.close)
-        # The topic has the name of the node.
+        topic = self.get_name()
         publisher = self.own(
-            self.create_lifecycle_publisher(self._message_type, self.get_name(), self._depth)
+            self.create_lifecycle_publisher(self._message_type, topic, self._depth)
         )
 
         def publish(compute: Callable[[FollowedSkin, Index], Any]) -> None:
             skin = subscriber.skin
             if skin is None or not self.is_active or not self.has_listeners(publisher):
                 return
-            # The health is computed at each publication, because a cube becomes stale by time
-            # alone, without new rows.
+            # The health of cubes is computed at each publication and not at each message of stress,
+            # because a cube becomes stale when no message arrives.
             health = skin.newest.health(subscriber.now(), STALE_S)
             message = compute(skin, health)
             if message is not None:

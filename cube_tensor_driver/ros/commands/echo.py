@@ -25,12 +25,12 @@ from ..session import domain_text, node_session, spin_until
 from .services import discover
 
 QUEUE_DEPTH = 100
-"""Maximum number of messages that wait to be printed. If printing is slower than the topic, the
-oldest are dropped."""
+"""Maximum number of messages that wait to be printed. If messages arrive faster than they are
+printed, the oldest ones are dropped."""
 
 MAX_INFO_S = 3.0
-"""Maximum time, in seconds, to wait for the names of the cubes (the topic `info`) after a topic of
-stress was found. Without names, the cubes are printed by their indices."""
+"""Maximum time, in seconds, to wait for the topic `info`, which contains the names of the cubes,
+before stress is printed. Without it the cubes are printed by their indices."""
 
 MAX_MESSAGE_S = 5.0
 """Maximum time, in seconds, to wait for a message if a single one was asked for (`once`). Without a
@@ -70,8 +70,8 @@ def listen(topic: str, once: bool) -> Iterator[list[Item]]:
         once: Whether to end after the first message.
 
     Yields:
-        For each message a list: one `StressReading` per row for topics of stress, a single dict of
-        plain values for other topics.
+        The content of one message, as a list: one `StressReading` per cube and sampling time if the
+        message contains stress, else a single dict with the fields of the message.
 
     Raises:
         CubeError: No node publishes the topic, the type of its messages is not installed, or with
@@ -87,7 +87,7 @@ def listen(topic: str, once: bool) -> Iterator[list[Item]]:
             )
         listener.subscribe()
         spin_until(executor, lambda: stop.is_set() or listener.has_names, MAX_INFO_S)
-        # Without `once`, the user watches the topic and ends the command himself (Ctrl-C).
+        # Without `once` there is no time limit, because the user ends the command with Ctrl-C.
         wait_s = MAX_MESSAGE_S if once else float("inf")
         while spin_until(executor, lambda: stop.is_set() or listener.waiting, wait_s):
             if stop.is_set():
@@ -115,7 +115,8 @@ def resolve_topics(node: Node, topics: Sequence[str]) -> list[str]:
     for topic in topics:
         try:
             names.append(node.resolve_topic_name(topic))
-        except (RuntimeError, ValueError):  # RCLError, InvalidTopicNameException
+        # rclpy raises RCLError or InvalidTopicNameException, which derive from these two types.
+        except (RuntimeError, ValueError):
             raise ConfigError(
                 f"topic {topic!r}, allowed: letters, digits, _ and /, and no digit after a /"
             ) from None
@@ -132,7 +133,8 @@ def to_plain(value: Any) -> Any:
     if hasattr(value, "get_fields_and_field_types"):
         names = value.get_fields_and_field_types()
         return {name: to_plain(getattr(value, name)) for name in names}
-    if isinstance(value, bytes):  # a field of type byte
+    # rclpy represents a field of type byte as a bytes object of length 1.
+    if isinstance(value, bytes):
         return value[0]
     if isinstance(value, (str, bool, int, float)):
         return value
@@ -168,7 +170,9 @@ class _Listener:
         return self._names is not None or not self._needs_names
 
     def subscribe(self) -> None:
-        """Subscribe to the topic, which has a publisher by now, unless the command is to end.
+        """Subscribe to the topic with the type and quality of service of its publishers.
+
+        Nothing is done if the topic has no publisher.
 
         Raises:
             CubeError: Publishers of the topic have different types, or the type of its messages is
@@ -192,7 +196,7 @@ class _Listener:
 
         profile = offered_profile(offers, QUEUE_DEPTH)
         if kind is SkinStress:
-            # Rows contain the index of a cube in the skin; its name is in the topic `info`.
+            # SkinStress contains only the indices of cubes; their names are in the topic `info`.
             self._needs_names = True
             info = f"{self._topic.rpartition('/')[0]}/info"
             self._node.create_subscription(SkinInfo, info, self._on_info, LATCHED)
@@ -203,7 +207,8 @@ class _Listener:
     def take(self) -> list[Item]:
         """Remove the oldest message from `waiting`, and return its content.
 
-        The list has one `StressReading` per row of a message of stress, or a single dict.
+        If the message contains stress, the list has one `StressReading` per cube and sampling time,
+        else a single dict with the fields of the message.
         """
         message = self.waiting.popleft()
         if isinstance(message, StressRows):

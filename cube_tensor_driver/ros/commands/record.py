@@ -43,7 +43,8 @@ interpreter lock more often.
 FLUSH_PERIOD_S = 0.25
 """Time, in seconds, after which written data are passed to the operating system (flushed).
 
-If the process is killed (SIGKILL), at most the messages of twice this time are lost.
+If the process is killed (SIGKILL), the messages that were not yet flushed are lost. Together with
+the time for writing, these are at most the messages of twice this period.
 """
 
 MAX_WAITING_BYTES = 256 << 20
@@ -56,8 +57,9 @@ FIND_PERIOD_S = 0.2
 MAX_CONNECT_S = 3.0
 """Longest time, in seconds, from the connection to the first publisher until recording begins.
 
-Recording begins as soon as every topic to record is connected to a publisher, so that each recorded
-stress has its frequencies in the bag, too. After this time it begins without the other topics.
+Recording begins as soon as every topic to record is connected to a publisher, so that the bag does
+not contain messages of stress without the frequencies from which they were computed. After this
+time it begins without the topics that are not connected yet.
 """
 
 SHOW_PERIOD_S = 1.0
@@ -72,8 +74,8 @@ class Recorder:
     those of latched topics from their connection on.
 
     Attributes:
-        has_begun: Whether messages are kept by now.
-        late: Topic that was connected after that time -> how much later, in seconds.
+        has_begun: Whether recording has begun, so that messages are kept.
+        late: Topic that was connected after recording began -> how much later, in seconds.
         received: Number of messages that have arrived.
         dropped: Number of messages that were not recorded, because the disk is too slow or writing
             has failed.
@@ -113,7 +115,8 @@ class Recorder:
         self._received_bytes = self._written_bytes = 0
         self._lock = threading.Lock()
         self._closing = threading.Event()
-        # It does not keep a process alive that ends by an error before `close`.
+        # The thread is a daemon, so that it does not keep the process alive if an error ends the
+        # main thread before it calls `close`.
         self._thread = threading.Thread(target=self._write, name="bag writer", daemon=True)
         self._thread.start()
 
@@ -194,7 +197,8 @@ class Recorder:
         def receive(data: bytes) -> None:
             self.received += 1
             self.counts[topic] += 1
-            # Two threads may use a deque without a lock, but its size in bytes must be counted.
+            # Appending to a deque needs no lock. The deque has no limit of its size in bytes, so
+            # the bytes that wait are counted here.
             waiting_bytes = self._received_bytes - self._written_bytes
             if waiting_bytes + len(data) > MAX_WAITING_BYTES or self.error is not None:
                 self.dropped += 1
@@ -214,7 +218,8 @@ class Recorder:
             while not is_last:
                 is_last = self._closing.wait(WRITE_PERIOD_S)
                 with self._lock:
-                    # If the topics were never all connected, the messages that have come are kept.
+                    # If recording ends while topics are still awaited, the messages that have
+                    # arrived until then are written nevertheless.
                     if self.has_begun or is_last:
                         self._write_waiting()
                     if time.monotonic() - flushed >= FLUSH_PERIOD_S:
@@ -296,8 +301,8 @@ def fill(
         nonlocal has_come, until
         now = time.monotonic()
         if not has_come and recorder.has_begun and any(recorder.counts.values()):
-            # The duration counts from the first message on, because finding the topics may take
-            # seconds on a busy machine.
+            # The duration is counted from the first message on and not from the start, because
+            # finding the topics may take seconds on a busy machine.
             has_come, until = True, until + now - begin
         return stop.is_set() or recorder.error is not None or now >= until
 

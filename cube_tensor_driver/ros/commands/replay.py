@@ -37,23 +37,26 @@ CLOCK_PERIOD_S = 0.01
 before every replayed message."""
 
 SETTLE_S = 1.0
-"""Time, in seconds, without a new subscriber after which the replay begins.
+"""Time, in seconds, without a new subscriber after which the replay begins if `frequencies` has a
+subscriber.
 
 A node discovers each topic separately, so a node that has subscribed to `info` may not have found
 `frequencies` yet and would miss the first messages.
 """
 
 MAX_WAIT_S = 3.0
-"""Time, in seconds, without a new subscriber after which the replay begins even if `frequencies`
-has no subscribers."""
+"""Time, in seconds, without a new subscriber after which the replay begins even if the topic
+`frequencies` has no subscriber, because no reconstruction node runs."""
 
 LOOK_PERIOD_S = 0.1
-"""Time, in seconds, between two counts of subscribers before the replay begins."""
+"""Time, in seconds, between two counts of the subscribers of the replayed topics, while the replay
+waits for them."""
 
 SHOWN_NS = 100_000_000
 """Duration of the recording, in ns, that is published after a jump while the player is paused.
 
-In this time every link has sent at least one row, so that viewers show the new position.
+In this time every cube was sampled at least once, so that viewers show the stress of all cubes at
+the new position.
 """
 
 STATE_PERIOD_S = 0.1
@@ -66,9 +69,10 @@ RECONSTRUCTED_TYPES = (
     f"{PACKAGE}/msg/StressTensorStamped",
     "geometry_msgs/msg/WrenchStamped",
 )
-"""Types of messages that a reconstruction publishes.
+"""Types of messages that the node `reconstruction` publishes.
 
-Their topics are not replayed by default, because a running reconstruction publishes them anew.
+Their topics are not replayed by default, because a reconstruction node that runs during the replay
+computes them anew from the replayed frequencies.
 """
 
 
@@ -112,7 +116,8 @@ class Player:
         self._paused, self._steps = False, 0
         self._jump_ns: int | None = None
         self._shown_until_ns = 0
-        # This condition guards the four states above, and wakes `run` when one of them changes.
+        # This condition variable guards the variables for pausing, stepping and jumping, which
+        # other threads change. It wakes the thread of `run` after a change.
         self._wake = threading.Condition()
         self._node, self._bag, self._rate = node, bag, rate
         self._publishers: dict[str, Publisher] = {}
@@ -143,7 +148,10 @@ class Player:
             self._wake.notify()
 
     def step(self) -> None:
-        """Publish all messages up to the next one of `frequencies`, while the replay is paused."""
+        """Publish all messages up to the next one of `frequencies`, and stay paused.
+
+        It has an effect only while the replay is paused.
+        """
         with self._wake:
             self._steps += 1
             self._wake.notify()
@@ -153,7 +161,8 @@ class Player:
 
         Args:
             position: The position, in s from the start of the bag.
-            paused: Whether the replay pauses there, after `SHOWN_NS` of the recording.
+            paused: Whether the replay pauses there. It does so after it has published `SHOWN_NS` of
+                the recording, so that viewers show the position.
 
         Raises:
             BagError: The position is negative or after the end of the bag.
@@ -221,8 +230,8 @@ class Player:
         no new one has come for `MAX_WAIT_S`.
         """
         everything = [*self._publishers.values(), *([self._clock] if self._clock else [])]
-        # A subscriber of each topic `frequencies` is awaited. It may never come, if no
-        # reconstruction runs; then the replay begins after MAX_WAIT_S.
+        # Each topic `frequencies` is to have a subscriber, the reconstruction node. If no such node
+        # runs, the replay begins after MAX_WAIT_S.
         needed = [self._publishers[name] for name in self._publishers if _is_frequencies(name)]
         found, since, wait_s = 0, time.monotonic(), MAX_WAIT_S
         while time.monotonic() - since < wait_s and not self.stop.wait(LOOK_PERIOD_S):
@@ -261,27 +270,31 @@ class Player:
         for entry in self._bag.entries(set(self._publishers), start_ns):
             if not self._wait_until_due(entry.time_ns):
                 return
-            # The clock of nodes with simulated time must have reached the time of a message before
-            # the message arrives.
+            # Nodes with simulated time must get the time of a message before the message itself,
+            # because otherwise its stamp would lie in the future.
             self._publish_clock(entry.time_ns)
             self._publish(entry)
-            # Other threads read the position. A single assignment needs no lock.
+            # Other threads read the position. Assigning one attribute is atomic and needs no lock.
             self.position = (entry.time_ns - self._bag.start_ns) / SECOND
-            # A step ends with a message of `frequencies`, which holds one scan.
+            # A step, requested by `step`, ends with the first message of `frequencies`.
             if self._steps and _is_frequencies(entry.topic):
                 with self._wake:
                     self._steps -= 1
 
     def _set_time(self, bag_ns: int) -> None:
-        """Store that a time of recording is replayed at the present time of the monotonic clock.
+        """Set the pair of corresponding times from which the due time of each message is computed.
 
         Args:
-            bag_ns: Time of recording, in ns since the Unix epoch.
+            bag_ns: Time of recording, in ns since the Unix epoch, that corresponds to the present
+                time of the monotonic clock.
         """
         self._anchor_ns, self._anchor_s = bag_ns, time.monotonic()
 
     def _wait_until_due(self, bag_ns: int) -> bool:
-        """Wait until a message is due, with pauses and steps.
+        """Wait until a message is due.
+
+        While the replay is paused, a message is due only if it belongs to a step (see `step`) or to
+        the time that is shown after a jump (see `SHOWN_NS`).
 
         Args:
             bag_ns: Time of recording of the message, in ns since the Unix epoch.
@@ -318,10 +331,10 @@ class Player:
 
 
 def _is_reconstructed(connection: Connection, skins: list[str]) -> bool:
-    """Return whether a reconstruction published a topic of a bag.
+    """Return whether the node `reconstruction` published a recorded topic.
 
     Other nodes publish messages of type WrenchStamped, too, so a topic of this type counts only if
-    it is the topic of a single cube.
+    its name is that of the topic of a single cube, `cubes/<name>/wrench`.
 
     Args:
         connection: Description of the topic in the bag.
@@ -389,7 +402,8 @@ def replay(
         stress: Whether to publish the recorded topics of a reconstruction (stress and wrenches) as
             well.
         hold: Whether the replay pauses at the end of the bag and waits for the service `~/steer`.
-        each: Called in the main thread with the player, after every step of the executor.
+        each: Called in the main thread with the player after each step of the executor, which lasts
+            0.05 s at most, and at the end.
 
     Raises:
         BagError: The bag cannot be read, or has no topic to publish.

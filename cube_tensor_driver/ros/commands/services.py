@@ -44,8 +44,8 @@ REPEAT_S = 3.0
 """Time, in seconds, after which a request without a response is sent again."""
 
 LIST_SERVICE = "/list_parameters"
-"""Last part of the name of a service that every node with parameters offers. Nodes are found by it.
-"""
+"""Last part of the name of a service that every node with parameters offers. The names of nodes are
+found by searching for these services."""
 
 EXPECTED = {
     bool: "true or false",
@@ -264,7 +264,8 @@ def find_services(session: Session, kind: str, wanted: str = "") -> list[str]:
             name for name, kinds in services if kind in kinds and not name.startswith(own)
         )
 
-    # If only one service is needed, the search does not go on for others.
+    # If one service is wanted, the search ends when it is found. Otherwise it ends when the list of
+    # services does not change any more.
     discover(session.executor, (lambda: wanted in find()) if wanted else find)
     return find()
 
@@ -291,7 +292,7 @@ def call_service(session: Session, service_type: type, name: str, request: Any) 
         futures: list[Any] = []
         until = time.monotonic() + MAX_ANSWER_S
         while time.monotonic() < until:
-            # DDS may lose a request, and then no response comes; so the request is repeated.
+            # DDS may lose a request, so the request is repeated until a response comes.
             futures.append(client.call_async(request))
             spin_until(session.executor, lambda: any(future.done() for future in futures), REPEAT_S)
             for future in futures:
@@ -317,7 +318,8 @@ def discover(executor: Executor, find: Callable[[], object]) -> bool:
     until = time.monotonic() + MAX_DISCOVERY_S
     if not spin_until(executor, find, MAX_DISCOVERY_S):
         return False
-    # DDS discovers nodes one after the other, so the search goes on until nothing new is found.
+    # DDS discovers nodes one after the other, so the search goes on until nothing new was found for
+    # SETTLE_S.
     before = None
     while before != (now := find()) and time.monotonic() < until:
         before = now

@@ -23,7 +23,7 @@ COUNT_S = 1.0
 
 MAX_TRIES = 3
 """Maximum number of times that the messages of all topics are counted. They are counted again if
-the number of topics has changed meanwhile."""
+the number of topics has changed during the count."""
 
 HIDDEN_TOPICS = ("/rosout", "/parameter_events")
 """Topics that are not listed, because every ROS node has them, also the node that lists."""
@@ -36,15 +36,15 @@ _CUBE_TOPIC = re.compile(r"(?P<before>.*/cubes/)(?P<cube>[^/]+)(?P<after>/(stres
 
 @dataclass
 class ListedTopic:
-    """A line of the list: one topic, or the topics of all cubes that differ only in the cube.
+    """A line of the list: one topic, or all topics whose names differ only in the name of a cube.
 
     Attributes:
         name: Full name of the topic. For topics of cubes it contains `<name>` in place of the name
             of the cube.
         kinds: Types of the messages.
         cubes: Names of the cubes that have the topic; empty for other topics.
-        count: Number of messages within `COUNT_S`, of the first cube for topics of cubes; None: the
-            type of the messages is not installed.
+        count: Number of messages within `COUNT_S` on the topic `counted_topic`; None: the type of
+            the messages is not installed.
     """
 
     name: str
@@ -58,8 +58,9 @@ class ListedTopic:
         return None if self.count is None else self.count / COUNT_S
 
     @property
-    def listened(self) -> str:
-        """Full name of the topic whose messages are counted: that of the first cube, if any."""
+    def counted_topic(self) -> str:
+        """Full name of the topic whose messages are counted; for topics of cubes, the topic of the
+        first cube."""
         return self.name.replace(ANY_CUBE, self.cubes[0]) if self.cubes else self.name
 
 
@@ -86,7 +87,7 @@ def _find_topics(node: Node) -> list[ListedTopic]:
     for name, kinds in sorted(node.get_topic_names_and_types()):
         if name in HIDDEN_TOPICS or not node.count_publishers(name):
             continue
-        # The topics of single cubes are listed together, as 1000 cubes would give 2000 lines.
+        # The topics of all cubes share one line, because 1000 cubes would give 2000 lines.
         found = _CUBE_TOPIC.fullmatch(name)
         common = f"{found['before']}{ANY_CUBE}{found['after']}" if found else name
         topic = topics.setdefault(common, ListedTopic(common, kinds, []))
@@ -129,7 +130,7 @@ def _subscribe(node: Node, topic: ListedTopic) -> Subscription | None:
         topic: The topic, whose `count` is increased by each message.
     """
     try:
-        kind = message_class(topic.listened, topic.kinds[0])
+        kind = message_class(topic.counted_topic, topic.kinds[0])
     except BagError:
         topic.count = None
         return None
@@ -137,6 +138,6 @@ def _subscribe(node: Node, topic: ListedTopic) -> Subscription | None:
     def receive(_: bytes) -> None:
         topic.count = (topic.count or 0) + 1
 
-    offers = node.get_publishers_info_by_topic(topic.listened)
+    offers = node.get_publishers_info_by_topic(topic.counted_topic)
     profile = offered_profile(offers, QUEUE_DEPTH)
-    return node.create_subscription(kind, topic.listened, receive, profile, raw=True)
+    return node.create_subscription(kind, topic.counted_topic, receive, profile, raw=True)

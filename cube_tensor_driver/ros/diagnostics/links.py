@@ -21,7 +21,11 @@ LEVELS = {
 
 
 class LinkDiagnostics:
-    """Makes the statuses of the node `driver` for /diagnostics. It is used once a second."""
+    """Makes the diagnostic statuses of the node `driver`, once a second.
+
+    There is one status about all rows (a row is one sample of one cube), and one per link
+    (connection to a hub, the device that reads cubes).
+    """
 
     def __init__(self, skin_name: str) -> None:
         self._skin_name = skin_name
@@ -31,8 +35,9 @@ class LinkDiagnostics:
         """Return the diagnostic statuses of the driver.
 
         Args:
-            links: The links, which count rows and report their states.
-            with_links: Whether the list contains a status for each link, after the one about rows.
+            links: The links to the hubs, which count rows and report their states.
+            with_links: Whether the list contains a status for each link, after the status about all
+                rows.
         """
         counts = links.row_counts()
         statuses = [_rows_status(self._skin_name, counts, self._counts_before)]
@@ -47,18 +52,18 @@ def _rows_status(
     counts: RowCounts,
     before: RowCounts,
 ) -> DiagnosticStatus:
-    """Return the status about all rows.
+    """Return the status about the numbers of rows that were published and lost.
 
     Args:
         skin_name: Name of the skin.
-        counts: Numbers of rows since the start.
-        before: The same numbers at the previous call, one second earlier.
+        counts: Numbers of rows (samples of one cube each) since the start.
+        before: The same numbers at the previous status, one second earlier.
     """
     level, text = DiagnosticStatus.OK, ""
     if counts.unaccounted:
         level = DiagnosticStatus.ERROR
         text = f"{counts.unaccounted} rows are lost in the driver: please report it"
-    # Only losses since the previous status count, so that the level returns to OK afterwards.
+    # Only losses since the previous status are reported. If there are none, the level is OK again.
     elif counts.lost > before.lost:
         level = DiagnosticStatus.ERROR
         text = f"{counts.lost - before.lost} rows lost by an error: {counts.lost_reason}"

@@ -26,34 +26,38 @@ if TYPE_CHECKING:
 MAX_CUBE_STATUSES = 64
 """Maximum number of cubes that have a status in one message of /diagnostics.
 
-If all hubs of a skin with 1000 cubes are disconnected, a status for each cube would be useless.
+If all hubs of a skin with 1000 cubes are disconnected, nobody would read 1000 equal statuses.
 """
 
 MISSING = "missing: no row yet, see its link"
-"""Status text of a cube that has not sent any row since the node was configured."""
+"""Status text of a cube of which no row (sample) has arrived since the node was configured."""
 
 STALE = "stale: no rows any more, see its link"
-"""Status text of a cube that has sent rows before, but none since the previous status."""
+"""Status text of a cube of which rows (samples) have arrived before, but none since the previous
+status."""
 
 MIN_UPDATES_TO_LOG = 5
 """Number of updates of the diagnostics (one per second) during which cubes without any row are not
 logged, because hubs may start later than the node."""
 
 MAX_KNOWN_PUBLISHERS = 8
-"""Maximum number of publishers of one topic whose last message numbers are remembered, so that
-messages of different publishers are not taken for gaps."""
+"""Maximum number of publishers of one topic whose last sequence number is remembered. If several
+publishers send on the topic, their different sequence numbers must not be taken for lost
+messages."""
 
 LogChanges = list[tuple[str, bool]]
-"""Lines for the log, each with whether it reports a problem (True) or the end of one (False)."""
+"""Lines for the log, each with a flag: True if it reports a problem, False if it reports the end of
+a problem."""
 
 
 class ReconstructionDiagnostics:
-    """Makes the diagnostic statuses of the reconstruction. It is used once a second.
+    """Makes the diagnostic statuses of the node `reconstruction`, once a second.
 
     Attributes:
         refused_messages: Number of messages of `frequencies` that were refused, because they were
             damaged or inconsistent.
-        compensation_problem: Why a compensation does not work now; empty: there is no problem.
+        compensation_problem: Why the compensation of weight does not work now; empty: there is no
+            problem.
     """
 
     def __init__(
@@ -64,21 +68,25 @@ class ReconstructionDiagnostics:
         self._skin, self._tare, self._lost = skin, tare, lost
         self._cubes = CubeHealth(skin, reconstructor)
         self._rows = self._invalid_rows = 0
-        self._rows_before = self._lost_before = 0  # at the last update
+        self._rows_before = self._lost_before = 0
         self._was_inactive = False
 
     def count(self, rows: StressRows) -> None:
-        """Count the rows (one cube at one sampling time) of one published message of `stress`, and
-        the invalid ones among them."""
+        """Count the rows of one published message of `stress`, and the invalid ones among them.
+
+        Args:
+            rows: Rows of stress; a row is the stress of one cube at one sampling time.
+        """
         self._rows += len(rows)
         self._invalid_rows += int(np.count_nonzero(rows.status & INVALID))
 
     def statuses(self, is_active: bool) -> tuple[list[DiagnosticStatus], LogChanges]:
         """Return the statuses for /diagnostics, and lines for the log about changes.
 
-        The first status is about all rows. The others are about cubes that have a fault now or had
-        one at the previous call. While the node is inactive there are no statuses of cubes, because
-        an inactive node processes no rows and all cubes would seem to be silent.
+        The first status is about all rows (samples of cubes). The others are about cubes that have
+        a fault now or had one at the previous call. While the node is inactive there are no
+        statuses of cubes, because an inactive node processes no rows, so that all cubes would be
+        reported as stale.
 
         Args:
             is_active: Whether the node is active now.
@@ -87,7 +95,9 @@ class ReconstructionDiagnostics:
         changes: LogChanges = []
         if is_active and not self._was_inactive:
             cubes, changes = self._cubes.statuses(self._tare.uids)
-        else:  # The node was inactive for at least a part of the time since the previous call.
+        else:
+            # The node was inactive at times since the previous call. Rows that are missing in this
+            # time are no fault of the cubes.
             self._cubes.discard()
         self._was_inactive = not is_active
 
@@ -124,18 +134,19 @@ class ReconstructionDiagnostics:
 
 
 class CubeHealth:
-    """Makes statuses of cubes for /diagnostics from what `Health` has found in the last second.
+    """Makes the diagnostic statuses of cubes from the faults that `Health` has found.
 
-    `Health` finds faulty conditions of pads (such as open or noisy) and high residuals of cubes.
+    A fault is a faulty condition of a pad (such as open or noisy), or a high residual of a cube: a
+    disagreement between the measurements of its pads.
     """
 
     def __init__(self, skin: Skin, reconstructor: Reconstructor) -> None:
         self._skin, self._pipeline = skin, reconstructor.pipeline
         self._health = reconstructor.health
         self._has_come = np.zeros(len(skin.cubes), bool)
-        # Index of a cube with a fault -> text of its status, in the previous statuses and in the
-        # log. The log may lag behind, because cubes are not logged just after the start.
+        # Index of a cube with a fault -> text of its previous diagnostic status.
         self._reported: dict[int, str] = {}
+        # Index of a cube -> text about it that was logged last.
         self._logged: dict[int, str] = {}
         self._updates = 0
 
@@ -143,29 +154,33 @@ class CubeHealth:
         """Return the statuses of cubes with a fault now or at the previous call, and log lines.
 
         Args:
-            uids: Index of a cube in the skin -> its uid, for cubes whose uid the skin file lacks.
+            uids: Index of a cube in the skin -> the uid that its hub reports. It is used for cubes
+                whose uid is not in the skin file.
         """
-        bits, strained, rows = self._health.collect()
+        bits, has_residual, rows = self._health.collect()
         self._updates += 1
         self._has_come |= rows > 0
 
-        levels = np.zeros(len(rows), int)
-        levels[strained | (bits != 0).any(axis=1)] = 1  # DiagnosticStatus.WARN
-        levels[(bits & LEFT_OUT != 0).any(axis=1)] = 2  # ERROR
-        levels[rows == 0] = 3  # STALE
-        not_fine = np.flatnonzero(levels)[:MAX_CUBE_STATUSES]
-        words = self._describe_cubes(not_fine, bits, strained, rows)
+        has_condition = (bits != 0).any(axis=1)
+        has_left_out_pad = (bits & LEFT_OUT != 0).any(axis=1)
+        levels = np.full(len(rows), DiagnosticStatus.OK, object)
+        levels[has_residual | has_condition] = DiagnosticStatus.WARN
+        levels[has_left_out_pad] = DiagnosticStatus.ERROR
+        levels[rows == 0] = DiagnosticStatus.STALE
+        is_faulty = levels != DiagnosticStatus.OK
+        faulty = np.flatnonzero(is_faulty)[:MAX_CUBE_STATUSES]
+        words = self._describe_cubes(faulty, bits, has_residual, rows)
 
         statuses: list[DiagnosticStatus] = []
         changes: LogChanges = []
         for number in sorted({*words, *self._reported}):
             cube = self._skin.cubes[number]
             text = words.get(number, "ok")
-            level = int(levels[number]) if number in words else 0
+            level = levels[number] if number in words else DiagnosticStatus.OK
             is_starting = self._updates <= MIN_UPDATES_TO_LOG and text == MISSING
             if text != self._logged.get(number, "ok") and not is_starting:
                 self._logged[number] = text
-                changes.append((f"cube {cube.name}: {text}", level > 0))
+                changes.append((f"cube {cube.name}: {text}", number in words))
             uid = cube.uid or uids.get(number, 0)
             hardware_id = f"{uid:#x}" if uid else ""
             values = {"rows since the last": int(rows[number])}
@@ -173,7 +188,7 @@ class CubeHealth:
                 make_status(
                     f"cube {cube.name}",
                     hardware_id,
-                    bytes([level]),
+                    level,
                     text,
                     values,
                 )
@@ -182,14 +197,14 @@ class CubeHealth:
         return statuses, changes
 
     def discard(self) -> None:
-        """Discard the conditions that `Health` has found since the previous call."""
+        """Discard the faults that `Health` has found since the previous call of `statuses`."""
         self._health.collect()
 
     def summary(self) -> dict[str, int]:
-        """Return the number of pads in each faulty condition (open, short, noisy and so on) now.
+        """Return the present numbers of pads in each faulty condition and of cubes with a residual.
 
-        The number of cubes with a high residual is added. Numbers that are 0 are left out. The keys
-        are those of the status on /diagnostics.
+        Conditions are open, short, noisy and so on. The keys of the dict are the keys of the
+        diagnostic status, such as "pads open". Numbers that are 0 are left out.
         """
         counts = {
             f"pads {word}": int(np.count_nonzero(self._health.state & bit))
@@ -199,17 +214,17 @@ class CubeHealth:
         return {name: count for name, count in counts.items() if count}
 
     def _describe_cubes(
-        self, cubes: AnyArray, bits: AnyArray, strained: Mask, rows: AnyArray
+        self, cubes: AnyArray, bits: AnyArray, has_residual: Mask, rows: AnyArray
     ) -> dict[int, str]:
-        """Return the text of the status of each of these cubes.
+        """Return the index of each of these cubes -> the text of its diagnostic status.
 
         Args:
             cubes: Indices of the cubes.
             bits: Condition bits of each pad of all cubes, (all cubes, pads).
-            strained: Whether the residual of a cube was high, (all cubes,).
-            rows: Number of rows of each cube since the previous call, (all cubes,).
+            has_residual: Whether the residual of a cube was high, (all cubes,).
+            rows: Number of rows (samples) of each cube since the previous call, (all cubes,).
         """
-        suspects = self._find_suspects(strained)
+        suspects = self._find_suspects(has_residual)
         words = {}
         for cube in cubes.tolist():
             if not rows[cube]:
@@ -220,22 +235,22 @@ class CubeHealth:
                 f"pad {pads[pad]} {_condition_words(int(bits[cube, pad]))}"
                 for pad in np.flatnonzero(bits[cube]).tolist()
             ]
-            if strained[cube]:
+            if has_residual[cube]:
                 texts.append(f"residual above its level: {_residual_cause(suspects.get(cube))}")
             words[cube] = "; ".join(texts)
         return words
 
-    def _find_suspects(self, strained: Mask) -> dict[int, list[str]]:
+    def _find_suspects(self, has_residual: Mask) -> dict[int, list[str]]:
         """Return the names of pads that may cause the high residuals of cubes.
 
         Args:
-            strained: Whether the residual of a cube was high, (all cubes,).
+            has_residual: Whether the residual of a cube was high, (all cubes,).
 
         Returns:
-            Index of a cube with a high residual -> its pads any one of which, if it alone were
-            faulty, would explain the residual.
+            Index of a cube with a high residual -> names of its suspected pads. A fault of a single
+            one of them would explain the residual.
         """
-        cubes = np.flatnonzero(strained)
+        cubes = np.flatnonzero(has_residual)
         if not len(cubes):
             return {}
         health = self._health
@@ -257,18 +272,22 @@ class LostMessages:
 
     DDS numbers the messages of each publisher consecutively, so that a gap in the numbers shows a
     lost message. Either the network has lost it, or it was dropped because this process did not
-    read its queue in time; DDS does not report the latter. If rclpy does not provide the numbers,
-    or several publishers send alternately, only the losses that DDS reports are counted. The count
-    continues when the node makes a new subscription.
+    read its queue in time; DDS does not report messages that were dropped in this way. If rclpy
+    does not provide the numbers, or several publishers send alternately, only the losses that DDS
+    reports are counted. The count continues when the node makes a new subscription.
     """
 
     def __init__(self) -> None:
-        # Number of lost messages: in earlier subscriptions; by gaps in this one; as DDS reports
-        # for this one.
-        self._earlier = self._left_out = self._reported = 0
+        # Number of messages that earlier subscriptions of the node have lost.
+        self._lost_earlier = 0
+        # Number of messages that are missing in the sequence numbers of the present subscription.
+        self._lost_by_number = 0
+        # Number of messages that the present subscription has lost according to DDS.
+        self._lost_by_dds = 0
         self._newest: int | None = None
-        # Number of messages missing just before the newest one. It is counted only when the next
-        # message continues the numbers, as otherwise the newest came from another publisher.
+        # Number of messages that are missing just before the newest one. They are counted as lost
+        # only when the next message has the next number: only then is the newest message not from
+        # another publisher with other numbers.
         self._gap = 0
         self._other_publishers: deque[int] = deque(maxlen=MAX_KNOWN_PUBLISHERS)
         self._has_several_publishers = False
@@ -276,7 +295,7 @@ class LostMessages:
     @property
     def count(self) -> int:
         """Number of messages lost so far, in all subscriptions since the node was made."""
-        return self._earlier + max(self._left_out, self._reported)
+        return self._lost_earlier + max(self._lost_by_number, self._lost_by_dds)
 
     def new_subscription(self) -> SubscriptionEventCallbacks:
         """Begin to count for a new subscription.
@@ -284,8 +303,10 @@ class LostMessages:
         Returns:
             The argument `event_callbacks` of `create_subscription`.
         """
-        self._earlier, self._left_out, self._reported = self.count, 0, 0
-        self._newest, self._gap, self._has_several_publishers = None, 0, False
+        self._lost_earlier = self.count
+        self._lost_by_number = self._lost_by_dds = self._gap = 0
+        self._newest = None
+        self._has_several_publishers = False
         self._other_publishers.clear()
         return SubscriptionEventCallbacks(message_lost=self._on_message_lost)
 
@@ -293,7 +314,7 @@ class LostMessages:
         """Record the arrival of a message.
 
         Args:
-            number: Number that DDS gave the message; None: rclpy does not provide it.
+            number: Sequence number that DDS gave the message; None: rclpy does not provide it.
         """
         newest, self._newest = self._newest, number
         if number is None or newest is None:
@@ -301,23 +322,24 @@ class LostMessages:
         is_next = number == newest + 1
         continues_other = not is_next and number - 1 in self._other_publishers
         if continues_other or number <= newest:
-            # The message came from another publisher: one of several that send alternately, or a
-            # new one, whose numbers begin at 1.
+            # The message came from another publisher. Either several publishers send alternately,
+            # or a publisher was restarted, so that its numbers begin at 1 again.
             self._has_several_publishers |= continues_other
             self._other_publishers.append(newest)
             self._gap = 0
         elif not self._has_several_publishers:
-            self._left_out += self._gap
+            self._lost_by_number += self._gap
             self._gap = number - newest - 1
 
     def _on_message_lost(self, event: Any) -> None:
-        self._reported = event.total_count
+        self._lost_by_dds = event.total_count
 
 
 def log_changes(logger: RcutilsLogger, changes: LogChanges) -> None:
     """Write lines to the log: problems as warnings, and the end of problems as information."""
     for line, is_bad in changes:
-        # rclpy requires that a line of code always logs with the same level, so there are two.
+        # There are two calls, because rclpy requires that one line of code always logs with the
+        # same severity.
         if is_bad:
             logger.warning(line)
         else:

@@ -27,7 +27,8 @@ PERIOD_S = 1.0
 """Time, in seconds, between two messages of diagnostics of a node."""
 
 QUEUE_DEPTH = 10
-"""Depth of the queue of each topic, in messages. The nodes of a robot publish at the same time."""
+"""Depth of the queue of each topic of diagnostics, in messages. It holds the messages of several
+nodes of a robot that publish at the same time."""
 
 
 class Diagnostics:
@@ -49,7 +50,8 @@ class Diagnostics:
         """
         self._node, self._statuses, self._count_errors = node, statuses, count_errors
         self._errors_before = 0
-        # Without a namespace both names are those of one topic.
+        # In a node without a namespace both names resolve to the same topic, which then gets only
+        # one publisher.
         topics = {node.resolve_topic_name(topic) for topic in TOPICS}
         self._publishers = [
             node.create_publisher(DiagnosticArray, topic, QUEUE_DEPTH) for topic in topics

@@ -38,7 +38,8 @@ from .serialised import (
 PLATE_SIDE = 2.04
 """Side of the square plate that shows the colour of a cube, divided by half the side of the cube.
 
-The plate covers the upper face of the cube; the sides of the cube are drawn from the robot model.
+The plate is slightly larger than the upper face of the cube (2), which it covers. RViz draws the
+cube itself from the URDF of the skin.
 """
 
 PLATE_THICKNESS = 0.3
@@ -65,11 +66,12 @@ SLIP_COLOUR: Colour = (1.0, 0.1, 0.1)
 """Colour of the text of a contact that slips."""
 
 COARSE_OPACITY = 0.5
-"""Opacity of the text of a contact whose forces do not come from a fit."""
+"""Opacity of the text of a contact with coarse forces, from 0 to 1. Forces are coarse until the
+first fit of the contact is ready; see the field `refined` of SkinContacts."""
 
 MAX_CONTACTS = 8
-"""Maximum number of contacts that are drawn. A message lists those with the largest forces first.
-"""
+"""Maximum number of contacts that are drawn: those with the largest normal forces, which a message
+of contacts lists first."""
 
 RING_CORNERS = 24
 """Number of corners of the polygon that is drawn as the ring around a contact."""
@@ -91,7 +93,7 @@ warning for a colour with opacity 0."""
 
 
 class Canvas:
-    """The picture of a skin. The namespace of each marker is its name, such as "faults".
+    """The picture of a skin: a MarkerArray message that is changed in place by the draw methods.
 
     Attributes:
         legend: The legend beside the skin.
@@ -111,8 +113,8 @@ class Canvas:
             frame_id: Frame id of the parent frame of the skin.
             poses: Poses of the cubes in this frame.
             crosses: Whether the principal stresses of each cube are drawn.
-            signed: Whether the quantity that colours show can be negative. The middle of the colour
-                scale is then 0.
+            signed: Whether the quantity that the colours of cubes show can be negative. The middle
+                of the colour scale is then 0.
         """
         self._poses = poses
         self._pitch = poses.pitch
@@ -129,14 +131,14 @@ class Canvas:
         plates = scene.above(poses, PLATE_HEIGHT)
         oriented = enumerate(zip(self._groups, rotations, strict=True))
         for group, (members, rotation) in oriented:
-            # Points of a marker are given in the frame of the marker's pose, so they are rotated
-            # from the parent frame into it.
+            # The points of a marker are given in the frame of the marker's pose, so the positions
+            # of the plates are rotated from the parent frame into that frame.
             self._markers[f"cubes {group}"].points[:] = plates[members] @ rotation
-        # The opacity is set once; the draw methods write only red, green and blue.
+        # The opacity of all points is set to 1 here. The draw methods change only red, green, blue.
         for marker in markers:
             self._markers[marker.ns].colours[:, 3] = 1.0
         self.legend = Legend(self._markers, place)
-        # Drawing no contacts hides the texts, which hold placeholders until there is a contact.
+        # Until there is a contact, the texts of contacts hold placeholders, which must be hidden.
         self.draw_contacts(None)
 
     @property
@@ -181,7 +183,7 @@ class Canvas:
             self._markers[name].points[:] = lines.reshape(-1, 3)
 
     def draw_faults(self, health: Index) -> None:
-        """Draw crosses over cubes whose health is not fine, unless nothing has changed.
+        """Draw crosses over cubes whose health is not fine. If no health has changed, do nothing.
 
         Args:
             health: Health of each cube, (cubes,): fine, doubtful, faulty or stale, as
@@ -194,7 +196,7 @@ class Canvas:
         faults = self._markers["faults"]
         crosses = scene.fault_crosses(self._poses, health)
         faults.points[:] = crosses.reshape(-1, 3)
-        # A cross consists of two lines with four end points, and each of them has a colour.
+        # A cross consists of two lines, thus of four end points, each of which has a colour.
         faults.colours[:, :3] = np.repeat(scene.MARK[health], 4, axis=0)
 
     def draw_crosses(self, values: Array, longest_pa: float) -> None:
@@ -216,9 +218,10 @@ class Canvas:
         crosses.colours[:, :3] = np.repeat(colours, 2, axis=0)
 
     def draw_contacts(self, contacts: SkinContacts | None) -> None:
-        """Draw each contact as a ring, with its normal and shear force as text, red if it slips.
+        """Draw each contact as a ring with a text that states its normal and shear force.
 
-        The text is pale if the forces are those of the field, before a fit is ready.
+        The text is red while the contact slips. It is pale (`COARSE_OPACITY`) until the first fit
+        of the contact is ready.
 
         Args:
             contacts: The newest message of contacts; None: all rings and texts are hidden.
@@ -232,7 +235,8 @@ class Canvas:
                 continue
             position = _to_array(contacts.position[number])
             normal = _to_array(contacts.normal[number])
-            # A circle with the area of the contact is drawn, although contacts have other shapes.
+            # The message does not contain the shape of a contact, so a circle of equal area is
+            # drawn.
             area = max(0.0, contacts.area[number])
             radius = float(np.sqrt(area / np.pi))
             rings[number] = scene.ring(position, normal, radius, RING_CORNERS)
@@ -246,7 +250,9 @@ class Canvas:
         self._markers["contacts"].points[:] = rings.reshape(-1, 3)
 
     def _make_cubes(self, frame_id: str, rotations: Array) -> list[Marker]:
-        """Return one marker for each orientation, because all boxes of a CUBE_LIST are parallel.
+        """Return the markers of the coloured plates of cubes, one for each group of parallel cubes.
+
+        A marker of type CUBE_LIST has a single orientation and a single size for all its boxes.
 
         Args:
             frame_id: Frame id of the parent frame of the skin.
@@ -255,7 +261,7 @@ class Canvas:
         markers = []
         for group, (w, x, y, z) in enumerate(quaternions(rotations).tolist()):
             members = self._groups[group]
-            # All boxes of a marker have the same size; it is that of the largest cube.
+            # All boxes of a marker have the same size, so that of the largest cube is taken.
             half_side = float(self._poses.half_side[members].max())
             side = PLATE_SIDE * half_side
             thickness = PLATE_THICKNESS * half_side
@@ -282,8 +288,8 @@ class Canvas:
             frame_id: Frame id of the parent frame of the skin.
             crosses: Whether there is a marker for principal stresses, too.
         """
-        # Each entry is the name, the number of points per cube, and the colour of a marker. None
-        # as colour means that each point has a colour of its own.
+        # Each entry contains the name of a marker, its number of points per cube, and its colour.
+        # If the colour is None, each point of the marker has its own colour.
         kinds: list[tuple[str, int, Colour | None]] = [
             ("traction", 6, TRACTION_COLOUR),
             ("gradient", 6, GRADIENT_COLOUR),

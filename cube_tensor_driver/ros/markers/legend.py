@@ -201,13 +201,15 @@ class Legend:
         self._markers["legend bar"].colours[:, :3] = scene.colours(quantity, values, top)
         for number, position in enumerate(NUMBER_POSITIONS):
             value = (low + position * (top - low)) / quantity.size
-            # A number of a signed quantity always has a sign, so that the text keeps its length.
+            # Numbers of a quantity that can be negative always have a sign, so that the length of
+            # the text does not change.
             sign = "-" if value < 0 else "+" if quantity.signed else ""
             text = sign + four_characters(abs(value))
             self._markers.write_text(f"legend number {number}", text)
 
         title = _title(quantity, top, health)
-        width = TITLE_BYTES - 2  # The text has a dot at each end.
+        n_dots = 2
+        width = TITLE_BYTES - n_dots
         self._markers.write_text("legend", f".{title[:width].center(width)}.")
 
     def draw_scale(self, traction_pa: float, gradient_pa_per_m: float) -> None:
@@ -257,8 +259,8 @@ def legend_markers(
         arrow.scale.x = 0.05 * place.pitch
         allocate(arrow, 6, with_colours=False)
         placeholder = _scale_text(scale, 0.0)
-        # The text begins to the right of the longest arrow. Its position is its centre, and its
-        # width is estimated from letters that are half as wide as high.
+        # The text begins to the right of the longest arrow. The position of a text marker is the
+        # centre of the text. To compute it, letters are assumed to be half as wide as high.
         begin = (TRACTION_LENGTH + 0.3) * place.pitch / place.width
         across = begin + 0.25 * len(placeholder) * TEXT_HEIGHT
         position = place.point(across, FIRST_SCALE_LINE + SCALE_LINES * number)

@@ -27,7 +27,7 @@ from ...core.arrays import AnyArray, Array, Single
 
 LIFETIME_S = 2
 """Time, in seconds, after which viewers remove a picture if the node `markers` has sent no newer
-one. So an old load is not shown as the present one after the node has ended."""
+one. Without this limit viewers would show the last load for ever after the node has ended."""
 
 Colour = tuple[float, float, float]
 """Red, green and blue, each from 0 to 1."""
@@ -141,7 +141,8 @@ class SerialisedMarkers:
                 cannot change afterwards; texts have at least four letters.
         """
         self.data = bytearray(serialize_message(MarkerArray(markers=list(markers))))
-        # All lengths in the copies are those of the markers, and so are the places of all fields.
+        # The byte offset of a field depends only on the lengths of the lists and texts before it.
+        # So it is found in the bytes of a copy in which the values of the fields are unique.
         copies = copy.deepcopy(list(markers))
         marks = [_mark(marker, number) for number, marker in enumerate(copies)]
         marked = serialize_message(MarkerArray(markers=copies))
@@ -177,17 +178,19 @@ class SerialisedMarkers:
 
 
 def _mark(marker: Marker, number: int) -> tuple[bytes, bytes, bytes, bytes, bytes]:
-    """Let each field of a marker begin with a number or text that no other field has.
+    """Set the beginning of each field of a marker to a value that occurs nowhere else.
+
+    The byte offset of a field in the serialised message is then found by searching for its value.
 
     Args:
         marker: The marker, which is changed.
-        number: Index of the marker among those of the message.
+        number: Index of the marker in the message.
 
     Returns:
-        The bytes with which the fields begin, in the order of `MarkerArrays`; no bytes for a field
-        that is empty.
+        The serialised value at the beginning of each field, in the order of the fields of
+        `MarkerArrays`; b"" for a field that is empty.
     """
-    # These numbers are far above all coordinates and colours.
+    # Numbers of 1e30 and more do not occur as coordinates or colours.
     first, second = 1e30 * (2 * number + 1), 1e30 * (2 * number + 2)
     points = colours = text = b""
     if marker.points:

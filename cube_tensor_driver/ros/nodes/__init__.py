@@ -9,7 +9,7 @@ executes this file before any import of numpy.
 
 import os
 
-# OpenBLAS (numpy's matrix library) divides products of 4096 and more rows among threads, which wait
-# for work in a busy loop: the reconstruction of 4108 cubes at 100 Hz took 111 % of a CPU core
-# instead of 13 %. A number of threads that the user has set is kept.
+# OpenBLAS (numpy's matrix library) divides products of matrices with 4096 or more rows among
+# threads, which wait for work in a busy loop. With its default, the reconstruction of 4108 cubes at
+# 100 Hz took 111 % of a CPU core instead of 13 %. A value that the user has set is kept.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -25,20 +25,21 @@ from ..node import run
 from ..skin_subscriber import FollowedSkin, SkinSubscriberNode
 
 RETRY_PERIOD_S = 5.0
-"""Time, in seconds, after a failed set-up of the contact finder until it is tried again, because a
-missing or damaged file may have been replaced."""
+"""Time, in seconds, from a failed set-up of the contact finder to the next attempt. It may succeed
+then, because a missing or damaged file may have been replaced."""
 
 
 class Contacts(SkinSubscriberNode):
-    """Publishes `contacts` for the newest `stress`, at most `rate` times per second (parameter).
+    """Publishes the contacts on a skin on the topic `contacts`, computed from the newest stress.
 
-    With the method `inverse` the state of slip is updated at each `stress`. When a contact begins
-    to slip, the contacts of the last message are published again with their new states, because a
-    hand must react earlier than the next regular message. Without contacts the arrays of a message
-    are empty. With the method `inverse` the node also publishes `traction`, the force per area on
-    the surface of the skin. The `ContactFinder` is set up in another thread, because that may take
-    long on a large skin and the node must answer requests meanwhile. Nothing is published before it
-    is ready.
+    A message is published at most `rate` times per second (parameter). Without contacts its arrays
+    are empty. If the parameter `method` is `inverse`, the node also publishes `traction`, the force
+    per area on the surface of the skin, and checks at each message of `stress` whether a contact
+    begins to slip. If so, it publishes the last contacts again at once with their new states of
+    slip, because a hand that loses an object must react before the next regular message.
+
+    The `ContactFinder` is set up in another thread, because that may take long on a large skin and
+    the node must answer requests meanwhile. Nothing is published before it is ready.
     """
 
     def __init__(self) -> None:
@@ -57,7 +58,7 @@ class Contacts(SkinSubscriberNode):
         return self._has_traction_listeners() or super().has_listeners(publisher)
 
     def prepare(self, skin: FollowedSkin) -> None:
-        # Each field of ContactSettings has a parameter of the same name.
+        # For each field of ContactSettings the node has a parameter of the same name.
         names = [field.name for field in fields(ContactSettings)]
         settings = ContactSettings(**{name: self.value(name) for name in names})
         self._processed_messages = 0
@@ -73,7 +74,7 @@ class Contacts(SkinSubscriberNode):
 
     def compute_message(self, skin: FollowedSkin, health: Index) -> SkinContacts | None:
         finder = self._take_finder()
-        # The finder tracks contacts over time, so it must not get the same message twice.
+        # The finder tracks contacts over time, so it must not get the same stress twice.
         if finder is None or skin.messages == self._processed_messages:
             return None
         self._processed_messages = skin.messages

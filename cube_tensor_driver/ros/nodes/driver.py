@@ -32,7 +32,7 @@ from ..qos import LATCHED, scans_per_message
 COUNT_PERIOD_S = 0.2
 """Time, in seconds, between two counts of the subscribers of `frequencies`.
 
-It matters only if rclpy (as in ROS 2 Humble) does not report changes of their number itself.
+They are counted only if rclpy (as in ROS 2 Humble) does not report changes of their number itself.
 """
 
 
@@ -47,9 +47,10 @@ class Driver(CubeNode):
         """Make the node.
 
         Args:
-            on_rows: Called in the reader's thread with the rows of each message. Their arrays are
-                overwritten after it has returned. If it is given, `frequencies` is published only
-                while the topic has subscribers; with None it is published always.
+            on_rows: Called in the thread that reads the links, with the rows of frequencies of each
+                message. Their arrays are overwritten after it has returned. If it is given, the
+                topic `frequencies` is published only while it has subscribers; with None it is
+                published always.
         """
         super().__init__("driver", DRIVER)
         self._on_rows = on_rows
@@ -79,7 +80,7 @@ class Driver(CubeNode):
             self._publish,
             rate=rate_hz,
             # Gathering several scans (samples of all cubes) in a message saves CPU time, but adds
-            # latency, so it is up to the user.
+            # latency, so the user decides on it by the parameter publish_period.
             scans_per_call=scans_per_message(self.value("publish_period"), rate_hz),
             make_rows=self._frequencies.make_rows,
             clock_ns=self._node_clock.now_ns,
@@ -101,7 +102,11 @@ class Driver(CubeNode):
             self._links.close()
 
     def on_parameter_change(self, name: str) -> None:
-        """Ask the hubs for the new sampling rate. The queues of the topics keep their depth."""
+        """Ask the hubs for the new sampling rate.
+
+        The depth of the topics' queues, which follows from the sampling rate, is not changed: that
+        would need new publishers.
+        """
         if self._links is not None:
             self._links.set_rate(self._rate())
 
@@ -109,7 +114,7 @@ class Driver(CubeNode):
         self._links = None
 
     def _rate(self) -> float | None:
-        """Return the sampling rate, in Hz, to ask of the hubs; None: the hubs choose it."""
+        """Return the sampling rate, in Hz, that hubs are asked for; None: each hub chooses one."""
         return float(self.value("rate")) or self._skin.rate
 
     def _publish(self, rows: FrequencyRows) -> None:
@@ -118,8 +123,9 @@ class Driver(CubeNode):
             self._on_rows(rows)
 
     def _count_errors(self) -> int:
-        """Return the number of exceptions in callbacks, in the main and the reader's thread."""
-        # `callback_errors` counts only the main thread; the links count the reader's thread.
+        """Return the number of exceptions in callbacks in both threads: main thread and reader."""
+        # `callback_errors` counts exceptions in the main thread only. The links count those in the
+        # thread that reads them.
         in_reader = 0 if self._links is None else self._links.callback_errors
         return self.callback_errors.count + in_reader
 
@@ -137,7 +143,8 @@ class Driver(CubeNode):
         )
 
     def _statuses(self) -> list[DiagnosticStatus]:
-        """Return the diagnostics: one status for all rows, and one per link while active."""
+        """Return the diagnostics: a status about all rows (samples), and while the node is active
+        one for each link (connection to a hub)."""
         if self._links is None:
             return []
         self._node_clock.update()
@@ -150,9 +157,9 @@ class Driver(CubeNode):
 
 
 class FrequenciesPublisher:
-    """Publishes `frequencies` without copies: rows are written into the serialised message.
+    """Publishes `frequencies` without copying: the caller writes rows into the serialised message.
 
-    `make_rows` and `publish` must be called from the same thread.
+    A row is one sample of one cube. `make_rows` and `publish` must be called from the same thread.
     """
 
     def __init__(
@@ -174,11 +181,12 @@ class FrequenciesPublisher:
         self._has_subscribers = False
         self._frame_id = frame_id.encode() + b"\0"
         self._buffer = lru_cache(maxsize=MAX_BUFFERS)(self._make_buffer)
-        # The message into which the reader writes rows now; None before the first `make_rows`.
+        # The message into which the caller of `make_rows` writes rows now; None before its first
+        # call.
         self._next: MessageBuffer[FrequencyRows] | None = None
 
-        # rclpy reports changes of the number of subscribers, which costs less than asking for the
-        # number at each message.
+        # rclpy reports each change of the number of subscribers. That takes less CPU time than
+        # asking for the number at each message.
         events = on_matched(self._note_subscribers)
         self._publisher = node.own(
             node.create_lifecycle_publisher(
@@ -189,10 +197,10 @@ class FrequenciesPublisher:
             node.own(node.create_timer(COUNT_PERIOD_S, self._count_subscribers))
 
     def make_rows(self, n_rows: int, n_pads: int) -> FrequencyRows:
-        """Return rows to be filled by the caller; their memory is that of the next message.
+        """Return rows for the caller to fill; their arrays are views of the next message's bytes.
 
         Args:
-            n_rows: Number of rows.
+            n_rows: Number of rows (samples of one cube each).
             n_pads: Number of frequencies per row.
 
         Returns:
@@ -202,7 +210,7 @@ class FrequenciesPublisher:
         return self._next.rows
 
     def publish(self) -> None:
-        """Publish the message with the rows that `make_rows` has returned last."""
+        """Publish the message whose rows `make_rows` returned last and the caller has filled."""
         if self._next is not None and (self._always or self._has_subscribers):
             self._publisher.publish(self._next.data())
 

@@ -76,7 +76,8 @@ class Markers(SkinSubscriberNode):
         if contacts is None:
             return None
         age_ns = skin.stamp_ns - to_ns(contacts.header.stamp)
-        # After the node `contacts` has ended, its last message must not be drawn for ever.
+        # Without this limit, the last contacts would be drawn for ever after the node `contacts`
+        # has ended.
         return contacts if age_ns <= MAX_CONTACTS_AGE_NS else None
 
     def _on_contacts(self, message: SkinContacts) -> None:

@@ -45,22 +45,23 @@ if TYPE_CHECKING:
     from ...bags.reprocess.recorded_reconstruction import RecordedReconstruction
 
 MAX_SCANS = 1000
-"""Maximum number of rows (samples) of one cube in a message that is accepted, unless the parameter
-publish_period requires more.
+"""Maximum number of scans in a message of `frequencies`; a scan has one sample of every cube. A
+message with more is refused, unless the parameter publish_period requires more.
 
-The limit keeps a single message from blocking the node for long: one row for each of 1280 cubes
-takes up to 0.3 ms.
+The limit keeps a single message from blocking the node for long: the computation of one scan of
+1280 cubes takes up to 0.3 ms.
 """
 
 STATES_PERIOD_NS = 10 * SECOND
 """Time, in ns, between two messages with the states of the compensation of creep and temperature.
 
-From each of them, a recording can be processed again with the same bits.
+A recording can be processed again from any of these messages on, and gives the same stress bit for
+bit.
 """
 
 BAG_SUFFIXES = (".mcap", ".db3")
-"""Suffixes by which the parameter `config` is recognised as the file of a bag (recording). A folder
-is also taken for a bag."""
+"""Suffixes of file names for which the parameter `config` is taken as the path of a bag (recording)
+and not of a skin file. The path of a folder is also taken for a bag."""
 
 
 class Reconstruction(CubeNode):
@@ -73,13 +74,13 @@ class Reconstruction(CubeNode):
         """Make the node.
 
         Args:
-            subscribes: Whether the node subscribes to `frequencies`. False is for a process in
-                which a driver calls `on_rows`.
+            subscribes: Whether the node subscribes to `frequencies`. It is false if a driver node
+                in the same process calls `on_rows` instead.
         """
         super().__init__("reconstruction", RECONSTRUCTION)
         self._subscribes = subscribes
-        # A driver in this process calls `on_rows` in the reader's thread, and services run in the
-        # main thread. Both use the reconstructor.
+        # The lock guards the reconstructor. It may be used in two threads: services run in the main
+        # thread, and a driver node in this process calls `on_rows` in another thread.
         self._lock = threading.Lock()
         self._lost = LostMessages()
         self._updater = Diagnostics(self, self._statuses, lambda: self.callback_errors.count)
@@ -89,8 +90,8 @@ class Reconstruction(CubeNode):
         skin = self._skin = self._recorded.skin if self._recorded else self.read_skin()
         self._reconstructor = Reconstructor(skin)
         self._reconstructor.drift_time = float(self.value("drift_time"))
-        # The driver may put one scan more into a message than the publish period holds. The factor
-        # 2 is for hubs that send faster than the rate in the skin file.
+        # The driver may put one scan more into a message than the number that belongs to
+        # publish_period. The factor 2 allows hubs to send faster than the rate in the skin file.
         scans = scans_per_message(self.value("publish_period"), skin.rate)
         self._max_scans = max(MAX_SCANS, 2 * (scans + 1))
 
@@ -106,7 +107,8 @@ class Reconstruction(CubeNode):
         false_alarms = float(self.value("touch_false_alarms"))
         self._touch = None
         if false_alarms:
-            # The import is here, because only this case needs the mechanics of the skin.
+            # The import is here and not at the top, because it loads the contact mechanics, which
+            # takes time and is needed only for the detection of touch.
             from .touch_publisher import TouchPublisher
 
             self._touch = TouchPublisher(self, skin, profile, false_alarms)
@@ -155,10 +157,11 @@ class Reconstruction(CubeNode):
         self._reconstructor.drift_time = float(self.value("drift_time"))
 
     def on_rows(self, rows: FrequencyRows) -> None:
-        """Process the rows that a driver in the same process would send as one message.
+        """Compute and publish the stress for rows from a driver node in the same process.
 
         Args:
-            rows: Rows of frequencies: one cube at one sampling time each.
+            rows: Rows of frequencies, one sample of one cube each. They are the rows of one message
+                of `frequencies`.
         """
         if self.is_active:
             frame_id = self._skin.parent_frame.encode() + b"\0"
@@ -182,7 +185,7 @@ class Reconstruction(CubeNode):
         """Compute and publish the stress for the frequencies of one message.
 
         Args:
-            rows: Rows of frequencies.
+            rows: Rows of frequencies, one sample of one cube each.
             stamp_ns: Stamp of the message, in ns since the Unix epoch.
             frame_id: Frame id of the message, encoded and with a closing zero byte.
         """
@@ -196,14 +199,15 @@ class Reconstruction(CubeNode):
                 out = self._publisher.make_rows(rows, frame_id)
                 rows = self._note_compensation(rows, stamp_ns)
                 rest_changes = self._reconstructor.rest_changes
-                # The lock keeps a tare from changing the rest frequencies during the computation.
+                # Without the lock, the service for tares could change the rest frequencies during
+                # the computation.
                 stress = self._reconstructor.process(rows, health, out)
                 if self._reconstructor.rest_changes != self._published_rest_changes:
                     self._publish_info()
         except CubeError as error:
             self._refuse(error)
             return
-        # Touch comes first, because a reflex waits for it.
+        # Touches are published first, because a robot that reacts to them needs the lowest latency.
         if self._touch is not None:
             self._touch.publish(stress, rest_changes)
         self._publisher.publish(stress, stamp_ns, frame_id)
@@ -212,12 +216,14 @@ class Reconstruction(CubeNode):
         self._diagnostics.count(stress)
 
     def _note_compensation(self, rows: FrequencyRows, stamp_ns: int) -> FrequencyRows:
-        """Return rows with specific forces, and publish what their compensation starts from.
+        """Publish the data of the compensation, and add the specific force at its cube to each row.
 
-        Without compensation the rows are returned as they are, and nothing is published.
+        The message `compensation` contains what a recording needs to repeat the compensation of
+        these rows: the motion of the skin, and at intervals the states of creep and temperature.
+        If the weight is not compensated, the rows are returned as they are.
 
         Args:
-            rows: Rows of frequencies.
+            rows: Rows of frequencies, one sample of one cube each.
             stamp_ns: Stamp of their message, in ns since the Unix epoch.
         """
         compensation, problem = self._reconstructor.compensation, ""
@@ -247,15 +253,16 @@ class Reconstruction(CubeNode):
         log_refused_message(self, "frequencies", error)
 
     def _check_scans(self, rows: FrequencyRows) -> None:
-        """Check that a message does not have too many rows of one cube, see `MAX_SCANS`.
+        """Check that a message does not have too many scans, see `MAX_SCANS`.
 
         Args:
-            rows: Rows of frequencies: one cube at one sampling time each.
+            rows: Rows of frequencies, one sample of one cube each.
 
         Raises:
             MessageError: The message has more than the allowed number of rows of one cube.
         """
-        # A message with few rows in total, as almost all are, need not be counted by cube.
+        # Counting the rows of each cube takes time. Almost all messages have so few rows in total
+        # that no cube can have too many.
         if len(rows) <= self._max_scans:
             return
         counts = np.bincount(rows.cube)
@@ -266,8 +273,8 @@ class Reconstruction(CubeNode):
             )
 
     def _publish_info(self) -> SkinInfo:
-        # The stamp states from which row on the rest frequencies are valid, which reprocessing of a
-        # bag needs: 1 ns after the last row that was computed without them.
+        # The stamp of `info` is the time from which on its rest frequencies are valid: 1 ns after
+        # the last row that was computed with others. Reprocessing of a bag relies on it.
         newest_ns = self._reconstructor.health.newest_ns
         since_ns = newest_ns + 1 if newest_ns else self.get_clock().now().nanoseconds
         self._published_rest_changes = self._reconstructor.rest_changes
@@ -285,8 +292,8 @@ class Reconstruction(CubeNode):
             return []
         with self._lock:
             statuses, changes = self._diagnostics.statuses(self.is_active)
-        # Logging is done after the lock is released, because the thread of a driver in this process
-        # may wait for the lock.
+        # Logging is slow, so it is done after the lock is released: a driver node in this process
+        # may wait for the lock in another thread.
         log_changes(self.get_logger(), changes)
         return statuses
 
@@ -301,8 +308,8 @@ class Reconstruction(CubeNode):
         path = self.config()
         if not path.is_dir() and path.suffix not in BAG_SUFFIXES:
             return None
-        # The import is here and not at the top, because the library for bags has no rosdep key and
-        # may be missing, and only this case needs it.
+        # The import is here and not at the top, because the library that reads bags may be missing:
+        # it has no rosdep key, and is needed only if `config` names a bag.
         try:
             from ...bags.reprocess.recorded_reconstruction import RecordedReconstruction
         except ModuleNotFoundError as error:

@@ -36,11 +36,13 @@ COMPONENTS = ("force.x", "force.y", "force.z", "torque.x", "torque.y", "torque.z
 """Names of the state interfaces of a force-torque sensor: forces in N, torques in N m."""
 
 NAMES_PERIOD_S = 1.0
-"""Time, in s, between two messages with the names. They are repeated because the component does not
-get messages that were sent before it subscribed."""
+"""Time, in s, between two messages with the names of the state interfaces. They are repeated
+because the hardware component of ros2_control does not get messages that were sent before it
+subscribed."""
 
 CHECK_PERIOD_S = 0.1
-"""Time, in s, between two checks for cubes whose last row is too old, and for new subscribers."""
+"""Time, in s, between two checks for cubes whose last row (sample) is too old, and for new
+subscribers."""
 
 
 class SkinWrenches:
@@ -48,7 +50,7 @@ class SkinWrenches:
 
     The wrench of a cube acts on its face +z, in the frame of the cube. The wrench of the skin is
     the sum of all cubes about the origin of the parent frame, in that frame; it is known only if
-    all of them are.
+    the wrenches of all cubes are known.
 
     Attributes:
         names: Names of the cubes, then that of the skin.
@@ -61,7 +63,7 @@ class SkinWrenches:
             skin: The skin.
             side: Side of the square face over which stress is integrated, in m; None: the side of
                 the cube itself.
-            stale_s: Time without a row after which the wrench of a cube is unknown, in s.
+            stale_s: Time without a row (sample) of a cube after which its wrench is unknown, in s.
 
         Raises:
             ConfigError: The skin has the name of one of its cubes.
@@ -77,10 +79,11 @@ class SkinWrenches:
         self._stale_s = stale_s
 
     def update(self, rows: StressRows, now: float) -> None:
-        """Take over new rows; of several rows of a cube, the last one counts.
+        """Compute the wrenches of cubes from new rows. If a cube has several, the last one counts.
 
         Args:
-            rows: Rows of stress. Those of cubes that the skin does not have are ignored.
+            rows: Rows of stress, one sample of one cube each. Rows of cubes that the skin does not
+                have are ignored.
             now: Time of arrival, in s from any origin.
         """
         rows = rows.select(rows.cube < len(self._wrench))
@@ -92,7 +95,7 @@ class SkinWrenches:
         self._arrived[rows.cube] = now
 
     def forget_stale(self, now: float) -> bool:
-        """Make the wrenches of cubes unknown whose last row is too old.
+        """Set the wrenches of cubes whose last row (sample) is too old to NaN.
 
         Args:
             now: Present time, in s, on the clock of `update`.
@@ -105,7 +108,10 @@ class SkinWrenches:
         return bool(is_lost.any())
 
     def values(self) -> Array:
-        """Return the wrenches (cubes + 1, 6) in the order of `names`, with columns `COMPONENTS`."""
+        """Return the wrenches of all cubes and of the skin, (cubes + 1, 6).
+
+        The rows are in the order of `names`, and the columns in the order of `COMPONENTS`.
+        """
         force, torque = (
             np.einsum("nij,nj->ni", self._rotation, part)
             for part in (self._wrench[:, :3], self._wrench[:, 3:])
@@ -116,7 +122,7 @@ class SkinWrenches:
 
 
 def make_state_interfaces(node: CubeNode, skin: Skin) -> StateInterfaces | None:
-    """Return the publisher that the parameter `hardware_name` of a node asks for; None: none.
+    """Return the publisher of state interfaces; None if the parameter `hardware_name` is empty.
 
     Args:
         node: The node `reconstruction`, which is being configured.
@@ -128,7 +134,8 @@ def make_state_interfaces(node: CubeNode, skin: Skin) -> StateInterfaces | None:
     component = node.value("hardware_name")
     if not component:
         return None
-    # A link counts as silent after three sample periods; rows wait for the publish period.
+    # A wrench is unknown when the link counts as silent (after three sample periods, at least
+    # SILENT_S). Rows are sent only once per publish period, so this period is added.
     silent_s = max(SILENT_S, 3 / (skin.rate or DEFAULT_RATE_HZ))
     stale_s = silent_s + node.value("publish_period")
     wrenches = SkinWrenches(skin, node.value("wrench_side") or None, stale_s)
@@ -136,7 +143,8 @@ def make_state_interfaces(node: CubeNode, skin: Skin) -> StateInterfaces | None:
 
 
 class StateInterfaces:
-    """Publishes the wrenches of a skin for a hardware component, until the node is cleaned up."""
+    """Publishes the wrenches of a skin for a hardware component of ros2_control, until the node is
+    cleaned up."""
 
     def __init__(self, node: CubeNode, skin: Skin, component: str, wrenches: SkinWrenches) -> None:
         """Make the publishers.
@@ -152,9 +160,10 @@ class StateInterfaces:
         """
         self._wrenches = wrenches
         self._frame_id = skin.parent_frame
-        # Two threads use the wrenches if the driver runs in the same process.
+        # The lock guards the wrenches. Two threads use them if the driver runs in this process.
         self._lock = threading.Lock()
-        # ros2_control names the node of a component in this way.
+        # ros2_control derives the name of a component's node, with which the topics begin, from the
+        # name of the component by the same rule.
         topic = component.lower().replace("/", "_")
         kinds = [
             message_class("parameter hardware_name", f"pal_statistics_msgs/msg/Statistics{what}")
@@ -165,7 +174,8 @@ class StateInterfaces:
             for kind, what in zip(kinds, ("names", "values"), strict=True)
         )
         names = [f"state_interface.{one}/{part}" for one in wrenches.names for part in COMPONENTS]
-        # Another skin must have another version, also after a restart of the node.
+        # The component finds the names that belong to values by their version, so other names need
+        # another version, also after a restart of the node. 0 would mean that there are no data.
         version = zlib.crc32("\n".join(names).encode()) or 1
         self._names = kinds[0](names=names, names_version=version)
         self._values = kinds[1](names_version=version)
@@ -175,10 +185,10 @@ class StateInterfaces:
         node.call_at_cleanup(self._forget_all)
 
     def publish(self, rows: StressRows, stamp_ns: int) -> None:
-        """Publish the wrenches of all cubes, with those of new rows.
+        """Compute wrenches from new rows, and publish the newest wrenches of all cubes.
 
         Args:
-            rows: New rows of stress.
+            rows: New rows of stress, one sample of one cube each.
             stamp_ns: Stamp of the message, in ns since the Unix epoch.
         """
         with self._lock:
@@ -186,7 +196,7 @@ class StateInterfaces:
             self._send(stamp_ns)
 
     def _check(self) -> None:
-        """Send the names if it is time or somebody has subscribed, and forget stale wrenches."""
+        """Publish the names if they are due or have a new subscriber, and forget old wrenches."""
         now = time.monotonic()
         listeners = self._names_publisher.get_subscription_count()
         if listeners > self._listeners or now >= self._names_at:
@@ -198,7 +208,8 @@ class StateInterfaces:
                 self._send(time.time_ns())
 
     def _forget_all(self) -> None:
-        """Send NaN for all wrenches, because the component would keep the last ones for ever."""
+        """Publish NaN for all wrenches, because the hardware component would otherwise return the
+        last values for ever."""
         with self._lock:
             self._wrenches.forget_stale(np.inf)
             self._send(time.time_ns())

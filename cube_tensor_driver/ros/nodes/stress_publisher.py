@@ -34,16 +34,16 @@ LISTENERS_PERIOD_S = 0.5
 (`cubes/<name>/stress` and `cubes/<name>/wrench`)."""
 
 MAX_ANNOUNCED_CUBES = 64
-"""Maximum number of cubes of a skin for which the publishers of the topics of all single cubes are
-made at the start.
+"""Maximum number of cubes of a skin whose single-cube topics (`cubes/<name>/stress` and
+`cubes/<name>/wrench`) all get a publisher at the start.
 
 On a larger skin such a publisher is made only when somebody subscribes to its topic, because DDS
 sends the description of every publisher to every process in the domain.
 """
 
 MAX_COVARIANCES = 4096
-"""Maximum number of cached covariance matrices. There is one for each cube and each set of pads
-that are left out because they are faulty."""
+"""Maximum number of cached covariance matrices of the stress of single cubes. There is one for each
+combination of a cube and a set of faulty pads, which are left out of its computation."""
 
 CUBE_TOPIC_DEPTH = 10
 """Depth of the queues of the topics of single cubes (`cubes/<name>/stress` and
@@ -55,7 +55,7 @@ and force on it, in N, both in the parent frame of the skin."""
 
 
 class StressPublisher:
-    """Publishes the stress rows of a reconstruction node, until the node is cleaned up."""
+    """Publishes the rows (stress of one cube at one instant each) of a reconstruction node."""
 
     def __init__(
         self,
@@ -94,10 +94,11 @@ class StressPublisher:
         node.own(node.create_timer(LISTENERS_PERIOD_S, self._cubes.find_listeners))
 
     def make_rows(self, rows: FrequencyRows, frame_id: bytes) -> StressRows:
-        """Return rows to be filled by the caller; their memory is that of the next message.
+        """Return rows of stress for the caller to fill; they are views of the next message's bytes.
 
         Args:
-            rows: Rows of frequencies, from which cube, sequence number and time stamp are taken.
+            rows: Rows of frequencies (samples of one cube each). Their cubes, sequence numbers and
+                stamps are copied into the returned rows.
             frame_id: Frame id of the message, encoded and with a closing zero byte.
         """
         out = self._buffer(frame_id, len(rows)).rows
@@ -112,10 +113,12 @@ class StressPublisher:
         stamp_ns: int,
         frame_id: bytes,
     ) -> None:
-        """Publish rows as one message, and on the topics of single cubes that have subscribers.
+        """Publish rows as one message of `stress`, and on other topics that have subscribers.
+
+        The other topics are `forces` and those of single cubes.
 
         Args:
-            stress: The rows.
+            stress: Rows of stress, one cube at one sampling time each.
             stamp_ns: Stamp of the message, in ns since the Unix epoch.
             frame_id: Frame id of the message, encoded and with a closing zero byte.
         """
@@ -131,8 +134,8 @@ class StressPublisher:
 class ForceCloud:
     """Publishes `forces`, a point cloud with one force per cube in the order of the skin file.
 
-    It is published only while it has subscribers. Software for other tactile sensors reads forces
-    in this form.
+    It is published only while it has subscribers. The form is one that software for other tactile
+    sensors can read.
     """
 
     def __init__(
@@ -145,8 +148,8 @@ class ForceCloud:
         self._forces = Forces(skin, side)
         self._n_cubes = len(skin.cubes)
         self._publisher = node.own(node.create_lifecycle_publisher(PointCloud2, "forces", profile))
-        # The message is made once and its data replaced, because its fields are many Python objects
-        # that never change.
+        # The message is made once, and later only its data and stamp are replaced. The description
+        # of its fields consists of many Python objects that never change.
         item = np.dtype("<f4").itemsize
         step = item * len(FORCE_FIELDS)
         self._message = PointCloud2(
@@ -164,10 +167,10 @@ class ForceCloud:
         ]
 
     def publish(self, rows: StressRows, stamp_ns: int) -> None:
-        """Publish the force of the last row of each cube. Cubes without a row have NaN.
+        """Publish the force of the last row of each cube; it is NaN for cubes without a row.
 
         Args:
-            rows: Rows of stress.
+            rows: Rows of stress, one cube at one sampling time each.
             stamp_ns: Stamp of the message, in ns since the Unix epoch.
         """
         if not self._publisher.get_subscription_count():
@@ -212,8 +215,8 @@ class CubeTopics:
         Args:
             rows: Rows of stress: one cube at one sampling time each.
         """
-        # In a process with the driver this runs in the reader's thread, while `find_listeners` may
-        # replace the lists in the main thread.
+        # The lists are read only once: `find_listeners` may replace them meanwhile in the main
+        # thread, if a driver in this process calls this method in its own thread.
         tensors, wrenches = self._tensors.listened, self._wrenches.listened
         if wrenches:
             self._publish_wrenches(rows, wrenches)
@@ -231,7 +234,8 @@ class CubeTopics:
             self._tensors.publish(cube, message)
 
     def _publish_wrenches(self, rows: StressRows, listened: list[int]) -> None:
-        # The wrench of an invalid row would be 0, which looks like the measurement of no load.
+        # `contact_wrench` would compute the wrench 0 for an invalid row, which looks like the
+        # measurement of no load.
         is_chosen = np.isin(rows.cube, listened) & (rows.status & INVALID == 0)
         chosen = np.flatnonzero(is_chosen)
         cubes = rows.cube[chosen].tolist()
@@ -263,32 +267,33 @@ class CubeTopics:
             if len(self._covariances) >= MAX_COVARIANCES:
                 self._covariances.clear()
             self._covariances[key] = self._reconstructor.pipeline.covariance(cube, left_out)
-        # The deviation of what is compensated changes from row to row.
+        # The uncertainty of the compensation of weight, creep and temperature changes from row to
+        # row, so its covariance is not cached but added here.
         growth = self._reconstructor.compensation.growth(cube, left_out)
         noise = self._covariances[key]
         return noise if growth is None else noise + growth
 
 
 class _CubePublishers:
-    """Publishers of one topic of each cube, such as `cubes/<name>/stress`.
+    """The publishers of the topics `cubes/<name>/stress` of all cubes, or `cubes/<name>/wrench`.
 
     Attributes:
         listened: Indices of the cubes whose topic has a subscriber.
     """
 
     def __init__(self, node: CubeNode, skin: Skin, what: str, message_type: type) -> None:
-        """Make the publishers, or on a large skin only find the names of the topics.
+        """Make the publishers, unless the skin is large (see `MAX_ANNOUNCED_CUBES`).
 
         Args:
             node: The node, which is being configured.
             skin: The skin.
-            what: Last part of the names of the topics.
+            what: Last part of the names of the topics, stress or wrench.
             message_type: Type of the messages.
         """
         self.listened: list[int] = []
         self._node, self._message_type = node, message_type
         self._publishers: dict[int, Publisher] = {}
-        # Topic without a publisher yet -> index of its cube.
+        # Name of a topic that has no publisher yet -> index of its cube.
         self._unannounced = {
             node.resolve_topic_name(f"cubes/{name}/{what}"): number
             for number, name in enumerate(skin.names)
@@ -297,7 +302,10 @@ class _CubePublishers:
             self._announce(set(self._unannounced))
 
     def find_listeners(self) -> None:
-        """Update `listened`, after publishers were made for topics that have a subscriber."""
+        """Update the attribute `listened`.
+
+        First, publishers are made for topics that have a subscriber but no publisher yet.
+        """
         if self._unannounced:
             known_topics = {name for name, _ in self._node.get_topic_names_and_types()}
             self._announce(known_topics & self._unannounced.keys())
@@ -308,7 +316,12 @@ class _CubePublishers:
         ]
 
     def publish(self, cube: int, message: StressTensorStamped | WrenchStamped) -> None:
-        """Publish a message of the cube with this index, which is in `listened`."""
+        """Publish a message of a cube.
+
+        Args:
+            cube: Index of the cube, which is in `listened`.
+            message: Stress or wrench of the cube.
+        """
         self._publishers[cube].publish(message)
 
     def _announce(self, topics: set[str]) -> None:

@@ -80,8 +80,8 @@ class Taring:
         self.uids: dict[int, int] = {}
         self.created: dict[int, datetime | None] = {}
 
-        # Neither the lock nor on_change is needed: the reconstructor is not used before the node
-        # is configured.
+        # The lock need not be held and on_change not be called here, because nothing else uses the
+        # reconstructor before the node is configured.
         restored = self._learn_uids({n: cube.uid for n, cube in enumerate(skin.cubes) if cube.uid})
         if restored is not None:
             reconstructor.rest_frequency = restored
@@ -90,11 +90,12 @@ class Taring:
 
     def on_info(self, message: SkinInfo) -> None:
         """Take over the uids of cubes from a message of `driver/info`, and restore their tares."""
-        # By mistake the driver of another skin may publish in the same namespace.
+        # If the driver of another skin publishes in the same namespace by mistake, its uids must
+        # not be used.
         if message.name != self._skin.name or len(message.cubes) != len(self._skin.cubes):
             return
-        # Reading files takes time, in which the lock would block the processing of rows. So it is
-        # acquired only afterwards.
+        # The tare files are read before the lock is acquired. Reading them takes time, in which the
+        # lock would keep the node from processing data.
         uids_before = dict(self.uids)
         reported = {n: cube.uid for n, cube in enumerate(message.cubes) if cube.uid}
         restored = self._learn_uids(reported)
@@ -105,9 +106,9 @@ class Taring:
                 self._on_change()
 
     def age(self) -> dict[str, str]:
-        """Return the number of tared cubes and the age of the oldest tare, in s, as texts.
+        """Return the number of tared cubes, and the age in seconds of the oldest tare, as texts.
 
-        The keys are those of the diagnostics.
+        The keys of the dict are the keys of the diagnostic status, such as "cubes tared".
         """
         times = [created for created in self.created.values() if created]
         if not times:
@@ -119,10 +120,10 @@ class Taring:
         }
 
     def _learn_uids(self, uids: Mapping[int, int]) -> Array | None:
-        """Take over uids, and restore the tares of cubes whose uid is new.
+        """Store the uids of cubes, and restore the tares of cubes whose uid is new or has changed.
 
-        A cube gets the stored tare of its uid. If the cube was exchanged and no tare is stored for
-        the new one, it gets the rest frequencies of its calibration.
+        A cube gets the tare that is stored for its uid. If the cube was exchanged and no tare is
+        stored for the new cube, it gets the rest frequencies of its calibration.
 
         Args:
             uids: Index of a cube in the skin -> its uid.
@@ -141,14 +142,15 @@ class Taring:
                 # The cube was exchanged, so that its tare is not valid.
                 self._forget_tare(number, rest)
             if number in self.created:
-                # A request in this run of the node is newer than the file of an earlier run.
+                # The cube was tared, or its tare cleared, since the node was started. That is newer
+                # than the tare file, which an earlier run of the node wrote.
                 self._store_late(number, rest)
             else:
                 self._restore_tare(number, uid, rest)
         return None if np.array_equal(before, rest, equal_nan=True) else rest
 
     def _restore_tare(self, number: int, uid: int, rest: Array) -> None:
-        """Read the tare file of one cube, if there is one, into the rest frequencies.
+        """Read the tare file of a cube, if it exists, and write its content into `rest`.
 
         A file that cannot be used gives a warning in the log.
 
@@ -185,9 +187,9 @@ class Taring:
         self.created.pop(number, None)
 
     def _store_late(self, number: int, rest: Array) -> None:
-        """Write or remove the tare file of a cube, as was requested before its uid was known.
+        """Store a tare that was measured or cleared before the uid of the cube was known.
 
-        A failure gives a warning in the log.
+        If the file cannot be written or removed, a warning is logged.
 
         Args:
             number: Index of the cube in the skin.
@@ -251,16 +253,17 @@ class Taring:
         now_ns = self._node.get_clock().now().nanoseconds
         duration_s = duration_s or float(self._node.value("tare_duration"))
         with self._lock:
-            # The reconstructor keeps the newest data after the links were lost. A tare of such old
-            # data would succeed with wrong values.
+            # The reconstructor keeps its newest data after the connections to the hubs were lost. A
+            # tare from such old data would succeed, but with wrong values.
             age_ns = now_ns - self._reconstructor.health.newest_ns
             if age_ns > 1e9 * MAX_DATA_AGE_S:
                 raise TareError("no data now: see the diagnostics of the links")
             before = self._reconstructor.rest_frequency
             rest = self._reconstructor.tare(cubes, duration_s)
             self._on_change()
-        moved = np.abs(rest / before - 1)[cubes]
-        moved_ppm = 1e6 * np.nanmax(moved)  # NaN fills the columns of pads that a cube lacks
+        relative_change = np.abs(rest / before - 1)[cubes]
+        # Cubes with fewer pads than others have NaN in the columns of the pads that they lack.
+        moved_ppm = 1e6 * np.nanmax(relative_change)
         kept = self._keep_tares(cubes, rest)
         return f"{len(cubes)} cubes, rest frequencies moved by up to {moved_ppm:.0f} ppm{kept}"
 
@@ -292,7 +295,8 @@ class Taring:
                 f"no cube {', '.join(map(repr, unknown))} in the skin; "
                 f"its cubes: {', '.join(self._skin.names)}"
             )
-        # A cube that is named repeatedly is tared once, because each tare writes a file.
+        # Names may be repeated in the request. Each cube is tared only once, because each tare
+        # writes a file. The keys of a dict are unique and keep their order.
         return list({index[name]: None for name in names or index})
 
     def _keep_tares(self, cubes: list[int], rest: Array) -> str:

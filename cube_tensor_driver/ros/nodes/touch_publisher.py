@@ -21,14 +21,19 @@ from ..messages import make_message, to_time
 from ..node import CubeNode
 
 STAMP = struct.Struct("<iI")
-"""Seconds and nanoseconds of the stamp in a serialised message (CDR, little endian)."""
+"""Binary format of the stamp in a serialised message (CDR, little endian): seconds (int32), then
+nanoseconds (uint32)."""
 
 STAMP_OFFSET = 4
-"""Byte offset of the time stamp from the start of a serialised message, after its encoding."""
+"""Offset of the stamp from the start of a serialised message, in bytes. The first four bytes of a
+message state its encoding (CDR encapsulation header)."""
 
 
 class TouchPublisher:
-    """Finds touches in the rows of a reconstruction node, and publishes one message per scan."""
+    """Finds touches in the stress of a skin, and publishes one message on `touch` for each scan.
+
+    A scan is one sample of every cube.
+    """
 
     def __init__(
         self,
@@ -43,13 +48,15 @@ class TouchPublisher:
             node: The node, which is being configured.
             skin: The skin.
             profile: Quality of service of `touch`.
-            false_alarms: Rate of touches found in noise alone, per hour, of the whole skin.
+            false_alarms: Accepted rate of false alarms of the whole skin, per hour. A false alarm
+                is a touch that is found although there is only noise.
         """
         self._touch = Touch(skin, false_alarms)
         self._frame_id = skin.parent_frame
         self._publisher = node.own(node.create_lifecycle_publisher(SkinTouch, "touch", profile))
         self._rest_changes = 0
-        # Most messages say that nothing touches, and differ in their stamp only.
+        # Most messages contain no touch and differ only in their stamps, so such a message is
+        # serialised once, and later only its stamp is replaced.
         self._empty = bytearray(serialize_message(self._make_message(NO_TOUCHES)))
 
     def publish(self, rows: StressRows, rest_changes: int) -> None:
@@ -57,14 +64,15 @@ class TouchPublisher:
 
         Args:
             rows: Rows of stress (samples of one cube each).
-            rest_changes: Number of changes of the rest frequencies (frequencies without load)
-                before these rows.
+            rest_changes: Number of times that the rest frequencies (frequencies without load) have
+                changed before these rows. After a change the detection is restarted.
         """
         if rest_changes != self._rest_changes:
             self._rest_changes = rest_changes
             self._touch.restart()
         for touches in self._touch(rows):
-            # Without subscribers the touches are followed, too.
+            # Without subscribers only publishing is left out. The detection above must go on,
+            # because it compares each scan with earlier ones.
             if not self._publisher.get_subscription_count():
                 continue
             if len(touches.cube):
