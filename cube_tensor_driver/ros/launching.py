@@ -203,7 +203,8 @@ def _recorded_topics(surroundings: dict[str, Any], namespace: str) -> dict[str, 
     """
     remaps: dict[str, str] = dict(surroundings.get("ros_remaps") or [])
     # The list of global parameters holds pairs of name and value, and paths of parameter files.
-    given = [pair for pair in surroundings.get("global_params", []) if isinstance(pair, tuple)]
+    global_parameters = surroundings.get("global_params", [])
+    given = [pair for pair in global_parameters if isinstance(pair, tuple)]
     parameters: dict[str, str] = dict(given)
     reliability = parameters.get("qos_reliability", "reliable")
 
@@ -262,7 +263,10 @@ def check_arguments(context: LaunchContext, declared: Iterable[str]) -> list[Act
 
     for name in PARAMETERS.keys() & declared:
         text = _argument(context, name)
-        refusal = PARAMETERS[name].refusal(PARAMETERS[name].parse(text)) if text else ""
+        if not text:
+            continue
+        parameter = PARAMETERS[name]
+        refusal = parameter.refusal(parameter.parse(text))
         if refusal:
             raise ConfigError(f"{name}:={text}: {refusal}")
     # This call raises an error if the argument `port` is set for a skin with several links.
@@ -286,9 +290,12 @@ def _check_names(context: LaunchContext, declared: Iterable[str]) -> None:
     Launch itself ignores such arguments. They are checked only if the command line names a launch
     file of this package, because another one that includes it has arguments of its own.
     """
-    if not {Path(word).name for word in sys.argv} & {SKIN_LAUNCH.name, "cube.launch.py"}:
+    file_names = {Path(word).name for word in sys.argv}
+    own_launch_files = {SKIN_LAUNCH.name, "cube.launch.py"}
+    if not file_names & own_launch_files:
         return
-    for name in (word.partition(":=")[0] for word in context.argv):
+    for word in context.argv:
+        name = word.partition(":=")[0]
         if name not in declared:
             raise ConfigError(
                 f"no launch argument {name}, there are: {', '.join(declared)}. Parameters of nodes "

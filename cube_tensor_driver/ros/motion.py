@@ -71,7 +71,8 @@ def make_motion_source(node: CubeNode, parent_frame: str) -> MotionSource | None
     Raises:
         ConfigError: Both parameters are set.
     """
-    topic, frame = str(node.value("imu")), str(node.value("gravity"))
+    topic = str(node.value("imu"))
+    frame = str(node.value("gravity"))
     if topic and frame:
         raise ConfigError(f"parameters imu ({topic}) and gravity ({frame}): set only one of them")
     if topic:
@@ -117,7 +118,9 @@ class Transforms:
             ) from None
         p, q = found.transform.translation, found.transform.rotation
         rotation = rotation_from_quaternion([q.x, q.y, q.z, q.w])
-        return rotation, np.array([p.x, p.y, p.z]), to_ns(found.header.stamp)
+        position = np.array([p.x, p.y, p.z])
+        time_ns = to_ns(found.header.stamp)
+        return rotation, position, time_ns
 
 
 class GravityMotion:
@@ -148,7 +151,8 @@ class GravityMotion:
                 "older than the rows: see who publishes it, and that clocks agree"
             )
         up = rotation @ np.array([0.0, 0.0, STANDARD_GRAVITY])
-        return Motion(np.array([last_ns]), up[None], np.zeros((1, 3, 3)))
+        no_rotation = np.zeros((1, 3, 3))
+        return Motion(np.array([last_ns]), up[None], no_rotation)
 
 
 class _Sample(NamedTuple):
@@ -274,4 +278,9 @@ def _time_ns(sample: _Sample) -> int:
 def _cross_matrix(vector: Array) -> Array:
     """Return the matrix (3, 3) whose product with any vector r is the cross product vector x r."""
     x, y, z = vector
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    rows = [
+        [0, -z, y],
+        [z, 0, -x],
+        [-y, x, 0],
+    ]
+    return np.array(rows)

@@ -282,7 +282,8 @@ class CubeNode(LifecycleNode):
             parameter: Name and value.
         """
         known = self._parameters_by_name.get(parameter.name)
-        if known and isinstance(known.default, float) and type(parameter.value) is int:
+        is_real = known is not None and isinstance(known.default, float)
+        if is_real and type(parameter.value) is int:
             return RclpyParameter(parameter.name, value=float(parameter.value))
         return parameter
 
@@ -443,7 +444,8 @@ def _run_nodes(nodes: Sequence[CubeNode], stopping: threading.Event) -> int:
     code = 0
     for node in nodes:
         executor.add_node(node)
-        if not stopping.is_set() and node.value("autostart") and not _start(node):
+        must_start = not stopping.is_set() and node.value("autostart")
+        if must_start and not _start(node):
             code = os.EX_CONFIG if node.is_misconfigured else 1
             stopping.set()
 

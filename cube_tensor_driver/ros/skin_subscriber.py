@@ -97,7 +97,8 @@ class SkinSubscriber:
             self.skin.info = info
             return
         try:
-            skin = FollowedSkin(info, cube_poses(info), LatestStress(len(info.cubes)))
+            newest = LatestStress(len(info.cubes))
+            skin = FollowedSkin(info, cube_poses(info), newest)
             self._on_skin(skin)
         except CubeError as error:
             log_refused_message(self._node, "info", error)

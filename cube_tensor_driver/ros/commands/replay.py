@@ -112,7 +112,8 @@ class Player:
         """
         self.stop = threading.Event()
         self.published = 0
-        self.position, self.length = 0.0, (bag.end_ns - bag.start_ns) / SECOND
+        self.position = 0.0
+        self.length = (bag.end_ns - bag.start_ns) / SECOND
         self._paused, self._steps = False, 0
         self._jump_ns: int | None = None
         self._shown_until_ns = 0
@@ -167,7 +168,10 @@ class Player:
         Raises:
             BagError: The position is negative or after the end of the bag.
         """
-        to_ns = max(self._bag.start_ns, min(self._to_ns(position), self._bag.end_ns - SHOWN_NS))
+        # At the end of the bag, a part of the recording is needed that can be shown.
+        latest_ns = self._bag.end_ns - SHOWN_NS
+        to_ns = min(self._to_ns(position), latest_ns)
+        to_ns = max(self._bag.start_ns, to_ns)
         with self._wake:
             self._jump_ns, self._paused, self._steps = to_ns, paused, 0
             self._wake.notify()
@@ -198,13 +202,18 @@ class Player:
             with self._wake:
                 if hold and not loop and self._jump_ns is None:
                     self._paused = True
-                    self._wake.wait_for(
-                        lambda: self.stop.is_set() or self._jump_ns is not None or not self._paused
-                    )
-                next_ns, self._shown_until_ns = begin_ns if loop or hold else None, 0
+                    self._wake.wait_for(self._has_request)
+                next_ns = begin_ns if loop or hold else None
+                self._shown_until_ns = 0
                 if self._jump_ns is not None:
-                    next_ns, self._jump_ns = self._jump_ns, None
+                    next_ns = self._jump_ns
+                    self._jump_ns = None
                     self._shown_until_ns = next_ns + SHOWN_NS
+
+    def _has_request(self) -> bool:
+        """Return whether `end`, `jump` or `pause` ended the pause at the end of the bag."""
+        has_jump = self._jump_ns is not None
+        return self.stop.is_set() or has_jump or not self._paused
 
     def _announce(self, topic: str, connection: Connection) -> None:
         """Make the publisher of a topic, with the quality of service of the recorded publisher.
@@ -229,16 +238,21 @@ class Player:
         The wait ends if `frequencies` has subscribers and no new one has come for `SETTLE_S`, or if
         no new one has come for `MAX_WAIT_S`.
         """
-        everything = [*self._publishers.values(), *([self._clock] if self._clock else [])]
+        publishers = list(self._publishers.values())
+        if self._clock is not None:
+            publishers.append(self._clock)
         # Each topic `frequencies` is to have a subscriber, the reconstruction node. If no such node
         # runs, the replay begins after MAX_WAIT_S.
-        needed = [self._publishers[name] for name in self._publishers if _is_frequencies(name)]
-        found, since, wait_s = 0, time.monotonic(), MAX_WAIT_S
-        while time.monotonic() - since < wait_s and not self.stop.wait(LOOK_PERIOD_S):
-            now = sum(publisher.get_subscription_count() for publisher in everything)
-            if now != found:
-                found, since = now, time.monotonic()
-                all_heard = all(one.get_subscription_count() for one in needed or everything)
+        needed = [one for topic, one in self._publishers.items() if _is_frequencies(topic)]
+        count = 0
+        changed_s = time.monotonic()
+        wait_s = MAX_WAIT_S
+        while time.monotonic() - changed_s < wait_s and not self.stop.wait(LOOK_PERIOD_S):
+            count_before = count
+            count = sum(publisher.get_subscription_count() for publisher in publishers)
+            if count != count_before:
+                changed_s = time.monotonic()
+                all_heard = all(one.get_subscription_count() for one in needed or publishers)
                 wait_s = SETTLE_S if all_heard else MAX_WAIT_S
 
     def _to_ns(self, position: float) -> int:
@@ -311,12 +325,14 @@ class Player:
                     self._wake.wait()
                     self._set_time(bag_ns)
                     continue
-                due_s = self._anchor_s + (bag_ns - self._anchor_ns) / SECOND / self._rate
+                since_anchor_s = (bag_ns - self._anchor_ns) / SECOND / self._rate
+                due_s = self._anchor_s + since_anchor_s
                 left_s = due_s - time.monotonic()
                 if left_s <= 0:
                     return True
                 if self._clock is not None:
-                    self._publish_clock(bag_ns - round(left_s * self._rate * SECOND))
+                    left_in_bag_ns = round(left_s * self._rate * SECOND)
+                    self._publish_clock(bag_ns - left_in_bag_ns)
                     left_s = min(left_s, CLOCK_PERIOD_S)
                 self._wake.wait(left_s)
         return False

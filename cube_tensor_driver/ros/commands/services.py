@@ -290,11 +290,15 @@ def call_service(session: Session, service_type: type, name: str, request: Any) 
         if not discover(session.executor, client.service_is_ready):
             raise CubeError(f"{name}: nobody offers this service in {domain_text()}")
         futures: list[Any] = []
+
+        def has_answer() -> bool:
+            return any(future.done() for future in futures)
+
         until = time.monotonic() + MAX_ANSWER_S
         while time.monotonic() < until:
             # DDS may lose a request, so the request is repeated until a response comes.
             futures.append(client.call_async(request))
-            spin_until(session.executor, lambda: any(future.done() for future in futures), REPEAT_S)
+            spin_until(session.executor, has_answer, REPEAT_S)
             for future in futures:
                 if future.done():
                     return future.result()

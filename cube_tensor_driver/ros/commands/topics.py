@@ -61,7 +61,9 @@ class ListedTopic:
     def counted_topic(self) -> str:
         """Full name of the topic whose messages are counted; for topics of cubes, the topic of the
         first cube."""
-        return self.name.replace(ANY_CUBE, self.cubes[0]) if self.cubes else self.name
+        if not self.cubes:
+            return self.name
+        return self.name.replace(ANY_CUBE, self.cubes[0])
 
 
 def list_topics() -> list[ListedTopic]:
@@ -115,7 +117,8 @@ def _count_messages(session: Session, topics: list[ListedTopic]) -> None:
     seconds = time.monotonic() - begin
     for topic in topics:
         if topic.count is not None:
-            topic.count = round((topic.count - before[topic.name]) * COUNT_S / seconds)
+            counted = topic.count - before[topic.name]
+            topic.count = round(counted * COUNT_S / seconds)
     for subscription in filter(None, subscriptions):
         node.destroy_subscription(subscription)
 

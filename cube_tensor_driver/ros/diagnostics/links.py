@@ -90,7 +90,8 @@ def _link_status(report: LinkReport) -> DiagnosticStatus:
     Args:
         report: State and counts of the link (connection to a hub) since the previous status.
     """
-    levels = [LEVELS[state] for state in (report.state, *report.past_states)]
+    states = (report.state, *report.past_states)
+    levels = [LEVELS[state] for state in states]
     if report.notes:
         # A note, for example about damaged frames, is a warning even while the link is open.
         levels.append(DiagnosticStatus.WARN)

@@ -197,7 +197,8 @@ class Canvas:
         crosses = scene.fault_crosses(self._poses, health)
         faults.points[:] = crosses.reshape(-1, 3)
         # A cross consists of two lines, thus of four end points, each of which has a colour.
-        faults.colours[:, :3] = np.repeat(scene.MARK[health], 4, axis=0)
+        cube_colours = scene.MARK[health]
+        faults.colours[:, :3] = np.repeat(cube_colours, 4, axis=0)
 
     def draw_crosses(self, values: Array, longest_pa: float) -> None:
         """Draw the principal stresses of each cube as three lines, if the picture shows them.
@@ -240,13 +241,20 @@ class Canvas:
             area = max(0.0, contacts.area[number])
             radius = float(np.sqrt(area / np.pi))
             rings[number] = scene.ring(position, normal, radius, RING_CORNERS)
-            slips = number < len(contacts.slip) and contacts.slip[number] == SkinContacts.SLIP
-            is_coarse = number < len(contacts.refined) and not contacts.refined[number]
+            # The arrays of slip and fits are empty for contacts that were found by interpolation.
+            has_slip = number < len(contacts.slip)
+            slips = has_slip and contacts.slip[number] == SkinContacts.SLIP
+            has_fit_state = number < len(contacts.refined)
+            is_coarse = has_fit_state and not contacts.refined[number]
+            colour = SLIP_COLOUR if slips else CONTACT_COLOUR
             opacity = COARSE_OPACITY if is_coarse else 1.0
-            label.colour[:] = *(SLIP_COLOUR if slips else CONTACT_COLOUR), opacity
-            label.position[:] = position + max(radius, MIN_TEXT_DISTANCE_M) * normal
-            normal_n, shear_n = contacts.normal_force[number], contacts.shear_force[number]
-            self._markers.write_text(f"contact {number}", _force_text(normal_n, shear_n))
+            label.colour[:] = *colour, opacity
+            distance = max(radius, MIN_TEXT_DISTANCE_M)
+            label.position[:] = position + distance * normal
+            normal_n = contacts.normal_force[number]
+            shear_n = contacts.shear_force[number]
+            text = _force_text(normal_n, shear_n)
+            self._markers.write_text(f"contact {number}", text)
         self._markers["contacts"].points[:] = rings.reshape(-1, 3)
 
     def _make_cubes(self, frame_id: str, rotations: Array) -> list[Marker]:

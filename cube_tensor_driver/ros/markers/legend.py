@@ -140,7 +140,8 @@ class LegendPlace(NamedTuple):
     @classmethod
     def beside(cls, poses: CubePoses) -> LegendPlace:
         """Return the position and size of the legend of a skin whose cubes have these poses."""
-        low, high = poses.position.min(axis=0), poses.position.max(axis=0)
+        low = poses.position.min(axis=0)
+        high = poses.position.max(axis=0)
         pitch = poses.pitch
         # The width has a minimum, so that the legend of a single cube is legible.
         width = max(high[0] - low[0], 4 * pitch)
@@ -162,7 +163,8 @@ class LegendPlace(NamedTuple):
         """
         x = self.centre_x + (across - 0.5) * self.width
         below = LINE_DISTANCE * TEXT_HEIGHT * self.width * line
-        return np.array([x, self.top_y - 0.3 * self.pitch - below, self.z])
+        bar_bottom_y = self.top_y - 0.3 * self.pitch
+        return np.array([x, bar_bottom_y - below, self.z])
 
 
 class Legend:

@@ -170,7 +170,8 @@ class SerialisedMarkers:
             namespace: Namespace of the marker.
             text: The new text in ASCII, which must be as long as the previous one.
         """
-        self._arrays[namespace].text[:] = np.frombuffer(text.encode(), np.uint8)
+        codes = np.frombuffer(text.encode(), np.uint8)
+        self._arrays[namespace].text[:] = codes
 
     def _view(self, dtype: str, start: int, shape: tuple[int, ...]) -> AnyArray:
         view: AnyArray = np.ndarray(shape, dtype, self.data, start)
@@ -191,7 +192,8 @@ def _mark(marker: Marker, number: int) -> tuple[bytes, bytes, bytes, bytes, byte
         `MarkerArrays`; b"" for a field that is empty.
     """
     # Numbers of 1e30 and more do not occur as coordinates or colours.
-    first, second = 1e30 * (2 * number + 1), 1e30 * (2 * number + 2)
+    first = 1e30 * (2 * number + 1)
+    second = 1e30 * (2 * number + 2)
     points = colours = text = b""
     if marker.points:
         marker.points[0] = Point(x=first)
@@ -203,4 +205,6 @@ def _mark(marker: Marker, number: int) -> tuple[bytes, bytes, bytes, bytes, byte
         marker.text = f"#{number:03}".ljust(len(marker.text))
         text = marker.text.encode()
     marker.pose.position.x = marker.color.r = second
-    return points, colours, text, struct.pack("<d", second), struct.pack("<f", second)
+    position = struct.pack("<d", second)
+    colour = struct.pack("<f", second)
+    return points, colours, text, position, colour

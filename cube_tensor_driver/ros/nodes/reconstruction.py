@@ -86,8 +86,8 @@ class Reconstruction(CubeNode):
         self._updater = Diagnostics(self, self._statuses, lambda: self.callback_errors.count)
 
     def configure(self) -> None:
-        self._recorded = self._open_recording()
-        skin = self._skin = self._recorded.skin if self._recorded else self.read_skin()
+        recorded = self._recorded = self._open_recording()
+        skin = self._skin = recorded.skin if recorded else self.read_skin()
         self._reconstructor = Reconstructor(skin)
         self._reconstructor.drift_time = float(self.value("drift_time"))
         # The driver may put one scan more into a message than the number that belongs to
@@ -118,7 +118,7 @@ class Reconstruction(CubeNode):
             self,
             skin,
             self._reconstructor,
-            None if self._recorded else tare_folder(self.value("tare_folder")),
+            None if recorded else tare_folder(self.value("tare_folder")),
             self._lock,
             self._publish_info,
         )

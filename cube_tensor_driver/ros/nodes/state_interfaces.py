@@ -87,10 +87,12 @@ class SkinWrenches:
             now: Time of arrival, in s from any origin.
         """
         rows = rows.select(rows.cube < len(self._wrench))
-        force, torque = contact_wrench(rows.stress, rows.gradient, self._side[rows.cube, None])
+        sides = self._side[rows.cube, None]
+        force, torque = contact_wrench(rows.stress, rows.gradient, sides)
         wrench = np.hstack([force, torque])
         # `contact_wrench` counts unknown components as 0, which would look like no load.
-        wrench[rows.status & INVALID != 0] = np.nan
+        is_invalid = rows.status & INVALID != 0
+        wrench[is_invalid] = np.nan
         self._wrench[rows.cube] = wrench
         self._arrived[rows.cube] = now
 
@@ -103,7 +105,9 @@ class SkinWrenches:
         Returns:
             Whether a wrench that was known has become unknown.
         """
-        is_lost = (now - self._arrived > self._stale_s) & ~np.isnan(self._wrench[:, 0])
+        is_stale = now - self._arrived > self._stale_s
+        is_known = ~np.isnan(self._wrench[:, 0])
+        is_lost = is_stale & is_known
         self._wrench[is_lost] = np.nan
         return bool(is_lost.any())
 
@@ -112,12 +116,13 @@ class SkinWrenches:
 
         The rows are in the order of `names`, and the columns in the order of `COMPONENTS`.
         """
-        force, torque = (
-            np.einsum("nij,nj->ni", self._rotation, part)
-            for part in (self._wrench[:, :3], self._wrench[:, 3:])
-        )
-        about_origin = torque + np.cross(self._position, force)
-        total = np.hstack([force.sum(axis=0), about_origin.sum(axis=0)])
+        rotation = self._rotation
+        force = np.einsum("nij,nj->ni", rotation, self._wrench[:, :3])
+        torque = np.einsum("nij,nj->ni", rotation, self._wrench[:, 3:])
+        torque_about_origin = torque + np.cross(self._position, force)
+        total_force = force.sum(axis=0)
+        total_torque = torque_about_origin.sum(axis=0)
+        total = np.hstack([total_force, total_torque])
         return np.vstack([self._wrench, total])
 
 
@@ -215,7 +220,8 @@ class StateInterfaces:
             self._send(time.time_ns())
 
     def _send(self, stamp_ns: int) -> None:
-        self._values.header = Header(stamp=to_time(stamp_ns), frame_id=self._frame_id)
+        stamp = to_time(stamp_ns)
+        self._values.header = Header(stamp=stamp, frame_id=self._frame_id)
         values: array[float] = pack_array("d", self._wrenches.values())
         self._values.values = values
         self._publisher.publish(self._values)

@@ -179,8 +179,9 @@ class ForceCloud:
         # indices of cubes that this skin does not have.
         known = rows.select(rows.cube < self._n_cubes)
         force = self._forces.of_skin(known)
-        cloud = np.hstack([self._forces.position, force]).astype("<f4")
-        self._message.data = pack_array("B", cloud.view(np.uint8))
+        points = np.hstack([self._forces.position, force])
+        point_bytes = points.astype("<f4").view(np.uint8)
+        self._message.data = pack_array("B", point_bytes)
         self._message.is_dense = bool(np.isfinite(force).all())
         self._message.header.stamp = to_time(stamp_ns)
         self._publisher.publish(self._message)
@@ -236,8 +237,9 @@ class CubeTopics:
     def _publish_wrenches(self, rows: StressRows, listened: list[int]) -> None:
         # `contact_wrench` would compute the wrench 0 for an invalid row, which looks like the
         # measurement of no load.
-        is_chosen = np.isin(rows.cube, listened) & (rows.status & INVALID == 0)
-        chosen = np.flatnonzero(is_chosen)
+        is_listened = np.isin(rows.cube, listened)
+        is_valid = rows.status & INVALID == 0
+        chosen = np.flatnonzero(is_listened & is_valid)
         cubes = rows.cube[chosen].tolist()
         stress, gradient = rows.stress[chosen], rows.gradient[chosen]
         sides = self._sides[cubes][:, None]

@@ -41,7 +41,8 @@ def tare_folder(parameter: str) -> Path:
     """
     if parameter:
         return Path(parameter).expanduser()
-    return Path(os.environ.get("ROS_HOME") or Path.home() / ".ros") / "cube_tensor_driver" / "tare"
+    ros_home = os.environ.get("ROS_HOME") or Path.home() / ".ros"
+    return Path(ros_home) / "cube_tensor_driver" / "tare"
 
 
 class Taring:
@@ -82,7 +83,8 @@ class Taring:
 
         # The lock need not be held and on_change not be called here, because nothing else uses the
         # reconstructor before the node is configured.
-        restored = self._learn_uids({n: cube.uid for n, cube in enumerate(skin.cubes) if cube.uid})
+        configured = {number: cube.uid for number, cube in enumerate(skin.cubes) if cube.uid}
+        restored = self._learn_uids(configured)
         if restored is not None:
             reconstructor.rest_frequency = restored
         node.own(node.create_service(Tare, "~/tare", self._on_tare))
@@ -92,12 +94,14 @@ class Taring:
         """Take over the uids of cubes from a message of `driver/info`, and restore their tares."""
         # If the driver of another skin publishes in the same namespace by mistake, its uids must
         # not be used.
-        if message.name != self._skin.name or len(message.cubes) != len(self._skin.cubes):
+        has_same_name = message.name == self._skin.name
+        has_same_size = len(message.cubes) == len(self._skin.cubes)
+        if not (has_same_name and has_same_size):
             return
         # The tare files are read before the lock is acquired. Reading them takes time, in which the
         # lock would keep the node from processing data.
         uids_before = dict(self.uids)
-        reported = {n: cube.uid for n, cube in enumerate(message.cubes) if cube.uid}
+        reported = {number: cube.uid for number, cube in enumerate(message.cubes) if cube.uid}
         restored = self._learn_uids(reported)
         with self._lock:
             if restored is not None:
@@ -315,7 +319,8 @@ class Taring:
                 self._store(number, rest)
         except ConfigError as error:
             return f"; in force, but not kept: {error}"
-        without_uid = [self._skin.names[number] for number in cubes if number not in self.uids]
+        without_uid = [number for number in cubes if number not in self.uids]
         if without_uid:
-            return f"; kept when their uid is known: {', '.join(without_uid)}"
+            names = [self._skin.names[number] for number in without_uid]
+            return f"; kept when their uid is known: {', '.join(names)}"
         return "; kept on disk"
