@@ -114,7 +114,10 @@ class Chart(NamedTuple):
 
     def values(self, history: History) -> dict[str, Array]:
         """Return label -> values (M,) of each line at the M instants of a history, in `unit`."""
-        return {line.label: history.of(line.cube, line.column) / self.unit for line in self.lines}
+        values = {}
+        for line in self.lines:
+            values[line.label] = history.of(line.cube, line.column) / self.unit
+        return values
 
 
 class Charts:

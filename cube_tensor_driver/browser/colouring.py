@@ -53,7 +53,9 @@ class Colouring(NamedTuple):
         # `surface.middle` contains, for each cube, the index of the point nearest to it.
         middle = scan.field.pressure[surface.middle]
         sigma = scan.field.sigma
-        above = None if sigma is None else np.stack([middle, sigma[surface.middle]], axis=1)
+        above = None
+        if sigma is not None:
+            above = np.stack([middle, sigma[surface.middle]], axis=1)
         if quantity is DEVIATION and above is not None:
             cubes = above[:, 1]
         # Only these three quantities have values between the cubes. For all others, each point of

@@ -390,7 +390,8 @@ class Scene:
         poses = placement.poses
         lines, is_tension = scene.principal_crosses(poses, values, pitch / longest)
         # `scene.principal_crosses` returns crosses centred on the upper faces; this lifts them.
-        lift = (CROSS_HEIGHT * pitch - poses.half_side)[:, None] * poses.rotation[:, :, 2]
+        height = CROSS_HEIGHT * pitch - poses.half_side
+        lift = height[:, None] * poses.rotation[:, :, 2]
         lines = lines + lift[:, None, None]
         return {"tension": lines[is_tension], "compression": lines[~is_tension]}
 
@@ -467,7 +468,8 @@ class Scene:
         """Draw the edges of the cubes, which separate neighbours of the same colour."""
         poses = self._placement.poses
         edges = np.einsum("nij,eaj->neai", poses.rotation, CUBE_EDGES)
-        lines = poses.position[:, None, None] + poses.half_side[:, None, None, None] * edges
+        offset = poses.half_side[:, None, None, None] * edges
+        lines = poses.position[:, None, None] + offset
         api.add_line_segments(
             "/edges",
             lines.reshape(-1, 2, 3),
@@ -483,8 +485,8 @@ class Scene:
         if len(self._names) > MAX_NAMED_CUBES:
             return frame
         poses = self._placement.poses
-        front = poses.rotation @ np.array([0.0, -1.2, -1.0]) * poses.half_side[:, None]
-        points = poses.position + front
+        front = poses.rotation @ np.array([0.0, -1.2, -1.0])
+        points = poses.position + front * poses.half_side[:, None]
         for number, name in enumerate(self._names):
             path, position = f"/names/{number}", tuple(points[number])
             api.add_label(

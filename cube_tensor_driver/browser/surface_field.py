@@ -106,7 +106,8 @@ class FieldModel:
             inverse = self.prepared.result()
             traction = inverse.field(values).traction
             # The traction is a vector in the frame of the cube below the point; z points outwards.
-            columns = np.stack([-traction[:, 2], np.hypot(*traction[:, :2].T)], axis=1)
+            x, y, z = traction.T
+            columns = np.stack([-z, np.hypot(x, y)], axis=1)
             pressure, shear = self._interpolate(inverse.points, columns).T
             return SurfaceField(pressure, shear, "on the surface of a thick elastomer")
         between = self._surface.field(values)

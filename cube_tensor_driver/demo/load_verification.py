@@ -281,7 +281,9 @@ class LoadVerification:
 
         times = np.linspace(0, self._load.period, RANGE_TIMES)
         script = [self._truth(time) for time in times]
-        span = np.nanmax(script, axis=(0, 1)) - np.nanmin(script, axis=(0, 1))
+        highest = np.nanmax(script, axis=(0, 1))
+        lowest = np.nanmin(script, axis=(0, 1))
+        span = highest - lowest
         # A component that is constant under the load has a range of 0 and is left out.
         varies = span > 0
         error = np.concatenate(errors)

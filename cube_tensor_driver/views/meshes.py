@@ -60,9 +60,12 @@ def corner_lines(rotation: Array, side: float) -> Array:
     """
     corners = side * _SQUARE
     # From each corner, lines go towards both neighbouring corners, each a quarter of the side long.
-    towards = [np.roll(corners, step, axis=0) for step in (1, -1)]
-    ends = [np.stack([corners, corners + 0.25 * (to - corners)], axis=1) for to in towards]
-    return np.asarray(np.concatenate(ends) @ rotation[:, :2].T)
+    lines = []
+    for step in (1, -1):
+        neighbours = np.roll(corners, step, axis=0)
+        ends = corners + 0.25 * (neighbours - corners)
+        lines.append(np.stack([corners, ends], axis=1))
+    return np.asarray(np.concatenate(lines) @ rotation[:, :2].T)
 
 
 def find_hit_cube(

@@ -238,7 +238,8 @@ def colours(
         share = share / 2 + 0.5
         table = _colour_table(DIVERGING)
     entries = np.linspace(0, 1, len(table))
-    mixed = np.stack([np.interp(share, entries, channel) for channel in table.T], axis=1)
+    channels = [np.interp(share, entries, channel) for channel in table.T]
+    mixed = np.stack(channels, axis=1)
     return np.where(np.isfinite(values)[:, None], mixed, GREY)
 
 
@@ -254,7 +255,8 @@ def linear_light(colours: Array) -> NDArray[np.uint8]:
 
 
 def _colour_table(hexes: str) -> Array:
-    return np.array([tuple(bytes.fromhex(text)) for text in hexes.split()]) / 255
+    colours = [bytes.fromhex(text) for text in hexes.split()]
+    return np.array([tuple(colour) for colour in colours]) / 255
 
 
 def above(poses: CubePoses, factor: float) -> Array:
@@ -347,7 +349,8 @@ def principal_crosses(
     in_parent = np.einsum("nij,nkj->nki", poses.rotation, directions)
     half = in_parent * (0.5 * length * np.abs(principal))[..., None]
     centre = above(poses, 1.0)[:, None]
-    return np.stack([centre - half, centre + half], axis=2), np.asarray(principal > 0)
+    lines = np.stack([centre - half, centre + half], axis=2)
+    return lines, np.asarray(principal > 0)
 
 
 def fault_crosses(poses: CubePoses, health: AnyArray) -> Array:
@@ -390,7 +393,8 @@ def heads(arrows: Array, normal: Array) -> Array:
     size = np.linalg.norm(across, axis=1, keepdims=True)
     half_width = 0.5 * np.linalg.norm(back, axis=1, keepdims=True)
     across *= half_width / np.where(size > 0, size, 1)
-    barbs = [np.stack([tip, tip + back + side], axis=1) for side in (across, -across)]
+    ends = (tip + back + across, tip + back - across)
+    barbs = [np.stack([tip, end], axis=1) for end in ends]
     return np.stack([arrows, *barbs], axis=1)
 
 
@@ -412,4 +416,5 @@ def ring(centre: Array, normal: Array, radius: float, corners: int) -> Array:
     angle = 2 * np.pi * np.arange(corners) / corners
     unit_circle = np.outer(np.cos(angle), first) + np.outer(np.sin(angle), second)
     points = centre + radius * unit_circle
-    return np.stack([points, np.roll(points, -1, axis=0)], axis=1)
+    next_points = np.roll(points, -1, axis=0)
+    return np.stack([points, next_points], axis=1)

@@ -114,4 +114,5 @@ def _wait(done: Callable[[], bool]) -> None:
 def _lost(links: LiveLinks) -> int:
     """Return the number of samples that the hubs took and that did not arrive so far."""
     names = ("lost_on_the_way", "dropped_in_hub")
-    return sum(int(str(report.values[name])) for report in links.report() for name in names)
+    counts = [report.values[name] for report in links.report() for name in names]
+    return sum(int(str(count)) for count in counts)

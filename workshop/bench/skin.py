@@ -187,7 +187,7 @@ def _measure_both(
     echo = (before["echo_cpu_percent"] + after["echo_cpu_percent"]) / 2
     loads = [f"cpu_{load}_percent" for load in LOADS]
     # The load is not part of what a robot runs.
-    used = [value for name, value in skin.items() if name.startswith("cpu_") and name not in loads]
+    used = [skin[name] for name in skin if name.startswith("cpu_") and name not in loads]
     return {
         "cubes": cubes,
         "rate_hz": bench.rate,

@@ -163,7 +163,8 @@ def draw_fit(fit: Fit, measured: Array) -> Figure:
             label="outlier",
         )
     # The points of a perfect fit lie on the diagonal.
-    ends = np.array([np.nanmin(fit.fitted), np.nanmax(fit.fitted)]) * 1e-3
+    lowest, highest = np.nanmin(fit.fitted), np.nanmax(fit.fitted)
+    ends = np.array([lowest, highest]) * 1e-3
     left.plot(
         ends,
         ends,

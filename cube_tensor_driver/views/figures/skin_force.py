@@ -73,7 +73,8 @@ def draw_forces(
         (centre, {"color": "black", "lw": 1}),
         (measured_centre, {"marker": "o", "ls": "", "color": "C3", "mfc": "none"}),
     ):
-        path.plot(MM_PER_M * points[:, 1], MM_PER_M * points[:, 0], ms=3, **style)
+        x, y, _ = MM_PER_M * points.T
+        path.plot(y, x, ms=3, **style)
     path.set(
         xlabel="$y$ / mm",
         ylabel="$x$ / mm",
