@@ -46,9 +46,9 @@ def one(data: bytes) -> None:
         if len(Decoder().feed(encode(frame))) != 1:
             raise RuntimeError(f"{frame} does not encode to itself")
         if isinstance(frame, Sample):
-            account.sample(frame)
+            account.classify(frame)
         elif isinstance(frame, Stats):
-            account.stats(frame)
+            account.add_stats(frame)
     counters = account.counters()
     rest = (
         counters["taken"]

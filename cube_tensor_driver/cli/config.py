@@ -114,7 +114,7 @@ def check_file(path: Path) -> int:
     """
     from ..config.pose_check import pose_doubts
     from ..config.skin import check_skin
-    from ..device.links.line_load import line_doubts
+    from ..device.links.line_load import find_slow_lines
     from ..views.terminal.output import counted, working
 
     # `working` shows that the command is busy, because a skin of thousands of cubes takes seconds.
@@ -123,7 +123,7 @@ def check_file(path: Path) -> int:
         # Doubtful poses, and lines that are too slow for the sample rate, can be found only in a
         # file without mistakes.
         if skin is not None:
-            mistakes = [*pose_doubts(skin), *line_doubts(skin)]
+            mistakes = [*pose_doubts(skin), *find_slow_lines(skin)]
     for mistake in mistakes:
         print(f"cube: {path}: {mistake}", file=sys.stderr)
     if skin is None or mistakes:

@@ -289,10 +289,15 @@ class LiveLinks:
         Returns:
             Whether they are whole scans. If not, the caller must add the samples to the scans.
         """
-        scans = self._scans.order_whole(native, self._scans_per_call, self._max_scans)
-        self._rows.received += sum(len(part.cubes) for part in scans)
+        scans = self._scans.order_whole(
+            native,
+            self._scans_per_call,
+            self._max_scans,
+        )
+        sizes = [len(part.cubes) for part in scans]
+        self._rows.received += sum(sizes)
         if self._is_overloaded():
-            self._count_overload(sum(len(part.cubes) for part in scans[:-1]))
+            self._count_overload(sum(sizes[:-1]))
             scans = scans[-1:]
         for part in scans:
             self._give_rows(partial(self._scans.build_whole, part))
@@ -379,7 +384,7 @@ class LiveLinks:
         samples: list[Sample] = []
         for frame in read.frames:
             if isinstance(frame, Sample):
-                arrival = record.account.sample(frame)
+                arrival = record.account.classify(frame)
                 if arrival is Arrival.RESET:
                     self._add_samples(read, samples)
                     samples = []
@@ -395,7 +400,7 @@ class LiveLinks:
                 if read.asked_ns:
                     record.clock.add_answer(read.asked_ns, frame.device_us, read.arrival_ns)
             elif isinstance(frame, Stats):
-                record.account.stats(frame)
+                record.account.add_stats(frame)
             elif isinstance(frame, Ack) and frame.request == Command.START:
                 record.account.expect_restart()
         self._add_samples(read, samples)
@@ -565,10 +570,9 @@ def _loss_notes(
         now: The counters now.
         lag_s: Longest time since the last report for which received bytes waited to be read, in s.
     """
-    change = {name: count - before.get(name, 0) for name, count in now.items()}
-    taken = change["taken"]
-    lost = change["lost_on_the_way"]
-    dropped = change["dropped_in_hub"]
+    taken = now["taken"] - before.get("taken", 0)
+    lost = now["lost_on_the_way"] - before.get("lost_on_the_way", 0)
+    dropped = now["dropped_in_hub"] - before.get("dropped_in_hub", 0)
     if lost + dropped <= 0:
         if dropped <= 0:
             return []

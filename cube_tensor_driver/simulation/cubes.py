@@ -100,6 +100,7 @@ class SimulatedCubes:
         for calibration, rows in self._groups:
             state = true_state(calibration, stress[rows], gradient[rows])
             pad_stress[rows] = state @ calibration.response.T
+        drifted = 1 + self._drift * seconds
         warm = np.ones_like(pad_stress)
         if self._thermal is not None:
             thermal_stress, warm = self._thermal.at(seconds)
@@ -110,7 +111,7 @@ class SimulatedCubes:
 
         hertz = np.empty_like(pad_stress)
         for calibration, rows in self._groups:
-            rest = calibration.rest_frequency * (1 + self._drift * seconds) * warm[rows]
+            rest = calibration.rest_frequency * drifted * warm[rows]
             hertz[rows] = pad_frequency(
                 pad_stress[rows], rest, calibration.beta, calibration.modulus
             )
@@ -271,7 +272,11 @@ def calibration_groups(
     cubes_by_id: dict[str, list[int]] = {}
     for number, calibration in enumerate(calibrations):
         cubes_by_id.setdefault(calibration.id, []).append(number)
-    return [(calibrations[cubes[0]], np.array(cubes)) for cubes in cubes_by_id.values()]
+    groups = []
+    for cubes in cubes_by_id.values():
+        calibration = calibrations[cubes[0]]
+        groups.append((calibration, np.array(cubes)))
+    return groups
 
 
 def true_state(

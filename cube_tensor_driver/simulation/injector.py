@@ -197,7 +197,8 @@ class Injector:
             if broken.reading is None:
                 broken.reading = sound
             frequency[pad] = broken_reading(broken.fault, sound, broken.reading, now_us)
-        return np.pad(frequency, ((0, 0), (0, hub.extra_pads)))
+        no_cubes, pads_behind = (0, 0), (0, hub.extra_pads)
+        return np.pad(frequency, (no_cubes, pads_behind))
 
     def load_us(self, link: SimulatedLink, now_us: int) -> int:
         """Return the simulated time, in µs, whose load acts on the cubes of a hub.

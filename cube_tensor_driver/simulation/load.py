@@ -394,7 +394,8 @@ def total(loads: Sequence[ContactLoad]) -> Resultant:
     weight = -(forces * normals).sum(axis=1)
     centre = weight @ positions / weight.sum()
     normal = weight @ normals
-    return forces.sum(axis=0), centre, normal / np.linalg.norm(normal)
+    normal /= np.linalg.norm(normal)
+    return forces.sum(axis=0), centre, normal
 
 
 class LoadMemory:

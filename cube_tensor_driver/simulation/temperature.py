@@ -128,8 +128,10 @@ class WarmLayer:
         rate, self._vectors = np.linalg.eigh(matrix)
         self._rate = -rate * DIFFUSIVITY / size**2
         # Amplitude of each eigenvector in the steady state, per °C of the ground and of the air.
-        self._from_ground = 2 * self._vectors[:, 0] / -rate
-        self._from_air = to_air[:, None] * self._vectors[:, -1] / -rate
+        at_ground = self._vectors[:, 0]
+        at_surface = self._vectors[:, -1]
+        self._from_ground = 2 * at_ground / -rate
+        self._from_air = to_air[:, None] * at_surface / -rate
         self._steady = self._find_steady(ground, air)
         self._amplitude = self._steady
 
@@ -156,9 +158,10 @@ class WarmLayer:
         steady = self._find_steady(ground, air)
         steps = self._rate * seconds
         decay = np.exp(-steps)
-        slope = (steady - self._steady) * -np.expm1(-steps) / steps
+        # The amplitudes follow a steady state that changes linearly, and lag behind it.
+        lag = (steady - self._steady) * -np.expm1(-steps) / steps
         departure = self._amplitude - self._steady
-        self._amplitude = steady + departure * decay - slope
+        self._amplitude = steady + departure * decay - lag
         self._steady = steady
 
 
@@ -217,7 +220,8 @@ class ThermalPads:
             seconds: Simulated time in s; it should not decrease from call to call.
         """
         knots = [times for times, _ in self._knots]
-        times = np.unique(np.concatenate([*knots, [seconds]]))
+        all_times = np.concatenate([*knots, [seconds]])
+        times = np.unique(all_times)
         is_passed = (times > self._seconds) & (times <= seconds)
         for time in times[is_passed].tolist():
             outside = self._outside(time)

@@ -199,8 +199,8 @@ def test_frames_of_cubes_that_the_hub_does_not_have_are_not_remembered() -> None
     account = SampleAccount()
     account.announce(8, 2)
     for first in range(20_000):
-        account.sample(sample(0, first=first))
-    account.stats(Stats(10, 1, 0))
+        account.classify(sample(0, first=first))
+    account.add_stats(Stats(10, 1, 0))
     assert len(account._trackers) == 8
     counters = account.counters()
     assert (counters["delivered"], counters["lost_on_the_way"]) == (20_000, 0)

@@ -199,7 +199,7 @@ class UsualLink:
     def handle(self, samples: list[Sample], arrival_ns: int, is_late: bool) -> list[int]:
         """Count and stamp samples in Python, as the chain does with those that are not usual."""
         for sample in samples:
-            assert self.account.sample(sample) is Arrival.NEW
+            assert self.account.classify(sample) is Arrival.NEW
         numbers = [sample.sequence for sample in samples]
         times_us = [sample.device_us for sample in samples]
         stamps = self.clock.update(times_us, arrival_ns, numbers, is_late)

@@ -78,8 +78,8 @@ def test_harmed_frames_are_delivered_or_missing_never_wrong(kind):
     link = FaultyLink({"kind": kind, "at": 0.01, "count": 20})
     decoder, samples = link.play(100)
     account = SampleAccount()
-    arrivals = [account.sample(sample) for sample in samples]
-    account.stats(Stats(10_000, link.hub.sequence, 0))
+    arrivals = [account.classify(sample) for sample in samples]
+    account.add_stats(Stats(10_000, link.hub.sequence, 0))
     counters = account.counters()
     assert not account.contradictions()
     assert counters["taken"] == 100 == counters["delivered"] + counters["lost_on_the_way"]
@@ -105,11 +105,11 @@ def test_stats_complete_the_account_and_tell_drops_from_loss():
     link = FaultyLink()
     _, samples = link.play(10)
     for sample in samples[:6]:
-        account.sample(sample)
-    account.stats(Stats(20, 10, 3))
+        account.classify(sample)
+    account.add_stats(Stats(20, 10, 3))
     assert account.counters()["taken"] == 10
     assert (account.counters()["dropped_in_hub"], account.counters()["lost_on_the_way"]) == (3, 1)
-    assert account.sample(samples[7]) is Arrival.LATE
+    assert account.classify(samples[7]) is Arrival.LATE
     assert account.counters()["lost_on_the_way"] + account.counters()["dropped_in_hub"] == 3
     account._received += 1
     assert "lost count" in account.contradictions()[0]

@@ -22,10 +22,10 @@ MAX_DELAY_NS = 60_000_000_000
 """Longest credible delay, in ns, between the sampling of a sample and its arrival. If the estimated
 time of sampling is further before the arrival, the arrival time is the stamp of the sample."""
 MAX_PAUSE_NS = 60_000_000_000
-"""Longest time, in ns by both the host's and the hub's clock, between two reads of a hub's samples
-after which the clock line (host time over device time) is still used. In a longer time the error of
-the drift (up to 100 ppm in the first seconds, so 6 ms per minute) would look like a step of the
-hub's clock, so the line is begun anew and only its drift is kept."""
+"""Longest pause, in ns by both clocks, between two reads of a hub's samples after which the clock
+line (host time over device time) is still used. After a longer pause the error of the drift, up to
+6 ms per minute, would look like a step of the hub's clock. The line is then begun anew, and only
+its drift is kept."""
 RESTART_US = 1_000_000
 """Smallest step back of the device time (the hub's clock), in µs, that is taken for a restart of
 the hub. If the device time of a sample is earlier by less, the sample has only come out of
@@ -60,8 +60,7 @@ class HubClock:
     It needs bounded memory and constant time per sample.
 
     Attributes:
-        resets: Number of times that the line (host time over device time) was restarted, for
-            example with the hub, or the hub's clock was set.
+        resets: Number of restarts of the hub plus number of detected steps of a clock.
         in_doubt: Whether the stamps of the last `update` may be wrong, because the hub's clock may
             have been set or cannot be used.
         problems: Texts of problems, which the caller reports and removes.
@@ -245,7 +244,7 @@ class HubClock:
         self._decision: StepDecision | None = None
 
     def _count_reset(self) -> None:
-        """Count a restart of the line (host time over device time) or a step of the hub's clock.
+        """Count a restart of the hub or a step of a clock.
 
         The time of the event is kept, to find a clock that is set again and again.
         """

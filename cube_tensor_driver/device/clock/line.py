@@ -202,7 +202,10 @@ class ClockLine:
             arrival_ns: This host time, in ns since the first sample.
         """
         trips = self._round_trips
-        while trips and trips[-1].device_ns + trips[-1].high_ns > arrival_ns:
+        while trips:
+            ended_ns = trips[-1].device_ns + trips[-1].high_ns
+            if ended_ns <= arrival_ns:
+                break
             trips.pop()
         self._intersect_bounds()
 
@@ -272,7 +275,8 @@ class ClockLine:
             track.drift = min(max(slope, -MAX_DRIFT), MAX_DRIFT)
         # No point (device time, arrival) may lie below the line, because no delay is negative. If
         # the slope was limited to MAX_DRIFT, any point may be the lowest, so all are compared.
-        track.offset = float((delays - track.drift * devices_ns).min())
+        offsets = delays - track.drift * devices_ns
+        track.offset = float(offsets.min())
         return was_set
 
     def _drift_error(self) -> float:
@@ -336,7 +340,9 @@ def _slope_at_centre(x: Array, y: Array) -> float:
         return 0.0
     # The edge of the lower hull is the segment from a point left of the centre (row) to one right
     # of it (column) that passes the centre lowest.
-    left_x, left_y = x[is_left, np.newaxis], y[is_left, np.newaxis]
-    slopes = (y[~is_left] - left_y) / (x[~is_left] - left_x)
+    left_x = x[is_left, np.newaxis]
+    left_y = y[is_left, np.newaxis]
+    right_x, right_y = x[~is_left], y[~is_left]
+    slopes = (right_y - left_y) / (right_x - left_x)
     heights = left_y + slopes * (x.mean() - left_x)
     return float(slopes.flat[heights.argmin()])

@@ -17,8 +17,8 @@ PORTS_WITHOUT_BAUD = (TCP, "/dev/ttyACM")
 USB devices themselves (not a serial line behind a USB adapter)."""
 
 
-def line_doubts(skin: Skin) -> Iterator[str]:
-    """Yield one warning for each link whose cubes send more bytes than its baud rate allows.
+def find_slow_lines(skin: Skin) -> Iterator[str]:
+    """Yield one warning for each serial line that is too slow for the samples of its cubes.
 
     There is no warning if the skin file sets no sample rate, because the hubs' own is unknown.
 

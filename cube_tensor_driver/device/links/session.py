@@ -253,13 +253,13 @@ class Session:
     def _note_progress(self, now: float) -> None:
         """Store the time at which bytes or samples came last, if there are new ones.
 
-        Samples that the module in C has handled do not come as frames, so they are noticed by their
-        number.
+        Samples that the module in C has handled do not come as frames, but increase a counter.
 
         Args:
             now: Monotonic time, in s.
         """
-        n_bytes, n_native = self.link.decoder.counters.bytes, self.link.track.n_native
+        n_bytes = self.link.decoder.counters.bytes
+        n_native = self.link.track.n_native
         if n_bytes != self._n_bytes:
             self._n_bytes, self.last_byte = n_bytes, now
         if n_native != self._n_native:

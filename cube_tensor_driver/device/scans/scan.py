@@ -210,11 +210,14 @@ class ScanBuilder:
         parts = [part for part in taken if part.stamp_ns <= end_ns]
         self._deferred = [part for part in taken if part.stamp_ns > end_ns]
 
+        cubes = [part.cubes for part in parts]
         sizes = [len(part.cubes) for part in parts]
-        rows = self._make_rows(sum(sizes), self.cubes.n_pads)
-        np.concatenate([part.cubes for part in parts], out=rows.cube)
         statuses = [part.status for part in parts]
-        rows.status[:] = np.repeat(statuses, sizes) if any(statuses) else 0
+        rows = self._make_rows(sum(sizes), self.cubes.n_pads)
+        np.concatenate(cubes, out=rows.cube)
+        rows.status[:] = 0
+        if any(statuses):
+            rows.status[:] = np.repeat(statuses, sizes)
         raws = [part.sample.raw for part in parts]
         if wire is not None and all(raws):
             _place(rows, raws, [part.stamp_ns for part in parts])
@@ -261,7 +264,8 @@ class ScanBuilder:
         cubes = self.cubes.find_all(live)
         if cubes is None or max(stamps_ns) - min(stamps_ns) > MAX_SPAN_NS:
             return []
-        for link, stamp_ns in zip(live, stamps_ns[-width:], strict=True):
+        newest_ns = stamps_ns[-width:]
+        for link, stamp_ns in zip(live, newest_ns, strict=True):
             self._built_ns[link] = stamp_ns
         scans = []
         # The scans are divided from the newest one backwards, so that the last item is full: a host
@@ -341,12 +345,11 @@ class ScanBuilder:
         return scans
 
     def _holds_late_sample(self, missing: set[int]) -> bool:
-        """Return whether the pending scan holds a sample that came after its own scan was built.
+        """Return whether the pending scan holds a late sample, whose scan was delivered without it.
 
-        If such a late sample waited for the next samples of the other links, its link would stay
-        one sample behind from then on. A sample counts as late if, for every missing link, the
-        newest built sample of this link is nearer to it in time than the newest built sample of its
-        own link.
+        Such a sample is delivered alone. If it waited for the next samples of the other links, its
+        link would stay one sample behind from then on. A sample counts as late if its time is
+        nearer to the last delivered sample of every missing link than to that of its own link.
 
         Args:
             missing: Links that deliver but have no sample in the pending scan.

@@ -124,7 +124,8 @@ class SequenceTracker:
         # after a restart of the hub.
         if self._restart_at == track.next and device_us < track.newest_us:
             return self._restart(sequence, device_us)
-        if (number, device_us) in self._seen() or self._is_old_repeat(number, device_us):
+        is_repeat = (number, device_us) in self._seen()
+        if is_repeat or self._is_old_repeat(number, device_us):
             self.counters.duplicate += 1
             return Arrival.DUPLICATE
         if ahead < -MAX_DISORDER or not self._fits_run(number, device_us):
@@ -285,7 +286,7 @@ class SampleAccount:
         self._dropped = 0
         self._dropped_before = 0
 
-    def sample(self, frame: Sample) -> Arrival:
+    def classify(self, frame: Sample) -> Arrival:
         """Classify one SAMPLE frame by its number (new, late, duplicate …), and count it."""
         self._received += 1
         tracker = self._trackers.get(frame.first_cube)
@@ -318,7 +319,7 @@ class SampleAccount:
         for tracker in self._trackers.values():
             tracker.expect_restart()
 
-    def stats(self, frame: Stats) -> None:
+    def add_stats(self, frame: Stats) -> None:
         """Take over how many samples the hub has taken and dropped, from its STATS frame.
 
         Samples that the hub has taken but that have not arrived are then counted as missing.
