@@ -105,12 +105,11 @@ def _map_axes(
             aspect="equal",
             xlim=(-VIEW_MM, VIEW_MM),
             ylim=(-VIEW_MM, VIEW_MM),
+            xlabel="$x$ / mm",
+            ylabel="$y$ / mm",
         )
         axis.grid(False)
-    for axis in axes[-1]:
-        axis.set_xlabel("$x$ / mm")
-    for axis in axes[:, 0]:
-        axis.set_ylabel("$y$ / mm")
+        axis.label_outer()
     return axes
 
 

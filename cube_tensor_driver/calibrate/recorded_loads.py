@@ -20,7 +20,7 @@ from ..core.calibration import Calibration
 from ..core.errors import BagError
 from ..core.layout import Layout
 from ..core.modes import COMPONENTS, STRESS
-from ..core.rows import FrequencyRows
+from ..core.rows import FrequencyRows, concatenate
 from ..core.symmetry import default_modes
 from ..messages.codec import SECOND
 from ..messages.types import STRESS as BATCH_TYPE
@@ -82,8 +82,7 @@ def read_recorded_loads(
         calibration = settings.calibrations[number]
         calibration.check(layout)
         rest = settings.rest_frequency[number, : layout.n_pads]
-        samples = read_samples(source, number, layout.n_pads)
-        stamp_ns, frequency, temperature = samples
+        stamp_ns, frequency, temperature = read_samples(source, number, layout.n_pads)
         reference_ns, state = _read_reference(
             source.bag,
             reference,
@@ -225,17 +224,9 @@ def read_samples(
     for rows in source:
         is_of_cube = rows.cube == number
         is_good = rows.pad_fault == 0
-        chosen = rows.select(is_of_cube & is_good)
-        part = (
-            chosen.stamp_ns,
-            chosen.frequency[:, :n_pads],
-            chosen.temperature,
-        )
-        parts.append(part)
-    stamp_ns, frequency, temperature = (
-        np.concatenate(column) for column in zip(*parts, strict=True)
-    )
-    return stamp_ns, frequency, temperature
+        parts.append(rows.select(is_of_cube & is_good))
+    samples = concatenate(parts)
+    return samples.stamp_ns, samples.frequency[:, :n_pads], samples.temperature
 
 
 def _read_reference(
@@ -331,13 +322,10 @@ def _read_batches(
     """
     parts = []
     for messages, _ in bag.stress(topic):
-        rows = messages.rows.select(messages.rows.cube == number)
-        components = np.hstack([rows.stress, rows.gradient])
-        part = (rows.stamp_ns, components.astype(float))
-        parts.append(part)
-    columns = zip(*parts, strict=True)
-    stamp_ns, values = (np.concatenate(column) for column in columns)
-    return stamp_ns, values
+        parts.append(messages.rows.select(messages.rows.cube == number))
+    rows = concatenate(parts)
+    components = np.hstack([rows.stress, rows.gradient])
+    return rows.stamp_ns, components.astype(float)
 
 
 def _axes(vector: Any) -> list[float]:
