@@ -71,8 +71,8 @@ class Body:
         x: Position of the cube's centre along x relative to the body's centre, in m.
         z: Position of the cube's centre along z relative to the body's centre, in m.
         ground: Whether the lower face is bonded to rigid ground.
-        confined: Whether the sides slide on walls. The layer then has no edges, and cubes in it
-            whose pitch is the width.
+        confined: Whether the sides slide on walls without friction. By symmetry the body then is
+            one cell of a skin without edges, in which the pitch of the cubes is the width.
         expansion: Linear thermal expansion of the elastomer, in 1/K.
         density: Density of the elastomer, in kg/m³. Silicones have 970 to 1150.
         cube_density: Density of the cube, in kg/m³: 7850 for steel, 2500 for glass, 1190 for
@@ -106,14 +106,16 @@ class Body:
         for name in (*positive, "density", "cube_density"):
             value = getattr(self, name)
             if not value > 0 or (np.isinf(value) and name != "cube_young"):
-                raise ElasticError(f"{name} is {value}; it must be a positive number in SI units")
+                raise ElasticError(
+                    f"{_model_key(name)} is {value}; it must be a positive number in SI units"
+                )
         for name in ("poisson", "cube_poisson"):
             value = getattr(self, name)
             if not 0 <= value < 0.5:
                 raise ElasticError(
-                    f"{name} is {value}; it must lie in [0, 0.5). For rubber take 0.48 to 0.4999: "
-                    "the elements do not lock, but at 0.5 pressure is no longer a function of "
-                    "strain"
+                    f"{_model_key(name)} is {value}; it must lie in [0, 0.5). For rubber take 0.48 "
+                    "to 0.4999: the elements do not lock, but at 0.5 pressure is no longer a "
+                    "function of strain"
                 )
         min_length = MIN_BODY_RATIO * self.side
         for name in ("width", "depth", "height"):
@@ -139,6 +141,12 @@ class Body:
     def depth_of_cube(self) -> float:
         """Depth of the cube's centre below the upper face, in m."""
         return self.height / 2 - self.z
+
+
+def _model_key(name: str) -> str:
+    """Return the key of a model file that holds an attribute of `Body`, such as cube.young."""
+    section = "cube" if name == "side" or name.startswith("cube_") else "body"
+    return f"{section}.{name.removeprefix('cube_')}"
 
 
 def strip_layout(
