@@ -13,7 +13,7 @@ from . import rules
 from .conversation import Conversation, Report, Wire
 from .rule import RULES, SECTIONS, Outcome, Rule, RuleResult
 
-__all__ = ["Checked", "check", "in_order", "rules"]
+__all__ = ["Checked", "check", "rules", "sort_rules"]
 
 
 @dataclass(frozen=True)
@@ -73,11 +73,11 @@ def check(wire: Wire, report: Report = lambda done, total, what: None) -> Checke
         CubeError: The hub sends without end.
     """
     transcript = Conversation(wire, report).run()
-    results = {one.number: one.check(transcript) for one in in_order()}
+    results = {one.number: one.check(transcript) for one in sort_rules()}
     return Checked(transcript.port, transcript.hello, results)
 
 
-def in_order() -> list[Rule]:
+def sort_rules() -> list[Rule]:
     """Return all rules in the order of docs/protocol.md."""
     sections = list(SECTIONS)
     return sorted(RULES.values(), key=lambda one: (sections.index(one.number[0]), one.number))

@@ -134,7 +134,10 @@ class Wire(Protocol):
         """Send bytes without waiting until they are gone."""
 
     def listen(self, seconds: float) -> bytes:
-        """Return what comes as soon as something does, b"" if nothing does in this time."""
+        """Wait for bytes from the hub, at most for this time, and return the first that come.
+
+        The result is b"" if none came.
+        """
 
     def ignore(self, seconds: float) -> None:
         """Let time pass without reading."""
@@ -223,7 +226,7 @@ class Conversation:
         self._ask("after period", Command.HELLO)
         self._ask("start", Request(Command.START, ANY_ARGUMENT), seconds=FLOW_S)
         self._ask_time("started")
-        # Each START comes at another place within a period.
+        # Each START comes at another phase of the sample period.
         for number in range(3):
             self._ask(f"start again {number}", Command.START, seconds=BETWEEN_START_S)
         self._ask("refused while started", Request(Command.SET_PERIOD, 0), seconds=STOPPED_S)
@@ -308,7 +311,7 @@ class Conversation:
         return self._step
 
     def _listen(self, seconds: float, enough: Callable[[], bool] = lambda: False) -> None:
-        """Add what comes to the step, for a time, or until `enough()`."""
+        """Add the frames that come to the step, for a time in seconds, or until `enough()`."""
         step = self._step
         until = self._wire.now() + seconds
         while (left := until - self._wire.now()) > 0 and not enough():

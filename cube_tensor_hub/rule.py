@@ -26,7 +26,8 @@ class Outcome(str, Enum):
 
 @dataclass(frozen=True)
 class RuleResult:
-    """The outcome of a rule, and in words what came or why it was not tried."""
+    """The outcome of a rule, and a text that says what the hub sent, or why the rule was not
+    tried."""
 
     outcome: Outcome
     text: str
@@ -57,7 +58,7 @@ class Rule:
 
     Attributes:
         number: Number on the page, for example S7.
-        says: The words of the page.
+        says: Text of the rule on the page.
         needs: Kinds of frames; without one of each, the rule is not tried.
         find_result: Function that looks for the rule in a conversation in which they came.
     """
@@ -104,7 +105,7 @@ def rule(
 
     Args:
         number: Number of the rule on docs/protocol.md, for example S7.
-        says: The words of the page.
+        says: Text of the rule on the page.
         needs: Kinds of frames; without one of each, the rule is not tried.
     """
 
@@ -120,7 +121,7 @@ def never_tried(number: str, says: str, why: str) -> None:
 
     Args:
         number: Number of the rule on docs/protocol.md, for example H5.
-        says: The words of the page.
+        says: Text of the rule on the page.
         why: Why it cannot be checked, as the check prints it.
     """
     rule(number, says, needs=())(lambda transcript: not_tried(why))

@@ -32,8 +32,8 @@ class Heard:
     Attributes:
         at_s: Time on the host's clock at which its last byte had come, in seconds.
         frame: The frame.
-        opened: Whether it has a zero of its own before it, besides the zero that closed the frame
-            before; None: there was no frame just before it.
+        opened: Whether two zero bytes lie between the frame before and this one, so that this one
+            begins with a zero of its own; None: there was no frame just before it.
     """
 
     at_s: float

@@ -25,7 +25,7 @@ COMPUTATIONS = {
 """Option that asks for another computation than the response to linear stress fields -> its help
 text."""
 DEFAULT_MESHES = 3
-"""Number of meshes if the command line does not name one."""
+"""Number of meshes, from coarse to fine, that are computed without the option --meshes."""
 
 
 def arguments(parser: Parser) -> None:

@@ -44,18 +44,21 @@ from .solid import Parity, Solid, lame
 Progress = Callable[[float, float, str], None]
 """Called as progress(done, total, what) before every step of a computation and at its end."""
 Load = Callable[[Parity], Sequence[Array]]
-"""Nodal forces of n loads on a meshed body as a function of the parity: of their part that is even
-(+1) or odd (-1) under the mirror of each axis (0: without mirror). They are those on the body, and
-after them those on the cube if there are some, each (dofs, n)."""
+"""Function that returns the nodal forces (dofs, n) of n loads, for one parity: that part of the
+loads which is even (+1) or odd (-1) under the mirror of each axis (0: without mirror). The first
+array of the result is the forces on the elastomer. A second one, if the loads act on the cube, too,
+is the forces on the cube."""
 
 MAX_MESHES = 3
 """Largest number of meshes on which one response is computed, from the coarsest to the finest."""
 NO_FORCE = 1e-12
-"""Largest nodal force of a load, relative to the largest of all loads, that counts as rounding:
-such a load has no part of the parity (even or odd under each mirror) that is solved."""
+"""Ratio of the largest nodal force of one load to that of all loads, up to which it counts as a
+rounding error. The load then has no part of this parity (even or odd under each mirror), and is not
+solved for it."""
 STIFF_CUBE_RATIO = 1e6
-"""Ratio of the Young's moduli of cube and body that stands for a rigid cube in a body on ground. A
-cube that is held at rest would not do, because the cube moves with the body there."""
+"""Ratio of the Young's moduli of cube and elastomer that stands for a rigid cube in a body on
+ground. Without ground a rigid cube is held at rest, but on ground it moves relative to the
+ground."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,8 +158,8 @@ def compute_response(
 
 
 def count_steps(progress: Progress | None, total: int) -> Callable[[str], None]:
-    """Return a function that reports, by its name, that the next of `total` steps of work
-    begins."""
+    """Return a function that is called with the name of each step of the work when it begins, and
+    reports that name, the number of steps done, and their `total`."""
     done = itertools.count()
 
     def report(what: str) -> None:
@@ -200,7 +203,7 @@ def solve_meshes(
         progress: Called before every solve and at the end.
 
     Raises:
-        ElasticError: The number of meshes is another one, pads overlap, or a mesh does not fit into
+        ElasticError: The number of meshes is not 1 to 3, pads overlap, or a mesh does not fit into
             memory.
     """
     if not 1 <= meshes <= MAX_MESHES:
@@ -321,7 +324,8 @@ def make_solid(
 def load_modes(solid: Solid, layout: Layout) -> Load:
     """Return the tractions of all modes of a layout on the outer faces of a body.
 
-    Their stresses on the pads are the response matrix, in Pa per Pa.
+    The stresses of the pads under a unit amplitude of each mode are the columns of the response
+    matrix.
     """
     axes = field_axes(layout)
     modes = default_modes(layout)
@@ -364,7 +368,8 @@ def pad_stresses(
         used = np.flatnonzero(largest > NO_FORCE * largest.max())
         weights = solid.pad_weights(layout, parity)
         if len(used) and weights.any():
-            # The cube bears what the stresses in the body and the loads on it do not balance.
+            # At the faces of the cube, the nodal forces of the stress in the elastomer exceed the
+            # loads on the elastomer by the forces with which the cube acts on it.
             displacement = solid.solve(parity, forces[:, used])
             reactions = solid.body @ displacement - in_body[:, used]
             part[:, used] = weights @ reactions
@@ -373,8 +378,8 @@ def pad_stresses(
 
 
 def each_parity(solid: Solid, report: Callable[[str], None] = lambda _: None) -> Iterator[Parity]:
-    """Yield and report the parities of a body, so that those that share a factorisation of the
-    stiffness follow one another."""
+    """Yield the parities of a body and report each. Parities that share a factorisation of the
+    stiffness matrix follow one another."""
 
     def shared(parity: Parity) -> Parity:
         return solid.with_sorted_axes(parity)[0]

@@ -39,7 +39,7 @@ def line_load(
     Returns:
         (7, m, 2) amplitudes of the modes `PLANE` (linear stress fields), in Pa under 1 N/m.
     """
-    # Midpoints of equal intervals, so that k = 0 needs no limit.
+    # The midpoints of equal intervals leave out k = 0, where the transfer function is a limit.
     k = (np.arange(WAVES) + 0.5) * MAX_WAVENUMBER / depth / WAVES
     transfer = layer.transfer(k, 0 * k, depth)
     transfer = transfer[:, :, [0, 2]]  # The columns of forces along x and z.
@@ -47,7 +47,8 @@ def line_load(
     is_gradient = ["_" in name for name in PLANE.names]
     rows[:, is_gradient] *= scale
 
-    # Waves of both signs are conjugate, so twice the real part of one half is the integral.
+    # The integrand at -k is the complex conjugate of that at k. So the integral over all k is twice
+    # the real part of that over k > 0, and the factor of the inverse transform is 2 / (2 pi).
     step = k[1] - k[0]
     wave = np.exp(-1j * np.outer(x, k)) * (step / np.pi)
     modes = np.tensordot(wave, rows, axes=1).real  # (m, 7, 2)

@@ -172,7 +172,8 @@ def _place_pads(
     if not pads:
         return layout
     width = pads.get("width", layout.pad_size * half_side)
-    # Rounding makes 0.4 of 0.0008 / 0.002, so that the pads of a built-in layout stay its own.
+    # Without rounding, 0.0008 / 0.002 is not quite 0.4, and pads of the same size as those of a
+    # built-in layout would make another layout.
     size = round(width / half_side, 12)
     try:
         if "centre" not in pads:

@@ -130,7 +130,8 @@ def interval_weights(
         if start <= (begin + end) / 2 <= stop:
             integral[own] += (end - begin) * element_integral
 
-    # The traction at a corner is that of the polynomial of the last element.
+    # The corner has no trial function of its own. The polynomials of the element beside it continue
+    # up to the corner.
     trial = np.eye(n)[:, 1:-1]
     trial[-1, -order:] = _continuation(order)
     trial[0, :order] = _continuation(order)[::-1]

@@ -61,7 +61,8 @@ def compute_influence(
         layer=Layer(body.height, body.poisson),
         depth=body.depth_of_cube,
         place=place * d0,
-        # The stress of unit nodal forces in units of d0 has one power of d0 less in a plane.
+        # With lengths in d0, a force of 1 causes a stress per 1/d0² in space. In a plane the force
+        # is per length along y, and the stress per 1/d0.
         pads=pads / d0 ** (solid.dim - 1),
     )
 
@@ -77,11 +78,12 @@ def _surface_influence(solid: Solid, layout: Layout) -> tuple[Array, Array]:
 
     total: Array | float = 0.0
     for parity in each_parity(solid):
-        # The weights of the pads are the right-hand sides, all of one parity in one solve.
+        # One solve has the weights of all pads as its right-hand sides.
         gaps = solid.pad_weights(layout, parity).T
         displacement = solid.solve(parity, solid.body @ gaps)
         on_surface = np.moveaxis(displacement[dofs], -1, 0)  # (P, n, dim)
-        # The displacement along an axis is odd where the field is even under the mirror.
+        # Mirrored points have mirrored displacements: `images` changes the sign of the component
+        # along a mirrored axis, and `weights` has the sign of the parity.
         images, weights = mirror_images(parity)
         flip = weights[:, None] * images
         total = total + on_surface[:, None] * flip[:, None]

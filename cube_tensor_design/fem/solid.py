@@ -62,9 +62,10 @@ def lame(
 def stiffness(scalar: skfem.Basis, moduli: tuple[float, float]) -> sp.csr_matrix:
     """Assemble the stiffness K_ij = int lambda div w_i div w_j + 2 mu eps(w_i) : eps(w_j) dV.
 
-    w_i are the nodal functions and eps their strain. The sparse matrix (dofs, dofs) is put together
-    from the integrals of d_a f d_b g over the scalar elements f and g. Vector elements have as many
-    zeros as components, and with them the assembly takes seven times as long.
+    w_i are the vector-valued nodal functions and eps their strain. The sparse matrix (dofs, dofs)
+    is put together from integrals of df/dx_a dg/dx_b, where f and g are nodal functions of a single
+    component. Assembling it with the vector-valued functions, most of whose components are zero,
+    takes seven times as long.
 
     Args:
         scalar: The elements of one component; the components of one node are neighbours among the
@@ -125,8 +126,8 @@ class Solid:
         moduli: Lame's constants of the body, and those of a cube that is not rigid.
         body: (dofs, dofs) stiffness of the body without the cube.
         total: (dofs, dofs) stiffness of body and cube.
-        parities: Parities (+1 even or -1 odd under the mirror of each axis, 0 without mirror) of
-            the parts that any field is the sum of.
+        parities: All parities of the body (+1 even or -1 odd under the mirror of each axis, 0
+            without mirror). Any field is a sum of one part for each of them.
     """
 
     def __init__(
@@ -165,26 +166,28 @@ class Solid:
         self.positions = np.repeat(self.basis.doflocs, self.dim, axis=1)
         self.component = np.arange(self.positions.shape[1]) % self.dim
 
-        # (dim, nodes) number of the line of the product grid of bricks on which each node lies
+        # In space the nodes lie on a product grid. `_grid` (dim, nodes) holds the number of each
+        # node's coordinate among the coordinates that occur along an axis.
         rounded = np.round(self.basis.doflocs, 9)
         lines = [np.unique(x, return_inverse=True) for x in rounded]
         self._grid = np.stack([index for _, index in lines])
-        # Axes with the same lines have the same number here.
+        # Axes with equal coordinates get equal numbers, and may be exchanged for each other.
         coordinates = [line.tolist() for line, _ in lines]
         self._axis_kind = [coordinates.index(line) for line in coordinates]
         self._last_solve: _Factors | None = None
 
-        self.body = stiffness(self.part(in_cube=False), body)
+        self.body = stiffness(self.scalar_elements(in_cube=False), body)
         self.total = self.body
         if cube is not None:
-            self.total = self.body + stiffness(self.part(in_cube=True), cube)
+            self.total = self.body + stiffness(self.scalar_elements(in_cube=True), cube)
 
     def outer_forces(self, parity: Parity, field: Callable[[Array], Array]) -> Array:
         """Return the nodal forces (dofs, n) of n fields that act as tractions on the outer faces.
 
         Args:
-            parity: Part of the fields that is taken.
-            field: From points (q, dim) to stress (q, n, dim, dim), which should be in equilibrium.
+            parity: Parity (even or odd under each mirror) of the part of the fields that acts.
+            field: Function that returns the stresses (q, n, dim, dim) of the fields at points (q,
+                dim). They should be in equilibrium.
         """
         mesh = self.basis.mesh
         edges = mesh.boundary_facets()
@@ -237,9 +240,9 @@ class Solid:
         return _Factors(parity, free, factors)
 
     def with_sorted_axes(self, parity: Parity) -> tuple[Parity, Index]:
-        """Sort equal axes of the product grid by their parity.
+        """Exchange axes along which the grid is the same, so that their parities are in order.
 
-        Parities that become the same one share their factors.
+        Parities that are the same after the exchange share one factorisation of the stiffness.
 
         Returns:
             The sorted parity, and an index `swap` (dofs,) such that u[swap] is the field u with its
@@ -259,8 +262,9 @@ class Solid:
         swap = self.dim * before[:, None] + axes
         return tuple(parity[k] for k in axes), swap.ravel()
 
-    def part(self, in_cube: bool) -> skfem.Basis:
-        """Return the elements of one component in the cube, or in the body around it."""
+    def scalar_elements(self, in_cube: bool) -> skfem.Basis:
+        """Return the scalar elements (of one displacement component) in the cube, or in the
+        elastomer around it."""
         mesh = self.basis.mesh
         centres = mesh.p[:, mesh.t].mean(axis=1)
         is_cube = np.all(np.abs(centres) < 1.0, axis=0)
@@ -269,7 +273,7 @@ class Solid:
     def pad_weights(self, layout: Layout, parity: Parity) -> Array:
         """Return weights (P, dofs) from nodal forces on the body to the mean stresses of the pads.
 
-        On the surface of the cube, `body` @ u are the forces of the cube.
+        These forces, `body` @ u on the surface of the cube, are those of the cube on the elastomer.
         """
         return -pad_weights(self.positions, self.order, layout, parity)
 
@@ -298,11 +302,13 @@ class Solid:
             in_cube = np.all(np.abs(x) < 1.0 + SAME_COORDINATE, axis=0)
             return held | in_cube
 
-        # Translations: the centre is held. A parity without a translation is zero there anyway.
+        # Holding the centre stops translations. A field of a parity that no translation has is zero
+        # at the centre anyway.
         held |= np.all(_is_at(x, 0.0), axis=0)
         for i, j in itertools.combinations(range(self.dim), 2):
-            # A rotation: component i of a point on axis j is held. It is odd along i and j; where
-            # axis i has an even parity, the mirror holds this component.
+            # Holding component i of a point on axis j stops the rotation in their plane. Where the
+            # parity is even along j, there is no rotation; where it is even along i, the mirror
+            # holds this component already.
             if parity[j] <= 0:
                 point = np.eye(self.dim)[j]
                 at_point = np.all(_is_at(x, point[:, None]), axis=0)
@@ -329,11 +335,12 @@ def _parity_part(
 
 
 def mirror_images(parity: Parity) -> tuple[Array, Array]:
-    """Return the parts of the whole body that mirrors make of the meshed one, M in number.
+    """Return the M images under mirrors of the meshed part, which together make the whole body.
 
     Returns:
-        The sign (M, dim) of each axis in each part, and the weight (M,) with which a field in that
-        part counts in its part of this parity: the sign of a field of this parity there, over M.
+        Signs (M, dim) of the coordinates in each image, relative to the meshed part; and weights
+        (M,). The part of a field that has this parity is the sum over the images of the weight
+        times the mirrored field.
     """
     # Along an axis without a mirror the body is meshed as a whole.
     signs = [(1.0, -1.0) if sign else (1.0,) for sign in parity]

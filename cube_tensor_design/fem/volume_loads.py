@@ -117,7 +117,7 @@ def compute_thermal_stress(
     def load(solid: Solid) -> Load:
         parts = []
         for number, (lam, mu) in enumerate(solid.moduli):
-            basis = solid.part(in_cube=number == 1)
+            basis = solid.scalar_elements(in_cube=number == 1)
             heights = (np.asarray(basis.default_parameters()["x"])[-1] + z) / half_height
             stiffness = n_held * lam + 2 * mu
             pressures = expansions[number] * stiffness * legvander(heights, N_PROFILES - 1)
@@ -164,13 +164,16 @@ def compute_weight(
     def load(solid: Solid) -> Load:
         parts = []
         for number, density in enumerate(densities):
-            volume = skfem.LinearForm(lambda w, _: w).assemble(solid.part(in_cube=number == 1))
+            volume = skfem.LinearForm(lambda w, _: w).assemble(
+                solid.scalar_elements(in_cube=number == 1)
+            )
             # A force along one axis acts on this component of each node.
             parts.append(-density * np.kron(volume[:, None], np.eye(solid.dim)))
 
         def of_parity(parity: Parity) -> Sequence[Array]:
             images, weights = mirror_images(parity)
-            # 1 where a force along the axis has this parity: odd along itself, even along others.
+            # A uniform force along an axis is odd under the mirror of that axis, and even under the
+            # others. So `has_parity` is 1 for the axes along which forces have this parity, else 0.
             has_parity = weights @ images
             return [part * has_parity for part in parts]
 

@@ -26,7 +26,8 @@ def draw_curves(
         axis: Panel.
         x: (n,) positions, in m.
         curves: (n,) values in Pa or Hz by label.
-        spacing: Number of points from marker to marker; those of two curves are not side by side.
+        spacing: Number of points from one marker of a curve to the next. The first markers of the
+            curves are at different points, so that markers do not cover each other.
         style: Styles that all curves share, in place of those of `curve_style`.
     """
     for number, (label, values) in enumerate(curves.items()):

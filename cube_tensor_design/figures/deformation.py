@@ -222,7 +222,14 @@ def _draw_arrows(
     drawn: Array,
     limits: Array,
 ) -> None:
-    """Draw the displacements of the mesh's nodes next to a regular grid; limits (2,) in mm."""
+    """Draw the displacements of the nodes that are nearest to the points of a regular grid.
+
+    Args:
+        axis: Panel.
+        deformation: Deformation whose displacements are drawn.
+        drawn: (2, nodes) positions at which the nodes are drawn, in mm.
+        limits: (2,) largest distances from the centre along x and z that are in view, in mm.
+    """
     d0 = deformation.half_side
     window = limits[0] / (1e3 * d0)
     height = min(window, deformation.height / 2 / d0) - 0.25

@@ -107,7 +107,10 @@ def _draw_modes(
 
 @print_style()
 def draw_rod_parts(found: dict[str, RodParts]) -> Figure:
-    """Draw P_shear and its parts over the rod's place, for strips on two kinds of rod."""
+    """Draw P_shear and its parts over the position of the rod, in one panel for each kind of rod.
+
+    The pads are the strips of `rod_parts.PADS`.
+    """
     strips = {name: parts for name, parts in found.items() if name.endswith("strips")}
     figure = Figure(figsize=(10, 4.4))
     axes = figure.subplots(1, len(strips), sharey=True)

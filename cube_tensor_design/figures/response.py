@@ -72,7 +72,10 @@ def draw_convergence(result: Response) -> Figure:
 
 @print_style()
 def draw_response(result: Response) -> Figure:
-    """Draw the response matrix, pads down and modes across. Negative is dark, in grey too."""
+    """Draw the response matrix, with a row for each pad and a column for each mode.
+
+    Negative entries are dark, so that a print in grey shows the sign, too.
+    """
     n_pads, n_modes = result.matrix.shape
     figure = Figure(figsize=(0.6 * n_modes + 2.5, 0.35 * n_pads + 1.5))
     axis = figure.subplots()
@@ -127,7 +130,7 @@ def draw_influence(
     x = np.linspace(-reach, reach, POINTS)
     along_x = np.eye(influence.place.shape[1])[0]
     forces = influence.at(x[:, None] * along_x)
-    # Under a force against z, and along x.
+    # The forces that are drawn press against z, or push along x.
     stress = forces[:, :, [-1, 0]] * [-1, 1]
     # A stress in Pa under 1 N/m has the same number in kPa under 1 N/mm.
     unit, force = (1.0, "1 N/mm") if layout.planar else (1e3, "1 N")

@@ -30,8 +30,9 @@ MAX_SHOWN_ERROR = 20
 
 @print_style()
 def draw_trust(result: LayoutStudy) -> Figure:
-    """Draw error over indenter width, one panel per layout and cube side; too large where grey.
+    """Draw the error over the width of the indenter, in one panel per layout and side of the cube.
 
+    Errors in the grey area are too large to trust the component.
     Full lines are stresses. Dashed lines are gradients: the marker stands for the component, the
     colour for the direction.
     """

@@ -221,7 +221,8 @@ def plates(
         pressed: Displacement of the top plate, in m.
         sheared: Displacement of the bottom plate, in m.
         bonded: Whether the plates hold the body; otherwise they slide and leave x free.
-        gripped: Whether plates that slid so far hold the body from now on, where it has slid to.
+        gripped: Whether plates that slid in the steps before hold the body in this step. The body
+            starts from where it has slid to.
         rod: Rod that presses in place of the top plate; None: the plate presses.
     """
 

@@ -125,12 +125,13 @@ class _Search:
         free = self._free
         right = -(state.force + matrix @ jump)[free]
         inner = matrix[free][:, free]
-        # Forces along the rows hold rows @ (u + change) = 0.
+        # The border adds Lagrange multipliers, which are forces along the rows. They make rows @ (u
+        # + change) = 0.
         border = sp.csr_matrix(self._rows[:, free])
         bordered = sp.bmat([[inner, border.T], [border, None]])
         right = np.append(right, -self._rows @ u)
         change = jump.copy()
-        change[free] = factors(bordered).solve(right)[: len(free)]
+        change[free] = factorise(bordered).solve(right)[: len(free)]
         return change
 
     def descend(
@@ -165,7 +166,7 @@ class _Search:
         return float(np.linalg.norm(force[self._free] - along_rows @ held))
 
 
-def factors(matrix: sp.spmatrix) -> SuperLU:
+def factorise(matrix: sp.spmatrix) -> SuperLU:
     """Return LU factors of a nearly symmetric matrix, in half the time of free pivoting."""
     return splu(
         matrix.tocsc(),

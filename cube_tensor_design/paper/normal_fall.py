@@ -29,8 +29,9 @@ from .experiments import Experiment, foam_frequency, prototype
 class NormalFall:
     """Parts of the change of P_normal, the prototype's signal for pressure, under shear.
 
-    The parts come, in this order, from s_zz, from s_zx on the rotated faces, from s_xx - s_zz on
-    them, from c, and from the difference between the pads of a face.
+    The order of the parts is: change of the true stress s_zz; shear s_zx on the faces of the
+    rotated cube; difference s_xx - s_zz on these faces; change of the stress that the cube adds,
+    because it is stiffer than the elastomer; difference between the two pads of a face.
 
     Attributes:
         stress: (4,) change of the pads' mean by the first four parts, in Pa.
@@ -58,10 +59,12 @@ def normal_fall(experiment: Experiment) -> NormalFall:
     shear_part = -2 * zx * sin * cos
     normal_part = (xx - zz) * sin**2
     field = np.array([zz - zz_before, shear_part, normal_part])
-    # What the stress field does not explain is the change of c, which the cube adds.
+    # The part of the change that the true stresses do not explain is a change of the stress that
+    # the cube adds.
     stress = np.append(field, after - before - field.sum())
 
-    # Four equal pads, after each part has been added to those before it.
+    # The signal that four equal pads would give, after each part in turn has been added to their
+    # stress.
     mean_stress = np.cumsum([before, *stress])
     equal_pads = np.tile(mean_stress[:, None], 4)
     signal = prototype(foam_frequency(equal_pads))[:, 0]

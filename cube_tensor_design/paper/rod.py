@@ -48,8 +48,8 @@ class Rod:
         pressed: Depth of the rod's lowest point below the undeformed top of the body.
         position: Position of the rod's centre along x, from the cube's centre.
         width: Width of the rod along x.
-        edge_radius: Radius of curvature of the parabolas at their apex, which is as far from the
-            edge.
+        edge_radius: Radius of curvature of the parabolas where they begin; they begin at this
+            distance from the side of the rod.
     """
 
     pressed: float
@@ -63,8 +63,13 @@ class Rod:
         top: float,
         unit: float,
     ) -> tuple[Array, Array, Array]:
-        """Return the height h of the rod's lower side, dh/dx and d²h/dx² at x. Lengths but those of
-        the rod are in units of `unit` m, and `top` is the height of the undeformed top."""
+        """Return the height h of the rod's lower side, and its derivatives dh/dx and d²h/dx².
+
+        Args:
+            x: Positions along x, in units of `unit`, like all lengths that are returned.
+            top: Height of the undeformed top of the body, in units of `unit`.
+            unit: Unit of these lengths, in m. The attributes of the rod are in m.
+        """
         radius = self.edge_radius / unit
         flat = (self.width / 2 - self.edge_radius) / unit
         from_centre = x - self.position / unit
@@ -132,7 +137,8 @@ class RodContact:
             curved: Whether the rod's curvature counts, which can make the tangent indefinite.
         """
         at = self._penetration(u)
-        # The derivatives of the pressure k p dp/dg by g and by the slope of the rod.
+        # The pressure is k p dp/dg, with the stiffness k, the penetration p and the gap g. `normal`
+        # is its derivative by g; `bending` comes from the change of the rod's slope along x.
         normal = self._stiffness * (at.dp**2 + at.p * at.ddp)
         pressure = self._stiffness * at.p * at.dp
         bending = -pressure * at.curvature * curved

@@ -44,7 +44,7 @@ from ..fem.body import Body, strip_layout
 from ..fem.fem import Progress
 from ..fem.solid import lame
 from .experiments import SHEAR_SIGNS, dent
-from .newton import factors
+from .newton import factorise
 from .rod import ROD_DEPTH, Rod
 from .virtual_bench import LoadStep, VirtualBench
 
@@ -175,7 +175,7 @@ def split_signals(
 
     free = bench.free(step)
     matrix = _superposed_matrix(bench, step, with_cube, u, field)
-    solver = factors(matrix)
+    solver = factorise(matrix)
     dofs = np.unique(bench.section.basis.element_dofs[:, in_cube])
     polynomials, part = _polynomials(bench)
     polynomials = polynomials[:, dofs]
@@ -188,12 +188,13 @@ def split_signals(
     rows = []
     for weights in signals:
         adjoint = np.zeros_like(u)
-        # The adjoint turns the solve for w, which is the same for all signals, into one of the
-        # signal's weights. A held force has one unknown more.
+        # The signal depends on w, the displacement that the cube adds. Instead of solving for the
+        # w of each polynomial, the transposed (symmetric) system is solved once, with the weights
+        # of the signal on the right. The matrix has one row more if the rod's force is held.
         right = np.zeros(matrix.shape[0])
         right[: len(free)] = -_forces(bench, weights, ~in_cube)[free]
         adjoint[free] = solver.solve(right)[: len(free)]
-        # The signal is response @ u0.
+        # The signal is the product of `response` and the displacements without the cube (`field`).
         response = _forces(empty, weights + adjoint, in_cube)
         response -= _forces(bench, adjoint, in_cube)
         each = (polynomials @ response[dofs]) * amplitude
@@ -211,7 +212,11 @@ def _superposed_matrix(
     u: Array,
     field: Array,
 ) -> sp.spmatrix:
-    """Return the matrix of w: K + S of the free unknowns, bordered where the force is held.
+    """Return the matrix of the equations for w, the displacement that the cube adds.
+
+    It is K + S (stiffness of the bench and secant of the rod's contact) of the free unknowns. If
+    the force of the rod is held, a last row and column are added for the way d by which the cube
+    drives the rod back.
 
     Args:
         bench: The bench with the cube.
@@ -232,7 +237,8 @@ def _superposed_matrix(
     matrix = matrix + springs[free][:, free]
     if with_cube is step:
         return matrix
-    # The unknown -d has the displacement e, so its row and column are those of the contact's force.
+    # Drawing the rod back by d acts on its contact as moving the body by -d along z does. So the
+    # column of the unknown -d is the contact's force under a unit displacement along z.
     push = sp.csr_matrix((springs @ along_z)[free])
     total_push = [[along_z @ springs @ along_z]]
     blocks = [[matrix, push.T], [push, total_push]]
@@ -263,7 +269,7 @@ def _polynomials(bench: VirtualBench) -> tuple[Array, Index]:
     fields = [1.0 + 0 * z, 1j + 0 * z, 1j * z]
     part = [PARTS.index("higher")] * 3
     for order in range(1, ORDERS + 1):
-        # Real and imaginary parts of a and of b are independent amplitudes.
+        # The real and imaginary parts of Kolosov's coefficients a and b are independent amplitudes.
         for a, b in ((1, 0), (1j, 0), (0, 1), (0, 1j)):
             if order == 1 and a == 1j:  # A rotation gives no stress.
                 continue
@@ -272,7 +278,7 @@ def _polynomials(bench: VirtualBench) -> tuple[Array, Index]:
             power = z**order
             fields.append(ratio * a * power - slope - np.conj(b * power))
             is_shear = order == 1 and b == 1j
-            # Numbers of PARTS; from the fourth order on they are the higher derivatives.
+            # These are indices in `PARTS`. All orders from the fourth on are "higher".
             part.append(0 if is_shear else min(order, 4))
     values = np.array(fields)
     is_along_x = section.component == 0

@@ -165,6 +165,7 @@ def _shear_weights(
         smooth = size**2 * own @ prior
         total += smooth @ own.T
         cross += smooth @ shear_kernel[:, component]
-    # Independent errors of the measurements, relative to their size under the prior.
+    # The errors of the measurements are independent. Their standard deviation is a fixed fraction
+    # of the one that the prior gives each measurement.
     total[np.diag_indices(n)] *= 1 + MODEL_ERROR**2
     return np.asarray(np.linalg.solve(total, cross), dtype=float)

@@ -43,7 +43,8 @@ class Section:
         self.points = np.asarray(self.basis.default_parameters()["x"])
         self.component = np.arange(self.basis.N) % 2
 
-        # From u to the gradient d u_i / d x_j (2, 2, E, Q) at all points.
+        # This sparse matrix computes the gradients d u_i / d x_j (2, 2, E, Q) at all quadrature
+        # points from the unknowns u.
         slopes = np.stack([shape[0].grad for shape in self.basis.basis])
         self._gradient = sample_matrix(self.basis, slopes)
         self._linear_tangent: sp.csr_matrix | None = None

@@ -29,7 +29,7 @@ from ..fem.mesh import mesh_quarter, mirror_quarter
 from ..fem.pads import pad_weights
 from ..fem.solid import lame
 from .material import Material
-from .newton import Balance, factors, find_balance
+from .newton import Balance, factorise, find_balance
 from .rod import Rod, RodContact
 from .section import Section
 
@@ -219,8 +219,12 @@ class VirtualBench:
         return self._newton(rest, self._task(step, rest))
 
     def rod_pressure(self, step: LoadStep) -> tuple[Array, Array]:
-        """Return positions (n,) along x, in m, and nodal forces (n,) of the rod of a linear step on
-        the body, in N/m."""
+        """Return the nodal forces with which a rod presses on the body in one step of a linear
+        bench.
+
+        Returns:
+            Positions of the nodes along x (n,), in m, and forces on them (n,), in N/m.
+        """
         u = self.solve(step)
         if u is None or step.rod is None or self.finite:
             raise ElasticError("give a linear step with a rod, that presses less")
@@ -283,7 +287,7 @@ class VirtualBench:
         free = np.setdiff1d(np.arange(section.basis.N), pinned)
         u = np.zeros(section.basis.N)
         matrix = section.tangent(u)[free][:, free]
-        u[free] = factors(matrix).solve(force[free])
+        u[free] = factorise(matrix).solve(force[free])
         result = section.material.stress(section.deformation(u))
         return Deformation(
             points=mesh.p,
@@ -313,7 +317,7 @@ class VirtualBench:
         prescribed = by_component[component, np.arange(basis.N)] / self._half_side
         if step.gripped:
             prescribed = prescribed + np.where(component == 0, loose, 0.0)
-        # Without sliding there are no rows.
+        # The mean displacement of the bottom is held only if the bottom slides.
         rows = self._bottom_mean[None][: int(step.sliding)]
         return _Task(prescribed, rows, step.rod)
 

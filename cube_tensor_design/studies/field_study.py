@@ -73,7 +73,8 @@ class FieldStudy:
     force: Array
 
     def cubes_saved(self, error: float) -> Array:
-        """Return how many times fewer cubes per area reach an error than values alone do.
+        """Return by what factor fewer cubes per area suffice for an error than if only their
+        stresses are used.
 
         Args:
             error: Relative rms error of the pressure.

@@ -223,7 +223,8 @@ def _recovery_matrix(matrix: Array, name: str) -> Array:
     """Return the matrix (15, pads) from the pad stresses of a layout to `COMPONENTS`."""
     layout = LAYOUTS[name]
     modes = PLANE if layout.planar else SPACE
-    # The layouts in a plane know plane modes only, whose states in space these are.
+    # A layout in a plane has plane modes only. `states` has the amplitudes of the modes in space
+    # that each mode of the layout stands for.
     states = SPACE.state(modes.stress, modes.gradient).T
     response = matrix[: layout.n_pads] @ states
     noise = np.ones(layout.n_pads)

@@ -70,7 +70,8 @@ class LayerBench(TractionBench):
         """
         super().__init__(setting, side, known)
         self._true = true
-        # The influence functions of the planar cube are among those of the 24-pad cube.
+        # Each pad of a planar cube is also a pad of the 24-pad cube, with the same influence
+        # function.
         self._pads = []
         for position in self.calibration.layout.positions:
             distance = np.abs(true.layout.positions - position).max(axis=1)
@@ -96,7 +97,10 @@ class LayerBench(TractionBench):
 
 
 def coarse_influence() -> Influence:
-    """Return the influence functions that count as true, from the coarsest mesh, after minutes."""
+    """Compute influence functions on the coarsest mesh, which takes minutes.
+
+    The study takes them as the true ones, while the inverse assumes those of a finer mesh.
+    """
     return compute_influence(BODY, LAYOUTS["cube"], 0)
 
 

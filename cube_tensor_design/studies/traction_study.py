@@ -57,8 +57,9 @@ CUBES = ("24-pad", "planar", "planar, crosswise")
 """Kinds of cubes on a skin. Crosswise means that every second planar cube is turned by a quarter
 about z."""
 METHODS = ("interpolation", "inverse", "inverse with contacts")
-"""Methods that compute the pressure between the cubes: interpolation, the surface traction that
-explains all cubes, and this inverse with contacts fitted first."""
+"""Methods that compute the pressure between the cubes: interpolation of the cubes' stresses; the
+inverse, which estimates the surface traction that explains all stresses; and the inverse after
+contacts were fitted, for the part that these do not explain."""
 SHAPES = ("ball", "flat punch")
 """Shapes of the load. `./cube bench contacts` has more."""
 GAIN_ERROR = 0.01
@@ -198,7 +199,8 @@ class TractionBench:
     ) -> Array:
         """Return true stress and gradient (N, 6 + 18), in Pa and Pa/m, at the cubes' depth below
         points (N, 2) of the surface, in m."""
-        # A table of the layer under a ball's unit forces, or the closed form of a half space.
+        # For a layer, a table holds the fields under unit forces of a ball. The half space has a
+        # closed form.
         if self._true_layer is not None:
             unit_fields = self._true_layer.field(points - centre, width / 2)
             return unit_fields @ force

@@ -87,7 +87,7 @@ def run_emulated(options: argparse.Namespace) -> int:
             daemon=True,
         )
         server.start()
-        # It ends when QEMU does, since that closes the line.
+        # The server ends when QEMU ends, which closes the line.
         server.join()
         emulator.check()
     return 0

@@ -18,7 +18,7 @@ OVERFULL = ("unread", "gone")
 @rule("F1", "A sender puts a zero before and behind each frame.")
 def zeros_around(transcript: Transcript) -> RuleResult:
     """Between two frames there must be two zeros: one behind the first, one before the second."""
-    # A frame that follows a damaged run tells nothing about its zeros.
+    # Behind damaged bytes it is not known which zeros belong to the next frame (`opened` is None).
     opened = [heard.opened for heard in transcript.heard() if heard.opened is not None]
     if not opened:
         return not_tried("no two frames came one behind the other")

@@ -115,7 +115,7 @@ def period_is_kept(transcript: Transcript) -> RuleResult:
         return not_tried(f"{len(gaps)} periods came in the step 'start', 3 are needed")
     middle = float(np.median(gaps))
     text = f"asked {PERIOD_US} µs, in force {ack.argument} µs, median {middle:.1f} µs"
-    # Device time has a resolution of 1 µs, hence the 2 µs.
+    # Both times of a period are rounded to 1 µs, the resolution of device time: hence the 2 µs.
     if abs(middle - ack.argument) > PERIOD_TOLERANCE * ack.argument + 2:
         return failed(text)
     return passed(f"{text}, mean {gaps.mean():.1f} µs, jitter {gaps.std():.1f} µs")

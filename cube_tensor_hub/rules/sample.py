@@ -204,9 +204,11 @@ def frames_of_a_sample(transcript: Transcript) -> RuleResult:
     needs=(Sample, Stats),
 )
 def drops_are_counted(transcript: Transcript) -> RuleResult:
-    """All numbers that are missing before a STATS must be in its count.
+    """The count of dropped samples in STATS must contain all sequence numbers that are missing
+    before this STATS.
 
-    It may count more: those that were dropped behind the last number that came.
+    It may be larger, because the hub may also have dropped samples that follow the last one that
+    came.
     """
     base = transcript.visit(Stats)[0].dropped
     frames = Counter(sample.sequence for sample in transcript.visit(Sample))
@@ -224,7 +226,7 @@ def drops_are_counted(transcript: Transcript) -> RuleResult:
             previous = number
         elif isinstance(frame, Stats):
             counted = frame.dropped - base & 0xFFFFFFFF
-            # Samples behind the last one that came may have been dropped, too.
+            # Number of samples that the hub took after the last one that came.
             behind = 0 if previous is None else max(0, forward(frame.taken, previous) - 1)
             if not missing <= counted <= missing + behind:
                 return failed(f"{missing} numbers are missing, STATS counts {counted} as dropped")
@@ -297,12 +299,13 @@ def frequencies_are_possible(transcript: Transcript) -> RuleResult:
     needs=(Sample, Stats),
 )
 def taken_is_the_next_number(transcript: Transcript) -> RuleResult:
-    """The count must lie between the numbers of the samples before and behind the STATS.
+    """The count of taken samples in STATS must be above the number of the sample before this STATS,
+    and at most the number of the sample behind it.
 
-    Mostly that leaves one number.
+    If no sample was lost in between, a single count is right.
     """
     waiting: list[Stats] = []
-    # The number behind that of the last sample.
+    # Number that the next sample has if none is lost.
     expected: int | None = None
     n_compared = 0
     for frame in transcript.visit_frames():
@@ -350,7 +353,7 @@ def full_buffer(transcript: Transcript) -> RuleResult:
         return failed(f"{step.damaged} damaged frames after {UNREAD_S:g} s without reading")
     if transcript.frames(Sample, "fast") and not transcript.frames(Sample, "period again"):
         return failed(f"no sample came any more after {UNREAD_S:g} s without reading")
-    # Only the steps before it, in which everything was read.
+    # The reference is the last STATS of the steps before "unread", in which everything was read.
     read = transcript.first_visit[: transcript.first_visit.index("unread")]
     before = transcript.frames(Stats, *read)[-1]
     stats = [before, *transcript.frames(Stats, "unread", "period again")]

@@ -42,7 +42,13 @@ class TimeExchange:
 
 
 def time_exchanges(transcript: Transcript, state: str) -> list[TimeExchange]:
-    """Return the requests for TIME that were answered in a state, such as started."""
+    """Return the requests for TIME that were answered while the hub was in a state.
+
+    Args:
+        transcript: The conversation.
+        state: Begin of the name of the state: "before start", "started", "stopped", or "st" for
+            both of the latter.
+    """
     trips = []
     for step in transcript.steps.values():
         if step.name.startswith(f"time {state}"):
@@ -69,11 +75,12 @@ def clock_is_read_between(transcript: Transcript) -> RuleResult:
 
     Each reading is uncertain by the time between request and answer.
     """
-    # Later ones may follow a restart when the port was opened.
+    # Requests "before start" come later in the conversation. They are left out, because the hub may
+    # have restarted its clock when the port was opened before them.
     trips = time_exchanges(transcript, "st")
     if not knows_time(transcript) or len(trips) < 2:
         return not_tried(NOT_KNOWN)
-    # The shortest time between request and answer is what the driver works with.
+    # The driver estimates the clock from the answers with the shortest time since the request.
     shortest = min(trip.came_s - trip.sent_s for trip in trips)
     for first, trip in pairwise(trips):
         slack = MAX_RATE_DIFFERENCE * (trip.came_s - first.sent_s) + RESOLUTION_S

@@ -18,7 +18,7 @@ from conftest import ROOT
 from cube_tensor_driver.core.errors import CubeError, LinkError
 from cube_tensor_driver.device.wire.decoder import Decoder
 from cube_tensor_driver.device.wire.protocol import Ack, Command, Request, Sample, Time, encode
-from cube_tensor_hub.check import Checked, check, in_order
+from cube_tensor_hub.check import Checked, check, sort_rules
 from cube_tensor_hub.rule import Outcome
 
 UIDS = (0xA1, 0xA2, 0xA3)
@@ -563,8 +563,8 @@ def test_rules_are_those_of_the_page_in_its_words():
     page = (ROOT / "docs/protocol.md").read_text(encoding="utf-8")
     found = re.findall(r"^- \*\*([A-Z]\d)\*\* (.*(?:\n  .*)*)", page, re.MULTILINE)
     of_page = {number: " ".join(text.split()) for number, text in found}
-    assert [one.number for one in in_order()] == list(of_page)
-    for one in in_order():
+    assert [one.number for one in sort_rules()] == list(of_page)
+    for one in sort_rules():
         assert one.says in of_page[one.number], one.number
         assert f"### {one.section}\n" in page
 
