@@ -14,6 +14,7 @@ from cube_tensor_driver.core.tensor import rotate_gradient, rotate_stress, rotat
 from cube_tensor_driver.mechanics import contact
 from cube_tensor_driver.mechanics.layer import Layer
 from cube_tensor_driver.touch.inverse import SurfaceInverse
+from cube_tensor_driver.touch.tracker import contact_tracker
 from cube_tensor_driver.touch.tracker.contact_tracker import ContactTracker
 from cube_tensor_driver.touch.tracker.local_values import CubeNoise, LocalValues
 from cube_tensor_driver.touch.tracker.tracked_region import TrackedRegion
@@ -344,6 +345,19 @@ def test_cubes_that_fail_beside_a_contact_and_a_skin_without_values(inverse):
     (found,) = tracker.update(values, max_work=np.inf)
     assert found.normal_force == pytest.approx(3, rel=0.05)
     assert tracker.update(np.full_like(values, np.nan), max_work=np.inf) == []
+
+
+@pytest.mark.parametrize("work_before", [1, np.inf], ids=["nodes", "Hertz contact"])
+def test_a_cube_that_fails_during_a_contact(inverse, work_before, monkeypatch):
+    """In the very next scan, the fit may not compute with values that are unknown since, even if
+    there is no time to linearise fits that have only moved. Without noise, a ball has its force."""
+    monkeypatch.setattr(contact_tracker, "MAX_LINEARISED_FITS", 0)
+    values = ball(inverse, 8e-3, np.array([2e-3, 1e-3]), (0, 0, -3.0))
+    tracker = ContactTracker(inverse, LEAST)
+    tracker.update(values, max_work=work_before)
+    values[COUNT**2 // 2 + 1] = np.nan
+    (found,) = tracker.update(values, max_work=np.inf)
+    assert found.normal_force == pytest.approx(3, rel=0.01)
 
 
 SHAPES = [

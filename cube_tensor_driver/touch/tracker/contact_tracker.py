@@ -150,9 +150,9 @@ class ContactTracker:
             self._noise.update(
                 scaled, np.unique(np.concatenate([one.values.cubes for one in fits]))
             )
-        moving = [one for one in fits if isinstance(one, HertzFit) and one.is_moving]
-        moving.sort(key=lambda fit: -fit.displacement)
-        linearise(inverse, moving[:MAX_LINEARISED_FITS])
+        for region in regions:
+            region.drop_nodes_of_other_values()
+        self._linearise_moving_fits()
         self._update_fits()
 
         # A region that has no fit yet is described by the field.
@@ -175,6 +175,17 @@ class ContactTracker:
             for one in region.fit.estimate_contacts():
                 contacts.append(self._to_parent_frame(one, region.fit, is_refined))
         return self._number_contacts([one for one in contacts if one.normal_force > 0])
+
+    def _linearise_moving_fits(self) -> None:
+        """Linearise the response of the cubes to the Hertz contacts that have moved farthest.
+
+        At most `MAX_LINEARISED_FITS` fits are linearised, but always those whose cubes have lost or
+        regained values: a step with the noise of other values would compute with unknown ones.
+        """
+        moving = [one for one in self._fits if isinstance(one, HertzFit) and one.is_moving]
+        moving.sort(key=lambda fit: (fit.values.has_same_values, -fit.displacement))
+        n_required = sum(not fit.values.has_same_values for fit in moving)
+        linearise(self._inverse, moving[: max(n_required, MAX_LINEARISED_FITS)])
 
     @property
     def _fits(self) -> list[HertzFit | NodeFit]:

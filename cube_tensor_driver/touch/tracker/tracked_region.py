@@ -174,8 +174,7 @@ class TrackedRegion:
         """Begin a new scan (set of values of all cubes), and move Hertz contacts to where they are
         expected in it.
 
-        A Hertz fit is dropped if its contacts have left the region or pull at it. A fit on nodes is
-        dropped if other components of the cubes are known than before.
+        A Hertz fit is dropped if its contacts have left the region or pull at it.
 
         Args:
             points: Indices of the points of the surface that form the region in this scan.
@@ -192,7 +191,13 @@ class TrackedRegion:
             # Beside others, a prediction would make the mutual corrections of fits swing.
             fit.predict(is_moving=not self.near)
             self._follow_home(fit)
-        elif fit is not None and not fit.values.has_same_values:
+
+    def drop_nodes_of_other_values(self) -> None:
+        """Drop a fit on nodes (small contacts on a grid) if its cubes have lost or regained values.
+
+        The covariance of the forces was computed for the values that were known before.
+        """
+        if isinstance(self.fit, NodeFit) and not self.fit.values.has_same_values:
             self.fit = None
 
     def _follow_home(self, fit: HertzFit) -> None:
