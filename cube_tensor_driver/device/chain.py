@@ -49,7 +49,7 @@ with many cubes sends in this time, so a shorter delay loses nothing."""
 OVERLOAD_S = 0.5
 """Delay, in s, of this process in reading received bytes, above which it drops whole scans (one
 sample of every cube) if samples are lost at the same time: the host is too slow. After a shorter
-delay it catches up without loss. Dropping ends when no scan had to be dropped for this time."""
+delay it catches up without loss. Dropping goes on until none was needed for this time."""
 
 
 @dataclass(frozen=True)
@@ -306,11 +306,11 @@ class LiveLinks:
     def _is_overloaded(self) -> bool:
         """Return whether scans (one sample of every cube) must be dropped, as the host is too slow.
 
-        This is so if samples were lost while received bytes have been waiting for `OVERLOAD_S`. If
-        bytes wait but no sample is lost, everything is delivered. Whole scans are dropped, the
-        oldest first, so that delivered scans are complete and late by a few sample periods at most.
-        If the kernel and the hubs dropped samples at random instead, scans would have gaps, and
-        they would cost more time than complete ones.
+        They must be if this process reads received bytes too late by `OVERLOAD_S` and samples are
+        lost. If it reads late but nothing is lost, everything is delivered. The oldest scans are
+        dropped as a whole, so that the others are complete and late by a few sample periods at
+        most. Otherwise the kernel and the hubs would drop samples at random, and scans with gaps
+        cost more time than complete ones.
         """
         now = time.monotonic()
         if self._reader is not None and self._reader.behind_s > OVERLOAD_S:

@@ -14,9 +14,9 @@ from ctypes import Structure, c_double, c_int64
 from typing import Any
 
 MAX_DISORDER = 64
-"""Number of newest samples of a hub whose numbers and device times are kept, to recognise late and
-repeated ones. A sample that is older than these and lies in the past of the hub's run (the samples
-since its last restart) is taken for a repeated one."""
+"""Number of newest samples of a hub whose numbers and times (hub's clock) are kept, to distinguish
+late samples from repeated ones. An older sample counts as repeated, unless its number or time shows
+that the hub has restarted."""
 MAX_DEVICE_US = 1 << 51
 """Largest device time (time since power-up by a hub's clock), in µs, that is used: 71 years. Larger
 ones, which only a faulty hub sends, are replaced by this one, so that differences of device times

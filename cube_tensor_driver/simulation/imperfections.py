@@ -47,8 +47,8 @@ GROWTH_S = 600.0
 """Duration of a steady load, in s, over which `Imperfections.creep_growth` states the creep."""
 
 MAX_DEVIATIONS = 6
-"""Largest deviation of the creep of a pad from the mean, in standard deviations; larger ones, which
-occur once in 10^9 pads, are cut to it."""
+"""Largest deviation of the creep of a pad from the mean, in standard deviations. Larger random
+deviations, which occur once in 10^9 pads, are limited to it."""
 
 POWER_LAW_TIMES = np.geomspace(1e-4, 1e10, 51)
 """Time constants (51,), in s, of the exponential terms whose sum replaces a power law of creep.

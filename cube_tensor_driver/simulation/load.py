@@ -37,8 +37,8 @@ _ORDERS = np.array([2, 3, 4, 6, 8, 11, 16, 23, 32, 45, 64])
 few, so that many cubes have the same order and are computed together."""
 
 _FAR_RATIO = 0.15
-"""Upper limit of the ratio of a contact's radius to the distance from a cube to the rim of the
-contact. Below this limit, one ring of point forces represents the contact accurately enough."""
+"""Ratio of a contact's radius to the distance from a cube to the rim of the contact, below which
+one ring of point forces represents the contact accurately enough."""
 
 
 def default_script() -> Script:

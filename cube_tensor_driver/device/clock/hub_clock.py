@@ -290,12 +290,13 @@ class HubClock:
         return stamps
 
     def _learn(self, newest_us: int, arrival_ns: int) -> bool:
-        """Fit the clock line to the newest of some samples, and look for steps of the hub's clock.
+        """Fit the clock line to a new sample, and look for steps of the hub's clock.
 
         The clock line states host time as a linear function of device time (the hub's clock).
 
         Args:
-            newest_us: Device time of the newest sample, in µs.
+            newest_us: Device time of the sample, in µs; the newest one of those that arrived
+                together.
             arrival_ns: Host time at which it arrived, in ns.
 
         Returns:

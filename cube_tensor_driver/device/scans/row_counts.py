@@ -72,6 +72,11 @@ class RowCounts:
         self.unaccounted = self._missing(n_waiting)
 
     def _missing(self, n_waiting: int) -> int:
-        """Return how many received rows were neither delivered, left out nor lost, nor wait."""
+        """Return the number of received rows that were not delivered, left out or lost, and do not
+        wait for the rest of their scan.
+
+        Args:
+            n_waiting: Number of rows that wait for the rest of their scan.
+        """
         left_out = self.unknown_cube + self.wrong_pads + self.duplicate + self.overload
         return self.received - self.delivered - left_out - self.lost - n_waiting

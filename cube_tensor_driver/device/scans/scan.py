@@ -29,9 +29,9 @@ MAX_SPAN_NS = 2_000_000_000
 `ScanBuilder.build` returns. These rows become one message, whose 32-bit offsets in ns reach up to
 2.1 s after its time stamp."""
 MAX_PERIODS_EARLIER = 0.75
-"""Largest time, in sample periods, by which an incomplete scan (one sample of each link) may be
-earlier than a sample that is put into it. It is less than one period, so that no sample is put into
-the scan before its own, and well above 0, because the hubs do not sample at the same instant."""
+"""Largest time, in sample periods, by which a scan (one sample of each link) may be earlier than a
+sample that is added to it. With 1 or more, a sample could be added to the scan before its own;
+with 0, hubs that do not sample at exactly the same time could not share a scan."""
 
 # This table holds the temperature, in °C, for each of the 65536 possible values in a SAMPLE frame.
 _PATTERNS = np.arange(1 << 16, dtype=np.uint16)

@@ -224,7 +224,7 @@ class SequenceTracker:
         self.counters.resets += 1
         arrival = self._begin(sequence, device_us, Arrival.RESET)
         if sequence <= MAX_GAP:
-            # Numbers begin at 0 with power-up, so all samples before this one are missing.
+            # Numbers begin at 0 with power-up, so all samples before this one have been lost.
             self.counters.missing += sequence
             self.first = 0
         return arrival

@@ -47,7 +47,8 @@ def decode_in_python(code: bytes) -> bytes | None:
         if end > len(code):
             return None
         blocks.append(code[start + 1 : end])
-        # A zero follows every block of the data, except for blocks of 254 bytes and the last one.
+        # COBS: each block stands for its bytes and a zero. The last block and blocks of the full
+        # length stand for their bytes only.
         if length <= MAX_BLOCK and end < len(code):
             blocks.append(b"\0")
         start = end
