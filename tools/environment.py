@@ -31,37 +31,37 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-"""Folder of the checkout."""
+"""Top folder of the checkout of the repository."""
 
 STATE = ROOT / ".cube"
-"""Folder for everything that is set up."""
+"""Folder for the Python environment, the build results and their logs."""
 
 OLDEST_DISTRO = "humble"
-"""Oldest distribution of ROS 2 that is used when it is sourced; their names are in the order of the
-alphabet."""
+"""Oldest distribution of ROS 2 that is used if the user has sourced it. Names of distributions are
+compared as texts, because ROS 2 names them in alphabetical order."""
 
 WHEEL_DISTROS = ("jazzy", "kilted")
-"""Distributions that exist as wheels. The first is used if none is named."""
+"""Distributions of ROS 2 that pip can install from wheels (Python packages). The first one is the
+default."""
 
 DISTRO_VARIABLE = "CUBE_DISTRO"
-"""Environment variable that passes --distro on to each ./cube that a command starts."""
+"""Environment variable by which a command passes --distro on to other ./cube that it starts."""
 
 OLDEST_PYTHON = (3, 10)
-"""Oldest version of Python for which there are wheels."""
+"""Oldest version of Python for which wheels of ROS 2 exist."""
 
 NEWEST_PYTHON = (3, 14)
-"""Newest version of Python for which there are wheels."""
+"""Newest version of Python for which wheels of ROS 2 exist."""
 
 LINKED_FOLDERS = ("cube_tensor_driver", "launch", "config", "scripts", "rviz")
-"""Folders that are installed as links to their files. A new file needs a build, a changed one does
-not."""
+"""Folders whose files are installed as symbolic links. Only a new file in them requires a build; a
+changed one does not."""
 
 BUILD_INPUTS = ("msg", "srv", "native", "CMakeLists.txt", "package.xml")
-"""Files and folders that need a build after every change."""
+"""Files and folders of the package after whose changes it must be built again."""
 
 WHEELS_PER_LINE = 25
-"""Number of wheels (packages) after which the set-up reports its progress if stderr is no terminal,
-such as a log file."""
+"""Number of wheels (Python packages) per line of progress, if stderr is not a terminal."""
 
 REQUIRED_MODULES = {
     "rclpy": "rclpy",
@@ -72,9 +72,10 @@ REQUIRED_MODULES = {
     "jsonschema": "python3-jsonschema",
     "scipy": "python3-scipy",
 }
-"""Rosdep key of each module that package.xml names and a sourced ROS 2 may lack.
+"""Python module that every command requires -> its rosdep key (name of the dependency).
 
-Commands that need more, such as rich to display something, name themselves what is missing.
+A sourced ROS 2 may lack these modules. A command that requires further ones, such as rich for its
+tables, reports itself which of them are missing.
 """
 
 PIP_OPTIONS = (
@@ -84,13 +85,13 @@ PIP_OPTIONS = (
     "--disable-pip-version-check",
     "--progress-bar=off",
 )
-"""Options of pip that install exactly what the lock file states."""
+"""Options with which pip installs exactly the wheels of the lock file, checked by their hashes."""
 
 LOG_LINES = 15
-"""Number of lines of the log of a failed step that are shown."""
+"""Number of lines at the end of the log that the error message of a failed set-up step quotes."""
 
 TERMINATION_S = 1.0
-"""Time, in seconds, that a step has to end after a signal, before the next signal."""
+"""Time, in seconds, that a process has to end after SIGTERM before it is sent SIGKILL."""
 
 
 class SetupError(Exception):
@@ -99,50 +100,50 @@ class SetupError(Exception):
 
 @dataclass(frozen=True)
 class Paths:
-    """Paths of the environment of a distribution.
+    """Paths of the private environment of one distribution of ROS 2.
 
     Attributes:
-        distro: Name of the distribution.
+        distro: Name of the distribution, such as "jazzy".
     """
 
     distro: str
 
     @property
     def state(self) -> Path:
-        """Folder for everything of this distribution."""
+        """Folder for the Python environment, build results and logs of this distribution."""
         return STATE if self.distro == WHEEL_DISTROS[0] else STATE / self.distro
 
     @property
     def venv(self) -> Path:
-        """Private Python environment."""
+        """Folder of the virtual Python environment with the wheels of ROS 2."""
         return self.state / "venv"
 
     @property
     def install(self) -> Path:
-        """Install space of this package."""
+        """Folder into which colcon installs this package."""
         return self.state / "install" / "cube_tensor_driver"
 
     @property
     def lock(self) -> Path:
-        """File with all wheels and their hashes."""
+        """File that lists the wheels of this distribution with their versions and hashes."""
         return ROOT / "tools" / f"requirements-{self.distro}.lock"
 
 
 def print_status(text: str) -> None:
-    """Print a line about the set-up, apart from the output of the command."""
+    """Print a line about the set-up on stderr, because stdout is for the output of the command."""
     print(f"cube: {text}", file=sys.stderr, flush=True)
 
 
 def run(
     command: list[str], env: dict[str, str], log: Path, on_line: Callable[[str], None] | None = None
 ) -> None:
-    """Run the command of a step. All of its processes are ended when this one is.
+    """Run a command of the set-up. If this process is interrupted, the command is ended, too.
 
     Args:
         command: Program and arguments.
-        env: Environment variables.
-        log: File for the output.
-        on_line: Called with every line of the output.
+        env: Environment variables of the command.
+        log: File to which the output of the command is written.
+        on_line: Function that is called with every line of the output; None: no function.
 
     Raises:
         SetupError: The command failed.
@@ -154,7 +155,7 @@ def run(
             cwd=ROOT,
             text=True,
             errors="replace",
-            # A group of its own can be ended together with all processes that it starts.
+            # In its own process group, the command can be ended with all processes it has started.
             start_new_session=True,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
@@ -170,14 +171,15 @@ def run(
             end_group(process)
             raise
     if code:
-        tail = "".join(log.read_text(errors="replace").splitlines(keepends=True)[-LOG_LINES:])
+        lines = log.read_text(errors="replace").splitlines(keepends=True)
+        tail = "".join(lines[-LOG_LINES:])
         raise SetupError(
             f"{Path(command[0]).name} failed with code {code}:\n{tail}The whole output: {log}"
         )
 
 
 def end_group(process: subprocess.Popen[str]) -> None:
-    """End a step and its children, with SIGTERM first and then with SIGKILL."""
+    """End a process and its children, first with SIGTERM and then with SIGKILL."""
     for number in (signal.SIGTERM, signal.SIGKILL):
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, number)
@@ -186,20 +188,26 @@ def end_group(process: subprocess.Popen[str]) -> None:
 
 
 def compute_digest(*parts: str | Path) -> str:
-    """Return a hash of texts and of the contents of files."""
+    """Return a hash (SHA-256) of texts and of the contents of files, in this order."""
     state = hashlib.sha256()
     for part in parts:
         state.update(part.read_bytes() if isinstance(part, Path) else part.encode())
-        # A separator, so that the parts "ab", "c" differ from "a", "bc".
+        # A separator is added, so that the hash of "ab", "c" differs from that of "a", "bc".
         state.update(b"\0")
     return state.hexdigest()
 
 
 @contextlib.contextmanager
 def step(stamp: Path, value: str) -> Iterator[bool]:
-    """Yield whether the step has to be done; write its stamp when the block ends without error."""
+    """Yield whether the step of the set-up in the `with` block must be done.
+
+    Args:
+        stamp: File with the value with which the step was last completed. It is written when the
+            block ends without error.
+        value: Hash of everything that the result of the step depends on.
+    """
     done = stamp.is_file() and stamp.read_text() == value
-    # Without its stamp, a step that is interrupted is done again.
+    # The stamp is removed first, so that an interrupted step is done again the next time.
     if not done:
         stamp.unlink(missing_ok=True)
     yield not done
@@ -208,13 +216,13 @@ def step(stamp: Path, value: str) -> Iterator[bool]:
 
 
 def has_sourced_ros() -> bool:
-    """Return whether a ROS 2 that is new enough is sourced.
+    """Return whether the user has sourced a distribution of ROS 2 that is new enough.
 
     Raises:
-        SetupError: One is, but modules are missing.
+        SetupError: Such a distribution is sourced, but lacks Python modules or colcon.
     """
     distro = os.environ.get("ROS_DISTRO", "")
-    # A distribution is sourced only if its paths are set as well.
+    # ROS_DISTRO alone does not prove that a distribution is sourced; its paths must be set, too.
     if not distro or not os.environ.get("AMENT_PREFIX_PATH"):
         return False
     if distro < OLDEST_DISTRO:
@@ -234,12 +242,13 @@ def has_sourced_ros() -> bool:
 
 
 def check_system() -> None:
-    """Check the system before any work.
+    """Check that the wheels of ROS 2 can be installed on this system.
 
     Raises:
-        SetupError: There are no wheels for this system, or system packages are missing.
+        SetupError: There are no wheels for this system, or packages of the system are missing.
     """
-    system, version = f"{platform.system()} {platform.machine()}", sys.version_info[:2]
+    system = f"{platform.system()} {platform.machine()}"
+    version = sys.version_info[:2]
     number = f"{version[0]}.{version[1]}"
     if system != "Linux x86_64" or not OLDEST_PYTHON <= version <= NEWEST_PYTHON:
         raise SetupError(
@@ -264,7 +273,7 @@ def check_system() -> None:
 
 
 def make_venv(paths: Paths) -> None:
-    """Make the private environment: every wheel of the lock file, checked against its hash."""
+    """Make the virtual Python environment and install every wheel of the lock file in it."""
     venv, state = paths.venv, paths.state
     stamp = state / "venv.stamp"
     if stamp.exists() and not is_made_here(venv):
@@ -276,11 +285,12 @@ def make_venv(paths: Paths) -> None:
         check_system()
         version = platform.python_version()
         print_status(f"[1/3] private Python {version} environment in {venv.relative_to(ROOT)}")
-        # What an interrupted step or another lock file has left must not be mixed with the new.
+        # Files of an interrupted installation or of another lock file must not stay in the new one.
         shutil.rmtree(venv, ignore_errors=True)
         clean = copy_variables(without=("PYTHONPATH", "PYTHONHOME"))
         run([sys.executable, "-m", "venv", str(venv)], clean, state / "venv.log")
-        name, log = paths.distro.capitalize(), state / "pip.log"
+        name = paths.distro.capitalize()
+        log = state / "pip.log"
         print_status(
             f"[2/3] real ROS 2 {name} and what the package needs, from pinned wheels "
             f"(about 350 MB); log: {log.relative_to(ROOT)}"
@@ -293,12 +303,13 @@ def make_venv(paths: Paths) -> None:
 
 
 def is_made_here(venv: Path) -> bool:
-    """Return whether the commands of a virtual environment start the Python that is in it.
+    """Return whether a virtual environment was made in the folder in which it is now.
 
-    They name it by its absolute path, so they do not if the folder was moved or copied.
+    Its commands contain the absolute path of its Python, so they fail if it was moved or copied.
     """
     try:
-        first = (venv / "bin" / "pip").read_bytes().splitlines()[0].decode(errors="replace")
+        lines = (venv / "bin" / "pip").read_bytes().splitlines()
+        first = lines[0].decode(errors="replace")
     except (OSError, IndexError):
         return False
     interpreter = Path(first.removeprefix("#!").strip())
@@ -307,9 +318,12 @@ def is_made_here(venv: Path) -> bool:
 
 @contextlib.contextmanager
 def show_pip_progress(lock: Path) -> Iterator[Callable[[str], None]]:
-    """Yield a function for every line of pip's output; it counts the wheels.
+    """Yield a function that takes a line of pip's output and shows how many wheels are installed.
 
-    On a terminal one line is updated, elsewhere there is a line for every `WHEELS_PER_LINE` wheels.
+    On a terminal one line is updated; elsewhere a line is printed per `WHEELS_PER_LINE` wheels.
+
+    Args:
+        lock: Lock file, whose number of wheels is the total.
     """
     terminal = sys.stderr.isatty()
     total = len(re.findall(r"^[a-z0-9].*==", lock.read_text(), re.MULTILINE))
@@ -323,7 +337,7 @@ def show_pip_progress(lock: Path) -> Iterator[Callable[[str], None]]:
 
     def on_line(line: str) -> None:
         nonlocal seen, total
-        # pip ignores wheels whose markers do not fit this Python.
+        # pip ignores wheels of the lock file that are for other versions of Python.
         if line.startswith("Ignoring "):
             total -= 1
         elif line.startswith("Collecting "):
@@ -340,7 +354,10 @@ def show_pip_progress(lock: Path) -> Iterator[Callable[[str], None]]:
 
 
 def correct_cmake_exports(venv: Path) -> None:
-    """Replace the include paths of the build machine in the CMake exports of the wheels by ours."""
+    """Correct the include paths in the CMake files of the wheels.
+
+    These files contain the paths of Python and numpy on the machine that built the wheels.
+    """
     site = next(venv.glob("lib/python3.*/site-packages"))
     numpy_includes = (site / "numpy/_core/include", site / "numpy/core/include")
     ours = {
@@ -358,13 +375,13 @@ def correct_cmake_exports(venv: Path) -> None:
 
 
 def copy_variables(*, without: tuple[str, ...]) -> dict[str, str]:
-    """Return the variables of this process except those with certain beginnings."""
+    """Return the environment variables, except those whose names begin with a text in `without`."""
     return {name: value for name, value in os.environ.items() if not name.startswith(without)}
 
 
 def make_private_variables(venv: Path) -> dict[str, str]:
-    """Return the variables of the private environment, without those of a sourced ROS 2."""
-    # Each wheel has its shared libraries beside its modules.
+    """Return the environment variables for the private environment instead of a sourced ROS 2."""
+    # Each wheel has a folder with its shared libraries beside its Python modules.
     bundled = [str(path) for path in venv.glob("lib/python3.*/site-packages/ros_*.libs")]
     inherited = copy_variables(without=("ROS_DISTRO", "COLCON_", "PYTHONHOME"))
     return inherited | {
@@ -375,13 +392,19 @@ def make_private_variables(venv: Path) -> dict[str, str]:
         "AMENT_PREFIX_PATH": str(venv),
         "CMAKE_PREFIX_PATH": str(venv),
         "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp",
-        # The wheels would otherwise start every interpreter a second time to set what we set here.
+        # Without this variable, the wheels start Python a second time to set the variables above.
         "_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1",
     }
 
 
 def build(env: dict[str, str], python: str, state: Path) -> None:
-    """Build this folder with colcon if the inputs of the build have changed."""
+    """Build the package with colcon if the inputs of the build have changed.
+
+    Args:
+        env: Environment variables of the build.
+        python: Path of the Python for which the package is built.
+        state: Folder for the build results.
+    """
     sources = [path for folder in ("msg", "srv", "native") for path in ROOT.glob(f"{folder}/*.*")]
     sources += [ROOT / "CMakeLists.txt", ROOT / "package.xml"]
     linked = [
@@ -400,8 +423,8 @@ def build(env: dict[str, str], python: str, state: Path) -> None:
         print_status(
             f"[3/3] building the messages and the wire with colcon; log: {log.relative_to(ROOT)}"
         )
-        # CMake refuses include paths below the source folder, and the private environment is
-        # there, so a folder of links is built.
+        # CMake refuses include paths inside the source folder, but the private environment lies in
+        # the checkout. Therefore a separate folder with links to the checkout is built.
         source = state / "src" / "cube_tensor_driver"
         remove_foreign_build(state, source)
         shutil.rmtree(source, ignore_errors=True)
@@ -418,9 +441,9 @@ def build(env: dict[str, str], python: str, state: Path) -> None:
 
 
 def remove_foreign_build(state: Path, source: Path) -> None:
-    """Remove what was built from another folder than `source`.
+    """Remove build results if they were made from another folder than `source`.
 
-    That happens in a checkout that was moved or copied, and CMake would refuse to continue.
+    This is so after the checkout was moved or copied; CMake would refuse to build again.
     """
     caches = state.glob("build/*/CMakeCache.txt")
     home = f"CMAKE_HOME_DIRECTORY:INTERNAL={source}"
@@ -430,9 +453,9 @@ def remove_foreign_build(state: Path, source: Path) -> None:
 
 
 def add_package(env: dict[str, str], install: Path) -> dict[str, str]:
-    """Return the variables with this package in front of the search paths.
+    """Return environment variables whose search paths begin with the paths of this package.
 
-    The modules come from the checkout, the messages from the install space.
+    Its Python modules are found in the checkout, its messages in the folder `install`.
     """
     places = ("lib/python3.*/site-packages", "local/lib/python3.*/dist-packages")
     site = next(path for place in places for path in install.glob(place))
@@ -450,21 +473,20 @@ def add_package(env: dict[str, str], install: Path) -> dict[str, str]:
 
 
 def split_distro(arguments: list[str]) -> tuple[str, list[str]]:
-    """Split `--distro` from the front of the arguments.
+    """Separate the option `--distro` from the arguments of ./cube.
 
     Returns:
-        The distribution, "" for none, and the other arguments.
+        The distribution of ROS 2 ("" if none is named), and the other arguments.
 
     Raises:
-        SetupError: There are no wheels of this distribution.
+        SetupError: There are no wheels for this distribution.
     """
-    distro, rest = os.environ.get(DISTRO_VARIABLE, ""), arguments
     if arguments[:1] == ["--distro"]:
         distro, rest = "".join(arguments[1:2]), arguments[2:]
     elif arguments and arguments[0].startswith("--distro="):
         distro, rest = arguments[0].partition("=")[2], arguments[1:]
     else:
-        return distro, rest
+        return os.environ.get(DISTRO_VARIABLE, ""), arguments
     if distro not in WHEEL_DISTROS:
         raise SetupError(
             f"--distro {distro}: there are wheels of {' and '.join(WHEEL_DISTROS)}; for another "
@@ -474,14 +496,14 @@ def split_distro(arguments: list[str]) -> tuple[str, list[str]]:
 
 
 def prepare(distro: str) -> tuple[str, dict[str, str]]:
-    """Set up what is missing.
+    """Make the private environment and build the package, as far as this is not done yet.
 
     Args:
-        distro: Distribution whose private environment is used; "" for the sourced ROS 2, or else
-            the first of `WHEEL_DISTROS`.
+        distro: Distribution whose private environment is used. "" stands for the sourced ROS 2, and
+            for the first of `WHEEL_DISTROS` if none is sourced.
 
     Returns:
-        The interpreter and the environment variables to run commands with.
+        Path of the Python that runs the command, and the environment variables of the command.
     """
     paths = Paths(distro or WHEEL_DISTROS[0])
     paths.state.mkdir(parents=True, exist_ok=True)
@@ -503,7 +525,7 @@ def prepare(distro: str) -> tuple[str, dict[str, str]]:
 
 
 def explain_refusal(folder: Path) -> str:
-    """Return why a folder cannot be written, and what to do about it."""
+    """Return whose folder cannot be written, and what to do about it, for an error message."""
     there = folder if folder.exists() else folder.parent
     uid = there.stat().st_uid
     try:
@@ -517,23 +539,27 @@ def explain_refusal(folder: Path) -> str:
 
 
 def interrupt(*_: object) -> None:
-    """Treat a signal as Ctrl-C."""
+    """Raise KeyboardInterrupt; a handler by which a signal has the effect of Ctrl-C."""
     raise KeyboardInterrupt
 
 
 def main(arguments: list[str]) -> int:
-    """Set up the environment and become the command; return only the code of an error."""
+    """Set up the environment and replace this process by the command.
+
+    Returns:
+        Exit code of an error; without an error, the function does not return.
+    """
     sys.path.insert(0, str(ROOT))
     from cube_tensor_driver.cli.main import parse
 
-    # Help, --version and usage errors end here (SystemExit), before anything is set up. A reader
-    # of their output, such as head, may close the pipe.
+    # With this handler, the process ends silently if the reader of its help text closes the pipe.
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)
     try:
         distro, arguments = split_distro(arguments)
     except SetupError as error:
         print_status(str(error))
         return 2
+    # Help, --version and wrong arguments raise SystemExit here, before anything is set up.
     parse(arguments)
     signal.signal(signal.SIGTERM, interrupt)
     try:
@@ -550,7 +576,7 @@ def main(arguments: list[str]) -> int:
     except OSError as error:
         print_status(f"set-up failed: {error}")
         return 1
-    # The command replaces this process, so that signals and the exit code are its own.
+    # The command replaces this process, so that it gets all signals and sets the exit code.
     command = [python, "-m", "cube_tensor_driver.cli", *arguments]
     try:
         os.execve(python, command, env)

@@ -20,11 +20,11 @@ if __name__ == "__main__":
         # If stdout cannot be written, this raises OSError, which is handled below.
         sys.stdout.flush()
     except KeyboardInterrupt:
-        # `main` handles Ctrl-C while the command runs; here it came while arguments were parsed.
+        # `main` handles Ctrl-C while the command runs, but not while arguments are parsed.
         code = INTERRUPTED
     except OSError as error:
-        # Errors of files are CubeErrors, which `main` handles, so this one is of stdout. Python
-        # flushes stdout once more when it ends; without this redirection that would fail again.
+        # Writing to stdout failed. (Errors of other files are CubeErrors, which `main` handles.)
+        # Python flushes stdout again at its exit, so stdout is redirected to avoid a second error.
         if error.errno not in (errno.EPIPE, errno.ENOSPC):
             raise
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -76,7 +76,7 @@ def show_bag(path: Path) -> None:
         # A bag without messages has no start and end time.
         if any(connection.msgcount for connection in bag.connections):
             duration_s = (bag.end_ns - bag.start_ns) * 1e-9
-            # The start is printed in ms, because its nanoseconds are of no interest to a reader.
+            # The start is printed with a resolution of 1 ms.
             start = np.datetime64(bag.start_ns, "ns").astype("datetime64[ms]")
             say(f"{path}: {duration_s:.3f} s from {start} UTC")
         else:
@@ -99,7 +99,8 @@ def show_topics(bag: Bag, duration_s: float) -> None:
     from ..views.terminal.output import print_table
 
     rows = []
-    for connection in sorted(bag.connections, key=lambda connection: connection.topic):
+    connections = sorted(bag.connections, key=lambda connection: connection.topic)
+    for connection in connections:
         count = connection.msgcount
         # A rate needs at least two messages.
         rate = f"{count / duration_s:.1f}" if duration_s and count > 1 else ""
@@ -128,11 +129,13 @@ def show_skin(bag: Bag, topic: str) -> None:
     frame, version = info.header.frame_id, info.version
     cubes = counted(len(info.cubes), "cube")
     say(f"skin {info.name!r}: {cubes} in {frame}, info version {version}")
-    for name, count in Counter(cube.calibration_id for cube in info.cubes).items():
-        # All cubes with the same calibration have the same layout, unless a file was edited.
-        layouts = sorted({cube.layout for cube in info.cubes if cube.calibration_id == name})
+    counts = Counter(cube.calibration_id for cube in info.cubes)
+    for name, count in counts.items():
+        # One calibration has one layout. A bag with several, which is damaged, shows all of them.
+        layouts = {cube.layout for cube in info.cubes if cube.calibration_id == name}
+        layout = ", ".join(sorted(layouts))
         cubes = counted(count, "cube")
-        say(f"  calibration {name}, layout {', '.join(layouts)}: {cubes}")
+        say(f"  calibration {name}, layout {layout}: {cubes}")
 
     rows = []
     for cube in cube_summaries(bag, topic, info):
@@ -151,7 +154,7 @@ def diagnostics_line(status: Any) -> str:
     Args:
         status: A message diagnostic_msgs/DiagnosticStatus.
     """
-    values = [
-        f"{pair.key} {pair.value}" for pair in status.values if pair.value not in ("0", "0.0", "")
-    ]
-    return f"{status.name}: {status.message or 'nothing wrong'}; {', '.join(values)}"
+    empty = ("0", "0.0", "")
+    values = [f"{pair.key} {pair.value}" for pair in status.values if pair.value not in empty]
+    message = status.message or "nothing wrong"
+    return f"{status.name}: {message}; {', '.join(values)}"

@@ -91,7 +91,7 @@ def run(options: argparse.Namespace) -> int:
         rest = watch_rest(source, screen)
         explanations = press_cubes(source, rest)
 
-    # The findings about all cubes are printed before it is decided whether a file is written.
+    # The results of all cubes are printed, even if one of them prevents that the file is written.
     for cube, explanation in explanations.items():
         data["cubes"][cube]["pose"]["rpy"] = rpy(explanation.rotation)
         show_explanation(names[cube], explanation, pads)
@@ -191,12 +191,15 @@ def watch_rest(source: LinkSource, screen: PadScreen) -> PadsAtRest:
     next_shown_s = 0.0
     for rows in source:
         parts.append(split_into_scans(rows, len(source.skin.cubes)))
-        now_s = float(parts[-1][1][-1] - parts[0][1][0])
+        _, first_times = parts[0]
+        _, last_times = parts[-1]
         # The duration is measured by the stamps of the samples and not by the computer's clock, so
         # that a slow computer collects as many samples as a fast one.
+        now_s = float(last_times[-1] - first_times[0])
         is_over = now_s >= REST_S
-        has_enough = sum(len(each) for each, _ in parts) >= MIN_SAMPLES
-        if not has_enough or not (is_over or now_s >= next_shown_s):
+        is_due = is_over or now_s >= next_shown_s
+        n_samples = sum(len(each) for each, _ in parts)
+        if n_samples < MIN_SAMPLES or not is_due:
             continue
         next_shown_s = now_s + AVERAGE_S
         frequency, seconds = (np.concatenate(each) for each in zip(*parts, strict=True))
@@ -258,7 +261,7 @@ def press_cubes(source: LinkSource, rest: PadsAtRest) -> dict[int, Explanation]:
     while waiting:
         which = "a cube that was not pressed yet," if explanations else "a cube"
         first_side, *other_sides = SIDES
-        # The cube that the first press loads is the one that the other presses must load, too.
+        # The user chooses the cube by the first press; the other presses must load the same cube.
         presses = [wait_for_press(waiting, f"{which} on its {first_side} side")]
         cube = presses[0].cube
         for side in other_sides:
@@ -345,8 +348,10 @@ def pad_fault(rest: PadsAtRest, cube: int, pad: int) -> str:
         cube: Index of the cube on the hub.
         pad: Index of the pad on the cube.
     """
-    faults = [name for name in ("silent", "stuck", "noisy") if getattr(rest, name)[cube, pad]]
-    return faults[0] if faults else ""
+    for name in ("silent", "stuck", "noisy"):
+        if getattr(rest, name)[cube, pad]:
+            return name
+    return ""
 
 
 def show_explanation(name: str, explanation: Explanation, pads: Sequence[str]) -> None:
@@ -386,7 +391,8 @@ def rpy(rotation: np.ndarray) -> list[float]:
     """
     from ..core.tensor import quaternion_from_rotation, rpy_from_quaternion
 
-    angles = rpy_from_quaternion(quaternion_from_rotation(rotation))
+    quaternion = quaternion_from_rotation(rotation)
+    angles = rpy_from_quaternion(quaternion)
     # Adding 0.0 turns -0.0 into 0.0, so that no "-0.0" is written into the file.
     return [round(float(angle) + 0.0, 9) for angle in angles]
 
@@ -399,4 +405,5 @@ def rotation_text(rotation: np.ndarray) -> str:
     """
     import math
 
-    return " ".join(f"{math.degrees(angle):.0f}°" for angle in rpy(rotation))
+    degrees = [math.degrees(angle) for angle in rpy(rotation)]
+    return " ".join(f"{angle:.0f}°" for angle in degrees)

@@ -74,16 +74,17 @@ def write_grid(options: argparse.Namespace) -> int:
     # Each option has the name of its argument of `grid`.
     names = "name", "nx", "ny", "pitch", "links", "calibration", "layout", "rate", "port"
     skin = grid(**{name: getattr(options, name) for name in names})
-    # Of a large grid only a few cubes are checked, because checking all of them would take longer
-    # than writing the file.
-    part = skin if len(skin["cubes"]) <= MAX_SPACED_CUBES else ends_of_links(skin)
+    # If the grid is large, only a few of its cubes are checked, because checking all of them would
+    # take longer than writing the file.
+    is_large = len(skin["cubes"]) > MAX_SPACED_CUBES
+    part = ends_of_links(skin) if is_large else skin
     checked, mistakes = check_skin_data(part, options.output.parent)
     if checked is not None:
         mistakes = list(pose_doubts(checked))
     if mistakes:
         raise ConfigError(f"grid: {mistakes[0]}")
     size = f"{options.nx} x {options.ny} cubes, {1e3 * options.pitch:g} mm apart"
-    # The text is printed, and written into the header of the file.
+    # This text is printed and also becomes the header of the file.
     text = f"{size}, on {counted(options.links, 'link')}"
     with working(f"writing {len(skin['cubes'])} cubes"):
         write_yaml(options.output, skin, f"{text}. docs/config.md describes the keys.")
@@ -94,8 +95,8 @@ def write_grid(options: argparse.Namespace) -> int:
 def ends_of_links(skin: dict[str, Any]) -> dict[str, Any]:
     """Return the content of a grid's skin file, reduced to the first and last cube of each link.
 
-    Checking these cubes is enough, because all cubes between them are described alike. A link is
-    the connection to one hub.
+    It is sufficient to check these cubes, because the entries of the cubes between them differ only
+    in names, indices and positions. A link is the connection to one hub.
     """
     first: dict[str, Any] = {}
     last: dict[str, Any] = {}
@@ -120,8 +121,8 @@ def check_file(path: Path) -> int:
     # `working` shows that the command is busy, because a skin of thousands of cubes takes seconds.
     with working(f"checking {path}"):
         skin, mistakes = check_skin(path)
-        # Doubtful poses, and lines that are too slow for the sample rate, can be found only in a
-        # file without mistakes.
+        # Implausible poses, and serial lines that are too slow for the sampling rate, can only be
+        # found if the file describes a valid skin.
         if skin is not None:
             mistakes = [*pose_doubts(skin), *find_slow_lines(skin)]
     for mistake in mistakes:

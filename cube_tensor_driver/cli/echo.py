@@ -50,17 +50,22 @@ def reading_line(reading: StressReading) -> str:
 
     pairs = zip(COMPONENTS, reading.values, strict=True)
     observed = {name: value for name, value in pairs if not math.isnan(value)}
-    stress = [f"{name} {value:9.1f}" for name, value in observed.items() if name in STRESS]
-    gradient = [f"{name} {value:10.0f}" for name, value in observed.items() if name not in STRESS]
+    stress, gradient = [], []
+    for name, value in observed.items():
+        if name in STRESS:
+            stress.append(f"{name} {value:9.1f}")
+        else:
+            gradient.append(f"{name} {value:10.0f}")
     parts = [f"{reading.stamp_ns * 1e-9:.3f} s", reading.cube]
-    # All stresses have one unit, which stands only behind the last of them; so have gradients.
+    # The unit is written once after all stresses, and once after all gradients.
     if stress:
         parts += [*stress[:-1], f"{stress[-1]} Pa"]
     if gradient:
         parts += [*gradient[:-1], f"{gradient[-1]} Pa/m"]
     if not math.isnan(reading.residual):
         parts.append(f"residual {reading.residual:.2f}")
-    parts.append(", ".join(status_words(reading.status)) or "ok")
+    words = status_words(reading.status)
+    parts.append(", ".join(words) or "ok")
     return "  ".join(parts)
 
 
@@ -73,12 +78,16 @@ def reading_json(reading: StressReading) -> str:
     from ..config.output_files import to_json
     from ..core.modes import COMPONENTS, STRESS
 
-    values = dict(zip(COMPONENTS, reading.values, strict=True))
+    stress: dict[str, float] = {}
+    gradient: dict[str, float] = {}
+    for name, value in zip(COMPONENTS, reading.values, strict=True):
+        components = stress if name in STRESS else gradient
+        components[name] = value
     content = {
         "stamp_ns": reading.stamp_ns,
         "cube": reading.cube,
-        "stress_pa": {name: values[name] for name in COMPONENTS if name in STRESS},
-        "gradient_pa_per_m": {name: values[name] for name in COMPONENTS if name not in STRESS},
+        "stress_pa": stress,
+        "gradient_pa_per_m": gradient,
         "residual": reading.residual,
         "status": status_words(reading.status),
     }
@@ -86,9 +95,9 @@ def reading_json(reading: StressReading) -> str:
 
 
 def status_words(status: int) -> list[str]:
-    """Return the names of the bits that are set in the status of a row, as in SkinStress.msg.
+    """Return the status bits of a row in words, with the names in SkinStress.msg.
 
-    They are followed by the reasons for which pads were left out of the computation.
+    The last words are the reasons for which pads were left out of the computation, if any were.
     """
     from ..core.status import STATUS, WORDS
 

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 UNUSUAL_DEPTH = 2
 """Ratio of the largest to the usual number of samples per frame above which a warning is printed.
 
-A frame is one time step of a LeRobot data set. All frames have room for as many samples as the
-largest one has, so a single unusual frame enlarges the whole data set.
+A frame is one time step of a LeRobot data set. All frames are stored with the size of the largest
+one, so a single frame with unusually many samples enlarges the whole data set.
 """
 
 TABLES = {
@@ -99,8 +99,8 @@ def run(options: argparse.Namespace) -> int:
             check_empty(options.output)
         return reprocess.run(options)
 
-    # All bags become one data set, so these choices apply to every bag. Each option has the name of
-    # its field.
+    # All bags become one data set with the same choices. Each field of `Choices` has the value of
+    # the option with the same name.
     options.overrides = reprocess.overrides_of(options)
     choices = Choices(**{field.name: getattr(options, field.name) for field in fields(Choices)})
     with progress_bar() as report:

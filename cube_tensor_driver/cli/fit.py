@@ -230,17 +230,18 @@ def run_creep(options: argparse.Namespace) -> int:
 def read_inputs(
     options: argparse.Namespace, layout: Layout
 ) -> tuple[Loads, Calibration, Array, str]:
-    """Read the loads, and the base calibration, which provides what the fit does not determine.
+    """Read the loads, and the base calibration with the quantities that are not fitted.
 
-    It provides the pad law (relation of the stress on a pad and its relative change of frequency,
-    with the parameters beta and foam modulus), half the side of the cube, and the noise.
+    These quantities are the pad law (relation between the stress on a pad and its relative change
+    of frequency, with the parameters beta and foam modulus), half the cube's side, and the noise.
 
     Args:
         options: The options of the command.
         layout: Layout of the cube's pads.
 
     Returns:
-        Loads; base calibration; rest frequencies (pads,) in Hz; origin of the latter, in words.
+        Loads; base calibration; rest frequencies (pads,) in Hz; origin of the rest frequencies, in
+        words.
 
     Raises:
         CubeError: The table or bag cannot be used, or there is no base calibration.
@@ -257,8 +258,8 @@ def read_inputs(
         loads, base = read_recorded_loads(
             options.loads, options.cube, options.reference, layout, options.area
         )
-        # A reference sensor never measures exactly 0, so no recorded row counts as unloaded. The
-        # rest frequencies are those that the recorded skin used after its last tare.
+        # Unloaded rows cannot be found in a bag, because a reference sensor never measures exactly
+        # 0. Therefore the rest frequencies are those of the last tare during the recording.
         rest, rest_source = base.rest_frequency, "of the bag, after tare"
     # A bag contains no loads; --reference names the topic with the loads.
     elif is_bag(options.loads):

@@ -34,7 +34,8 @@ ended.
 """
 
 RESEND_S = 0.01
-"""Time, in seconds, from a Ctrl-C that Python has lost until SIGINT is sent again."""
+"""Time, in seconds, after which SIGINT is sent again if Python has lost the KeyboardInterrupt of a
+Ctrl-C (see `interrupt_again`)."""
 
 WHEELS = {
     "PIL": "pillow",
@@ -73,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"cube: {error}", file=sys.stderr)
         return 1
     except ModuleNotFoundError as error:
-        # The package does not require libraries that only some commands need.
+        # Libraries that only some commands need are not installed with the package.
         print(f"cube: {missing_module_text(error.name or '')}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
@@ -96,7 +97,8 @@ def missing_module_text(name: str) -> str:
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
     """Return the options of a command, with the function that executes it as `options.run`.
 
-    It needs only the standard library.
+    Only the standard library is required, because ./cube also parses before other libraries are
+    installed.
 
     Args:
         arguments: The command and its options.

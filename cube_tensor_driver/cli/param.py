@@ -33,6 +33,7 @@ def shown(value: object) -> str:
     """Return the value of a parameter as YAML on one line."""
     from ..config.yaml import to_yaml
 
-    # As a document of its own, a text would be followed by an end-of-document mark ("...").
-    # Therefore it is written as a list of one entry, whose brackets are removed.
-    return to_yaml([value]).strip()[1:-1]
+    # PyYAML writes an end-of-document mark ("...") after a single text. Therefore the value is
+    # written as a list with one entry, and the brackets of the list are removed.
+    text = to_yaml([value]).strip()
+    return text.removeprefix("[").removesuffix("]")

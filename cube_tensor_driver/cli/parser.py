@@ -66,7 +66,8 @@ class Parser(argparse.ArgumentParser):
                 computes the path from the parsed options.
         """
         metavar = "DIR" if kind == "folder" else "FILE"
-        action = self.add_argument(*flags, **{"type": Path, "metavar": metavar} | settings)
+        settings = {"type": Path, "metavar": metavar} | settings
+        action = self.add_argument(*flags, **settings)
         self._outputs.append(Output(flags[0], action.dest, kind))
         self.set_defaults(outputs=self._outputs)
 
@@ -135,7 +136,7 @@ class Parser(argparse.ArgumentParser):
         if words[:1] in (["-h"], ["--help"]):
             self.print_help()
             self.exit()
-        # argparse would accept a missing word as an empty list.
+        # argparse itself does not report a missing word: it returns an empty list.
         if self._missing and not words:
             self.exit(2, f"{self._prefix()}{self._missing}\n")
         namespace, _ = super().parse_known_args([], namespace)
@@ -153,7 +154,8 @@ class Parser(argparse.ArgumentParser):
         if self._subcommands is not None:
             known = list(self._subcommands.choices)
             word = next((word for word in words if not word.startswith("-")), None)
-            if word is None and not {"-h", "--help"} & set(words):
+            wants_help = "-h" in words or "--help" in words
+            if word is None and not wants_help:
                 self.error(f"one of these has to follow: {', '.join(known)}")
             if word is not None and word not in known:
                 self.error(f"unknown command {word}; {nearest(word, known)}")
@@ -209,7 +211,8 @@ def nearest(word: str, known: Iterable[str]) -> str:
     names = {one.lstrip("-"): one for one in known if len(one) > 2}
     close = difflib.get_close_matches(word.lstrip("-"), names, n=2)
     if close:
-        return f"did you mean {' or '.join(names[one] for one in close)}?"
+        meant = " or ".join(names[one] for one in close)
+        return f"did you mean {meant}?"
     return f"known: {', '.join(names.values())}"
 
 

@@ -40,7 +40,7 @@ def arguments(parser: Parser) -> None:
     parser.add_argument(
         "--contacts",
         nargs="*",
-        metavar=("METHOD", "KEY:=VALUE"),
+        metavar=("METHOD", "KEY:=VAL"),
         help="add contacts and traction, as the node contacts makes them, with method:=METHOD "
         "and its other parameters: depth:=0.005 thickness:=0.011 rate:=20",
     )
@@ -116,7 +116,7 @@ def run(options: argparse.Namespace) -> int:
                 else:
                     console.print(result_line(job.output, result))
     finally:
-        # The folder of a bag that was interrupted must not look like a complete result.
+        # If no bag was completed, the folder is removed, so that the command can be given again.
         remove_without_results(options.output)
     if failed:
         console.print(f"{failed} of {len(jobs)} bags could not be reprocessed", style="red")
@@ -159,14 +159,15 @@ def overrides_of(options: argparse.Namespace) -> Overrides:
         if not 0 <= begin < end:
             raise ConfigError(f"--tare-from {begin:g} {end:g}: needed is 0 <= T0 < T1, in s")
     if options.calibration is not None:
-        calibration = read_calibration(find_calibration(options.calibration, Path()))
+        path = find_calibration(options.calibration, Path())
+        calibration = read_calibration(path)
     if options.skin is not None:
         skin = read_skin(options.skin)
     return Overrides(calibration, skin, tare)
 
 
 def contacts_of(options: argparse.Namespace) -> ContactOptions | None:
-    """Return the settings for computing contacts, or None without the option --contacts.
+    """Return the options with which contacts are computed; None without the option --contacts.
 
     Raises:
         ConfigError: The output format cannot contain contacts, or the node `contacts` would refuse
@@ -187,9 +188,12 @@ def contacts_of(options: argparse.Namespace) -> ContactOptions | None:
     if method not in CONTACT_METHODS:
         raise ConfigError(f"--contacts {method}: the methods are {', '.join(CONTACT_METHODS)}")
 
-    # Of the parameters of the node `contacts`, only the numbers and the influence table affect the
-    # result; the others concern its topics.
-    known = {one.name: one for one in CONTACTS if one.span is not None or one.name == "influence"}
+    # Only the numbers and the influence table can be assigned. The other parameters of the node
+    # `contacts` do not affect the computed contacts.
+    known = {}
+    for one in CONTACTS:
+        if one.span is not None or one.name == "influence":
+            known[one.name] = one
     values = {name: one.default for name, one in known.items()}
     for text in assignments:
         name, _, value = text.partition(":=")

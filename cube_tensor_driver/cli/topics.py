@@ -30,10 +30,10 @@ def run(options: argparse.Namespace) -> int:
 
 
 def cubes_text(cubes: list[str]) -> str:
-    """Return the number and the names of the cubes whose topics one line of the list represents.
+    """Return the number and names of the cubes that have a topic of the same kind, as a text.
 
     Args:
-        cubes: Names of the cubes; empty for a topic of the whole skin, which gives an empty text.
+        cubes: Names of the cubes. They are empty for a topic of the whole skin, and so is the text.
     """
     from ..views.terminal.output import counted
 

@@ -79,8 +79,8 @@ def named_layout(name: str) -> Layout:
 def shipped_calibration(layout: Layout) -> Calibration | None:
     """Return the calibration that the package contains for a built-in layout.
 
-    It was computed with finite elements, not measured. In the returned copy no mode (component of
-    stress or gradient) is neglected. A layout that is not built in has none, and gives None.
+    The calibration was computed with finite elements, not measured. Its list of neglected modes
+    (components of stress or gradient) is emptied. The result is None for any other layout.
     """
     # A layout that was read from a file may have the name of a built-in one but other pads.
     built_in = LAYOUTS.get(layout.name)

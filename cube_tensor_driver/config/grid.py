@@ -72,7 +72,8 @@ def grid(
             "number of the link belongs"
         )
 
-    # Leading zeros (c00, c01, ...) make the alphabetical order of names that of the cubes.
+    # Names have leading zeros (c00, c01, ...), so that sorting them by text gives the same order as
+    # sorting the cubes by number.
     digits = len(str(n_cubes - 1))
     cubes = []
     for number in range(n_cubes):

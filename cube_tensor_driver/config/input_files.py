@@ -31,7 +31,8 @@ _ARCHIVE_ERRORS = (
 )
 """Errors that zipfile and NumPy raise for a damaged file of arrays (.npz).
 
-`RuntimeError` is that for a member that seems to be encrypted or compressed by an unknown method.
+zipfile raises `RuntimeError` if damage makes a member look encrypted, or compressed by an unknown
+method.
 """
 
 

@@ -218,12 +218,15 @@ def interpolate_knots(knots: Array, when: float | Array) -> Array:
         knots: The values at the knots, (K, ...), with K of at least 2.
         when: Normalised time, from 0 at the first knot to 1 at the last one; a number or an array.
     """
-    position = np.clip(when, 0.0, 1.0) * (len(knots) - 1)
-    first = np.minimum(np.floor(position).astype(int), len(knots) - 2)
-    part = 0.5 - 0.5 * np.cos(np.pi * (position - first))
+    last = len(knots) - 1
+    position = np.clip(when, 0.0, 1.0) * last
+    first = np.floor(position).astype(int)
+    first = np.minimum(first, last - 1)
+    weight = 0.5 - 0.5 * np.cos(np.pi * (position - first))
     # If the knots are vectors, the same weight applies to each component.
-    part = part.reshape(part.shape + (1,) * (knots.ndim - 1))
-    value: Array = knots[first] + part * (knots[first + 1] - knots[first])
+    weight = weight.reshape(weight.shape + (1,) * (knots.ndim - 1))
+    change = knots[first + 1] - knots[first]
+    value: Array = knots[first] + weight * change
     return value
 
 
@@ -301,12 +304,12 @@ def _max_shear_ratio(action: Action) -> float:
     if len(action.shear) == 1:
         return float(np.linalg.norm(action.shear) / action.force.max())
 
-    # The first and last instants are left out: both forces may be 0 there, and so the ratio 0/0.
+    # The first and last instants are left out, because both forces may be 0 there.
     when = np.linspace(0, 1, FRICTION_SAMPLES)[1:-1]
     force = interpolate_knots(action.force, when)
     shear = np.linalg.norm(interpolate_knots(action.shear, when), axis=-1)
     without_force = np.where(shear > 0, np.inf, 0.0)
-    # An indenter with a tangential but no normal force slips, so that ratio is infinite.
+    # A tangential force without a normal force makes the indenter slip: its ratio is infinite.
     ratio = np.divide(
         shear,
         force,

@@ -19,7 +19,7 @@ from uuid import uuid4
 from ..core.errors import ConfigError
 
 YAML_SUFFIXES = (".yaml", ".yml")
-"""Suffixes by which a path is recognised as that of a YAML file."""
+"""Suffixes of the names of YAML files."""
 
 
 @contextmanager
@@ -44,8 +44,8 @@ def atomic_write(path: Path) -> Iterator[Path]:
 def check_writable(path: Path) -> None:
     """Raise ConfigError if `atomic_write` could not write this file.
 
-    A temporary file is made beside it and removed. To read its permissions would not
-    suffice: root passes every check of permissions, even below /proc and on read-only file systems.
+    A temporary file is made in the same folder and removed. Checking permissions is not sufficient:
+    the user root passes every such check, even for /proc and for read-only file systems.
     """
     with _temporary_file(path):
         pass
@@ -85,7 +85,8 @@ def check_folder(option: str, path: Path | None) -> None:
     if path is None:
         return
     # The test file is made in the closest parent that exists.
-    existing = next(parent for parent in (path, *path.absolute().parents) if parent.exists())
+    candidates = (path, *path.absolute().parents)
+    existing = next(folder for folder in candidates if folder.exists())
     problem = "is no folder"
     if existing.is_dir():
         problem = f"{existing} cannot be written"
@@ -151,7 +152,7 @@ def temporary_folder(prefix: str) -> Path:
         prefix: Text with which the name of the folder begins.
     """
     folder = Path(tempfile.mkdtemp(prefix=prefix))
-    # At exit and not earlier: nodes that a launch file starts read files of the folder until then.
+    # The folder is kept until this process exits, because the nodes that it starts read its files.
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder
 
@@ -161,7 +162,7 @@ def _temporary_file(path: Path) -> Iterator[Path]:
     """Yield the path of a new file in the folder of `path`; it is removed when the block ends.
 
     Raises:
-        ConfigError: An error of the operating system occurred in the block, or `path` is no file.
+        ConfigError: An OSError was raised in the block, or `path` is a folder or a device.
     """
     # A rename is atomic only within one file system, so the file lies in the same folder. Its name
     # is random, because several processes may write `path` at the same time.

@@ -41,10 +41,10 @@ def find_shipped(pattern: str, name: str, folder: Path, advice: str) -> Path:
     Args:
         pattern: Path of such files below config/ in the package, with * for the name.
         name: Name of a file in the package, or a path relative to `folder`. The package is searched
-            first, so that a file which happens to have that name in the folder (cube is the
-            executable of a checkout, for example) is not taken.
-        folder: Folder in which the user names files.
-        advice: What can be named, for the error message.
+            first, because the folder can contain an unrelated file of that name: "cube", for
+            example, is also the program ./cube of a checkout.
+        folder: Folder to which a relative path refers.
+        advice: Description of the files that can be named, for the error message.
 
     Raises:
         ConfigError: The package has no file of this name and the path leads to none. The message

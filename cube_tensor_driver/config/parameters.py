@@ -23,9 +23,9 @@ QUANTITIES = ("pressure", "shear", "gradient", *STRESS, "residual")
 
 
 def hardware_problem(name: str) -> str:
-    """Return an error message for the name of a hardware component, or "" if it is valid.
+    """Return an error message for the name of a ros2_control hardware component, "" if it is valid.
 
-    The name, with "_" for "/", becomes a part of the name of topics.
+    Names of topics contain this name, with each "/" replaced by "_".
     """
     if re.fullmatch("[A-Za-z_][A-Za-z0-9_/]*", name):
         return ""
@@ -42,7 +42,8 @@ class Parameter(NamedTuple):
         span: Smallest and largest allowed value of a number, both included; None: no limits.
         choices: Allowed values of a text, separated by ", "; empty: any text.
         live: Whether the value may change while the node is configured.
-        minimum: Smallest allowed value of a number other than 0, where 0 has a meaning of its own.
+        minimum: Smallest allowed value of a number for which 0 is also allowed, with a special
+            meaning such as "off"; None: 0 has no special meaning.
         problem: Function that takes the value of a text and returns an error message, or "" if the
             value is valid. It is not called for an empty text.
     """
@@ -57,9 +58,9 @@ class Parameter(NamedTuple):
     problem: Callable[[str], str] | None = None
 
     def parse(self, text: str) -> Any:
-        """Return the value that a text states: a truth value, a number, or the text itself.
+        """Convert a text into a value of the parameter's type: bool, float or str.
 
-        The result for a text that is no number is NaN, which `refusal` refuses.
+        If the parameter is a number but the text is not, the result is NaN. `refusal` reports it.
         """
         if isinstance(self.default, bool):
             return text.lower() == "true"

@@ -38,9 +38,9 @@ MAX_NAMES = 4
 
 
 def pose_doubts(skin: Skin) -> Iterator[str]:
-    """Yield a warning (one line) for each mistake that the cubes' poses most likely have.
+    """Yield a warning (one line) for each probable mistake in the poses of the cubes.
 
-    Warnings are given for several cubes at one position, and for positions in mm instead of m.
+    Probable mistakes are several cubes at one position, and positions in mm instead of m.
     """
     positions = np.array([cube.xyz for cube in skin.cubes])
     yield from _find_shared_positions(skin, positions)
@@ -80,8 +80,8 @@ def _seems_in_millimetres(positions: Array) -> bool:
     """Return whether positions (cubes, 3), which should be in m, are most likely in mm."""
     if np.abs(positions).max() > MAX_DISTANCE_M:
         return True
-    # Typed in mm, a small skin near the origin passes the limit of coordinates, but its cubes seem
-    # to be metres apart.
+    # Coordinates of a small skin near the origin are below the limit even if they are in mm. Then
+    # the distances of neighbouring cubes are too large.
     if not MIN_SPACED_CUBES <= len(positions) <= MAX_SPACED_CUBES:
         return False
     distance = np.linalg.norm(positions[:, np.newaxis] - positions, axis=2)

@@ -32,14 +32,17 @@ def rviz_view(skin: Skin) -> dict[str, Any]:
     and the wrench of the cube closest to the centre is displayed.
     """
     positions = np.array([cube.xyz for cube in skin.cubes])
-    low, high = positions.min(axis=0), positions.max(axis=0)
+    low = positions.min(axis=0)
+    high = positions.max(axis=0)
     # RViz shows the wrench of one cube only; the central one is the most likely to be touched.
-    to_centre = np.linalg.norm(positions - (low + high) / 2, axis=1)
-    central_cube = skin.cubes[int(to_centre.argmin())]
+    centre = (low + high) / 2
+    distance = np.linalg.norm(positions - centre, axis=1)
+    central_cube = skin.cubes[int(distance.argmin())]
 
-    # The node `markers` draws the legend beside the skin in the direction -y, so the box grows
-    # there.
-    low[1] -= LEGEND_HEIGHT * (high[0] - low[0])
+    # The box around the skin is extended in the direction -y, where the node `markers` draws the
+    # legend.
+    width = high[0] - low[0]
+    low[1] -= LEGEND_HEIGHT * width
     diagonal = float(np.linalg.norm(high - low))
     focal_point = (low + high) / 2
 

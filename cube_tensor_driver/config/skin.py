@@ -266,7 +266,7 @@ def check_skin_data(data: Any, folder: Path) -> tuple[Skin | None, list[str]]:
         folder: The folder in which the file is or will be. Calibrations are named relative to it.
 
     Returns:
-        The skin and an empty list, or None and all mistakes (errors only), one line each.
+        The skin and an empty list, or None and all mistakes, one line each.
     """
     schema_mistakes = _SCHEMA.mistakes(data)
     mistakes = [line for _, line in schema_mistakes]
@@ -275,8 +275,8 @@ def check_skin_data(data: Any, folder: Path) -> tuple[Skin | None, list[str]]:
     # Further checks go through the entries of both lists, so both must be lists.
     if not isinstance(data.get("links"), list) or not isinstance(data.get("cubes"), list):
         return None, mistakes
-    # The path of a mistake is the keys that lead to the wrong value. The first two identify the
-    # entry: ("cubes", 3) for any mistake in cubes[3].
+    # The first two keys on the path to a mistake identify the entry of a link or a cube, as in
+    # ("cubes", 3, "pose").
     malformed = {where[:2] for where, _ in schema_mistakes}
 
     links = tuple(
@@ -286,10 +286,11 @@ def check_skin_data(data: Any, folder: Path) -> tuple[Skin | None, list[str]]:
     )
     mistakes += _find_link_mistakes(links)
 
-    # The name of a malformed link is unknown. A cube may name just that link, so that names of
-    # links are checked only if all links could be read.
-    all_links_known = len({link.name for link in links}) == len(data["links"])
-    reader = _CubeReader(folder, [link.name for link in links] if all_links_known else None)
+    # A cube may name a link whose entry is malformed and whose name is therefore unknown. So the
+    # links that cubes name are checked only if all links could be read.
+    link_names = [link.name for link in links]
+    all_links_known = len(set(link_names)) == len(data["links"])
+    reader = _CubeReader(folder, link_names if all_links_known else None)
     # Malformed entries are skipped instead of ending the check, so that the user sees the mistakes
     # of all entries at once.
     for number, item in enumerate(data["cubes"]):
@@ -301,9 +302,11 @@ def check_skin_data(data: Any, folder: Path) -> tuple[Skin | None, list[str]]:
     mistakes += _find_pad_mistakes(links, cubes)
 
     elastomer = None
-    if "elastomer" in data and ("elastomer",) not in {where[:1] for where, _ in schema_mistakes}:
+    malformed_keys = {where[:1] for where, _ in schema_mistakes}
+    if "elastomer" in data and ("elastomer",) not in malformed_keys:
         numbers = {key: float(value) for key, value in data["elastomer"].items()}
-        elastomer = Elastomer(**{**numbers, "thickness": numbers["thickness"] or np.inf})
+        numbers["thickness"] = numbers["thickness"] or np.inf
+        elastomer = Elastomer(**numbers)
         if elastomer.depth >= elastomer.thickness:
             mistakes.append(
                 f"elastomer.depth: {elastomer.depth} m; it must be below the thickness, "
@@ -312,7 +315,7 @@ def check_skin_data(data: Any, folder: Path) -> tuple[Skin | None, list[str]]:
 
     if mistakes:
         return None, mistakes
-    # The rate is converted because YAML gives an integer if it is written as 100.
+    # YAML reads a rate without a decimal point as an integer.
     rate = None if data.get("rate") is None else float(data["rate"])
     skin = Skin(data["name"], data["parent_frame"], rate, links, cubes, elastomer=elastomer)
     return skin, []
@@ -331,7 +334,8 @@ class _CubeReader:
 
         Args:
             folder: The folder of the skin file, in which calibration files are searched.
-            links: Names of all links of the file; None: not all are known, as a link is malformed.
+            links: Names of all links of the file; None: the entry of a link is malformed, so names
+                of links cannot be checked.
         """
         self.cubes: list[SkinCube] = []
         self.mistakes: list[str] = []
@@ -375,7 +379,8 @@ class _CubeReader:
         """
         if name not in self._calibrations:
             try:
-                self._calibrations[name] = read_calibration(find_calibration(name, self._folder))
+                path = find_calibration(name, self._folder)
+                self._calibrations[name] = read_calibration(path)
             except CubeError as error:
                 self._calibrations[name] = None
                 self.mistakes.append(f"cubes[{number}].calibration: {error}")
@@ -401,8 +406,8 @@ class _CubeReader:
                 ": found neither uid nor both link and index, which say where the cube is; "
                 "add one of them"
             )
-        # If the cube at this index was exchanged for another one, the uid and the index in the file
-        # would identify different cubes.
+        # If the cube at this index is replaced by another one, the uid and the index in the file
+        # identify different cubes.
         if uid is not None and index is not None:
             yield ": found both uid and index; keep one, they might contradict each other"
         if item["layout"] != calibration.layout.name:
@@ -430,8 +435,9 @@ def _find_link_mistakes(links: tuple[SkinLink, ...]) -> Iterator[str]:
     hub_uids = [hex(link.hub_uid) for link in links if link.hub_uid is not None]
     yield from _find_repeated("links", "hub_uid", hub_uids)
     # Two links may have the same pattern of device paths: the driver tries all devices that match.
-    ports = [repr(link.port) for link in links if "://" in link.port or not has_magic(link.port)]
-    yield from _find_repeated("links", "port", ports)
+    ports = [link.port for link in links]
+    fixed_ports = [repr(port) for port in ports if "://" in port or not has_magic(port)]
+    yield from _find_repeated("links", "port", fixed_ports)
 
 
 def _find_cube_mistakes(cubes: tuple[SkinCube, ...]) -> Iterator[str]:

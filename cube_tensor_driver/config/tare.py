@@ -67,7 +67,7 @@ def write_tare(
         ConfigError: The folder cannot be made, or the file in it cannot be written.
     """
     try:
-        # By default the folder is below ~/.ros, and no user would make it by hand.
+        # The folder is made, because the default below ~/.ros does not exist at first.
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(
@@ -103,8 +103,8 @@ def read_tare(folder: Path, uid: int, calibration: Calibration) -> StoredTare | 
     for _, mistake in _tare_schema(calibration.layout.n_pads).mistakes(data):
         raise ConfigError(f"{path}: {mistake}; tare again")
 
-    # The uid in the file differs from that in its name if somebody has renamed the file or copied
-    # it for another cube.
+    # The uid in the content differs from the uid in the file name if somebody has renamed the file
+    # or copied it for another cube.
     if int(data["uid"], 16) != uid:
         raise ConfigError(
             f"{path}: uid is {data['uid']!r}, the file's name says {uid:#x}; tare again"
@@ -166,8 +166,8 @@ def _tare_schema(n_pads: int) -> Schema:
             "description": "a uid in hexadecimal as in 0x1f",
         },
         "calibration_id": TEXT,
-        # Any value passes here: depending on its notation YAML yields a datetime or a text, and
-        # `_parse_time` checks both.
+        # The schema allows any value, because YAML reads a time as a datetime or as a text. Both
+        # are checked by `_parse_time`.
         "created": {},
         "rest_frequency": frequencies,
     }

@@ -47,13 +47,13 @@ _Dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
     """PyYAML's safe loader (in C where installed) that refuses a key that appears twice.
 
-    PyYAML itself silently keeps the last value, so that a cube with a duplicated key, as after
-    copying lines of a skin file, would lose the first one.
+    PyYAML itself silently keeps the last value of such a key. A key that was duplicated by copying
+    lines of a skin file would then lose its first value unnoticed.
     """
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        # The call below inserts the keys that "<<" copies into the node. Overriding such a key is
-        # allowed, so only the keys written in the mapping itself are compared; they are listed now.
+        # A mapping may override keys that "<<" copies from another mapping. Therefore its own keys
+        # are listed now, before PyYAML inserts the copied ones into the node.
         own_keys = [key for key, _ in node.value if key.tag != _MERGE_TAG]
         mapping: dict[Any, Any] = super().construct_mapping(node, deep)
         seen: set[Any] = set()
