@@ -24,7 +24,7 @@ from ..messages.types import COMPENSATION
 from .read import Bag, stamp_ns
 
 MAX_DISORDER_NS = SECOND
-"""Maximum time, in ns, by which a message may be recorded after one with a later stamp."""
+"""Largest difference of stamps, in ns, by which messages in a bag may be out of order."""
 
 
 class RecordedCompensation(NamedTuple):
@@ -50,7 +50,7 @@ class CompensationReader:
     `MAX_DISORDER_NS` older than that of the previous call, the bag is read again from its start.
 
     Attributes:
-        is_recorded: Whether the bag has messages of `compensation`.
+        is_recorded: Whether the bag has messages on the topic `compensation` of the skin.
     """
 
     def __init__(self, bag: Bag, topic: str, poses: CubePoses) -> None:
@@ -91,7 +91,8 @@ class CompensationReader:
         if wanted_ns < self._wanted_ns - MAX_DISORDER_NS:
             self._restart()
         self._wanted_ns = wanted_ns
-        # A message that is missing is only known to be so when later stamps have been read.
+        # Messages can be out of order, so the wanted one counts as missing only when a message with
+        # a much later stamp has been read.
         last_ns = wanted_ns + MAX_DISORDER_NS
         while wanted_ns not in self._known and self._newest_ns < last_ns:
             item = next(self._unread, None)

@@ -26,9 +26,9 @@ from ..messages.types import STRESS
 from .read import Bag
 
 MAX_DISORDER_NS = SECOND
-"""Maximum time, in ns, by which a sample may be recorded after one with a later stamp.
+"""Largest difference of stamps, in ns, by which samples in a bag may be out of order.
 
-To find the stress of a sample of frequencies, the bag is read up to stamps this much later.
+To find the stress of a sample of frequencies, the bag is read until stamps are this much later.
 """
 
 HEALTH_BITS = np.uint16(sum(WORDS))
@@ -87,7 +87,7 @@ class RecordedHealthReader:
         """Return the recorded health (which pads were left out, and why) for rows of frequencies.
 
         The row of stress that belongs to a row of frequencies has the same cube, sequence number
-        and stamp. Where none was recorded, `known` is false.
+        and stamp. If it was not recorded, `known` is false for this row in the result.
         """
         count = len(rows)
         health = RecordedHealth(

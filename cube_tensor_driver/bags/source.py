@@ -143,9 +143,8 @@ class BagSource:
         begins = np.flatnonzero(_begins_segment(cube, info_index, recorded)) + 1
         bounds = [0, *begins.tolist(), len(messages)]
         for begin, end in pairwise(bounds):
-            # A scan (one row per cube, by rising cube index) ends where the index does not rise.
-            # If it rises into the next message, joining the messages would join their scans, which
-            # would change the health of the pads. Such messages become one segment each.
+            # Rows with rising cube indices count as one scan. Messages are joined only if the index
+            # does not rise between them: their scans, on which the health depends, stay separate.
             order = cube[begin]
             can_join = len(order) and order[0] <= order[-1]
             step = end - begin if can_join else 1
