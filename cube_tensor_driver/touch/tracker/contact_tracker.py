@@ -182,7 +182,9 @@ class ContactTracker:
         At most `MAX_LINEARISED_FITS` fits are linearised, but always those whose cubes have lost or
         regained values: a step with the noise of other values would compute with unknown ones.
         """
-        moving = [one for one in self._fits if isinstance(one, HertzFit) and one.is_moving]
+        moving = [
+            one for one in self._fits if isinstance(one, HertzFit) and one.needs_linearisation
+        ]
         moving.sort(key=lambda fit: (fit.values.has_same_values, -fit.displacement))
         n_required = sum(not fit.values.has_same_values for fit in moving)
         linearise(self._inverse, moving[: max(n_required, MAX_LINEARISED_FITS)])

@@ -38,33 +38,42 @@ FORCE_DEVIATION = 1e2
 The value is so large that the prior does not influence the fitted force."""
 
 FLATNESS_STEP = 0.2
-"""Change of the natural logarithm of the radius that defines the unit of the flatness.
+"""Difference h of the natural logarithms of radii in the definition of the flatness, a parameter of
+the pressure distribution of a contact.
 
-The flatness moves pressure from the centre of a contact to its rim without changing force, position
-and second moment: a contact is added, and a mixture of a narrower and a wider one is subtracted. A
-Hertz contact has flatness 0, a rigid flat punch flatness 1.
+To a Hertz contact of radius a, the flatness adds a multiple of the following difference: this
+contact minus a mixture of Hertz contacts of the radii a exp(h) and a exp(-h) with the same force,
+centre and second moment. It moves pressure from the centre to the rim. A Hertz contact has
+flatness 0, a rigid flat punch flatness 1.
 """
 
 SHAPE_CUBES = 9
-"""Number of cubes nearest to the contacts whose deviations from the fit show whether the contacts
-have the shape (Hertz pressure in a circle) that the fit assumes."""
+"""Number of cubes nearest to the contacts whose residuals test whether the contacts have the shape
+(Hertz pressure in a circle) that the fit assumes."""
 
 SETTLED_STEP = 0.02
 """Size of a Gauss-Newton step below which a fit has converged. The size is the larger one of two
 numbers: the shift of a contact divided by the depth of the cubes' centres, and the change of the
 natural logarithm of its radius."""
 
-START_STIFFNESS = 1e4
-"""Precision of the errors of the elastomer's data in the first step of a fit, in which the contacts
-alone are to explain the values."""
+START_ELASTOMER_PRECISION = 1e4
+"""Prior precision, in the first Gauss-Newton step, of the errors of depth, thickness and Poisson's
+ratio of the elastomer, in units of their standard deviations.
 
-MAX_STIFFNESS = 2.0
-"""Ratio of the precision of these errors to the misfit above which the precision is lowered to the
-misfit, the value that the prior has if the noise has this variance."""
+The precision of later steps is the misfit (chi-squared per known value, at least 1). The first one
+is so much higher because these errors would otherwise take up the large residual of contacts that
+are far from their solution.
+"""
 
-MAX_UNFOLLOWED_STEP = 0.1
-"""Largest size of a Gauss-Newton step, as in `SETTLED_STEP`, after which the linearised response is
-still used for the values of the same scan."""
+MAX_PRECISION_RATIO = 2.0
+"""Largest ratio of the prior precision of the elastomer's errors to the misfit (chi-squared per
+known value). Both should be equal, because the misfit multiplies all variances of a fit, and the
+prior variance of these errors is 1. Above this ratio, the response is linearised again with the
+present misfit as precision."""
+
+REPEAT_STEP = 0.1
+"""Size of a Gauss-Newton step, as in `SETTLED_STEP`, above which the fit makes another step for the
+values of the same scan, from a response that is linearised at the new contacts."""
 
 _MAX_STEP = 0.5
 """Largest Gauss-Newton step: shift of a contact divided by the depth of the cubes' centres, and
@@ -87,12 +96,12 @@ class HertzFit:
 
     Attributes:
         found: Parameters (force, centre, radius) of the contacts that the last step has found.
-        misfit: Squared deviation of the values from the fit, divided by the value that their noise
-            causes; at least 1.
-        shape_misfit: Mean squared deviation of the whitened values of the cubes nearest to the
-            contacts (`SHAPE_CUBES`), which a wrong shape changes more than contacts elsewhere do.
-        last_step: Size of the last step: shift divided by the depth of the cubes' centres, or
-            change of the logarithm of the radius.
+        misfit: Chi-squared (squared whitened residual and prior terms) divided by the number of
+            known values; at least 1.
+        shape_misfit: Mean squared whitened residual of the `SHAPE_CUBES` cubes nearest to the
+            contacts. A wrong shape changes it more than contacts elsewhere do.
+        last_step: Size of the last Gauss-Newton step, as in `SETTLED_STEP`; infinite before the
+            first step.
         jacobian: Derivatives (n C, 8 J) of the whitened values by the 8 parameters of each contact:
             force (3), centre (2), logarithm of the radius, flatness, moment.
         covariance: Covariance (8 J, 8 J) of these parameters for a misfit of 1.
@@ -108,70 +117,79 @@ class HertzFit:
         """
         self.values = values
         self._depth = depth = inverse.depth
-        # `Kernels` interpolates responses between the second and the third last radius of its
-        # table.
+        # The cubic interpolation of `Kernels` needs one tabulated radius below and two above.
         self._log_range = np.log(DISC_SIZES[[1, -3]] * depth)
         self.found = starts._replace(log_sizes=np.clip(starts.log_sizes, *self._log_range))
-        self.misfit = self.shape_misfit = self._stiffness = 1.0
+        self.misfit = 1.0
+        self.shape_misfit = 1.0
         self.last_step = np.inf
-        self._previous = self._at = self.found
+        self._elastomer_precision = 1.0
+        self._previous = self.found
+        self._base = self.found
         self._flatness = self._moments = np.zeros(len(starts.forces))
-        deviations = [FORCE_DEVIATION] * 3 + [depth] * 2 + [SIZE_DEVIATION, 1.0]
-        deviations.append(FORCE_DEVIATION * depth)
+        flatness_deviation = 1.0
+        moment_deviation = FORCE_DEVIATION * depth
+        deviations = [
+            *[FORCE_DEVIATION] * 3,
+            *[depth] * 2,
+            SIZE_DEVIATION,
+            flatness_deviation,
+            moment_deviation,
+        ]
         self._contact_precision = np.tile(np.array(deviations) ** -2, len(starts.forces))
-        self._elastomer = np.zeros(0)
+        self._elastomer_errors = np.zeros(0)
 
     @property
     def displacement(self) -> float:
-        """Difference of the contacts from those at which the response was linearised.
+        """Distance of the contacts from those at which the response was linearised.
 
-        It has the unit of `SETTLED_STEP`, and is infinite if no step was made yet.
+        It is measured as the step in `SETTLED_STEP`, and infinite if no step was made yet.
         """
         if not np.isfinite(self.last_step):
             return np.inf
-        shift = np.abs(self.found.centres - self._at.centres).max() / self._depth
-        growth = np.abs(self.found.log_sizes - self._at.log_sizes).max()
-        return float(max(shift, growth))
+        shift = np.abs(self.found.centres - self._base.centres)
+        growth = np.abs(self.found.log_sizes - self._base.log_sizes)
+        return float(max(shift.max() / self._depth, growth.max()))
 
     @property
-    def is_moving(self) -> bool:
+    def needs_linearisation(self) -> bool:
         """Whether the response of the cubes must be linearised again before the next step.
 
-        This is so if the `displacement` exceeds `SETTLED_STEP`, if the misfit has fallen, or if the
-        noise of the cubes has changed.
+        It must if the `displacement` exceeds `SETTLED_STEP`, if the misfit has fallen so far that
+        the prior is too narrow (`MAX_PRECISION_RATIO`), or if the noise of the cubes has changed.
         """
-        is_stiff = self._stiffness > MAX_STIFFNESS * self.misfit
-        return self.displacement >= SETTLED_STEP or is_stiff or self.values.is_stale
+        is_far = self.displacement >= SETTLED_STEP
+        is_prior_narrow = self._elastomer_precision > MAX_PRECISION_RATIO * self.misfit
+        return is_far or is_prior_narrow or self.values.is_stale
 
     @property
     def is_unsettled(self) -> bool:
-        """Whether the last step was larger than `MAX_UNFOLLOWED_STEP`, so that the response of the
-        cubes, linearised before the step, is not exact after it."""
-        return self.last_step > MAX_UNFOLLOWED_STEP
+        """Whether the last step was larger than `REPEAT_STEP`, so that the response of the cubes,
+        linearised before the step, is not exact after it."""
+        return self.last_step > REPEAT_STEP
 
     @property
     def inflation(self) -> float:
-        """Factor by which all variances grow, because the values deviate more than by their noise.
+        """Factor on all variances, as the residuals are larger than noise alone makes them.
 
-        It is the larger misfit, that of all cubes or that of the nearest ones: the edge of a flat
-        punch, where the pressure is infinite, shows in the nearest cubes alone.
+        It is the larger one of `misfit` and `shape_misfit`: the edge of a flat punch, where the
+        pressure is infinite, only changes the values of the nearest cubes.
         """
         return max(self.misfit, self.shape_misfit)
 
     @property
     def score(self) -> float:
-        """-2 ln of the evidence (probability of the values, in Laplace approximation).
-
-        It is comparable with the score of a fit of the traction on nodes.
-        """
-        _, log_determinant = np.linalg.slogdet(self._information)
-        volume = log_determinant - np.log(self._precision).sum()
-        scatter = max(self.values.count, 1) * np.log(self.misfit)
-        return float(self._chi_squared / self.misfit + scatter + volume)
+        """-2 ln of the evidence (probability of the values, in Laplace approximation), up to a
+        constant that is the same for `Posterior.score` of a fit of the traction on nodes."""
+        _, log_posterior_precision = np.linalg.slogdet(self._information)
+        log_prior_precision = np.log(self._precision).sum()
+        occam_term = log_posterior_precision - log_prior_precision
+        noise_term = max(self.values.count, 1) * np.log(self.misfit)
+        return float(self._chi_squared / self.misfit + noise_term + occam_term)
 
     @property
     def discs(self) -> Discs:
-        """Contacts that the last step has found, or that are predicted for this scan."""
+        """Hertz contacts that the last step has found, or that are predicted for this scan."""
         return self.found
 
     @property
@@ -181,24 +199,26 @@ class HertzFit:
         They are the C components of stress and gradient (times d0, half the side of a cube) of each
         of n cubes around the region, (n, C), in Pa.
         """
-        change = np.zeros((len(self.found.forces), _N_PARAMETERS))
-        change[:, :3] = self.found.forces - self._at.forces
-        change[:, 3:5] = self.found.centres - self._at.centres
-        change[:, 5] = self.found.log_sizes - self._at.log_sizes
+        found, base = self.found, self._base
+        change = np.zeros((len(found.forces), _N_PARAMETERS))
+        change[:, :3] = found.forces - base.forces
+        change[:, 3:5] = found.centres - base.centres
+        change[:, 5] = found.log_sizes - base.log_sizes
         change[:, 6] = self._flatness
         change[:, 7] = self._moments
-        return np.asarray(self._explained + self._columns @ np.append(change, self._elastomer))
+        all_changes = np.append(change, self._elastomer_errors)
+        return np.asarray(self._base_values + self._derivatives @ all_changes)
 
-    def predict(self, is_moving: bool) -> None:
-        """Begin a new scan (set of values of all cubes).
+    def predict(self, extrapolates: bool) -> None:
+        """Set the contacts at which the fit of a new scan (set of values of all cubes) begins.
 
         Args:
-            is_moving: Whether centres and forces are extrapolated, by their changes between the
-                last two scans; otherwise the contacts of the last scan are the start.
+            extrapolates: Whether they are extrapolated, by the changes of centres and forces
+                between the last two scans; otherwise they are the contacts of the last scan.
         """
         found, previous = self.found, self._previous
         self._previous = found
-        if is_moving:
+        if extrapolates:
             limit = _MAX_STEP * self._depth
             shift = np.clip(found.centres - previous.centres, -limit, limit)
             forces = 2 * found.forces - previous.forces
@@ -219,11 +239,12 @@ class HertzFit:
         cosine, sine = np.cos(angle), np.sin(angle)
         to_home = np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
 
-        def turn(discs: Discs) -> Discs:
+        def transform(discs: Discs) -> Discs:
             centres = (discs.centres - place) @ to_home[:2, :2].T
             return discs._replace(forces=discs.forces @ to_home.T, centres=centres)
 
-        self.found, self._previous = turn(self.found), turn(self._previous)
+        self.found = transform(self.found)
+        self._previous = transform(self._previous)
         self.values = values
         self.last_step = np.inf
 
@@ -242,27 +263,31 @@ class HertzFit:
             sensitivity: Changes (n, S, C) in Pa of the values under the contacts by one standard
                 deviation of each of S quantities of the elastomer (sensitivity.py).
         """
-        self._at = self.found
-        distance = np.linalg.norm(self.values.place[:, None] - self._at.centres, axis=2)
-        self._near = np.argsort(distance.min(axis=1), kind="stable")[:SHAPE_CUBES]
-        columns = slopes.astype(float)
-        explained = np.einsum("jnac,ja->nc", columns[:, :, :3], self._at.forces)
-        # The mixture of a wider and a narrower contact with the second moment of the contact.
-        columns[:, :, 6] = FLATNESS_STEP**2 * (columns[:, :, 5] - columns[:, :, 6] / 2)
-        whitening = self.values.whitening
-        by_cube = columns.transpose(1, 3, 0, 2).reshape(*explained.shape, -1)
-        by_cube = np.concatenate([by_cube, sensitivity.swapaxes(1, 2)], axis=2)
-        # In units of their standard deviations, the errors of these quantities have precision 1,
-        # for values whose noise has the variance `misfit`. Far from the solution, the misfit is so
-        # large that they do not take up what is due to the contacts.
+        base = self._base = self.found
+        to_contacts = self.values.place[:, None] - base.centres
+        distance = np.linalg.norm(to_contacts, axis=2).min(axis=1)
+        self._near = np.argsort(distance, kind="stable")[:SHAPE_CUBES]
+
+        derivatives = slopes.astype(float)
+        base_values = np.einsum("jnac,ja->nc", derivatives[:, :, :3], base.forces)
+        # With h = FLATNESS_STEP and the derivatives by the logarithm of the radius, the response to
+        # the difference of contact and mixture is h^2 (first - second / 2), to order h^2.
+        first, second = derivatives[:, :, 5], derivatives[:, :, 6]
+        derivatives[:, :, 6] = FLATNESS_STEP**2 * (first - second / 2)
+        by_contacts = derivatives.transpose(1, 3, 0, 2).reshape(*base_values.shape, -1)
+        by_elastomer = sensitivity.swapaxes(1, 2)
+        self._base_values = base_values
+        self._derivatives = np.concatenate([by_contacts, by_elastomer], axis=2)
+
         has_misfit = np.isfinite(self.last_step)
-        self._stiffness = self.misfit if has_misfit else START_STIFFNESS
-        of_elastomer = np.full(sensitivity.shape[1], self._stiffness)
-        precision = np.append(self._contact_precision, of_elastomer)
-        self._precision = precision
-        self._explained, self._columns = explained, by_cube
-        self.jacobian = (whitening @ by_cube).reshape(-1, by_cube.shape[2])
-        self._model = (whitening @ explained[:, :, None]).ravel()
+        self._elastomer_precision = self.misfit if has_misfit else START_ELASTOMER_PRECISION
+        elastomer_precision = np.full(sensitivity.shape[1], self._elastomer_precision)
+        self._precision = np.append(self._contact_precision, elastomer_precision)
+
+        whitening = self.values.whitening
+        jacobian = whitening @ self._derivatives
+        self.jacobian = jacobian.reshape(-1, jacobian.shape[2])
+        self._white_base = (whitening @ base_values[:, :, None]).ravel()
         information = self.jacobian.T @ self.jacobian
         information[np.diag_indices(len(information))] += self._precision
         self.covariance = np.linalg.inv(information)
@@ -275,41 +300,55 @@ class HertzFit:
             white: Whitened values (n C,), C components of each of n cubes, transformed by
                 `LocalValues.whiten` so that their noise has variance 1 and no correlation.
         """
-        at = self._at
-        residual = white - self._model
-        deviation = np.zeros((len(at.forces), _N_PARAMETERS))
-        deviation[:, :3] = at.forces
-        deviation[:, 5] = at.log_sizes - np.log(USUAL_SIZE * self._depth)
-        flat = np.append(deviation, 0 * self._precision[deviation.size :])
-        right = self.jacobian.T @ residual - self._precision * flat
-        change = self.covariance @ right
-        penalty = flat @ (self._precision * flat)
-        chi_squared = float(residual @ residual + penalty - right @ change)
-        known = max(self.values.count, 1)
-        self.misfit = max(chi_squared / known, 1.0)
-        rest = (residual - self.jacobian @ change).reshape(self.values.known.shape)
-        near = self._near
-        below = max(int(self.values.known[near].sum()), 1)
-        self.shape_misfit = float((rest[near] ** 2).sum()) / below
-        self._chi_squared = chi_squared
+        base, values = self._base, self.values
+        n_parameters = len(self._contact_precision)
+        from_prior_mean = np.zeros(len(self._precision))
+        of_contacts = from_prior_mean[:n_parameters].reshape(-1, _N_PARAMETERS)
+        of_contacts[:, :3] = base.forces
+        of_contacts[:, 5] = base.log_sizes - np.log(USUAL_SIZE * self._depth)
 
-        self._elastomer = change[deviation.size :]
-        change = change[: deviation.size].reshape(-1, _N_PARAMETERS)
+        residual = white - self._white_base
+        prior_gradient = self._precision * from_prior_mean
+        gradient = self.jacobian.T @ residual - prior_gradient
+        change = self.covariance @ gradient
+        penalty = from_prior_mean @ prior_gradient
+        self._chi_squared = float(residual @ residual + penalty - gradient @ change)
+        self.misfit = max(self._chi_squared / max(values.count, 1), 1.0)
+
+        new_residual = (residual - self.jacobian @ change).reshape(values.known.shape)
+        n_near = max(int(values.known[self._near].sum()), 1)
+        self.shape_misfit = float((new_residual[self._near] ** 2).sum()) / n_near
+        self._elastomer_errors = change[n_parameters:]
+        self._move_contacts(change[:n_parameters].reshape(-1, _N_PARAMETERS))
+
+    def _move_contacts(self, change: Array) -> None:
+        """Change the contacts from those at which the response is linearised.
+
+        Args:
+            change: Changes (J, 8) of the 8 parameters of each contact. Shifts and changes of radii
+                are limited to `_MAX_STEP`.
+        """
+        base = self._base
         limit = _MAX_STEP * self._depth
         shift = np.clip(change[:, 3:5], -limit, limit)
         growth = np.clip(change[:, 5], -_MAX_STEP, _MAX_STEP)
         largest_shift = float(np.abs(shift).max()) / self._depth
-        self.last_step = max(largest_shift, float(np.abs(growth).max()))
-        sizes = np.clip(at.log_sizes + growth, *self._log_range)
-        self.found = Discs(at.forces + change[:, :3], at.centres + shift, sizes)
+        largest_growth = float(np.abs(growth).max())
+        self.last_step = max(largest_shift, largest_growth)
+        self.found = Discs(
+            forces=base.forces + change[:, :3],
+            centres=base.centres + shift,
+            log_sizes=np.clip(base.log_sizes + growth, *self._log_range),
+        )
         self._flatness = change[:, 6]
         self._moments = change[:, 7]
 
     def to_contacts(self, step: float) -> ContactSum:
-        """Describe these contacts and their deviations as a sum of Hertz contacts.
+        """Describe the contacts, with flatness, moment and covariance, as a sum of Hertz contacts.
 
         Each contact becomes seven: itself, one shifted each way along x and along y, one wider and
-        one narrower. Differences of them are its derivatives by centre, size, flatness and moment.
+        one narrower. Differences between them approximate the derivatives of its traction by
+        centre, size, flatness and moment.
 
         Args:
             step: Shift in m. It is at least the spacing of the points at which the traction is
@@ -321,26 +360,36 @@ class HertzFit:
         factors = np.exp(FLATNESS_STEP * np.array([0, 0, 0, 0, 0, 1, -1]))
         sizes = np.exp(self.found.log_sizes)[:, None] * factors
 
-        # Derivatives (3, contacts of the sum, parameters) of the forces by the parameters.
+        # Derivatives (3 axes, J, 7, J, 8) of the forces of all Hertz contacts of the sum by the 8
+        # parameters of each of the J fitted contacts.
         slopes = np.zeros((3, count, 7, count, _N_PARAMETERS))
-        share = 1 / (1 + np.exp(2 * FLATNESS_STEP))
-        for j, force in enumerate(self.found.forces):
+        wider_share = 1 / (1 + np.exp(2 * FLATNESS_STEP))
+        narrower_share = 1 - wider_share
+        moment_arms = 4 * step
+        for j, force in enumerate(self.found.forces[:, :, None]):
             own = slopes[:, j, :, j]
+            by_shift = force * [1, -1] / (2 * step)
             own[:, 0, :3] = np.eye(3)
-            own[:, [1, 2], 3] = force[:, None] * [1, -1] / (2 * step)
-            own[:, [3, 4], 4] = force[:, None] * [1, -1] / (2 * step)
-            own[:, [5, 6], 5] = force[:, None] * [1, -1] / (2 * FLATNESS_STEP)
-            own[:, [0, 5, 6], 6] = force[:, None] * [1, -share, share - 1]
-            own[1, [1, 2], 7] = np.array([1, -1]) / (4 * step)
-            own[0, [3, 4], 7] = np.array([-1, 1]) / (4 * step)
-        forces = np.einsum("ajkj,j->ajk", slopes[..., 6], self._flatness)
-        forces += np.einsum("ajkj,j->ajk", slopes[..., 7], self._moments)
+            own[:, [1, 2], 3] = by_shift
+            own[:, [3, 4], 4] = by_shift
+            own[:, [5, 6], 5] = force * [1, -1] / (2 * FLATNESS_STEP)
+            own[:, [0, 5, 6], 6] = force * [1, -wider_share, -narrower_share]
+            own[1, [1, 2], 7] = np.array([1, -1]) / moment_arms
+            own[0, [3, 4], 7] = np.array([-1, 1]) / moment_arms
+        by_flatness, by_moment = slopes[..., 6], slopes[..., 7]
+        forces = np.einsum("ajkj,j->ajk", by_flatness, self._flatness)
+        forces += np.einsum("ajkj,j->ajk", by_moment, self._moments)
         forces[:, :, 0] += self.found.forces.T
 
-        n = _N_PARAMETERS * count
-        covariance = self.inflation * self.covariance[:n, :n]
-        root = slopes.reshape(3, -1, n) @ np.linalg.cholesky(covariance)
-        return ContactSum(places.reshape(-1, 2), sizes.ravel(), forces.reshape(3, -1), root)
+        n_parameters = _N_PARAMETERS * count
+        covariance = self.inflation * self.covariance[:n_parameters, :n_parameters]
+        cholesky_factor = np.linalg.cholesky(covariance)
+        return ContactSum(
+            places=places.reshape(-1, 2),
+            sizes=sizes.ravel(),
+            forces=forces.reshape(3, -1),
+            root=slopes.reshape(3, -1, n_parameters) @ cholesky_factor,
+        )
 
     def estimate_contacts(self) -> list[ContactEstimate]:
         """Return force, position, moment and area of each contact."""
@@ -387,25 +436,19 @@ def linearise(inverse: SurfaceInverse, fits: Sequence[HertzFit]) -> None:
         variants.append(np.tile(values.variant, count))
         sizes.append(np.repeat(np.exp(found.log_sizes), n))
         forces.append(np.repeat(found.forces, n, axis=0))
-    slopes = inverse.kernels.response_slopes(
-        np.concatenate(offsets),
-        np.concatenate(angles),
-        np.concatenate(variants),
-        np.concatenate(sizes),
-        np.concatenate(forces),
-    )[:, :, inverse.columns]
-    ends = np.cumsum([len(one) for one in angles])
-    sensitivity = inverse.kernels.sensitivity(
-        np.concatenate(offsets),
-        np.concatenate(angles),
-        np.concatenate(sizes),
-        np.concatenate(forces),
-    )[:, :, inverse.columns]
-    for fit, own, changes in zip(
-        fits, np.split(slopes, ends[:-1]), np.split(sensitivity, ends[:-1]), strict=True
-    ):
+    offset = np.concatenate(offsets)
+    angle = np.concatenate(angles)
+    variant = np.concatenate(variants)
+    size = np.concatenate(sizes)
+    force = np.concatenate(forces)
+    kernels, observed = inverse.kernels, inverse.columns
+    slopes = kernels.response_slopes(offset, angle, variant, size, force)[:, :, observed]
+    sensitivity = kernels.sensitivity(offset, angle, size, force)[:, :, observed]
+    starts = np.cumsum([len(one) for one in angles])[:-1]
+    slopes_by_fit = np.split(slopes, starts)
+    sensitivity_by_fit = np.split(sensitivity, starts)
+    for fit, own, changes in zip(fits, slopes_by_fit, sensitivity_by_fit, strict=True):
         count = len(fit.found.forces)
-        fit.linearise(
-            own.reshape(count, -1, *own.shape[1:]),
-            changes.reshape(count, -1, *changes.shape[1:]).sum(axis=0),
-        )
+        own = own.reshape(count, -1, *own.shape[1:])
+        changes = changes.reshape(count, -1, *changes.shape[1:])
+        fit.linearise(own, changes.sum(axis=0))

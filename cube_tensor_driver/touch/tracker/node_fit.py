@@ -11,10 +11,13 @@ the whitened values w, which have noise of variance 1, the posterior is that of 
     w = B f + e,    f ~ N(0, s^2 K),    e ~ N(0, t)
     mean f = s^2 K B' W w,    covariance t (s^2 K - s^4 K B' W B K),    W = (1 + s^2 B K B')^-1
 
-K is the covariance of the nodes for a pressure of 1 Pa^2. The scale s is that with the greatest
-evidence; the misfit t, never below 1, is the factor by which the values deviate more than their
-noise explains, so that an imperfect model increases the stated deviations. An eigenvalue
+K is the prior covariance of the forces for a pressure of variance 1 Pa^2. The scale s is that with
+the greatest evidence; the misfit t is chi-squared divided by the number of values, but at least 1,
+so that an imperfect model increases the stated deviations. An eigenvalue
 decomposition of K^1/2' B' B K^1/2 gives all of this for every s at once.
+
+Depth, thickness and Poisson's ratio of the elastomer have errors, too. To first order, they change
+w by further columns, whose factors have the prior N(0, 1).
 
 Source: C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learning (2006), 2.2 and
 5.4.1 (evidence).
@@ -38,24 +41,26 @@ from .pressure_regions import split_peaks
 
 NODE_STEP = 0.4
 """Distance of neighbouring nodes (small contacts that make up the traction), divided by the depth
-of the cubes' centres. With 0.6, the traction of a narrow contact cannot be represented exactly
-enough, and forces are off by 0.5 % instead of 0.1 %."""
+of the cubes' centres. With 0.6 instead of 0.4, forces of narrow contacts are off by 0.5 % instead
+of 0.1 %."""
 
 MAX_NODES = 80
 """Largest number of nodes (small contacts that make up the traction) of a fit, whose time grows
 with its third power. The nodes of larger regions lie farther apart."""
 
 BORDER_REACH_PITCHES = 1.5
-"""Distance from the region, divided by the pitch (distance of neighbouring cubes), up to which
-nodes are placed beyond the border of the skin, where no field is computed."""
+"""Distance from a region of contact at the border of the skin, divided by the pitch (distance of
+neighbouring cubes), up to which nodes (small contacts) are placed beyond the border. The region
+itself ends there, because it consists of points of the skin, but the contact may not."""
 
 ENVELOPE_FLOOR = 0.03
 """Smallest prior standard deviation of the force of a node (one of the small contacts whose sum is
 the traction), divided by that of the strongest node.
 
-A second fit of the same values gets a prior that is proportional to the forces of the first fit
-(their smoothed envelope), so that force spread over nodes without contact disappears. The limit
-lets a node keep a little force that the first fit did not find there.
+A second fit of the same values gets prior standard deviations that are proportional to the forces
+of the first fit, smoothed over neighbouring nodes. Force that the first fit spread over nodes
+without contact then disappears. The limit lets the second fit find a little force where the first
+one found none.
 """
 
 MIN_SCORE_GAIN = 1.0
@@ -76,19 +81,19 @@ _POINT_MARGIN = 0.75
 point of its region of contact, divided by the distance of neighbouring points of the surface. Half
 of the diagonal of the square that a point represents is 0.71."""
 
-_LENGTHS = np.array([0.2, 0.8, 3.0])
+_CORRELATION_LENGTHS = np.array([0.2, 0.8, 3.0])
 """Correlation lengths of the pressure in a contact, divided by the depth of the cubes' centres: for
 narrow, medium and wide contacts."""
 
-_SHARES = np.array([0.4, 0.4, 0.2])
-"""Shares (3,) of the prior variance of the pressure that have the correlation lengths `_LENGTHS`,
-from the narrowest to the widest."""
+_VARIANCE_SHARES = np.array([0.4, 0.4, 0.2])
+"""Shares (3,) of the prior variance of the pressure that have the correlation lengths 0.2, 0.8 and
+3 depths (`_CORRELATION_LENGTHS`)."""
 
 _SCALES = AMPLITUDE * np.geomspace(0.01, 100, 41)
-"""Prior standard deviations (41,) of the pressure, in Pa. The one with the greatest evidence
-(probability of the values) is used."""
+"""Prior standard deviations (41,) of the pressure, in Pa, from which every fit chooses the one with
+the greatest evidence (probability of the values)."""
 
-_DEVIATIONS = np.array([SHEAR_RATIO, SHEAR_RATIO, 1.0])
+_RELATIVE_DEVIATIONS = np.array([SHEAR_RATIO, SHEAR_RATIO, 1.0])
 """Prior standard deviations of the traction along x, y and z, divided by that of the pressure."""
 
 
@@ -113,12 +118,13 @@ class NodeFit:
         places: Positions (q, 2) of the nodes in m, on the skin laid flat.
         spacing: Distance of neighbouring nodes in m.
         size: Radius of the Hertz contact of a node in m.
-        response: Values (n, C, 3 q) in Pa/N of the cubes around the region, for forces along x of
-            all nodes, then along y, then along z.
-        values: Values of these cubes.
+        response: Response (n, C, 3 q), in Pa/N, of the C components of n cubes around the region to
+            the force of each node: along x of all nodes, then along y, then along z.
+        values: Noise and positions of these cubes.
         posterior: Posterior of the forces for the newest values.
-        misfit: Factor t by which the values deviate more than their noise explains.
-        is_sharp: Whether a narrower prior has no greater evidence.
+        misfit: Chi-squared divided by the number of known values; at least 1. It multiplies the
+            covariance of the forces.
+        is_sharp: Whether `sharpen` has found that a narrower prior has no greater evidence.
         labels: Number (q,) of the contact to which each node belongs.
     """
 
@@ -136,25 +142,28 @@ class NodeFit:
         """
         self.values = values
         around = np.flatnonzero(np.isin(inverse.cube, values.cubes))
-        region = unroll_points(inverse, values.home, points)
-        self.places, self.spacing = _place_nodes(
-            region, unroll_points(inverse, values.home, around), inverse
-        )
+        region_points = unroll_points(inverse, values.home, points)
+        points_around = unroll_points(inverse, values.home, around)
+        self.places, self.spacing = _place_nodes(region_points, points_around, inverse)
         self.size = _NODE_RADIUS * self.spacing
 
-        # Prior covariance for a pressure of variance 1 Pa^2
-        self._squares = cdist(self.places, self.places, "sqeuclidean")
-        exponents = self._squares / (2 * (_LENGTHS[:, None, None] * inverse.depth) ** 2)
-        self._covariance = self.spacing**4 * np.tensordot(_SHARES, np.exp(-exponents), 1)
+        # The force of a node is its pressure times the square of the spacing.
+        self._squared_distances = cdist(self.places, self.places, "sqeuclidean")
+        lengths = _CORRELATION_LENGTHS[:, None, None] * inverse.depth
+        exponents = self._squared_distances / (2 * lengths**2)
+        pressure_covariance = np.tensordot(_VARIANCE_SHARES, np.exp(-exponents), 1)
+        self._covariance = self.spacing**4 * pressure_covariance
 
         self.response, white = values.respond(self.places, self.size)
         self._white_response = white.reshape(len(white), 3, -1)
         self._peak_width = _PEAK_WIDTH * inverse.depth
         self.is_sharp = False
-        # Errors of the elastomer's data in standard deviations, and changes (n, C, S) by one each.
-        self._errors = np.zeros(0)
-        self._changes = np.zeros((*values.known.shape, 1))
-        self._white_changes = np.zeros((len(white), 1))
+        # The sensitivity (n, C, S) holds the changes of the values, in Pa, by one standard
+        # deviation of each of S quantities of the elastomer, the depth first. It is known after the
+        # first step; until then one column of zeros stands for the depth.
+        self._elastomer_errors = np.zeros(0)
+        self._sensitivity = np.zeros((*values.known.shape, 1))
+        self._white_sensitivity = np.zeros((len(white), 1))
         self._decomposition = self._decompose(np.ones(len(self.places)))
 
     def step(self, white: Array) -> None:
@@ -165,48 +174,57 @@ class NodeFit:
                 transformed by `LocalValues.whiten` so that their noise has variance 1.
         """
         design, eigenvalues, vectors, basis = self._decomposition
-        # The columns are the values, then their changes by errors of depth, Poisson's ratio, ...
-        columns = np.column_stack([white, self._white_changes])
+        # Column 0 holds the values, column 1 their sensitivity to the depth, and the others the
+        # sensitivities to further quantities of the elastomer.
+        columns = np.column_stack([white, self._white_sensitivity])
         projected = vectors.T @ (design.T @ columns)
-        ratio = _SCALES[:, None] ** 2
-        shares = ratio / (1 + ratio * eigenvalues)
-        # Products of the columns with W = (1 + s^2 B K B')^-1 between them, for every scale s.
-        products = columns.T @ columns - np.einsum("se,ea,eb->sab", shares, projected, projected)
-        # All errors but that of the depth are estimated together with the forces.
+        prior_variances = _SCALES[:, None] ** 2
+
+        # By the Woodbury identity, columns' W columns is columns' columns minus the part that the
+        # prior of the forces explains, for every scale s and W = (1 + s^2 B K B')^-1.
+        weights = prior_variances / (1 + prior_variances * eigenvalues)
+        explained_by_forces = np.einsum("se,ea,eb->sab", weights, projected, projected)
+        products = columns.T @ columns - explained_by_forces
+
+        # The errors of all quantities but the depth are estimated together with the forces. The
+        # depth only adds to the covariance.
         information = products[:, 2:, 2:] + np.eye(columns.shape[1] - 2)
-        right = products[:, 2:, :2]
-        errors = np.linalg.solve(information, right)
-        explained = (errors[:, :, 0] * right[:, :, 0]).sum(axis=1)
-        chi_squared = np.maximum(products[:, 0, 0] - explained, 0)
+        gradients = products[:, 2:, :2]
+        errors = np.linalg.solve(information, gradients)
+        explained_by_errors = (errors[:, :, 0] * gradients[:, :, 0]).sum(axis=1)
+        chi_squared = np.maximum(products[:, 0, 0] - explained_by_errors, 0)
         count = self.values.count
         misfit = np.maximum(chi_squared / count, 1.0)
-        scores = np.log1p(ratio * eigenvalues).sum(axis=1) + np.linalg.slogdet(information)[1]
-        scores += chi_squared / misfit + count * np.log(misfit)
 
+        scores = np.log1p(prior_variances * eigenvalues).sum(axis=1)
+        scores += np.linalg.slogdet(information)[1]
+        scores += chi_squared / misfit + count * np.log(misfit)
         best = int(np.argmin(scores))
-        self._scale = float(_SCALES[best])
         self.misfit = float(misfit[best])
-        self._errors = errors[best, :, 0]
-        gain = 1 / (eigenvalues + self._scale**-2)
-        means = basis @ (gain[:, None] * projected)
-        forces, by_depth = (means[:, :2] - means[:, 2:] @ errors[best]).T
-        # Square root of the covariance: for known data of the elastomer, then one column for each
-        # error of these data.
-        root_errors = np.linalg.inv(np.linalg.cholesky(information[best])).T
-        parts = [basis * np.sqrt(gain), means[:, 2:] @ root_errors, by_depth[:, None]]
+        self._elastomer_errors = errors[best, :, 0]
+
+        variances = 1 / (eigenvalues + _SCALES[best] ** -2)
+        means = basis @ (variances[:, None] * projected)
+        by_errors = means[:, 2:]
+        forces, by_depth = (means[:, :2] - by_errors @ errors[best]).T
+        # The covariance is the sum of three parts: for an exactly known elastomer, by its estimated
+        # errors, and by the error of the depth. Its square root has the columns of all three.
+        errors_root = np.linalg.inv(np.linalg.cholesky(information[best])).T
+        parts = [basis * np.sqrt(variances), by_errors @ errors_root, by_depth[:, None]]
         root = np.sqrt(self.misfit) * np.hstack(parts)
         self.posterior = Posterior(
-            forces.reshape(3, -1), root.reshape(3, len(self.places), -1), float(scores[best])
+            forces=forces.reshape(3, -1),
+            root=root.reshape(3, len(self.places), -1),
+            score=float(scores[best]),
         )
 
     def update_sensitivity(self) -> None:
-        """Compute how the values change by errors of the elastomer's data, for the present forces.
-
-        It is in use from the next `step` on.
-        """
-        self._changes = self.values.sensitivity(self.places, self.size, self.posterior.forces)
-        white = self.values.whitening @ self._changes
-        self._white_changes = white.reshape(-1, white.shape[2])
+        """Compute how the values change by errors of depth, thickness and Poisson's ratio of the
+        elastomer, under the present forces. The next `step` takes these errors into account."""
+        forces = self.posterior.forces
+        self._sensitivity = self.values.sensitivity(self.places, self.size, forces)
+        white = self.values.whitening @ self._sensitivity
+        self._white_sensitivity = white.reshape(-1, white.shape[2])
 
     def sharpen(self, white: Array) -> None:
         """Fit again with a prior that allows less force where the present fit finds little force.
@@ -219,30 +237,36 @@ class NodeFit:
         """
         self.update_sensitivity()
         self.step(white)
-        before = self.posterior, self.misfit, self._errors, self._scale, self._decomposition
-        square = self.posterior.forces[2] ** 2 + (self.posterior.root[2] ** 2).sum(axis=1)
-        smoothing = np.exp(-self._squares / (2 * self.spacing**2))
-        envelope = np.sqrt(smoothing @ square / smoothing.sum(axis=1))
-        self._decomposition = self._decompose(np.maximum(envelope / envelope.max(), ENVELOPE_FLOOR))
+        present_score = self.posterior.score
+        present = self.posterior, self.misfit, self._elastomer_errors, self._decomposition
+        normal_variance = (self.posterior.root[2] ** 2).sum(axis=1)
+        mean_square = self.posterior.forces[2] ** 2 + normal_variance
+        smoothing = np.exp(-self._squared_distances / (2 * self.spacing**2))
+        envelope = np.sqrt(smoothing @ mean_square / smoothing.sum(axis=1))
+        relative_envelope = np.maximum(envelope / envelope.max(), ENVELOPE_FLOOR)
+        self._decomposition = self._decompose(relative_envelope)
         self.step(white)
-        if self.posterior.score > before[0].score - MIN_SCORE_GAIN:
-            self.posterior, self.misfit, self._errors, self._scale, self._decomposition = before
+        if self.posterior.score > present_score - MIN_SCORE_GAIN:
+            self.posterior, self.misfit, self._elastomer_errors, self._decomposition = present
             self.is_sharp = True
         self.label_peaks()
 
     def label_peaks(self) -> None:
         """Set `labels`: assign each node to one of the peaks of the pressure, which are
         contacts."""
-        smoothing = np.exp(-self._squares / (2 * self._peak_width**2))
+        smoothing = np.exp(-self._squared_distances / (2 * self._peak_width**2))
         pressure = -smoothing @ self.posterior.forces[2]
         root = smoothing @ self.posterior.root[2]
-        self.labels = split_peaks(pressure, root, self._squares < (1.5 * self.spacing) ** 2)
+        # Diagonal neighbours on the grid are 1.41 spacings apart.
+        is_neighbour = self._squared_distances < (1.5 * self.spacing) ** 2
+        self.labels = split_peaks(pressure, root, is_neighbour)
 
     @property
     def explained(self) -> Array:
         """Values (n, C) in Pa of the cubes around the region under the traction on the nodes."""
-        explained = self.response @ self.posterior.forces.ravel()
-        return np.asarray(explained + self._changes[:, :, 1:] @ self._errors)
+        by_forces = self.response @ self.posterior.forces.ravel()
+        by_errors = self._sensitivity[:, :, 1:] @ self._elastomer_errors
+        return np.asarray(by_forces + by_errors)
 
     @property
     def discs(self) -> Discs:
@@ -260,10 +284,10 @@ class NodeFit:
 
     @property
     def shape_misfit(self) -> float:
-        """Squared deviation of the values from the fit, divided by the value that noise causes.
+        """Misfit that shows whether the model of the traction is wrong.
 
-        It is `misfit`, that of all cubes around the region, because nodes assume no shape. A
-        `HertzFit` computes the property of this name from the cubes nearest to its contacts.
+        It is `misfit`, that of all cubes around the region, because nodes assume no shape of the
+        contact. A `HertzFit`, which does, computes it from the cubes nearest to its contacts.
         """
         return self.misfit
 
@@ -284,22 +308,28 @@ class NodeFit:
                 largest one.
 
         Returns:
-            The response D (n C, 3 q) of the whitened values (C of each of n cubes) to unknowns that
-            have independent priors of variance 1; eigenvalues (3 q,) and eigenvectors (3 q, 3 q) of
+            Design matrix D (n C, 3 q): whitened values (C of each of n cubes) under unknowns with
+            independent priors of variance 1; eigenvalues (3 q,) and eigenvectors (3 q, 3 q) of
             D' D; and the matrix (3 q, 3 q) from amplitudes of the eigenvectors to the forces of the
             nodes.
         """
         covariance = self._covariance * np.outer(envelope, envelope)
-        # This tiny increase of the diagonal makes up for rounding errors.
+        # Rounding errors could give the covariance a negative eigenvalue, and this tiny increase of
+        # its diagonal prevents that.
         covariance[np.diag_indices(len(covariance))] *= 1 + 1e-8
-        root = np.linalg.cholesky(covariance)
-        white = self._white_response
-        parts = [white[:, axis] @ (root * _DEVIATIONS[axis]) for axis in range(3)]
-        design = np.concatenate(parts, axis=1)
+        cholesky_factor = np.linalg.cholesky(covariance)
+        design = np.concatenate(
+            [
+                self._white_response[:, axis] @ (cholesky_factor * deviation)
+                for axis, deviation in enumerate(_RELATIVE_DEVIATIONS)
+            ],
+            axis=1,
+        )
         eigenvalues, vectors = np.linalg.eigh(design.T @ design)
-        by_axis = vectors.reshape(3, len(root), -1)
-        basis = (root @ by_axis) * _DEVIATIONS[:, None, None]
-        return design, np.maximum(eigenvalues, 0), vectors, basis.reshape(len(vectors), -1)
+        eigenvalues = np.maximum(eigenvalues, 0)
+        vectors_by_axis = vectors.reshape(3, len(cholesky_factor), -1)
+        basis = (cholesky_factor @ vectors_by_axis) * _RELATIVE_DEVIATIONS[:, None, None]
+        return design, eigenvalues, vectors, basis.reshape(len(vectors), -1)
 
 
 def _place_nodes(region: Array, around: Array, inverse: SurfaceInverse) -> tuple[Array, float]:
@@ -315,15 +345,19 @@ def _place_nodes(region: Array, around: Array, inverse: SurfaceInverse) -> tuple
     """
     reach = BORDER_REACH_PITCHES * inverse.pitch
     margin = _POINT_MARGIN * inverse.spacing
-    middle = region.mean(axis=0)
-    extent = np.abs(region - middle).max() + reach
+    centre = region.mean(axis=0)
+    extent = np.abs(region - centre).max() + reach
     step = NODE_STEP * inverse.depth
     while True:
-        nodes = middle + square_points(step, 2 * int(np.ceil(extent / step)) + 1)
+        steps_each_way = int(np.ceil(extent / step))
+        nodes = centre + square_points(step, 2 * steps_each_way + 1)
         to_region = cdist(nodes, region).min(axis=1)
-        nodes, to_region = nodes[to_region < reach], to_region[to_region < reach]
-        is_outside = cdist(nodes, around).min(axis=1) > margin
-        nodes = nodes[(to_region < margin) | is_outside]
+        is_within_reach = to_region < reach
+        nodes, to_region = nodes[is_within_reach], to_region[is_within_reach]
+        is_beyond_border = cdist(nodes, around).min(axis=1) > margin
+        is_in_region = to_region < margin
+        nodes = nodes[is_in_region | is_beyond_border]
         if len(nodes) <= MAX_NODES:
             return nodes, step
+        # The number of nodes is proportional to 1 / step^2. The 2 % spare a further round.
         step *= np.sqrt(1.02 * len(nodes) / MAX_NODES)

@@ -189,7 +189,7 @@ class TrackedRegion:
         self._bad_scans = self._bad_scans + 1 if is_bad else 0
         if isinstance(fit, HertzFit):
             # Beside others, a prediction would make the mutual corrections of fits swing.
-            fit.predict(is_moving=not self.near)
+            fit.predict(extrapolates=not self.near)
             self._follow_home(fit)
 
     def drop_nodes_of_other_values(self) -> None:
@@ -288,7 +288,7 @@ class TrackedRegion:
             return Work.NONE if self._is_tried else Work.BEGIN
         is_worse = fit.shape_misfit > MAX_MISFIT_GROWTH * self._first_misfit
         if isinstance(fit, HertzFit):
-            if fit.is_unsettled or (is_worse and fit.is_moving):
+            if fit.is_unsettled or (is_worse and fit.needs_linearisation):
                 return Work.MOVE
             is_over = is_worse and self._bad_scans >= MAX_BAD_SCANS
             is_over = is_over and self.has_fitted_neighbours
@@ -342,7 +342,7 @@ class TrackedRegion:
             linearise(self._inverse, [fit])
             fit.step(white)
             work += STEP_WORK * len(fit.found.forces)
-            if not fit.is_moving:
+            if not fit.needs_linearisation:
                 break
         return work
 
