@@ -179,7 +179,8 @@ def record_skin(context: LaunchContext) -> list[Action]:
 
     time = f"{datetime.now():%Y_%m_%d-%H_%M_%S}"
     parts = [*namespace.split("/"), _read_skin(context).name, time]
-    folder = Path("_".join(part for part in parts if part)).absolute()
+    name = "_".join(part for part in parts if part)
+    folder = Path(name).absolute()
     command = ["ros2", "bag", "record", "--storage", "mcap", "--output", str(folder)]
     command += ["--qos-profile-overrides-path", str(overrides)]
     # `ros2 bag record` of Humble lacks the option --topics; all releases have --regex.

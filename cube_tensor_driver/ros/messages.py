@@ -93,7 +93,13 @@ class CheckedSubscription:
         # The timer runs only during the pause that follows a damaged message.
         self._pause = node.create_timer(LOG_PERIOD_S, self._end_pause)
         self._pause.cancel()
-        self._subscription = node.create_subscription(kind, topic, self._receive, profile, raw=True)
+        self._subscription = node.create_subscription(
+            kind,
+            topic,
+            self._receive,
+            profile,
+            raw=True,
+        )
 
     def close(self) -> None:
         """End the subscription."""
@@ -162,7 +168,10 @@ def make_message(type_name: str, **fields: Any) -> Any:
 
 
 def compensation_message(
-    frame_id: str, stamp_ns: int, motion: Motion | None, states: Mapping[str, Array]
+    frame_id: str,
+    stamp_ns: int,
+    motion: Motion | None,
+    states: Mapping[str, Array],
 ) -> SkinCompensation:
     """Return a SkinCompensation message: what a recording must contain to repeat a compensation.
 
@@ -175,13 +184,15 @@ def compensation_message(
             `Compensation.states` returns it.
     """
     known = motion or UNKNOWN_MOTION
+    header = Header(stamp=to_time(stamp_ns), frame_id=frame_id)
+    packed_states = {name: pack_array("d", state) for name, state in states.items()}
     return SkinCompensation(
-        header=Header(stamp=to_time(stamp_ns), frame_id=frame_id),
+        header=header,
         weight=motion is not None,
         time_offset=pack_array("q", known.time_ns - stamp_ns),
         specific_force=pack_array("d", known.specific_force),
         gradient=pack_array("d", known.gradient),
-        **{name: pack_array("d", state) for name, state in states.items()},
+        **packed_states,
     )
 
 
@@ -269,7 +280,7 @@ def info_message(
     uids: Mapping[int, int] = MappingProxyType({}),
     sender: str = "reconstruction",
 ) -> SkinInfo:
-    """Return a SkinInfo message: cubes, poses, calibrations and present rest frequencies of a skin.
+    """Return a SkinInfo message, which contains all that is needed to compute the stress of a skin.
 
     Args:
         skin: The skin.
@@ -314,16 +325,20 @@ def _cube_info(cube: SkinCube, frame_id: str) -> CubeInfo:
     the skin file."""
     calibration = cube.calibration
     px, py, pz = cube.xyz
+    position = Point(x=px, y=py, z=pz)
     x, y, z, w = quaternion_from_rpy(*cube.rpy).tolist()
+    orientation = Quaternion(
+        x=x,
+        y=y,
+        z=z,
+        w=w,
+    )
     # Fields of a message cannot be None, so a link that the skin file leaves out is sent as an
     # empty text, and an index as 0.
     return CubeInfo(
         name=cube.name,
         frame_id=frame_id,
-        pose=Pose(
-            position=Point(x=px, y=py, z=pz),
-            orientation=Quaternion(x=x, y=y, z=z, w=w),
-        ),
+        pose=Pose(position=position, orientation=orientation),
         link=cube.link or "",
         index=cube.index or 0,
         layout=calibration.layout.name,

@@ -216,19 +216,33 @@ class CubeNode(LifecycleNode):
     # These methods of rclpy register callbacks. They are overridden to catch exceptions in them.
 
     def create_subscription(
-        self, msg_type: type, topic: str, callback: Callback, *others: Any, **options: Any
+        self,
+        msg_type: type,
+        topic: str,
+        callback: Callback,
+        *others: Any,
+        **options: Any,
     ) -> Any:
         callback = self.callback_errors.catch(callback)
         return super().create_subscription(msg_type, topic, callback, *others, **options)
 
     def create_timer(
-        self, timer_period_sec: float, callback: Callback, *others: Any, **options: Any
+        self,
+        timer_period_sec: float,
+        callback: Callback,
+        *others: Any,
+        **options: Any,
     ) -> Any:
         callback = self.callback_errors.catch(callback)
         return super().create_timer(timer_period_sec, callback, *others, **options)
 
     def create_service(
-        self, srv_type: type, srv_name: str, callback: Callback, *others: Any, **options: Any
+        self,
+        srv_type: type,
+        srv_name: str,
+        callback: Callback,
+        *others: Any,
+        **options: Any,
     ) -> Any:
         callback = self.callback_errors.catch_in_service(callback)
         options.setdefault("qos_profile", SERVICES)
@@ -271,7 +285,8 @@ class CubeNode(LifecycleNode):
     def set_parameters_atomically(
         self, parameter_list: list[RclpyParameter]
     ) -> SetParametersResult:
-        return super().set_parameters_atomically(list(map(self._as_declared, parameter_list)))
+        converted = [self._as_declared(parameter) for parameter in parameter_list]
+        return super().set_parameters_atomically(converted)
 
     def _as_declared(self, parameter: RclpyParameter) -> RclpyParameter:
         """Return a parameter, converted from int to float if its declared type is double.

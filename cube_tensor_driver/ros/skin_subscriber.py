@@ -129,7 +129,11 @@ class SkinSubscriberNode(CubeNode):
     """
 
     def __init__(
-        self, name: str, parameters: Sequence[Parameter], message_type: type, depth: int
+        self,
+        name: str,
+        parameters: Sequence[Parameter],
+        message_type: type,
+        depth: int,
     ) -> None:
         """Make the node.
 

@@ -81,7 +81,11 @@ def listen(topic: str, once: bool) -> Iterator[list[Item]]:
     with node_session("echo") as (node, executor):
         name = resolve_topics(node, [topic])[0]
         listener = _Listener(node, name)
-        if not discover(executor, lambda: stop.is_set() or node.count_publishers(name)):
+
+        def is_published() -> bool:
+            return stop.is_set() or node.count_publishers(name) > 0
+
+        if not discover(executor, is_published):
             raise CubeError(
                 f"nobody publishes {name} in {domain_text()}; ./cube topics lists what there is"
             )
@@ -156,9 +160,9 @@ class _Listener:
         self._names: list[str] | None = None
         self._needs_names = False
         self._early_subscription: Subscription | None = None
-        cubes, _, what = topic.rpartition("/")
-        self._cube = cubes.rpartition("/")[2]
-        if what == "stress" and cubes.rpartition("/")[0].endswith("/cubes"):
+        parent, _, what = topic.rpartition("/")
+        cubes, _, self._cube = parent.rpartition("/")
+        if what == "stress" and cubes.endswith("/cubes"):
             # On a large skin the publisher of a single cube's topic is made only when somebody
             # subscribes, so the subscription comes before the search for the publisher.
             profile = offered_profile([], QUEUE_DEPTH)
@@ -198,7 +202,8 @@ class _Listener:
         if kind is SkinStress:
             # SkinStress contains only the indices of cubes; their names are in the topic `info`.
             self._needs_names = True
-            info = f"{self._topic.rpartition('/')[0]}/info"
+            namespace = self._topic.rpartition("/")[0]
+            info = f"{namespace}/info"
             self._node.create_subscription(SkinInfo, info, self._on_info, LATCHED)
             self._add(SkinStress, self._on_stress, profile, raw=True)
         else:
@@ -218,9 +223,19 @@ class _Listener:
         return [to_plain(message)]
 
     def _add(
-        self, kind: type, receive: Callable[[Any], None], profile: QoSProfile, raw: bool = False
+        self,
+        kind: type,
+        receive: Callable[[Any], None],
+        profile: QoSProfile,
+        raw: bool = False,
     ) -> Subscription:
-        return self._node.create_subscription(kind, self._topic, receive, profile, raw=raw)
+        return self._node.create_subscription(
+            kind,
+            self._topic,
+            receive,
+            profile,
+            raw=raw,
+        )
 
     def _on_message(self, message: Any) -> None:
         self.waiting.append(message)

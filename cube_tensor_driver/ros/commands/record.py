@@ -117,7 +117,11 @@ class Recorder:
         self._closing = threading.Event()
         # The thread is a daemon, so that it does not keep the process alive if an error ends the
         # main thread before it calls `close`.
-        self._thread = threading.Thread(target=self._write, name="bag writer", daemon=True)
+        self._thread = threading.Thread(
+            target=self._write,
+            name="bag writer",
+            daemon=True,
+        )
         self._thread.start()
 
     @property
@@ -143,7 +147,8 @@ class Recorder:
                 if self.has_begun:
                     self.late[topic] = now - self._begin_s
         is_complete = not (self.missing or self._unconnected)
-        has_waited = self._connected_s and now - self._connected_s > MAX_CONNECT_S
+        has_connection = self._connected_s > 0
+        has_waited = has_connection and now - self._connected_s > MAX_CONNECT_S
         if not self.has_begun and (is_complete or has_waited):
             self._begin(now)
 
@@ -155,7 +160,8 @@ class Recorder:
         Args:
             now: Time of the monotonic clock, in seconds.
         """
-        early = Counter(topic for topic, _, _ in self._waiting if topic not in self._latched)
+        topics = [topic for topic, _, _ in self._waiting]
+        early = Counter(topic for topic in topics if topic not in self._latched)
         with self._lock:
             kept = [one for one in self._waiting if one[0] in self._latched]
             self._received_bytes = sum(len(data) for _, _, data in kept)
@@ -200,7 +206,8 @@ class Recorder:
             # Appending to a deque needs no lock. The deque has no limit of its size in bytes, so
             # the bytes that wait are counted here.
             waiting_bytes = self._received_bytes - self._written_bytes
-            if waiting_bytes + len(data) > MAX_WAITING_BYTES or self.error is not None:
+            is_full = waiting_bytes + len(data) > MAX_WAITING_BYTES
+            if is_full or self.error is not None:
                 self.dropped += 1
                 return
             self._received_bytes += len(data)
@@ -267,10 +274,17 @@ def record(
     with node_session("recorder") as session:
         names = resolve_topics(session.node, topics)
         bag = BagWriter(folder, storage, max_bytes, max_seconds)
-        return fill(bag, session, names, stop=stop, duration=duration, show=show)
+        return record_into(
+            bag,
+            session,
+            names,
+            stop=stop,
+            duration=duration,
+            show=show,
+        )
 
 
-def fill(
+def record_into(
     bag: BagWriter,
     session: Session,
     names: Sequence[str],
@@ -279,18 +293,19 @@ def fill(
     duration: float | None,
     show: Callable[[Recorder, float], None],
 ) -> Recorder:
-    """Record topics into a bag, and close the bag, as `record` does.
+    """Record topics into an open bag until an event is set or the duration is over; close the bag.
 
     Args:
         bag: The bag, which is empty.
         session: The node that subscribes.
         names: Full names of the topics.
         stop: Recording ends when this event is set.
-        duration: See `record`.
-        show: See `record`.
+        duration: Time, in s, from the first message on, after which recording ends; None: it ends
+            only at the event.
+        show: Called once a second with the recorder and the time since the start, in s.
 
     Raises:
-        BagError: See `record`.
+        BagError: Writing the bag has failed, or no message arrived.
     """
     recorder = Recorder(session.node, names, bag)
     begin = find_at = show_at = time.monotonic()
@@ -303,7 +318,8 @@ def fill(
         if not has_come and recorder.has_begun and any(recorder.counts.values()):
             # The duration is counted from the first message on and not from the start, because
             # finding the topics may take seconds on a busy machine.
-            has_come, until = True, until + now - begin
+            has_come = True
+            until += now - begin
         return stop.is_set() or recorder.error is not None or now >= until
 
     def find_and_show() -> None:

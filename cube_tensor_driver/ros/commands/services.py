@@ -24,7 +24,7 @@ from ...srv import Tare
 from ..session import Session, domain_text, node_session, spin_until
 
 MAX_DISCOVERY_S = 5.0
-"""Maximum time, in seconds, for which topics and services of other nodes are searched."""
+"""Maximum time, in seconds, to search for topics and services of other nodes."""
 
 ANNOUNCE_S = 3.5
 """Time, in seconds, after which all nodes in a DDS domain are found, even on a busy machine: Fast
@@ -47,7 +47,7 @@ LIST_SERVICE = "/list_parameters"
 """Last part of the name of a service that every node with parameters offers. The names of nodes are
 found by searching for these services."""
 
-EXPECTED = {
+VALUE_DESCRIPTIONS = {
     bool: "true or false",
     int: "a whole number",
     float: "a number",
@@ -58,7 +58,7 @@ EXPECTED = {
 
 @dataclass(frozen=True)
 class TareAnswer:
-    """The response of one reconstruction node to a request for a tare.
+    """The response of one reconstruction node to a request for a tare (zeroing of its cubes).
 
     Attributes:
         node: Full name of the reconstruction node.
@@ -72,14 +72,16 @@ class TareAnswer:
 
 
 def request_tare(cubes: Sequence[str], clear: bool) -> list[TareAnswer]:
-    """Request a tare (new rest frequencies) from every reconstruction node in the DDS domain.
+    """Request a tare from every reconstruction node in the DDS domain.
+
+    In a tare, a node takes the present load of cubes as zero load.
 
     Args:
         cubes: Names of the cubes; an empty sequence: all cubes.
         clear: Whether to clear the tares of all cubes instead.
 
     Raises:
-        CubeError: No reconstruction runs, or one has not responded within `MAX_ANSWER_S`.
+        CubeError: No reconstruction node runs, or one has not responded within `MAX_ANSWER_S`.
     """
     with node_session("tare_request") as session:
         services = find_services(session, "cube_tensor_driver/srv/Tare")
@@ -217,9 +219,11 @@ class _NodeParameters:
                 type=ParameterType.PARAMETER_DOUBLE, double_value=float(value.integer_value)
             )
         refusal = f"{self._name}: {parameter} is not set to {text}"
-        if kind in EXPECTED and not isinstance(parameter_value_to_python(value), kind):
-            raise ConfigError(f"{refusal}: needed is {EXPECTED[kind]}")
-        request = SetParameters.Request(parameters=[Parameter(name=parameter, value=value)])
+        is_known = kind in VALUE_DESCRIPTIONS
+        if is_known and not isinstance(parameter_value_to_python(value), kind):
+            raise ConfigError(f"{refusal}: needed is {VALUE_DESCRIPTIONS[kind]}")
+        change = Parameter(name=parameter, value=value)
+        request = SetParameters.Request(parameters=[change])
         result = self._call(SetParameters, "set_parameters", request).results[0]
         if not result.successful:
             raise ConfigError(f"{refusal}: {result.reason}")
@@ -232,8 +236,9 @@ def _find_nodes(session: Session, wanted_service: str = "") -> list[str]:
     """Return the full names of the nodes in the DDS domain that have parameters.
 
     Args:
-        session: The node that searches, which is left out.
-        wanted_service: Full name of a service with which the search ends; empty: all are searched.
+        session: The node that searches. Its own name is not returned.
+        wanted_service: Full name of a service; the search ends when it is found. If it is empty,
+            the search ends when no further node appears.
 
     Raises:
         ConfigError: No node was found within `MAX_DISCOVERY_S`.
@@ -252,9 +257,9 @@ def find_services(session: Session, kind: str, wanted: str = "") -> list[str]:
     Args:
         session: The node that searches. Its own services are left out.
         kind: Type of the services, as in std_srvs/srv/Trigger.
-        wanted: Full name of a service with which the search ends. If it is empty, the search ends
-            when no further service has appeared for `SETTLE_S`, at the latest after
-            `MAX_DISCOVERY_S`.
+        wanted: Full name of a service; the search ends when it is found. If it is empty, the search
+            ends when no further service has appeared for `SETTLE_S`. In both cases it ends at the
+            latest after `MAX_DISCOVERY_S`.
     """
     own = f"{session.node.get_fully_qualified_name()}/"
 

@@ -61,7 +61,11 @@ class ReconstructionDiagnostics:
     """
 
     def __init__(
-        self, skin: Skin, reconstructor: Reconstructor, tare: Taring, lost: LostMessages
+        self,
+        skin: Skin,
+        reconstructor: Reconstructor,
+        tare: Taring,
+        lost: LostMessages,
     ) -> None:
         self.refused_messages = 0
         self.compensation_problem = ""
@@ -214,7 +218,11 @@ class CubeHealth:
         return {name: count for name, count in counts.items() if count}
 
     def _describe_cubes(
-        self, cubes: AnyArray, bits: AnyArray, has_residual: Mask, rows: AnyArray
+        self,
+        cubes: AnyArray,
+        bits: AnyArray,
+        has_residual: Mask,
+        rows: AnyArray,
     ) -> dict[int, str]:
         """Return the index of each of these cubes -> the text of its diagnostic status.
 
@@ -352,7 +360,8 @@ def _condition_words(bits: int) -> str:
     Args:
         bits: Bits of the conditions, see `core/status.py`.
     """
-    return " and ".join(word for bit, word in WORDS.items() if bits & bit)
+    words = [word for bit, word in WORDS.items() if bits & bit]
+    return " and ".join(words)
 
 
 def _residual_cause(suspects: list[str] | None) -> str:

@@ -68,17 +68,21 @@ class Diagnostics:
         for status in statuses:
             status.name = f"{node_name}: {status.name}"
         message = DiagnosticArray(status=statuses)
-        message.header.stamp = self._node.get_clock().now().to_msg()
+        now = self._node.get_clock().now()
+        message.header.stamp = now.to_msg()
         for publisher in self._publishers:
             publisher.publish(message)
 
     def _add_errors(self, status: DiagnosticStatus) -> None:
         errors = self._count_errors()
-        status.values = [*status.values, KeyValue(key="callback errors", value=str(errors))]
+        pair = KeyValue(key="callback errors", value=str(errors))
+        status.values = [*status.values, pair]
         if errors > self._errors_before:
             status.level = DiagnosticStatus.ERROR
-            text = f"{errors - self._errors_before} callbacks failed: see the log of the node"
-            status.message = "; ".join(filter(None, [status.message, text]))
+            new_errors = errors - self._errors_before
+            text = f"{new_errors} callbacks failed: see the log of the node"
+            texts = filter(None, [status.message, text])
+            status.message = "; ".join(texts)
         self._errors_before = errors
 
 

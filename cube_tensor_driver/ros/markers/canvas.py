@@ -156,7 +156,7 @@ class Canvas:
             self._markers[f"cubes {group}"].colours[:, :3] = colours[members]
 
     def draw_arrows(self, values: Array, ranges: scene.Ranges) -> None:
-        """Draw the arrows of traction and gradient of each cube.
+        """Draw the arrows of each cube: traction (force per area on its upper face) and gradient.
 
         Args:
             values: 6 stress components (Pa) and 9 gradients (Pa/m) of each cube in its own frame,
@@ -216,7 +216,8 @@ class Canvas:
         lines, is_pull = scene.principal_crosses(self._poses, values, scale)
         crosses.points[:] = lines.reshape(-1, 3)
         colours = np.where(is_pull.reshape(-1, 1), PULL_COLOUR, PUSH_COLOUR)
-        crosses.colours[:, :3] = np.repeat(colours, 2, axis=0)
+        end_colours = np.repeat(colours, 2, axis=0)
+        crosses.colours[:, :3] = end_colours
 
     def draw_contacts(self, contacts: SkinContacts | None) -> None:
         """Draw each contact as a ring with a text that states its normal and shear force.
@@ -267,7 +268,8 @@ class Canvas:
             rotations: Rotation matrix of each group of cubes, (groups, 3, 3).
         """
         markers = []
-        for group, (w, x, y, z) in enumerate(quaternions(rotations).tolist()):
+        orientations = quaternions(rotations).tolist()
+        for group, (w, x, y, z) in enumerate(orientations):
             members = self._groups[group]
             # All boxes of a marker have the same size, so that of the largest cube is taken.
             half_side = float(self._poses.half_side[members].max())
@@ -290,11 +292,11 @@ class Canvas:
         return markers
 
     def _make_lines(self, frame_id: str, crosses: bool) -> list[Marker]:
-        """Return the markers of arrows and of the crosses over faulty cubes.
+        """Return the markers that consist of lines: arrows, and crosses over faulty cubes.
 
         Args:
             frame_id: Frame id of the parent frame of the skin.
-            crosses: Whether there is a marker for principal stresses, too.
+            crosses: Whether to add a marker with the principal stresses of each cube.
         """
         # Each entry contains the name of a marker, its number of points per cube, and its colour.
         # If the colour is None, each point of the marker has its own colour.
@@ -329,7 +331,8 @@ def _group_by_orientation(rotation: Array) -> tuple[list[Index], Array]:
     flat = rotation.round(6).reshape(len(rotation), 9)
     unique, group = np.unique(flat, axis=0, return_inverse=True)
     group = group.ravel()  # numpy 2.0, but no other version, returns shape (cubes, 1)
-    members = [np.flatnonzero(group == number) for number in range(len(unique))]
+    n_groups = len(unique)
+    members = [np.flatnonzero(group == number) for number in range(n_groups)]
     orientations = unique.reshape(-1, 3, 3)
     return members, orientations * UPSIDE_DOWN
 

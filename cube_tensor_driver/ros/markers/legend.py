@@ -172,14 +172,16 @@ class Legend:
 
     def __init__(self, markers: SerialisedMarkers, place: LegendPlace) -> None:
         self._markers = markers
-        centres = np.linspace(0, 1, 2 * BAR_BOXES + 1)[1::2]
+        edges_and_centres = np.linspace(0, 1, 2 * BAR_BOXES + 1)
+        centres = edges_and_centres[1::2]
         bar = np.array([place.point(across, 0) for across in centres])
         bar[:, 1] += 0.15 * place.pitch
         markers["legend bar"].points[:] = bar * UPSIDE_DOWN
         upwards = np.array([[0.0, 0.0, 1.0]])
         for number, scale in enumerate(SCALES):
             tail = place.point(0, FIRST_SCALE_LINE + SCALE_LINES * number)
-            tip = tail + np.array([scale.length * place.pitch, 0, 0])
+            length = scale.length * place.pitch
+            tip = tail + np.array([length, 0, 0])
             arrow = np.stack([tail, tip])
             lines = scene.heads(arrow[np.newaxis], upwards)
             markers[f"{scale.name} arrow"].points[:] = lines.reshape(-1, 3)
@@ -200,7 +202,8 @@ class Legend:
         """
         low = -top if quantity.signed else 0.0
         values = np.linspace(low, top, BAR_BOXES)
-        self._markers["legend bar"].colours[:, :3] = scene.colours(quantity, values, top)
+        bar = self._markers["legend bar"]
+        bar.colours[:, :3] = scene.colours(quantity, values, top)
         for number, position in enumerate(NUMBER_POSITIONS):
             value = (low + position * (top - low)) / quantity.size
             # Numbers of a quantity that can be negative always have a sign, so that the length of

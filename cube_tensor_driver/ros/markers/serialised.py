@@ -149,10 +149,12 @@ class SerialisedMarkers:
         self._arrays: dict[str, MarkerArrays] = {}
         for marker, begins in zip(markers, marks, strict=True):
             points, colours, text, position, colour = map(marked.index, begins)
+            n_points, n_colours = len(marker.points), len(marker.colors)
+            n_characters = len(marker.text)
             self._arrays[marker.ns] = MarkerArrays(
-                points=self._view("<f8", points, (len(marker.points), 3)),
-                colours=self._view("<f4", colours, (len(marker.colors), 4)),
-                text=self._view("u1", text, (len(marker.text),)),
+                points=self._view("<f8", points, (n_points, 3)),
+                colours=self._view("<f4", colours, (n_colours, 4)),
+                text=self._view("u1", text, (n_characters,)),
                 position=self._view("<f8", position, (3,)),
                 colour=self._view("<f4", colour, (4,)),
             )

@@ -127,7 +127,8 @@ class Contacts(SkinSubscriberNode):
         return self._finder
 
     def _statuses(self) -> list[DiagnosticStatus]:
-        """Return a status that says why no contacts are computed; empty if they are."""
+        """Return one diagnostic status with the reason why no contacts are computed; an empty list
+        if contacts are computed."""
         if self._take_finder() is not None or not self._problem:
             return []
         text = f"no contacts: {self._problem}"

@@ -47,10 +47,10 @@ class Driver(CubeNode):
         """Make the node.
 
         Args:
-            on_rows: Called in the thread that reads the links, with the rows of frequencies of each
-                message. Their arrays are overwritten after it has returned. If it is given, the
-                topic `frequencies` is published only while it has subscribers; with None it is
-                published always.
+            on_rows: Called in the thread that reads the links, with the rows (samples of one cube
+                each) of a message. Their arrays are overwritten after it has returned. If it is
+                given, the topic `frequencies` is published only while it has subscribers; with None
+                it is published always.
         """
         super().__init__("driver", DRIVER)
         self._on_rows = on_rows
@@ -148,8 +148,8 @@ class Driver(CubeNode):
         if self._links is None:
             return []
         self._node_clock.update()
-        # Hubs report the uids of cubes some time after the start. The reconstruction needs them to
-        # find the stored tares, so `driver/info` is published again.
+        # Hubs report the uids (unique numbers) of cubes some time after the start. The
+        # reconstruction finds the tare files by them, so `driver/info` is published again.
         if self._links.cube_uids != self._published_uids:
             self._published_uids = self._links.cube_uids
             self._publish_info()

@@ -23,9 +23,10 @@ contacts are not drawn."""
 class Markers(SkinSubscriberNode):
     """Publishes `markers`, the picture of a skin for RViz and Foxglove.
 
-    It shows the cubes in the colours of a quantity, arrows for traction (force per area on the
-    upper face) and for the gradient, a legend, crosses over cubes whose health is not fine, and the
-    contacts while the node `contacts` runs.
+    The colour of each cube shows a quantity, such as the normal stress, and its arrows show the
+    traction (force per area on the upper face) and the gradient of the stress. The picture also has
+    a legend, crosses over cubes whose health is not fine, and the contacts while the node
+    `contacts` runs.
     """
 
     def __init__(self) -> None:

@@ -145,10 +145,11 @@ class Reconstruction(CubeNode):
         )
         self._states_ns = 0
         for cube in skin.cubes if self._motion else ():
-            if cube.calibration.weight is None:
+            calibration = cube.calibration
+            if calibration.weight is None:
                 self.get_logger().warning(
                     f"cube {cube.name}: weight is not compensated, as its calibration "
-                    f"{cube.calibration.id} has no response to it: ./cube fem or ./cube fit "
+                    f"{calibration.id} has no response to it: ./cube fem or ./cube fit "
                     "--weight computes it"
                 )
                 break
@@ -164,8 +165,9 @@ class Reconstruction(CubeNode):
                 of `frequencies`.
         """
         if self.is_active:
+            stamp_ns = int(rows.stamp_ns.min())
             frame_id = self._skin.parent_frame.encode() + b"\0"
-            self._process(rows, int(rows.stamp_ns.min()), frame_id)
+            self._process(rows, stamp_ns, frame_id)
 
     def _on_frequencies(self, data: bytes, number: int | None) -> None:
         self._lost.note_arrival(number)
@@ -174,7 +176,8 @@ class Reconstruction(CubeNode):
         except CubeError as error:
             self._refuse(error)
             return
-        self._process(message.rows, int(message.stamp_ns[0]), message.frame_id)
+        stamp_ns = int(message.stamp_ns[0])
+        self._process(message.rows, stamp_ns, message.frame_id)
 
     def _process(
         self,
@@ -232,9 +235,9 @@ class Reconstruction(CubeNode):
             motion = self._recorded.compensation_at(stamp_ns, self._reconstructor)
         elif self._motion:
             try:
-                first_ns = rows.stamp_ns.min(initial=stamp_ns)
-                last_ns = rows.stamp_ns.max(initial=stamp_ns)
-                motion = self._motion.motion(int(first_ns), int(last_ns))
+                first_ns = int(rows.stamp_ns.min(initial=stamp_ns))
+                last_ns = int(rows.stamp_ns.max(initial=stamp_ns))
+                motion = self._motion.motion(first_ns, last_ns)
             except MissingMotion as error:
                 motion, problem = UNKNOWN_MOTION, f"weight is not compensated: {error}"
                 self.get_logger().warning(problem, throttle_duration_sec=LOG_PERIOD_S)
@@ -266,9 +269,10 @@ class Reconstruction(CubeNode):
         if len(rows) <= self._max_scans:
             return
         counts = np.bincount(rows.cube)
-        if counts.max() > self._max_scans:
+        n_scans = counts.max()
+        if n_scans > self._max_scans:
             raise MessageError(
-                f"a message has {counts.max()} rows of cube {counts.argmax()}, the limit is "
+                f"a message has {n_scans} rows of cube {counts.argmax()}, the limit is "
                 f"{self._max_scans}: set parameter publish_period to the driver's"
             )
 

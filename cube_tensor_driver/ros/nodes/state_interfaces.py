@@ -74,8 +74,9 @@ class SkinWrenches:
         forces = Forces(skin, side)
         self._side, self._position = forces.side, forces.position
         self._rotation = np.array([rotation_from_rpy(*cube.rpy) for cube in skin.cubes])
-        self._wrench = np.full((len(skin.cubes), 6), np.nan)
-        self._arrived = np.full(len(skin.cubes), -np.inf)
+        n_cubes = len(skin.cubes)
+        self._wrench = np.full((n_cubes, 6), np.nan)
+        self._arrived = np.full(n_cubes, -np.inf)
         self._stale_s = stale_s
 
     def update(self, rows: StressRows, now: float) -> None:
@@ -151,7 +152,13 @@ class StateInterfaces:
     """Publishes the wrenches of a skin for a hardware component of ros2_control, until the node is
     cleaned up."""
 
-    def __init__(self, node: CubeNode, skin: Skin, component: str, wrenches: SkinWrenches) -> None:
+    def __init__(
+        self,
+        node: CubeNode,
+        skin: Skin,
+        component: str,
+        wrenches: SkinWrenches,
+    ) -> None:
         """Make the publishers.
 
         Args:

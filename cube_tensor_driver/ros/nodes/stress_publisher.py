@@ -153,7 +153,10 @@ class ForceCloud:
         item = np.dtype("<f4").itemsize
         step = item * len(FORCE_FIELDS)
         self._message = PointCloud2(
-            height=1, width=self._n_cubes, point_step=step, row_step=step * self._n_cubes
+            height=1,
+            width=self._n_cubes,
+            point_step=step,
+            row_step=step * self._n_cubes,
         )
         self._message.header.frame_id = skin.parent_frame
         self._message.fields = [
@@ -194,7 +197,11 @@ class CubeTopics:
     """
 
     def __init__(
-        self, node: CubeNode, skin: Skin, reconstructor: Reconstructor, side: float | None
+        self,
+        node: CubeNode,
+        skin: Skin,
+        reconstructor: Reconstructor,
+        side: float | None,
     ) -> None:
         self._node, self._skin, self._reconstructor = node, skin, reconstructor
         own_sides = [2 * cube.calibration.half_side for cube in skin.cubes]
@@ -204,7 +211,7 @@ class CubeTopics:
         self._wrenches = _CubePublishers(node, skin, "wrench", WrenchStamped)
 
     def find_listeners(self) -> None:
-        """Find out which topics of single cubes have subscribers. A timer calls this regularly."""
+        """Update the lists of cubes whose topics have subscribers. A timer calls this method."""
         self._tensors.find_listeners()
         self._wrenches.find_listeners()
 
@@ -268,7 +275,8 @@ class CubeTopics:
             # with pads that fail intermittently would grow for ever.
             if len(self._covariances) >= MAX_COVARIANCES:
                 self._covariances.clear()
-            self._covariances[key] = self._reconstructor.pipeline.covariance(cube, left_out)
+            pipeline = self._reconstructor.pipeline
+            self._covariances[key] = pipeline.covariance(cube, left_out)
         # The uncertainty of the compensation of weight, creep and temperature changes from row to
         # row, so its covariance is not cached but added here.
         growth = self._reconstructor.compensation.growth(cube, left_out)
@@ -283,7 +291,13 @@ class _CubePublishers:
         listened: Indices of the cubes whose topic has a subscriber.
     """
 
-    def __init__(self, node: CubeNode, skin: Skin, what: str, message_type: type) -> None:
+    def __init__(
+        self,
+        node: CubeNode,
+        skin: Skin,
+        what: str,
+        message_type: type,
+    ) -> None:
         """Make the publishers, unless the skin is large (see `MAX_ANNOUNCED_CUBES`).
 
         Args:

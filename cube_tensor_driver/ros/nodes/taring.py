@@ -28,8 +28,8 @@ from ..callbacks import shorten
 from ..node import CubeNode
 
 MAX_DATA_AGE_S = 1.0
-"""Maximum age, in seconds, of the newest measurement when a tare is requested. With older data the
-request is refused, because the load on the skin may have changed since then."""
+"""Maximum age, in seconds, of the newest data when a tare (zeroing of the cubes) is requested. With
+older data the request is refused, because the load on the skin may have changed since then."""
 
 
 def tare_folder(parameter: str) -> Path:
@@ -47,6 +47,8 @@ def tare_folder(parameter: str) -> Path:
 
 class Taring:
     """Offers the services for tares in a reconstruction node, and stores tares in files.
+
+    A tare is a new measurement of the rest frequencies (frequencies without load) of a cube.
 
     Attributes:
         uids: Index of a cube in the skin -> its uid (unique number), for cubes whose uid is known
@@ -160,8 +162,9 @@ class Taring:
 
         Args:
             number: Index of the cube in the skin.
-            uid: Uid of the cube.
-            rest: Rest frequencies of all cubes, (cubes, pads), in Hz, which are changed.
+            uid: Unique number of the cube, which is part of the name of the file.
+            rest: Rest frequencies (without load) of all cubes, (cubes, pads), in Hz, which are
+                changed.
         """
         if self._folder is None:
             return
@@ -208,11 +211,12 @@ class Taring:
     def _store(self, number: int, rest: Array) -> None:
         """Write the tare file of a cube, or remove it if the tare was cleared.
 
-        Nothing is done while the uid of the cube is unknown.
+        Nothing is done while the uid (unique number) of the cube is unknown, because the file is
+        named by it.
 
         Args:
             number: Index of the cube in the skin.
-            rest: Rest frequencies of all cubes, (cubes, pads), in Hz.
+            rest: Rest frequencies (without load) of all cubes, (cubes, pads), in Hz.
 
         Raises:
             ConfigError: The file cannot be written or removed.
@@ -243,7 +247,8 @@ class Taring:
         return response
 
     def _tare(self, names: list[str], duration_s: float) -> str:
-        """Tare cubes, store their tares, and return the text for the response.
+        """Measure and store the rest frequencies (without load) of cubes, and return a text for the
+        response of the service.
 
         Args:
             names: Names of the cubes; an empty list: all cubes.
@@ -308,7 +313,7 @@ class Taring:
 
         Args:
             cubes: Indices of the cubes in the skin.
-            rest: Rest frequencies of all cubes, (cubes, pads), in Hz.
+            rest: Rest frequencies (without load) of all cubes, (cubes, pads), in Hz.
         """
         created = datetime.now(timezone.utc)
         self.created.update(dict.fromkeys(cubes, created))

@@ -78,7 +78,8 @@ class TouchPublisher:
             if len(touches.cube):
                 self._publisher.publish(self._make_message(touches))
             else:
-                STAMP.pack_into(self._empty, STAMP_OFFSET, *divmod(touches.stamp_ns, SECOND))
+                seconds, nanoseconds = divmod(touches.stamp_ns, SECOND)
+                STAMP.pack_into(self._empty, STAMP_OFFSET, seconds, nanoseconds)
                 self._publisher.publish(bytes(self._empty))
 
     def _make_message(self, touches: Touches) -> SkinTouch:
@@ -94,9 +95,11 @@ class TouchPublisher:
             "shear_x_uncertainty": shear_x_uncertainty,
             "shear_y_uncertainty": shear_y_uncertainty,
         }
+        header = Header(stamp=to_time(touches.stamp_ns), frame_id=self._frame_id)
+        arrays = {name: column.astype(np.float32) for name, column in columns.items()}
         return make_message(
             TOUCH,
-            header=Header(stamp=to_time(touches.stamp_ns), frame_id=self._frame_id),
+            header=header,
             cube=touches.cube.astype(np.uint16),
-            **{name: column.astype(np.float32) for name, column in columns.items()},
+            **arrays,
         )
