@@ -52,12 +52,15 @@ def edges(
     """
     found = np.zeros(len(millihertz), EDGES)
     hertz = 1e-3 * millihertz.astype(float)
-    periods = np.ceil(hertz * WINDOW_US * 1e-6 - phase) - 1
+    in_window = hertz * WINDOW_US * 1e-6
+    periods = np.ceil(in_window - phase) - 1
     # A pad without two edges in the window has no period to capture.
     runs = periods >= 1
     hertz, phase, periods = hertz[runs], phase[runs], periods[runs]
-    found["first"][runs] = np.floor(phase / hertz * COUNTER_HZ)
-    found["last"][runs] = np.floor((phase + periods) / hertz * COUNTER_HZ)
+    first_s = phase / hertz
+    last_s = (phase + periods) / hertz
+    found["first"][runs] = np.floor(first_s * COUNTER_HZ)
+    found["last"][runs] = np.floor(last_s * COUNTER_HZ)
     found["periods"][runs] = periods
     return found
 

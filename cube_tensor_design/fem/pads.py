@@ -75,8 +75,9 @@ def pad_weights(
         direction = normal if face == normal[axis] else -parity[axis] * normal
         if rotation is not None:
             direction = rotation @ direction
-        on_face = np.abs(positions[axis] - face) < SAME_COORDINATE
-        on_face &= np.all(np.abs(positions[others]) < 1.0 + SAME_COORDINATE, axis=0)
+        in_plane = np.abs(positions[axis] - face) < SAME_COORDINATE
+        beside_edges = np.abs(positions[others]) < 1.0 + SAME_COORDINATE
+        on_face = in_plane & np.all(beside_edges, axis=0)
         for along in np.flatnonzero(direction):
             dofs = np.flatnonzero(on_face & (component == along))
             product = np.full(len(dofs), direction[along])
@@ -135,8 +136,9 @@ def interval_weights(
     trial = np.eye(n)[:, 1:-1]
     trial[-1, -order:] = _continuation(order)
     trial[0, :order] = _continuation(order)[::-1]
+    matrix = (mass @ trial)[1:-1].T
     weights = np.zeros(n)
-    weights[1:-1] = np.linalg.solve((mass @ trial)[1:-1].T, trial.T @ integral)
+    weights[1:-1] = np.linalg.solve(matrix, trial.T @ integral)
     return weights
 
 
@@ -149,7 +151,8 @@ def _line_element(order: int) -> tuple[Array, Array]:
     nodes = np.arange(order + 1) / order
     to_nodal = np.linalg.inv(np.vander(nodes, increasing=True))
     phi = np.vander(points, order + 1, increasing=True) @ to_nodal
-    return (phi * weight[:, None]).T @ phi, weight @ phi
+    weighted = phi * weight[:, None]
+    return weighted.T @ phi, weight @ phi
 
 
 def _continuation(order: int) -> Array:

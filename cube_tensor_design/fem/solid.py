@@ -200,12 +200,14 @@ class Solid:
             outer = edges[_is_at(sign * centres[axis], end)]
             face = skfem.FacetBasis(mesh, self.basis.elem, facets=outer, intorder=6)
             x = np.asarray(face.default_parameters()["x"])
-            stress = _parity_part(field, x.reshape(self.dim, -1).T, parity)
+            points = x.reshape(self.dim, -1).T
+            stress = _parity_part(field, points, parity)
             traction = sign * stress[..., axis]  # (q, n, dim)
+            by_point = traction.reshape(face.dx.size, -1)
             # A quadrature point loads the nodes whose functions are not zero there.
             values = np.stack([np.asarray(shape[0]) for shape in face.basis])
             samples = sample_matrix(face, values * face.dx)
-            forces = samples.T @ traction.reshape(face.dx.size, -1)
+            forces = samples.T @ by_point
             by_node = forces.reshape(face.N, -1, self.dim).swapaxes(1, 2)
             total = total + by_node.reshape(len(self.component), -1)
         return total
@@ -226,7 +228,9 @@ class Solid:
         ordering = "MMD_AT_PLUS_A"
         if self.dim == 3:
             # Five times faster, and half the memory, of SuperLU's own ordering.
-            free = free[nested_dissection(self._grid[:, free // self.dim])]
+            nodes = free // self.dim
+            order = nested_dissection(self._grid[:, nodes])
+            free = free[order]
             ordering = "NATURAL"
         matrix = self.total[free][:, free].tocsc()
         # The matrix is positive definite, so no pivoting is needed.
@@ -251,16 +255,20 @@ class Solid:
         if self.dim == 2:  # triangles are on no product grid
             return parity, np.arange(len(self.component))
         axes = np.arange(self.dim)
+        kinds = np.array(self._axis_kind)
         for kind in set(self._axis_kind):
-            equal = np.flatnonzero(np.array(self._axis_kind) == kind)
+            equal = np.flatnonzero(kinds == kind)
             axes[equal] = sorted(equal, key=lambda k: parity[k])
 
         # Component k at x is, before the exchange, component axes[k] at y with y[axes[k]] = x[k].
-        node_at = np.empty(self._grid.max(axis=1) + 1, dtype=int)
+        n_coordinates = self._grid.max(axis=1) + 1
+        node_at = np.empty(n_coordinates, dtype=int)
         node_at[tuple(self._grid)] = np.arange(self._grid.shape[1])
-        before = node_at[tuple(self._grid[np.argsort(axes)])]
+        exchanged = self._grid[np.argsort(axes)]
+        before = node_at[tuple(exchanged)]
         swap = self.dim * before[:, None] + axes
-        return tuple(parity[k] for k in axes), swap.ravel()
+        sorted_parity = tuple(parity[k] for k in axes)
+        return sorted_parity, swap.ravel()
 
     def scalar_elements(self, in_cube: bool) -> skfem.Basis:
         """Return the scalar elements (of one displacement component) in the cube, or in the
@@ -293,9 +301,12 @@ class Solid:
                 held |= _is_at(x[k], 0.0) & (is_normal == (sign > 0))
         if self._confined:
             for k in range(self.dim - 1):
-                at_side = _is_at(x[k], x[k].max()) | _is_at(x[k], x[k].min())
+                at_end = _is_at(x[k], x[k].max()) | _is_at(x[k], x[k].min())
+                # The other end is a mirror if only the positive part is meshed.
+                at_side = at_end & (np.abs(x[k]) > 1.0)
                 is_normal = component == k
-                held |= at_side & (np.abs(x[k]) > 1.0) & (is_normal == (parity[k] >= 0))
+                is_even = parity[k] >= 0
+                held |= at_side & (is_normal == is_even)
         if self._ground:
             return held | _is_at(x[-1], x[-1].min())
         if self.is_rigid:

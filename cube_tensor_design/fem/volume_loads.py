@@ -118,9 +118,11 @@ def compute_thermal_stress(
         parts = []
         for number, (lam, mu) in enumerate(solid.moduli):
             basis = solid.scalar_elements(in_cube=number == 1)
-            heights = (np.asarray(basis.default_parameters()["x"])[-1] + z) / half_height
+            x = np.asarray(basis.default_parameters()["x"])
+            heights = (x[-1] + z) / half_height
+            profiles = legvander(heights, N_PROFILES - 1)
             stiffness = n_held * lam + 2 * mu
-            pressures = expansions[number] * stiffness * legvander(heights, N_PROFILES - 1)
+            pressures = expansions[number] * stiffness * profiles
             # The work of a pressure in a test function w of component k is p dw/dx_k.
             forces = [
                 [
@@ -164,9 +166,8 @@ def compute_weight(
     def load(solid: Solid) -> Load:
         parts = []
         for number, density in enumerate(densities):
-            volume = skfem.LinearForm(lambda w, _: w).assemble(
-                solid.scalar_elements(in_cube=number == 1)
-            )
+            elements = solid.scalar_elements(in_cube=number == 1)
+            volume = skfem.LinearForm(lambda w, _: w).assemble(elements)
             # A force along one axis acts on this component of each node.
             parts.append(-density * np.kron(volume[:, None], np.eye(solid.dim)))
 

@@ -93,7 +93,8 @@ class Section:
         # Components ij and kl of the gradient at the same point depend on each other.
         by_component = moduli.reshape(4, 4, -1)
         blocks = [[sp.diags(entries) for entries in row] for row in by_component]
-        weighted = sp.bmat(blocks, format="csr") @ self._gradient
+        stress_change = sp.bmat(blocks, format="csr")
+        weighted = stress_change @ self._gradient
         matrix = (self._gradient.T @ weighted).tocsr()
         if not self.material.finite:
             self._linear_tangent = matrix

@@ -227,7 +227,9 @@ def drops_are_counted(transcript: Transcript) -> RuleResult:
         elif isinstance(frame, Stats):
             counted = frame.dropped - base & 0xFFFFFFFF
             # Number of samples that the hub took after the last one that came.
-            behind = 0 if previous is None else max(0, forward(frame.taken, previous) - 1)
+            behind = 0
+            if previous is not None:
+                behind = max(0, forward(frame.taken, previous) - 1)
             if not missing <= counted <= missing + behind:
                 return failed(f"{missing} numbers are missing, STATS counts {counted} as dropped")
     if counted:
@@ -280,13 +282,17 @@ def frequencies_are_possible(transcript: Transcript) -> RuleResult:
     table = np.array([one.frequency.ravel() for one in frames], float)
     if (table == NOT_MEASURED).any():
         return failed(f"a frequency is 0x{NOT_MEASURED:X}")
-    measured = np.where(table > 0, table, np.nan)[:, (table > 0).any(axis=0)]
+    is_measured = table > 0
+    works = is_measured.any(axis=0)
+    measured = np.where(is_measured, table, np.nan)[:, works]
     if not measured.size:
         return not_tried("no pad was measured")
     middle = float(np.nanmedian(measured))
     if middle < MIN_MILLIHERTZ:
         return failed(f"the median frequency is {middle:.0f} mHz: look for another unit")
-    ratio = float(np.median(np.nanmax(measured, axis=0) / np.nanmin(measured, axis=0)))
+    highest = np.nanmax(measured, axis=0)
+    lowest = np.nanmin(measured, axis=0)
+    ratio = float(np.median(highest / lowest))
     if ratio > MAX_FREQUENCY_RATIO:
         return failed(f"frequencies of a pad differ by a factor of {ratio:.1f}: look at the bytes")
     return passed(f"median {1e-6 * middle:.3f} kHz; stop one oscillator to see its 0")
