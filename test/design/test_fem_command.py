@@ -62,7 +62,7 @@ def test_fem_shows_and_writes_what_is_asked(tmp_path):
         capture_output=True,
         text=True,
         cwd=ROOT,
-        timeout=60,
+        timeout=180,
         check=False,
     )
     assert done.returncode == 0, done.stderr
