@@ -17,7 +17,7 @@ from ...core.arrays import Array
 
 _MIN_NORMAL_FORCE = 1e-12
 """Smallest absolute value, in N, of a normal force by which the first moment of the pressure is
-divided to get the position of a contact. It avoids a division by 0."""
+divided for the position of a contact. The limit avoids a division by 0."""
 
 _HERTZ_MOMENT = 0.2
 """Second moment of the pressure of a Hertz contact about its centre along one axis, divided by the
@@ -68,9 +68,10 @@ class ContactSum(NamedTuple):
 
 
 class Discs(NamedTuple):
-    """Parameters of J Hertz contacts on the skin laid flat around the home cube of a fit.
+    """Parameters of J Hertz contacts on the flattened skin.
 
-    The frame is that of the home cube: x and y along the surface, z out of the skin.
+    For a fit, the skin is laid flat around one cube, the home cube, whose frame is used here: x and
+    y along the surface, z out of the skin.
 
     Attributes:
         forces: Forces (J, 3) on the skin, along x, y and z, in N.
@@ -109,7 +110,8 @@ def estimate_contact(nodes: Array, forces: Array, root: Array, size: float) -> C
     arm = nodes - place
     moment = arm[:, 0] @ forces[1] - arm[:, 1] @ forces[0]
 
-    # Derivatives (4, 3, nodes) of position, moment and area by the forces of the nodes.
+    # Derivatives (4, 3, q) of the position (x, y), the moment and the area by the 3 components of
+    # the force of each of q nodes.
     slopes = np.zeros((4, 3, len(nodes)))
     slopes[:2, 2] = arm.T / normal_force
     slopes[2, 0] = -arm[:, 1]
@@ -117,25 +119,29 @@ def estimate_contact(nodes: Array, forces: Array, root: Array, size: float) -> C
     shear = force[:2] / normal_force
     slopes[2, 2] = shear[0] * arm[:, 1] - shear[1] * arm[:, 0]
 
-    # Each node is a Hertz contact itself.
-    own = _HERTZ_MOMENT * size**2 * np.eye(2)
-    spread = (arm * forces[2][:, None]).T @ arm / normal_force + own
-    values, axes = np.linalg.eigh(spread)
-    values = np.maximum(values, own[0, 0])
-    area = np.pi / _HERTZ_MOMENT * float(np.sqrt(values.prod()))
-    relative = ((arm @ axes) ** 2 + own[0, 0] - values) / values
-    slopes[3, 2] = area * relative.sum(axis=1) / (2 * normal_force)
+    # The second moment of the pressure is that of the forces at the nodes, plus that of the Hertz
+    # pressure of one node about its own centre. Its eigenvectors are the axes of the ellipse.
+    node_moment = _HERTZ_MOMENT * size**2
+    weighted_arm = arm * forces[2][:, None]
+    second_moment = weighted_arm.T @ arm / normal_force + node_moment * np.eye(2)
+    principal_moments, axes = np.linalg.eigh(second_moment)
+    principal_moments = np.maximum(principal_moments, node_moment)
+    area = np.pi / _HERTZ_MOMENT * float(np.sqrt(principal_moments.prod()))
+    excess = (arm @ axes) ** 2 + node_moment - principal_moments
+    relative_excess = (excess / principal_moments).sum(axis=1)
+    slopes[3, 2] = area * relative_excess / (2 * normal_force)
 
-    variance = (np.einsum("kan,anm->km", slopes, root) ** 2).sum(axis=1)
-    total = root.sum(axis=1)
+    propagated_root = np.einsum("kan,anm->km", slopes, root)
+    variance = (propagated_root**2).sum(axis=1)
+    force_root = root.sum(axis=1)
     return ContactEstimate(
         force=force,
-        force_covariance=total @ total.T,
+        force_covariance=force_root @ force_root.T,
         place=place,
         place_variance=variance[:2],
         moment=float(moment),
         moment_variance=float(variance[2]),
         area=area,
         area_variance=float(variance[3]),
-        aspect=float(np.sqrt(values[1] / values[0])),
+        aspect=float(np.sqrt(principal_moments[1] / principal_moments[0])),
     )

@@ -33,9 +33,9 @@ from .pressure_regions import PressureRegions
 from .tracked_region import MAX_START_SIZE, TrackedRegion, Work, update_responses
 
 NEIGHBOUR_REACH_PITCHES = 3.0
-"""Distance from a region of contact, divided by the pitch (distance of neighbouring cubes), within
-which other regions take part in its fit, with coarse unknown tractions of their own. The response
-to regions farther away is subtracted from the values before the fit."""
+"""Distance between two regions of contact, divided by the pitch (distance of neighbouring cubes),
+below which they are neighbours: the same cubes measure both, so a contact only counts as refined
+when the regions beside it are fitted, too."""
 
 MAX_REGIONS = 32
 """Largest number of regions of contact on one skin; those with the largest pressure are kept."""
@@ -52,9 +52,10 @@ MAX_LINEARISED_FITS = 6
 """Largest number of fits of Hertz contacts whose response is linearised again in one scan. Those
 whose contacts have moved farthest since the last time come first."""
 
-MAX_PIECES_OF_WORK = 12
-"""Largest number of steps (new fits and improvements of fits) per region of contact in one scan
-(set of values of all cubes). It ends scans that may do any amount of work."""
+MAX_FIT_STEPS = 12
+"""Largest number of steps (new fits and improvements of fits) in one scan (set of values of all
+cubes), divided by the number of regions of contact. It ends a scan whose work is not limited by
+`MAX_WORK_PER_SCAN`."""
 
 MATCH_PITCHES = 1.0
 """Largest distance that a contact moves between two scans, divided by the pitch (distance of
@@ -74,14 +75,14 @@ class TrackedContact(NamedTuple):
     """One contact in the skin's parent frame, with standard deviations.
 
     Attributes:
-        id: Number that stays the same from the first touch to the last.
+        id: Number of the contact, which stays the same as long as the contact lasts.
         position: Position (3,) in m, where the line of action of the normal force meets the
             surface.
         normal: Unit normal (3,) out of the skin.
         force: Force (3,) in N on the skin.
         normal_force: Normal force in N, positive for a body that presses on the skin.
         shear_force: Length of the tangential force in N.
-        moment: Moment of the traction about the normal through `position`, in N m.
+        moment: Moment of the tangential traction about the normal through `position`, in N m.
         area: Area of the elliptic Hertz contact with the same second moments of pressure, in m^2.
         position_uncertainty: Standard deviation of the position along each axis, in m.
         force_uncertainty: Standard deviation of the normal force, in N.
@@ -122,8 +123,8 @@ class ContactTracker:
         self._pressure_regions = PressureRegions(inverse, min_pressure)
         self._noise = CubeNoise(inverse)
         self._regions: list[TrackedRegion] = []
-        self._known = np.zeros((0, 3))
-        self._ids: list[int] = []
+        self._last_positions = np.zeros((0, 3))
+        self._last_ids: list[int] = []
         self._next_id = 0
         n_values = (len(inverse.poses.position), len(inverse.columns))
         self._scaled = np.full(n_values, np.nan)
@@ -147,23 +148,22 @@ class ContactTracker:
         regions = self._regions
         fits = self._fits
         if fits:
-            self._noise.update(
-                scaled, np.unique(np.concatenate([one.values.cubes for one in fits]))
-            )
+            cubes = np.unique(np.concatenate([one.values.cubes for one in fits]))
+            self._noise.update(scaled, cubes)
         for region in regions:
             region.drop_nodes_of_other_values()
         self._linearise_moving_fits()
         self._update_fits()
 
-        # A region that has no fit yet is described by the field.
+        # Contacts in regions without a fit are integrals of the traction field.
         coarse = {}
         unfitted = [region for region in regions if region.fit is None]
         if unfitted:
             coarse = dict(zip(unfitted, self._integrate_field(unfitted, field), strict=True))
             for region, contact in coarse.items():
-                region.start = self._start(contact)
+                region.start = self._start_of_fit(contact)
         if self._improve_fits(max_work) and len(regions) > 1:
-            # The other fits now know the response to the new ones.
+            # A new fit changes the response that is subtracted from the values of the other fits.
             self._update_fits()
 
         contacts = []
@@ -191,7 +191,7 @@ class ContactTracker:
 
     @property
     def _fits(self) -> list[HertzFit | NodeFit]:
-        """Fits of all regions that have one."""
+        """Fits of all regions that are fitted."""
         return [region.fit for region in self._regions if region.fit is not None]
 
     @property
@@ -219,17 +219,23 @@ class ContactTracker:
         return FieldDeviation(*np.sqrt(variance).T)
 
     def _response_to_fits(self) -> Array:
-        """Return the values that the traction of all fits causes.
+        """Return the response of all cubes to the traction of all fits.
 
-        They are the C components of stress and gradient (times d0, half the side of a cube) that
-        the pads determine, for all cubes of the skin (cubes, C), in Pa.
+        It consists of the C components of stress and gradient (times d0, half the side of a cube)
+        that the pads determine (cubes, C), in Pa; NaN where the value of a cube is unknown.
         """
         fitted = [region for region in self._regions if region.fit is not None]
-        update_responses(self._inverse, fitted, np.arange(len(self._scaled)))
-        return np.asarray(sum((region.response for region in fitted), 0 * self._scaled))
+        all_cubes = np.arange(len(self._scaled))
+        update_responses(self._inverse, fitted, all_cubes)
+        total = 0 * self._scaled
+        for region in fitted:
+            total = total + region.response
+        return np.asarray(total)
 
     def _follow_regions(self, pressure: Array) -> None:
-        """Find the regions of the newest scan, and their fits among those of the previous scan.
+        """Find the regions of the newest scan, and match them with those of the previous scan.
+
+        A matched region keeps its fit.
 
         Args:
             pressure: Pressure (M,) in Pa at the depth of the cubes' centres, below each of the M
@@ -239,15 +245,16 @@ class ContactTracker:
         owner = np.full(len(pressure), len(self._regions))
         for number, region in enumerate(self._regions):
             owner[region.points] = number
-        # A region continues the one with which it has most points in common.
-        left: list[TrackedRegion | None] = [*self._regions, None]
+        # A region matches the previous one with which it has most points in common, if no region
+        # with a larger pressure has matched it. The last entry stands for points outside of all.
+        unmatched: list[TrackedRegion | None] = [*self._regions, None]
         regions = []
         for points in found:
-            counts = np.bincount(owner[points], minlength=len(left))
-            counts[-1] = 0
-            best = int(counts.argmax())
-            old = left[best] if counts[best] else None
-            left[best] = None
+            n_common = np.bincount(owner[points], minlength=len(unmatched))
+            n_common[-1] = 0
+            best = int(n_common.argmax())
+            old = unmatched[best] if n_common[best] else None
+            unmatched[best] = None
             region = old or TrackedRegion(self._inverse, self._noise)
             region.begin_scan(points, float(pressure[points].max()))
             regions.append(region)
@@ -255,7 +262,9 @@ class ContactTracker:
         distances = self._region_distances(found)
         for region, row in zip(regions, distances, strict=True):
             is_near = row < NEIGHBOUR_REACH_PITCHES * self._inverse.pitch
-            region.near = [regions[k] for k in np.flatnonzero(is_near) if regions[k] is not region]
+            within_reach = [regions[k] for k in np.flatnonzero(is_near)]
+            region.near = [other for other in within_reach if other is not region]
+            # The smallest distance is that of the region from itself.
             region.gap = float(np.partition(row, 1)[1]) if len(row) > 1 else np.inf
 
     def _region_distances(self, found: list[Index]) -> Array:
@@ -267,67 +276,78 @@ class ContactTracker:
         """
         if not found:
             return np.zeros((0, 0))
-        first = np.cumsum([0, *(len(one) for one in found[:-1])])
+        sizes = [len(one) for one in found]
+        starts = np.cumsum([0, *sizes[:-1]])
         points = self._inverse.points[np.concatenate(found)]
-        rows = np.minimum.reduceat(cdist(points, points), first, axis=0)
-        return np.asarray(np.minimum.reduceat(rows, first, axis=1))
+        to_points = np.minimum.reduceat(cdist(points, points), starts, axis=0)
+        return np.asarray(np.minimum.reduceat(to_points, starts, axis=1))
 
     def _update_fits(self) -> None:
-        """Compute all fits for the newest values, minus the response to the other regions."""
+        """Compute all fits for the newest values.
+
+        The response of the cubes to the other regions is subtracted from their values before.
+        """
         fitted = [region for region in self._regions if region.fit is not None]
         if len(fitted) > 1:
             cubes = np.unique(np.concatenate([fit.values.cubes for fit in self._fits]))
             update_responses(self._inverse, fitted, cubes)
-        everything = np.arange(len(self._scaled))
-        total, deviation = self._sum_others(everything, None)
+        all_cubes = np.arange(len(self._scaled))
+        total, deviation = self._sum_responses(all_cubes, None)
         for region in fitted:
             if region.fit is not None:
                 values = region.fit.values
                 cubes = values.cubes
                 own = region.response[cubes]
+                own_deviation = region.relative_error * np.abs(own)
                 region.others = total[cubes] - own
-                values.disturbance = deviation[cubes] - region.relative_error * np.abs(own)
+                values.disturbance = deviation[cubes] - own_deviation
                 region.fit.step(values.whiten(self._scaled, region.others))
                 if region.near:
                     explained = region.fit.explained
                     total[cubes] += explained - own
                     region.response[cubes] = explained
 
-    def _respond(self, cubes: Index, but: TrackedRegion) -> tuple[Array, Array]:
-        """Compute the response to all regions but one where contacts have changed, and return it.
-
-        Args:
-            cubes: Indices (n,) of the cubes that respond.
-            but: Region that is left out.
-
-        Returns:
-            As `_sum_others`: change (n, C), in Pa, of the C measured components of each cube by the
-            other regions, and its standard deviation (n, C), in Pa.
-        """
-        others = [region for region in self._regions if region is not but]
-        update_responses(self._inverse, others, cubes)
-        return self._sum_others(cubes, but)
-
-    def _sum_others(self, cubes: Index, but: TrackedRegion | None) -> tuple[Array, Array]:
+    def _update_and_sum_responses(
+        self, cubes: Index, excluded: TrackedRegion
+    ) -> tuple[Array, Array]:
         """Return the response of some cubes to all regions of contact but one.
 
+        The stored responses to regions whose contacts have changed are computed again before.
+
         Args:
-            cubes: Indices (n,) of the cubes that respond.
-            but: Region that is left out; None: no region is left out.
+            cubes: Indices (n,) of the cubes.
+            excluded: Region whose contacts are left out.
 
         Returns:
             Change (n, C), in Pa, of the C measured components of each cube by the other regions,
             and its standard deviation (n, C), in Pa.
         """
-        total = np.zeros((2, len(cubes), len(self._inverse.columns)))
-        for region in self._regions:
-            if region is not but:
-                own = region.response[cubes]
-                total[0] += own
-                total[1] += region.relative_error * np.abs(own)
-        return total[0], total[1]
+        others = [region for region in self._regions if region is not excluded]
+        update_responses(self._inverse, others, cubes)
+        return self._sum_responses(cubes, excluded)
 
-    def _start(self, contact: TrackedContact) -> tuple[int, Discs]:
+    def _sum_responses(self, cubes: Index, excluded: TrackedRegion | None) -> tuple[Array, Array]:
+        """Return the sum of the stored responses of some cubes to all regions of contact but one.
+
+        Args:
+            cubes: Indices (n,) of the cubes.
+            excluded: Region whose contacts are left out; None: no region is left out.
+
+        Returns:
+            Change (n, C), in Pa, of the C measured components of each cube by the other regions,
+            and its standard deviation (n, C), in Pa.
+        """
+        total = np.zeros((len(cubes), len(self._inverse.columns)))
+        deviation = np.zeros_like(total)
+        for region in self._regions:
+            if region is not excluded:
+                response = region.response[cubes]
+                total += response
+                # The error has the same relative size in all cubes, so deviations add linearly.
+                deviation += region.relative_error * np.abs(response)
+        return total, deviation
+
+    def _start_of_fit(self, contact: TrackedContact) -> tuple[int, Discs]:
         """Return the start of the fit of a contact.
 
         Returns:
@@ -339,13 +359,17 @@ class ContactTracker:
         home = int(np.linalg.norm(above - contact.position, axis=1).argmin())
         rotation = inverse.poses.rotation[home]
         place = (contact.position - above[home]) @ rotation[:, :2]
-        # At the depth of the cubes, a contact looks wider by about the depth.
-        square = contact.area / np.pi - inverse.depth**2
-        square = np.clip(square, (inverse.depth / 2) ** 2, (MAX_START_SIZE * inverse.depth) ** 2)
-        return home, Discs(contact.force[None] @ rotation, place[None], np.log([square]) / 2)
+        # The area of the contact is that of its region of pressure at the depth of the cubes, where
+        # the squared radius of a contact is larger by about the squared depth.
+        squared_radius = contact.area / np.pi - inverse.depth**2
+        smallest = inverse.depth / 2
+        largest = MAX_START_SIZE * inverse.depth
+        squared_radius = np.clip(squared_radius, smallest**2, largest**2)
+        force = contact.force @ rotation
+        return home, Discs(force[None], place[None], np.log([squared_radius]) / 2)
 
     def _improve_fits(self, max_work: float) -> bool:
-        """Improve the fits of regions, the most urgent first, until the budget is spent.
+        """Make and improve fits of regions, the most urgent first (`Work`), up to a limit of work.
 
         Args:
             max_work: Work after which no further fit is improved.
@@ -355,14 +379,15 @@ class ContactTracker:
         """
         regions = self._regions
         spent = 0
-        for _ in range(MAX_PIECES_OF_WORK * len(regions)):
+        for _ in range(MAX_FIT_STEPS * len(regions)):
             # Among equally urgent regions, the one that has waited longest comes first.
             order = [(region.next_work, -region.waited) for region in regions]
             number = min(range(len(regions)), key=order.__getitem__)
             if spent >= max_work or order[number][0] == Work.NONE:
                 break
             region = regions[number]
-            spent += region.improve(self._scaled, partial(self._respond, but=region))
+            respond_to_others = partial(self._update_and_sum_responses, excluded=region)
+            spent += region.improve(self._scaled, respond_to_others)
         return spent > 0
 
     def _integrate_field(
@@ -375,11 +400,12 @@ class ContactTracker:
             field: Traction on the surface.
         """
         inverse, regions = self._inverse, self._regions
-        # The field of a narrow contact spreads beyond its region. Each point within a pitch belongs
-        # to the nearest region.
-        tree = cKDTree(inverse.points[np.concatenate([one.points for one in regions])])
-        numbers = np.repeat(np.arange(len(regions)), [len(one.points) for one in regions])
-        distance, nearest = tree.query(inverse.points)
+        # The traction field of a narrow contact is blurred beyond its region. So the integral takes
+        # in all points of the surface within a pitch of the region, unless another one is nearer.
+        region_points = np.concatenate([one.points for one in regions])
+        sizes = [len(one.points) for one in regions]
+        numbers = np.repeat(np.arange(len(regions)), sizes)
+        distance, nearest = cKDTree(inverse.points[region_points]).query(inverse.points)
         owner = np.where(distance < inverse.pitch, numbers[nearest], -1)
         force = inverse.area * field.traction
         return [
@@ -389,13 +415,14 @@ class ContactTracker:
         ]
 
     def _sum_points(self, own: Index, force: Array, count: int) -> TrackedContact:
-        """Return the contact that consists of some points of the surface.
+        """Return the contact whose traction is that at some points of the surface.
 
         Args:
-            own: Indices (n,) of the points.
-            force: Force (M, 3) in N on the square of each point, in the frame of its cube.
-            count: Number of points of the region of contact, where the pressure is above the
-                threshold; the area follows from it.
+            own: Indices (n,) of the points over which the traction is summed.
+            force: Force (M, 3), in N, on the square around each of the M points of the surface, in
+                the frame of the cube below the point.
+            count: Number of squares whose area is the area of the contact. These are the points
+                with a pressure above the threshold, which are fewer than n.
         """
         inverse = self._inverse
         rotation = inverse.poses.rotation[inverse.cube[own]]
@@ -446,7 +473,7 @@ class ContactTracker:
         position = inverse.poses.position[cube] + rotation @ np.array([*local, inverse.depth])
 
         shear = float(np.linalg.norm(estimate.force[:2]))
-        # The variance of the length of the shear force is the variance along its direction.
+        # To first order, the length of the shear force only changes by errors along its direction.
         direction = estimate.force[:2] / max(shear, 1e-300)
         shear_variance = direction @ estimate.force_covariance[:2, :2] @ direction
         return TrackedContact(
@@ -473,18 +500,18 @@ class ContactTracker:
             The contacts with their ids, the one with the largest normal force first.
         """
         positions = np.array([one.position for one in contacts]).reshape(-1, 3)
-        distance = cdist(positions, self._known)
+        distance = cdist(positions, self._last_positions)
         ids = [-1] * len(contacts)
         rows, columns = np.nonzero(distance < MATCH_PITCHES * self._inverse.pitch)
         nearest_first = np.argsort(distance[rows, columns], kind="stable")
         for pair in nearest_first.tolist():
-            row, number = int(rows[pair]), self._ids[columns[pair]]
+            row, number = int(rows[pair]), self._last_ids[columns[pair]]
             if ids[row] < 0 and number not in ids:
                 ids[row] = number
         for row, number in enumerate(ids):
             if number < 0:
                 ids[row] = self._next_id
                 self._next_id += 1
-        self._known, self._ids = positions, ids
+        self._last_positions, self._last_ids = positions, ids
         numbered = [one._replace(id=k) for one, k in zip(contacts, ids, strict=True)]
         return sorted(numbered, key=lambda contact: -contact.normal_force)

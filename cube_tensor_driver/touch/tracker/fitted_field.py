@@ -19,8 +19,13 @@ from .local_values import unroll_points
 from .node_fit import NodeFit
 
 _MIN_RINGS = 4
-"""Smallest number of rings of point forces that represent a Hertz contact when its force is shared
-out among the points of the surface."""
+"""Smallest number of concentric rings of point forces by which a Hertz contact is represented when
+its force is distributed over the points of the surface."""
+
+_RINGS_PER_SPACING = 16
+"""Distance of neighbouring points of the surface, divided by the width of a ring of point forces.
+Each point force is added to the nearest point of the surface. With rings this narrow, the rounding
+error of the pressure is below the standard deviation of the pressure."""
 
 
 def add_fits(
@@ -33,7 +38,8 @@ def add_fits(
 
     Args:
         inverse: Points and kernels of the skin.
-        residual: Traction and pressure that explain what the fits leave of the values.
+        residual: Traction and pressure that explain the residual: the values minus the response of
+            the cubes to all fits.
         fits: Fits of all regions of contact.
 
     Returns:
@@ -45,8 +51,9 @@ def add_fits(
     for fit in fits:
         contacts = fit.to_contacts(inverse.spacing)
         points, share, below, rotation = _distribute(inverse, fit, contacts)
-        local = np.einsum("mab,bm->ma", rotation, contacts.forces @ share.T)
-        traction[points] += local / inverse.area
+        point_forces = contacts.forces @ share.T
+        local_forces = np.einsum("mab,bm->ma", rotation, point_forces)
+        traction[points] += local_forces / inverse.area
         pressure[points] += below @ contacts.forces.ravel()
     return TractionField(traction, pressure)
 
@@ -83,31 +90,33 @@ def _distribute(
     points = np.flatnonzero(np.isin(inverse.cube, fit.values.cubes))
     place = unroll_points(inverse, fit.values.home, points)
     count = len(contacts.places)
-    # The squares share the force of a contact by the rings within them, so rings must be narrow: at
-    # a sixteenth of a spacing the error of the pressure is below its deviation.
-    rings = max(_MIN_RINGS, math.ceil(16 * contacts.sizes.max() / inverse.spacing))
-    offsets, weights = hertz(1.0, (0, 0, 1), order=rings)
-    samples = contacts.places[:, None] + contacts.sizes[:, None, None] * offsets[:, :2]
-    # Forces beyond the border of the skin act on no point.
-    reach = inverse.spacing
-    distance, nearest = cKDTree(place).query(samples.reshape(-1, 2), distance_upper_bound=reach)
-    share = np.zeros((len(points), count))
+    rings = math.ceil(_RINGS_PER_SPACING * contacts.sizes.max() / inverse.spacing)
+    offsets, weights = hertz(1.0, (0, 0, 1), order=max(_MIN_RINGS, rings))
+    shifts = contacts.sizes[:, None, None] * offsets[:, :2]
+    samples = (contacts.places[:, None] + shifts).reshape(-1, 2)
+    # Point forces beyond the border of the skin (at an infinite distance) act on no point.
+    distance, nearest = cKDTree(place).query(samples, distance_upper_bound=inverse.spacing)
     contact = np.repeat(np.arange(count), len(offsets))
     weight = np.tile(weights[:, 2], count)
-    on_skin = np.isfinite(distance)
-    np.add.at(share, (nearest[on_skin], contact[on_skin]), weight[on_skin])
+    is_on_skin = np.isfinite(distance)
+    entries = nearest[is_on_skin], contact[is_on_skin]
+    share = np.zeros((len(points), count))
+    np.add.at(share, entries, weight[is_on_skin])
 
     below = np.zeros((len(points), 3, count))
     for size in np.unique(contacts.sizes):
-        alike = np.flatnonzero(contacts.sizes == size)
-        from_contacts = (place[:, None] - contacts.places[alike]).reshape(-1, 2)
-        pressure = -inverse.kernels.field(from_contacts, size)[:, FIELD.index("zz")]
-        below[:, :, alike] = pressure.reshape(len(points), -1, 3).swapaxes(1, 2)
+        of_this_size = np.flatnonzero(contacts.sizes == size)
+        from_contacts = place[:, None] - contacts.places[of_this_size]
+        stress = inverse.kernels.field(from_contacts.reshape(-1, 2), size)
+        pressure = -stress[:, FIELD.index("zz")]
+        below[:, :, of_this_size] = pressure.reshape(len(points), -1, 3).swapaxes(1, 2)
 
     _, angle = inverse.unroll(fit.values.home, inverse.cube[points])
     rotation = np.zeros((len(points), 3, 3))
-    rotation[:, 0, 0] = rotation[:, 1, 1] = np.cos(angle)
-    rotation[:, 0, 1] = np.sin(angle)
-    rotation[:, 1, 0] = -rotation[:, 0, 1]
+    cosine, sine = np.cos(angle), np.sin(angle)
+    rotation[:, 0, 0] = cosine
+    rotation[:, 0, 1] = sine
+    rotation[:, 1, 0] = -sine
+    rotation[:, 1, 1] = cosine
     rotation[:, 2, 2] = 1.0
     return points, share, below.reshape(len(points), -1), rotation

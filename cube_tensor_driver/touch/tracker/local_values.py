@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Values of the cubes around a region, divided by their noise.
 
-The noise of a cube depends on the stress of its pads, whose gains are only known to `GAIN_ERROR`.
-It is computed again when this stress changes, cube by cube, because that takes long.
+The noise of a cube grows with the stress of its pads, because the relative error of their gains is
+`GAIN_ERROR`. Computing it takes long, and is only done for cubes whose stress has changed.
 """
 
 from __future__ import annotations
@@ -19,18 +19,17 @@ MIN_FACING = 0.5
 responds to a contact above the other. On a bent skin, cubes that face away do not respond."""
 
 MAX_NOISE_CHANGE = 1.6
-"""Factor by which the variance of a pad's error grows or falls before the noise of its cube is
-computed again."""
-
+"""Factor between the present variance of a pad's error and the one in use, in either direction,
+above which the noise of its cube is computed again."""
 
 MODEL_ERROR = 1e-4
-"""Standard deviation of the error of each pad's predicted stress, divided by the largest stress of
-a pad in the surrounding cubes."""
-
+"""Standard deviation of the error of the stress that the model of the skin predicts on a pad,
+divided by the largest stress on any pad of the surrounding cubes."""
 
 _MIN_DISTURBANCE = 1e-3
-"""Sum of the standard deviations of the response to other contacts, in Pa, that counts as none. It
-is far below the noise of a pad and far above rounding errors."""
+"""Change, in Pa, of the disturbance by other contacts (sum of the standard deviations of the stress
+that they cause in the cubes of a fit) that is ignored. It is far below the noise of a pad and far
+above rounding errors."""
 
 
 class CubeNoise:
@@ -67,26 +66,32 @@ class CubeNoise:
         """
         inverse = self._inverse
         if self._revision != inverse.revision:
-            # Other pads are in use: every cube is computed again when it is needed.
+            # The set of pads in use has changed, so all stored variances are invalid (0).
             self._revision = inverse.revision
             self._variance[:] = 0.0
         known = np.isfinite(scaled[cubes]) & inverse.observed[cubes]
-        is_other = (known != self.known[cubes]).any(axis=1) | (self._variance[cubes, 0] == 0)
-        if is_other.any():
-            other = cubes[is_other]
-            self.known[other] = known[is_other]
-            self._by_pad[other] = np.where(known[is_other, :, None], inverse.by_pad[other], 0.0)
-            self._to_pads[other] = np.linalg.pinv(self._by_pad[other])
-            self._variance[other] = 0.0
+        has_other_values = (known != self.known[cubes]).any(axis=1)
+        is_outdated = has_other_values | (self._variance[cubes, 0] == 0)
+        if is_outdated.any():
+            outdated, known_there = cubes[is_outdated], known[is_outdated]
+            self.known[outdated] = known_there
+            by_pad = np.where(known_there[:, :, None], inverse.by_pad[outdated], 0.0)
+            self._by_pad[outdated] = by_pad
+            self._to_pads[outdated] = np.linalg.pinv(by_pad)
+            self._variance[outdated] = 0.0
         values = np.where(known, scaled[cubes], 0.0)
         stresses = (self._to_pads[cubes] @ values[:, :, None])[:, :, 0]
-        # Contacts that are not found yet and errors of the tables disturb all cubes around.
+
+        # The predicted stress of a pad is wrong by interpolation errors of the tabulated response
+        # and by contacts that are not found yet. Both grow with the stress in the cubes around.
         self._peak[cubes] = np.abs(stresses).max(axis=1)
-        floor = MODEL_ERROR * self._peak[inverse.near[cubes]].max(axis=1)
-        variance = 1 + (GAIN_ERROR * stresses) ** 2 + floor[:, None] ** 2
+        largest_around = self._peak[inverse.near[cubes]].max(axis=1)
+        model_deviation = MODEL_ERROR * largest_around[:, None]
+        variance = 1 + (GAIN_ERROR * stresses) ** 2 + model_deviation**2
+
         before = self._variance[cubes]
-        growth = np.maximum(variance, before) > MAX_NOISE_CHANGE * np.minimum(variance, before)
-        is_changed = growth.any(axis=1)
+        larger, smaller = np.maximum(variance, before), np.minimum(variance, before)
+        is_changed = (larger > MAX_NOISE_CHANGE * smaller).any(axis=1)
         if is_changed.any():
             self._whiten(cubes[is_changed], variance[is_changed])
 
@@ -99,13 +104,14 @@ class CubeNoise:
                 variance of the pad's noise without load.
         """
         by_pad = self._by_pad[cubes]
-        noise = (by_pad * variance[:, None]) @ by_pad.swapaxes(1, 2)
-        # A 1 on the diagonal keeps the matrices of cubes with unknown values invertible, and the
-        # tiny increase those of components that are almost dependent.
-        identity = np.eye(noise.shape[1])
-        noise += identity * ~self.known[cubes][:, None] + 1e-9 * identity * noise
-        root = np.linalg.inv(np.linalg.cholesky(noise))
-        self.whitening[cubes] = root * self.known[cubes][:, None]
+        covariance = (by_pad * variance[:, None]) @ by_pad.swapaxes(1, 2)
+        # Rows of unknown values are 0, and components may be almost linearly dependent. In both
+        # cases an addition to the diagonal keeps the covariance invertible.
+        is_known = self.known[cubes][:, None]
+        identity = np.eye(covariance.shape[1])
+        covariance += identity * ~is_known + 1e-9 * identity * covariance
+        inverse_factor = np.linalg.inv(np.linalg.cholesky(covariance))
+        self.whitening[cubes] = inverse_factor * is_known
         self._variance[cubes] = variance
         self.version[cubes] += 1
 
@@ -126,7 +132,8 @@ class LocalValues:
         whitening: Matrices (n, C, C) as in `CubeNoise`, of the last `refresh`.
         known: Whether each of the C components of the cubes is known (n, C).
         count: Number of known values.
-        disturbance: Standard deviation (n, C) in Pa of the response to other contacts.
+        disturbance: Standard deviation (n, C), in Pa, of the values' part that other contacts
+            cause.
     """
 
     whitening: Array
@@ -151,15 +158,19 @@ class LocalValues:
         self.refresh()
 
     def refresh(self) -> None:
-        """Copy the newest noise of the cubes, and reduce the weight of cubes that other contacts
-        disturb."""
+        """Copy the newest noise of the cubes.
+
+        Cubes in which other contacts cause stress that is not exactly known (`disturbance`) get a
+        smaller weight.
+        """
         self._versions = self._noise.version[self.cubes]
         self.variant = self._inverse.variant[self.cubes]
         whitening = self._noise.whitening[self.cubes]
-        self._disturbed = float(self.disturbance.sum())
-        # A cube that other contacts disturb counts less.
-        relative = (whitening @ self.disturbance[:, :, None])[:, :, 0]
-        weight = 1 / np.sqrt(1 + (relative**2).mean(axis=1))
+        self._total_disturbance = float(self.disturbance.sum())
+        # The noise has variance 1 after whitening, so the disturbance increases it to this one.
+        white_disturbance = (whitening @ self.disturbance[:, :, None])[:, :, 0]
+        total_variance = 1 + (white_disturbance**2).mean(axis=1)
+        weight = 1 / np.sqrt(total_variance)
         self.whitening = whitening * weight[:, None, None]
         self.known = self._noise.known[self.cubes]
         self.count = int(self.known.sum())
@@ -167,13 +178,14 @@ class LocalValues:
     @property
     def is_stale(self) -> bool:
         """Whether the noise of the cubes or the disturbance has changed since `refresh`."""
-        sums = self._disturbed, float(self.disturbance.sum())
-        is_other = max(sums) > MAX_NOISE_CHANGE * min(sums) + _MIN_DISTURBANCE
-        return is_other or not np.array_equal(self._versions, self._noise.version[self.cubes])
+        totals = self._total_disturbance, float(self.disturbance.sum())
+        is_disturbance_new = max(totals) > MAX_NOISE_CHANGE * min(totals) + _MIN_DISTURBANCE
+        is_noise_new = not np.array_equal(self._versions, self._noise.version[self.cubes])
+        return is_disturbance_new or is_noise_new
 
     @property
     def has_same_values(self) -> bool:
-        """Whether the same components are known as at the last `refresh`."""
+        """Whether the known components of the cubes are the same as at the last `refresh`."""
         return np.array_equal(self.known, self._noise.known[self.cubes])
 
     def whiten(self, scaled: Array, others: Array | float) -> Array:
@@ -194,9 +206,9 @@ class LocalValues:
             size: Radius of the contacts in m.
 
         Returns:
-            Values (n, C, 3 K) in Pa/N of the C components of n cubes, and the same values divided
-            by their noise (n C, 3 K), in 1/N. The last axis holds forces along x of all contacts,
-            then along y, then along z.
+            Response (n, C, 3 K), in Pa/N, of the C components of n cubes, and the whitened response
+            (n C, 3 K), in 1/N. The last axis holds forces along x of all contacts, then along y,
+            then along z.
         """
         count = len(centres)
         offset = (self.place[:, None] - centres).reshape(-1, 2)
@@ -204,13 +216,15 @@ class LocalValues:
         variant = np.repeat(self.variant, count)
         inverse = self._inverse
         response = inverse.kernels.response(offset, angle, variant, size)[:, inverse.columns]
-        shape = (len(self.place), count, -1, 3)
-        values = response.reshape(shape).transpose(0, 2, 3, 1)
-        values = values.reshape(*self.known.shape, -1)
-        return values, (self.whitening @ values).reshape(-1, 3 * count)
+        by_contact = response.reshape(len(self.place), count, -1, 3)
+        by_axis = by_contact.transpose(0, 2, 3, 1)
+        values = by_axis.reshape(*self.known.shape, -1)
+        whitened = self.whitening @ values
+        return values, whitened.reshape(-1, 3 * count)
 
     def sensitivity(self, centres: Array, size: float, forces: Array) -> Array:
-        """Compute how the values change by errors of the elastomer's data (sensitivity.py).
+        """Compute how the values change by errors of the elastomer's depth, thickness and Poisson's
+        ratio (sensitivity.py).
 
         Args:
             centres: Centres (K, 2) of Hertz contacts in m, in the frame of the home cube.
@@ -223,12 +237,12 @@ class LocalValues:
         """
         n, count = len(self.cubes), len(centres)
         inverse = self._inverse
-        changes = inverse.kernels.sensitivity(
-            (self.place[:, None] - centres).reshape(-1, 2),
-            np.repeat(self.angle, count),
-            np.full(n * count, size),
-            np.tile(forces.T, (n, 1)),
-        )[:, :, inverse.columns]
+        offset = (self.place[:, None] - centres).reshape(-1, 2)
+        angle = np.repeat(self.angle, count)
+        sizes = np.full(n * count, size)
+        all_forces = np.tile(forces.T, (n, 1))
+        changes = inverse.kernels.sensitivity(offset, angle, sizes, all_forces)
+        changes = changes[:, :, inverse.columns]
         by_contact = changes.reshape(n, count, *changes.shape[1:])
         return np.asarray(by_contact.sum(axis=1).swapaxes(1, 2), float)
 
