@@ -121,7 +121,7 @@ class FromSkin(Substitution):  # type: ignore[misc]
         return f"{self._make.__name__} of config"
 
     def perform(self, context: LaunchContext) -> str:
-        """Return the text.
+        """Read the skin file, and return the text of this substitution.
 
         Raises:
             ConfigError: The skin file cannot be read or has mistakes.

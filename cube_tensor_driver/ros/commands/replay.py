@@ -168,7 +168,7 @@ class Player:
         Raises:
             BagError: The position is negative or after the end of the bag.
         """
-        # At the end of the bag, a part of the recording is needed that can be shown.
+        # A jump to the end of the bag goes back by SHOWN_NS, so that there are messages to show.
         latest_ns = self._bag.end_ns - SHOWN_NS
         to_ns = min(self._to_ns(position), latest_ns)
         to_ns = max(self._bag.start_ns, to_ns)

@@ -193,7 +193,7 @@ def _mark(marker: Marker, number: int) -> tuple[bytes, bytes, bytes, bytes, byte
         The serialised value at the beginning of each field, in the order of the fields of
         `MarkerArrays`; b"" for a field that is empty.
     """
-    # Numbers of 1e30 and more do not occur as coordinates or colours.
+    # Numbers of 1e30 and more do not occur as coordinates or colours, so they are unique.
     first = 1e30 * (2 * number + 1)
     second = 1e30 * (2 * number + 2)
     points = colours = text = b""

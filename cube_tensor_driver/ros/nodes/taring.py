@@ -93,7 +93,11 @@ class Taring:
         node.own(node.create_service(Trigger, "~/clear_tare", self._on_clear))
 
     def on_info(self, message: SkinInfo) -> None:
-        """Take over the uids of cubes from a message of `driver/info`, and restore their tares."""
+        """Store the unique numbers (uids) of the cubes that hubs have reported, and restore tares.
+
+        Args:
+            message: Message of `driver/info`, which contains the uids.
+        """
         # If the driver of another skin publishes in the same namespace by mistake, its uids must
         # not be used.
         has_same_name = message.name == self._skin.name
