@@ -14,21 +14,22 @@ from ...core.arrays import Array, Index, Mask
 from ..inverse import SurfaceInverse
 
 DETECTION_FRACTION = 0.2
-"""Pressure above which a point belongs to a contact, divided by the largest pressure on the skin.
-An absolute threshold applies in addition."""
+"""Pressure (at the depth of the cubes' centres) above which a point of the surface belongs to a
+contact, divided by the largest one on the skin. The pressure must also exceed an absolute
+threshold."""
 
 RELEASE_FRACTION = 0.75
-"""Factor of the two thresholds of the pressure (relative and absolute) for points that belonged to
-a contact in the previous scan. It keeps noise from changing the regions of contact in every
-scan."""
+"""Factor by which the thresholds of the pressure (relative and absolute) are lower for points that
+belonged to a contact in the previous scan (set of values of all cubes). This hysteresis keeps noise
+from changing the regions of contact in every scan."""
 
 JOIN_PITCHES = 1.25
 """Largest distance of two regions of contact, divided by the pitch (distance of neighbouring
 cubes), at which they are fitted as one region, because the same cubes measure both."""
 
 MAX_JOINED_CUBES = 12
-"""Largest number of cubes below several regions of contact that are fitted as one region. If there
-are more cubes, the regions stay apart, so that each one is small enough to be fitted."""
+"""Largest number of cubes below regions of contact that are joined to one. Regions above more cubes
+stay separate, so that each one is small enough to be fitted."""
 
 VALLEY = 0.8
 """Threshold of the ratio of the lowest pressure between two peaks to the pressure at the lower
@@ -55,7 +56,7 @@ class PressureRegions:
             min_pressure: Smallest pressure of a contact at the depth of the cubes, in Pa.
         """
         self._min_pressure = min_pressure
-        # A distance of 1.5 includes diagonal neighbours.
+        # Diagonal neighbours on the grid of points are 1.41 spacings apart.
         tree = cKDTree(inverse.points)
         self._neighbours = _list_neighbours(tree, 1.5 * inverse.spacing)
         self._wide_neighbours = _list_neighbours(tree, JOIN_PITCHES * inverse.pitch)
@@ -101,14 +102,16 @@ class PressureRegions:
             points: Indices (n,) of the points.
             neighbours: Indices (M, k) of the points to which each point is connected.
         """
-        # Every point takes the smallest label around it, until no label changes.
+        # At first, the label of a point is its own index. Then each point takes the smallest label
+        # of its neighbours, until no label changes.
         outside = len(self._inside)
         labels = np.full(outside + 1, outside)
         labels[points] = points
         around = neighbours[points]
         while True:
             smallest = labels[around].min(axis=1)
-            # The label of a point is itself a point, whose label may already be smaller.
+            # A label is the index of a point of the same component, whose own label may already be
+            # smaller. Taking that one saves iterations.
             smallest = labels[smallest]
             if np.array_equal(smallest, labels[points]):
                 return np.asarray(smallest)
@@ -142,8 +145,8 @@ def split_peaks(pressure: Array, root: Array, is_neighbour: Mask) -> Index:
     owner = np.full(len(pressure), -1)
     peaks: list[int] = []
     limit = MIN_PEAK * float(pressure.max())
-    # From the highest node down, each one joins the peak of its neighbours. Where two peaks meet,
-    # the pressure of the node is the lowest one between them.
+    # Nodes are assigned in the order of falling pressure, each one to the peak of its neighbours. A
+    # node with neighbours of two peaks is the saddle point between these peaks.
     for node in np.argsort(-pressure).tolist():
         around = np.unique(owner[is_neighbour[node]])
         around = around[around >= 0]
@@ -160,6 +163,7 @@ def split_peaks(pressure: Array, root: Array, is_neighbour: Mask) -> Index:
             uncertainty = np.linalg.norm(root[peak] - root[node])
             if fall < max((1 - VALLEY) * pressure[peak], MIN_FALL * uncertainty):
                 owner[owner == other] = first
-    # Nodes with little pressure that no peak has reached join the highest one.
+    # Nodes that are left have too little pressure for a peak and no neighbour that belongs to one.
+    # They are assigned to the highest peak.
     owner[owner < 0] = 0
     return np.asarray(np.unique(owner, return_inverse=True)[1].reshape(-1))

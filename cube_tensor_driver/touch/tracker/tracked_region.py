@@ -23,8 +23,8 @@ from .node_fit import NodeFit
 
 MAX_CUBES = 48
 """Largest number of cubes from whose values the traction in one region of contact is fitted. A
-wider region, such as that of a palm, is not fitted; its contact is the integral of the linear
-field."""
+wider region, such as that of a palm, is not fitted: its force is the integral of the traction that
+the linear inverse problem yields."""
 
 NEAREST_CUBES = (21, 13, 9)
 """Numbers of cubes nearest to each cube below a region of contact that take part in the fit of the
@@ -35,30 +35,29 @@ MAX_CHANGE = 0.25
 """Relative change since the last fit of the traction on nodes above which the region is fitted
 again.
 
-It is the larger one of two changes: that of the largest pressure, and the share of surface points
-that have joined or left the region. The fit depends on the pressure, because the assumed errors of
-the pads' gains are proportional to the stress.
+The change is the largest of three: that of the largest pressure, the share of surface points that
+have joined the region, and the share that has left it. The fit depends on the pressure, because the
+assumed noise includes errors of the pads' gains, which are proportional to the stress.
 """
 
 MAX_MISFIT_GROWTH = 1.3
-"""Growth of the misfit since the last fit of a region above which the region is fitted again. The
-misfit is the squared deviation of the values from the fit, divided by the value that their noise
-causes. It grows when a contact moves or changes its shape."""
+"""Ratio of the misfit (chi-squared per known value) to that of the last fit of a region, above
+which the region is fitted again. The misfit grows when a contact moves or changes its shape."""
 
 MAX_HERTZ_MISFIT = 1.5
-"""Misfit (squared deviation of the values from the fit, divided by the value that noise causes) of
-the cubes nearest to Hertz contacts, above which a fit of the traction on nodes (small contacts on a
-grid) is tried instead. The misfit of the right model is 1 with a standard deviation of 0.12 for 9
-cubes with 15 values each, and of 0.2 for planar cubes."""
+"""Misfit (chi-squared per known value) of the cubes nearest to Hertz contacts, above which a fit of
+the traction on nodes (small contacts on a grid) is tried instead. The misfit of the right model is
+1 with a standard deviation of 0.12 for 9 cubes with 15 values each, and of 0.2 for planar
+cubes."""
 
 MAX_BAD_SCANS = 5
-"""Number of scans (sets of values of all cubes) in a row with too large a misfit (squared deviation
-of the values from the fit, divided by its value for noise) after which a fit on nodes (small
-contacts on a grid) is tried instead of Hertz contacts.
+"""Number of successive scans (sets of values of all cubes) with too large a misfit (chi-squared per
+known value) after which a fit on nodes (small contacts on a grid) is tried instead of Hertz
+contacts.
 
-A misfit is too large if it exceeds `MAX_MISFIT_GROWTH` times the one of the first fit. One bad scan
-does not suffice, because a new contact elsewhere disturbs the fit until its pressure is large
-enough to be found.
+A misfit is too large if it exceeds `MAX_MISFIT_GROWTH` times the one of the first fit. One such
+scan does not suffice, because a new contact nearby also increases the misfit until its pressure is
+large enough to be found.
 """
 
 MAX_START_SIZE = 2.0
@@ -72,8 +71,9 @@ tried. Length and width are those that the fit on nodes (small contacts on a gri
 
 MAX_DIRECT_PITCH = 2.5
 """Largest pitch (distance of neighbouring cubes), in depths of the cubes' centres, at which Hertz
-contacts are tried before the traction on nodes. Between cubes that are farther apart, a fit that
-begins at the maximum of the field may end at the wrong side of a cube."""
+contacts are fitted before the traction on nodes (small contacts on a grid). At a larger pitch, a
+fit that begins at the maximum of the pressure may end in a local optimum, on the wrong side of a
+cube."""
 
 HOME_PITCHES = 0.55
 """Largest distance of Hertz contacts (of their mean centre) from their home cube, the cube around
@@ -81,11 +81,11 @@ which the skin is laid flat for the fit, in pitches (distances of neighbouring c
 distance, the cube nearest to the contacts becomes the home cube."""
 
 MAX_STALE_CHANGE = 0.003
-"""Largest change of a contact with which the computed stress of distant cubes under this contact
-stays in use.
+"""Largest relative change of a contact at which the stress of distant cubes under this contact is
+not computed again.
 
-The change is the larger one of the shift, divided by the distance from the nearest other region of
-contact, and the change of the force, divided by the force.
+The change is the larger one of two ratios: shift to distance of the nearest other region of
+contact, and change of the force to force.
 """
 
 START_ERROR = 0.15
@@ -114,11 +114,12 @@ changes (n, C), in Pa."""
 
 
 class Work(IntEnum):
-    """Next step of the fit of a region of contact; the step with the smallest number comes first.
+    """Next step of the fit of a region of contact. Steps with the smallest number are made first.
 
-    MOVE lets Hertz contacts follow the body that presses. BEGIN makes the first fit. CHOOSE tries
-    Hertz contacts in place of the traction on nodes. FIT makes a new fit of the traction on nodes.
-    SHARPEN improves it for the same values. NONE: nothing is to be done.
+    MOVE makes a Gauss-Newton step of Hertz contacts. BEGIN makes the first fit. CHOOSE tries Hertz
+    contacts in place of the traction on nodes (small contacts on a grid). FIT makes a new fit of
+    the traction on nodes. SHARPEN repeats it for the same values with a narrower prior. NONE stands
+    for a fit that needs no step.
     """
 
     MOVE = 0
@@ -137,13 +138,13 @@ class TrackedRegion:
 
     Attributes:
         points: Indices (k,) of the k points of the surface in the region, in the newest scan.
-        peak: Largest pressure in Pa at the depth of the cubes' centres.
+        peak: Largest pressure in Pa in the region, at the depth of the cubes' centres.
         near: Other regions within `NEIGHBOUR_REACH_PITCHES`. Their contacts change the values of
             the same cubes, so the fit of this region subtracts the response to them.
         fit: Fit of the traction to n cubes around the region; None: not fitted yet.
-        others: Response (n, C) of the n cubes of the fit to all other regions.
+        others: Response (n, C), in Pa, of the n cubes of the fit to all other regions.
         gap: Distance from the nearest other region in m.
-        response: Response (cubes, C) of all cubes of the skin to this region.
+        response: Response (cubes, C), in Pa, of all cubes of the skin to this region.
         start: Index of the home cube (around which the skin is laid flat; its frame is that of the
             fit) and the Hertz contact at which the first fit begins.
         waited: Number of scans (sets of values of all cubes) since the fit was last improved.
@@ -174,7 +175,7 @@ class TrackedRegion:
         """Begin a new scan (set of values of all cubes), and move Hertz contacts to where they are
         expected in it.
 
-        A Hertz fit is dropped if its contacts have left the region or pull at it.
+        A Hertz fit is dropped if its contacts have left the region or pull at the surface.
 
         Args:
             points: Indices of the points of the surface that form the region in this scan.
@@ -184,11 +185,11 @@ class TrackedRegion:
         self.waited += 1
         self._is_tried = False
         fit = self.fit
-        is_bad = fit is not None and fit.shape_misfit > MAX_MISFIT_GROWTH * self._first_misfit
-        is_bad = is_bad and self.has_fitted_neighbours
+        is_bad = self._is_misfit_larger and self.has_fitted_neighbours
         self._bad_scans = self._bad_scans + 1 if is_bad else 0
         if isinstance(fit, HertzFit):
-            # Beside others, a prediction would make the mutual corrections of fits swing.
+            # Each of two fits near each other subtracts the response to the other. Extrapolation of
+            # both would amplify the changes that these corrections cause.
             fit.predict(extrapolates=not self.near)
             self._follow_home(fit)
 
@@ -200,30 +201,37 @@ class TrackedRegion:
         if isinstance(self.fit, NodeFit) and not self.fit.values.has_same_values:
             self.fit = None
 
+    @property
+    def _is_misfit_larger(self) -> bool:
+        """Whether the misfit has grown by more than `MAX_MISFIT_GROWTH` since the fit was made."""
+        limit = MAX_MISFIT_GROWTH * self._first_misfit
+        return self.fit is not None and self.fit.shape_misfit > limit
+
     def _follow_home(self, fit: HertzFit) -> None:
         """Lay the skin flat around another cube if the contacts have moved there.
 
-        A fit whose contacts have left the region, or pull at it, is dropped.
+        A fit whose contacts have left the region, or pull at the surface, is dropped.
         """
-        inverse = self._inverse
-        values = fit.values
+        inverse, values = self._inverse, fit.values
         centres = fit.found.centres
-        below = values.cubes[np.linalg.norm(centres[:, None] - values.place, axis=2).argmin(axis=1)]
-        is_around = np.zeros(len(inverse.near), bool)
-        is_around[inverse.near[inverse.cube[self.points], : NEAREST_CUBES[-1]]] = True
+        from_cubes = np.linalg.norm(centres[:, None] - values.place, axis=2)
+        below = values.cubes[from_cubes.argmin(axis=1)]
+        cubes_of_region = inverse.near[inverse.cube[self.points], : NEAREST_CUBES[-1]]
         is_pressing = fit.found.forces[:, 2] < 0
-        if not (is_pressing & is_around[below]).all():
+        if not (is_pressing & np.isin(below, cubes_of_region)).all():
             self.fit = None
             return
-        middle = np.linalg.norm(centres.mean(axis=0) - values.place, axis=1)
-        nearest = int(values.cubes[middle.argmin()])
-        from_home = float(middle[values.cubes == values.home][0])
+        mean_centre = centres.mean(axis=0)
+        to_cubes = np.linalg.norm(mean_centre - values.place, axis=1)
+        nearest = int(values.cubes[to_cubes.argmin()])
+        from_home = float(to_cubes[values.cubes == values.home][0])
         if nearest != values.home and from_home > HOME_PITCHES * inverse.pitch:
             cubes = np.unique(inverse.near[np.append(below, nearest)])
             fit.move_home(self._collect(nearest, cubes))
 
     def _collect(self, home: int, cubes: Index) -> LocalValues:
-        """Return the input of a fit: the cubes that do not face away from its home cube.
+        """Return noise and positions, for a fit, of the cubes that respond to contacts above its
+        home cube.
 
         Args:
             home: Index of the home cube, around which the skin is laid flat for the fit.
@@ -241,7 +249,8 @@ class TrackedRegion:
 
     @property
     def relative_error(self) -> float:
-        """Relative standard deviation of the stress that this region causes in other cubes."""
+        """Relative standard deviation of the stress that the contacts of this region cause in the
+        cubes around other regions."""
         return START_ERROR if self.fit is None else FIT_ERROR
 
     @property
@@ -253,9 +262,9 @@ class TrackedRegion:
         return self.start
 
     def is_response_stale(self, cubes: Index) -> bool:
-        """Return whether the stored response of some cubes to this region is out of date.
+        """Return whether the stored response of some cubes to this region must be computed again.
 
-        It is, if it was not computed for all of these cubes, or if the contacts have changed by
+        It must if it was not computed for all of these cubes, or if the contacts have changed by
         more than `MAX_STALE_CHANGE` since.
         """
         if not self._responding[cubes].all():
@@ -282,25 +291,24 @@ class TrackedRegion:
 
     @property
     def next_work(self) -> Work:
-        """Next step of the fit."""
+        """Next step of the fit of this region."""
         fit = self.fit
         if fit is None:
             return Work.NONE if self._is_tried else Work.BEGIN
-        is_worse = fit.shape_misfit > MAX_MISFIT_GROWTH * self._first_misfit
+        is_worse = self._is_misfit_larger
         if isinstance(fit, HertzFit):
             if fit.is_unsettled or (is_worse and fit.needs_linearisation):
                 return Work.MOVE
-            is_over = is_worse and self._bad_scans >= MAX_BAD_SCANS
-            is_over = is_over and self.has_fitted_neighbours
-            return Work.FIT if is_over and not self._is_tried else Work.NONE
-        changes = (
-            abs(self.peak / self._fitted_peak - 1),
-            _new_share(self.points, self._fitted_points),
-            _new_share(self._fitted_points, self.points),
-        )
+            is_lastingly_worse = is_worse and self._bad_scans >= MAX_BAD_SCANS
+            is_given_up = is_lastingly_worse and self.has_fitted_neighbours
+            return Work.FIT if is_given_up and not self._is_tried else Work.NONE
         if self._is_hertz_due:
             return Work.CHOOSE
-        if (max(changes) > MAX_CHANGE or is_worse) and not self._is_tried:
+        peak_change = abs(self.peak / self._fitted_peak - 1)
+        joined = _new_share(self.points, self._fitted_points)
+        left = _new_share(self._fitted_points, self.points)
+        is_changed = max(peak_change, joined, left) > MAX_CHANGE
+        if (is_changed or is_worse) and not self._is_tried:
             return Work.FIT
         return Work.NONE if fit.is_sharp else Work.SHARPEN
 
@@ -309,15 +317,15 @@ class TrackedRegion:
         scaled: Array,
         respond_to_others: Respond,
     ) -> int:
-        """Do the next piece of work that makes the fit more exact.
+        """Make the next step of the fit (`next_work`).
 
         Args:
             scaled: The C measured components of stress and gradient (times d0, half the side of a
                 cube) of all cubes (cubes, C), in Pa.
-            respond_to_others: Returns the response of cubes to the other regions.
+            respond_to_others: Function that returns the response of cubes to the other regions.
 
         Returns:
-            Work that this took, in the unit of `MAX_WORK_PER_SCAN`.
+            Work of this step, in the unit of `MAX_WORK_PER_SCAN`.
         """
         self.waited = 0
         work, fit = self.next_work, self.fit
@@ -335,7 +343,13 @@ class TrackedRegion:
         return self._fit_nodes(scaled, respond_to_others)
 
     def _iterate(self, fit: HertzFit, scaled: Array, steps: int) -> int:
-        """Make up to a number of Gauss-Newton steps, and return their work."""
+        """Make Gauss-Newton steps until the fit has converged, and return their work.
+
+        Args:
+            fit: Fit that is improved.
+            scaled: Values (cubes, C), in Pa, of all cubes.
+            steps: Largest number of steps.
+        """
         white = fit.values.whiten(scaled, self.others)
         work = 0
         for _ in range(steps):
@@ -353,8 +367,9 @@ class TrackedRegion:
     ) -> int:
         """Fit one Hertz contact, from the contact `start` that the linear inverse problem found.
 
-        The fit is kept if its steps have converged and its misfit is small, or if other regions are
-        near, whose fits change its misfit later.
+        The fit is kept if its steps have converged and its misfit is small. It is always kept if
+        other regions are near: their contacts may cause the misfit, which then falls when these
+        regions are fitted, too.
         """
         home, discs = self.start
         self._is_hertz_due = False
@@ -368,7 +383,6 @@ class TrackedRegion:
         values.refresh()
         fit = HertzFit(self._inverse, values, discs)
         work = self._iterate(fit, scaled, MAX_STEPS)
-        # While the fits of neighbours are not settled, the misfit says little.
         is_good = not fit.is_unsettled and fit.shape_misfit < MAX_HERTZ_MISFIT
         if is_good or self.near:
             self._accept(fit)
@@ -376,12 +390,14 @@ class TrackedRegion:
         return work
 
     def _fit_nodes(self, scaled: Array, respond_to_others: Respond) -> int:
-        """Fit the traction on nodes, in place of the present fit."""
+        """Fit the traction on nodes (small contacts on a grid) in place of the present fit, and
+        return the work of it."""
         self._is_tried = True
         inverse = self._inverse
         points = inverse.points[self.points]
         below = inverse.cube[self.points]
-        to_middle = np.linalg.norm(points - points.mean(axis=0), axis=1)
+        to_centre = np.linalg.norm(points - points.mean(axis=0), axis=1)
+        home = int(below[to_centre.argmin()])
         for count in NEAREST_CUBES:
             cubes = np.unique(inverse.near[np.unique(below), :count])
             if len(cubes) <= MAX_CUBES:
@@ -389,7 +405,7 @@ class TrackedRegion:
         else:
             return 0
         self._noise.update(scaled, cubes)
-        values = self._collect(int(below[to_middle.argmin()]), cubes)
+        values = self._collect(home, cubes)
         if not values.count:
             return 0
         self.others, values.disturbance = respond_to_others(values.cubes)
@@ -405,7 +421,8 @@ class TrackedRegion:
         return len(fit.places)
 
     def _replace_by_hertz(self, nodes: NodeFit, scaled: Array) -> int:
-        """Fit one Hertz contact for each contact on nodes, and keep them if they are likelier."""
+        """Replace the fit on nodes by one Hertz contact for each contact, if that increases the
+        evidence of the values. Return the work of it."""
         self._is_hertz_due = False
         starts = nodes.estimate_contacts()
         if max(one.aspect for one in starts) > MAX_HERTZ_ASPECT:
@@ -431,8 +448,9 @@ def update_responses(
 ) -> None:
     """Compute the response of cubes (change of their components, in Pa) to regions of contact.
 
-    Only regions whose contacts have changed are computed, as round Hertz contacts, because distant
-    cubes hardly depend on the shape. The cubes of a region's own fit get the values of this fit.
+    The response is only computed again for regions whose contacts have changed. It is that to round
+    Hertz contacts, because the stress of distant cubes hardly depends on the shape. For the cubes
+    of a region's own fit, it is the response that this fit predicts.
 
     Args:
         inverse: Poses and kernels of the skin.
@@ -445,7 +463,7 @@ def update_responses(
     for region in stale:
         home, discs = region.discs
         place, angle = inverse.unroll(home, cubes)
-        # Cubes that face away do not respond.
+        # On a bent skin, cubes that face away from a contact do not respond to it.
         is_facing = normals[cubes] @ normals[home] > MIN_FACING
         for force, centre, log_size in zip(*discs, strict=True):
             offsets.append(place - centre)
@@ -453,7 +471,7 @@ def update_responses(
             sizes.append(np.full(len(cubes), np.exp(log_size)))
             forces.append(is_facing[:, None] * force)
     if stale:
-        variants = np.concatenate([inverse.variant[cubes]] * len(offsets))
+        variants = np.tile(inverse.variant[cubes], len(offsets))
         response = inverse.kernels.response_to_forces(
             np.concatenate(offsets),
             np.concatenate(angles),
