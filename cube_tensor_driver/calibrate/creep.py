@@ -37,8 +37,8 @@ from .fit import measured_stress
 from .recorded_loads import average_neighbours, find_cube, read_samples
 
 TIMES_PER_DECADE = 2.0
-"""Number of relaxation times of the creep law per decade (factor 10 of time). With 1.5, the error
-of the sum of exponentials makes the law wrong by 0.4 % of the load after an hour."""
+"""Number of relaxation times of the creep law per decade (factor 10 of time). With only 1.5, a sum
+of exponentials differs from creep by a power of time by 0.4 % of the load after an hour."""
 
 SHORTEST_TIME_S = 0.1
 """Shortest relaxation time of the creep law, in s. Creep that is faster than this counts as part of
@@ -46,31 +46,38 @@ the immediate response of a pad to a load."""
 
 REACH = 60.0
 """Smallest ratio of the longest relaxation time of the creep law to the duration for which the load
-was held. It makes a law from a hold of minutes serve for loads that last an hour."""
+was held. The law is then also usable for loads that last much longer than the hold."""
 
 FORECAST = 6.0
-"""Ratio of the duration of a load to that of the hold, for which the law's deviation is computed:
-an hour for a hold of ten minutes."""
+"""Duration of a future load for which the uncertainty of the creep law is computed, divided by the
+duration for which the load was held: an hour for a hold of ten minutes."""
 
 READING_ERROR = 1e-4
-"""Standard deviation of a mean reading, besides noise, divided by the load: the error of a sum of
-exponentials (rms)."""
+"""Standard deviation of an averaged stress reading in addition to noise, divided by the load. It is
+the rms error with which a sum of exponentials describes real creep."""
 
 MAX_MISFIT = 5e-3
 """Largest error of the creep law (rms difference between the measured and the computed stress
 readings of the pads), divided by the load. With a larger error, the load was not held constant."""
 
 FIRST_BEND = 0.15
-"""Standard deviation of the second differences of the amplitudes at successive relaxation times in
-the first fit, divided by their mean. For creep that grows as a power of time it is 0.03 to 0.7 for
-exponents of 0.1 to 0.4."""
+"""Standard deviation that the first fit assumes for second differences of the creep law's
+amplitudes at successive relaxation times, divided by the mean amplitude.
+
+Creep that grows as a power of time, with an exponent of 0.1 to 0.4, has values of 0.03 to 0.7.
+"""
 
 BEND = 0.05
-"""The same in the second fit, which takes out a power of time."""
+"""Standard deviation that the second fit assumes for second differences of the creep law's
+amplitudes at successive relaxation times, divided by the mean amplitude.
+
+It is smaller than `FIRST_BEND`, because the growth of the amplitudes that the first fit found
+(creep by a power of time) is divided out of these differences.
+"""
 
 FAST_ERROR = 0.02
-"""Standard deviation of the fastest memory's amplitude divided by it: creep of shorter times, which
-it stands for, is not a part of the recording."""
+"""Relative standard deviation of the amplitude at the shortest relaxation time of the creep law.
+This amplitude also stands for faster creep, which a recording does not show."""
 
 REST_S = 2.0
 """Duration at the begin of a recording, in s, in which the cube must be unloaded. The mean stress
@@ -91,7 +98,8 @@ BLOCKS_PER_E_FOLD = 12
 the factor e (2.718). Averages over logarithmic intervals suffice, because creep slows down."""
 
 GAIN_TIME_S = 1.0
-"""Time after a load began, in s, at which loads are measured for the calibration of gains."""
+"""Time, in s, from the begin of a load to the measurement of the pads' readings in a calibration of
+gains (sensitivities of the pads)."""
 
 MAX_RATE_HZ = 50.0
 """Largest rate, in Hz, of the averaged stress readings of the pads from which creep is fitted. The
@@ -103,12 +111,13 @@ class CreepFit(NamedTuple):
 
     Attributes:
         model: The law.
-        load: Load of each pad in the hold (P,), in Pa.
-        hold_s: Duration of the hold, in s.
-        misfit: Error of the law (rms), divided by the load.
-        seconds: Times of mean readings since the press (N,), in s.
-        before: Mean readings of the pads minus the first one in the hold, during it (N, P), in Pa.
-        after: Mean readings minus what the law makes of the load (N, P), in Pa.
+        load: Mean reading of each pad while the load was held (P,), in Pa.
+        hold_s: Duration for which the load was held, in s.
+        misfit: Rms difference between measured and computed readings, divided by the load.
+        seconds: Times of averaged readings since the begin of the load (N,), in s.
+        before: Creep in the averaged readings (N, P), in Pa: under the load, the reading minus the
+            first one under it; after the load, the reading itself.
+        after: Error of the law (N, P), in Pa: averaged minus computed readings.
     """
 
     model: CreepModel
@@ -121,11 +130,11 @@ class CreepFit(NamedTuple):
 
 
 class _Hold(NamedTuple):
-    """Readings of a press that is held, and of the recovery after it, as means of N blocks.
+    """Readings of the pads under a load that is held, and after it, averaged over N blocks of time.
 
     Attributes:
-        time: Time since the press (N,), in s.
-        is_loaded: 1 during the hold, 0 after it (N,).
+        time: Time since the begin of the load (N,), in s.
+        is_loaded: 1 under the load, 0 after it (N,).
         n_readings: Number of readings in each block (N,).
         reading: Readings of the pads (N, P), in Pa.
     """
@@ -137,13 +146,13 @@ class _Hold(NamedTuple):
 
 
 class _Solution(NamedTuple):
-    """Amplitudes by least squares.
+    """Amplitudes of the creep law for K relaxation times, by least squares.
 
     Attributes:
         amplitude: Amplitudes of each pad (P, K).
-        error: Errors of the mean readings (N, P), in Pa.
-        deviation: Pattern of one standard deviation of the amplitudes (P, K), the one that makes a
-            forecast wrong.
+        error: Measured minus computed averages of the readings (N, P), in Pa.
+        deviation: Error of the amplitudes (P, K) that changes the predicted creep under a long load
+            by one standard deviation of this prediction.
     """
 
     amplitude: Array
@@ -179,7 +188,8 @@ def fit_recorded_creep(path: Path, name: str | None) -> tuple[CreepFit, Calibrat
     known = temperature[is_complete] if np.isfinite(temperature).all() else None
     reading = measured_stress(current, frequency[is_complete], known)
     seconds = (stamp_ns - stamp_ns[:1]) / SECOND
-    result = fit_creep(seconds, reading, calibration.noise, calibration.layout.pads)
+    pads = calibration.layout.pads
+    result = fit_creep(seconds, reading, calibration.noise, pads)
     origin = f"{calibration.source}; creep fitted to {path.name}"
     fitted = add_creep(calibration, result.model)
     return result, replace(fitted, source=origin)
@@ -202,7 +212,8 @@ def fit_creep(
     Raises:
         FitError: The recording has no such press, or does not determine the law.
     """
-    rate_hz = len(seconds) / max(np.ptp(seconds), 1e-9)
+    duration_s = max(np.ptp(seconds), 1e-9)
+    rate_hz = len(seconds) / duration_s
     size = max(1, round(rate_hz / MAX_RATE_HZ))
     seconds = average_neighbours(seconds, size)
     reading = average_neighbours(reading, size)
@@ -212,16 +223,20 @@ def fit_creep(
     press, release = _find_hold(seconds, reading)
     hold_s = release - press
     blocks = _find_blocks(seconds, press, release)
+    block_time = [seconds[block].mean() for block in blocks]
+    is_loaded = [seconds[block[0]] < release for block in blocks]
+    n_readings = [len(block) * size for block in blocks]
     means = _Hold(
-        time=np.array([seconds[block].mean() - press for block in blocks]),
-        is_loaded=np.array([1.0 * (seconds[block[0]] < release) for block in blocks]),
-        n_readings=np.array([len(block) * size for block in blocks]),
-        reading=np.array([reading[block].mean(axis=0) for block in blocks]),
+        time=np.array(block_time) - press,
+        is_loaded=np.array(is_loaded, float),
+        n_readings=np.array(n_readings),
+        reading=_average_blocks(reading, blocks),
     )
     held = means.reading[means.is_loaded > 0]
     load = held.mean(axis=0)
     needed = MIN_LOAD_RATIO * noise
-    for pad in np.flatnonzero(np.abs(load) < needed).tolist():
+    is_weak = np.abs(load) < needed
+    for pad in np.flatnonzero(is_weak).tolist():
         raise FitError(
             f"creep: pad {names[pad]} got {load[pad]:.0f} Pa, needed are {needed[pad]:.0f} Pa; "
             "press harder, so that every pad is loaded"
@@ -233,13 +248,18 @@ def fit_creep(
     memory = _find_memories(seconds, reading, time, blocks)
     forecast = relaxed_share(FORECAST * hold_s / time)
     first = _solve(means, memory, load, noise, forecast, 1.0, FIRST_BEND)
-    # Memories between the time at which readings begin and the end of the hold are well known.
+    # The recording determines well only the amplitudes whose relaxation time lies between the first
+    # fitted reading and the end of the load.
     is_known = (time > SETTLE_S) & (time < hold_s / 3)
     known = first.amplitude[:, is_known]
-    growth = float((known[:, 1:] * known[:, :-1]).sum() / (known[:, :-1] ** 2).sum())
+    shorter = known[:, :-1]
+    longer = known[:, 1:]
+    products = longer * shorter
+    growth = float(products.sum() / (shorter**2).sum())
     solution = _solve(means, memory, load, noise, forecast, growth, BEND)
     amplitude = solution.amplitude
-    misfit = float(np.sqrt(np.mean((solution.error / load) ** 2)))
+    relative_error = solution.error / load
+    misfit = float(np.sqrt(np.mean(relative_error**2)))
     total = amplitude.sum(axis=1).max()
     if misfit > MAX_MISFIT or total >= 1:
         raise FitError(
@@ -248,12 +268,21 @@ def fit_creep(
             f"{SETTLE_S:g} s, and hold a constant load, such as a dead weight"
         )
 
-    # The fastest memory is the reading itself, so its amplitude changes all readings alike.
+    # The reading after the shortest low-pass filter nearly equals the reading, so an error of its
+    # amplitude changes all computed stresses by the same fraction.
     fast = np.zeros_like(amplitude)
     fast[:, 0] = np.hypot(misfit, FAST_ERROR * amplitude[:, 0])
-    model = CreepModel(time, amplitude, np.array([fast, solution.deviation]))
-    before = means.reading - np.outer(means.is_loaded, means.reading[0])
-    return CreepFit(model, load, hold_s, misfit, means.time, before, solution.error)
+    deviation = np.array([fast, solution.deviation])
+    first_reading = np.outer(means.is_loaded, means.reading[0])
+    return CreepFit(
+        model=CreepModel(time, amplitude, deviation),
+        load=load,
+        hold_s=hold_s,
+        misfit=misfit,
+        seconds=means.time,
+        before=means.reading - first_reading,
+        after=solution.error,
+    )
 
 
 def reading_after_step(model: CreepModel, seconds: float) -> Array:
@@ -271,7 +300,8 @@ def reading_after_step(model: CreepModel, seconds: float) -> Array:
         ratio = step / model.time[:, None]
         share = relaxed_share(ratio)
         slope_share = 1 - share / ratio
-        # The new reading u_1 stands on both sides: u_1 = 1 + a r, and r contains u_1.
+        # The stress is 1, so the new reading u_1 is 1 + sum_k a_k r_k. As the low-passed readings
+        # r_k contain (slope share) * u_1, the equation is solved for u_1.
         memory += share * (reading - memory) - slope_share * reading
         known = 1 + (amplitude * memory).sum(axis=0)
         weight = 1 - (amplitude * slope_share).sum(axis=0)
@@ -281,9 +311,11 @@ def reading_after_step(model: CreepModel, seconds: float) -> Array:
 
 
 def add_creep(calibration: Calibration, model: CreepModel) -> Calibration:
-    """Return a calibration with a law of creep, and with gains that fit it.
+    """Return a calibration with a law of creep, and with gains reduced by the creep they contain.
 
-    Gains are sensitivities `GAIN_TIME_S` after a load began. Without creep, a pad reads less then.
+    The gains (sensitivities of the pads) were measured `GAIN_TIME_S` after the begin of a load, so
+    they contain the creep until then. The compensation removes creep from the readings, so it must
+    be removed from the gains, too.
 
     Args:
         calibration: Calibration of the recording; it may have an older law of creep.
@@ -296,14 +328,16 @@ def add_creep(calibration: Calibration, model: CreepModel) -> Calibration:
 
 
 def _find_hold(seconds: Array, reading: Array) -> tuple[float, float]:
-    """Return the times at which the load came on and went, in s.
+    """Return the times at which the load began and ended, in s.
 
     Raises:
-        FitError: There is not one load that was held long enough after a time without load.
+        FitError: There is no load, more than one, or one that was held too briefly or was not
+            preceded by enough time without load.
     """
     total = np.abs(reading).sum(axis=1)
     is_loaded = total > 0.5 * np.quantile(total, 0.95)
-    begin, end = np.flatnonzero(is_loaded)[[0, -1]]
+    loaded = np.flatnonzero(is_loaded)
+    begin, end = loaded[[0, -1]]
     press = float(seconds[begin])
     release = float(seconds[end])
     rest_s = press - seconds[0]
@@ -327,10 +361,20 @@ def _find_blocks(
     press: float,
     release: float,
 ) -> list[Index]:
-    """Return the numbers of the readings in each block, which grow with the time since a change."""
+    """Divide readings into blocks, whose length grows with the time since the load changed.
+
+    Args:
+        seconds: Times of the readings (S,), in s.
+        press: Time at which the load began, in s.
+        release: Time at which it ended, in s.
+
+    Returns:
+        Numbers of the readings in each block.
+    """
     blocks: list[Index] = []
     for begin, end in ((press, release), (release, np.inf)):
-        is_settled = (seconds > begin + SETTLE_S) & (seconds < end - SETTLE_S)
+        is_settled = seconds > begin + SETTLE_S
+        is_settled &= seconds < end - SETTLE_S
         chosen = np.flatnonzero(is_settled)
         elapsed = seconds[chosen] - begin
         place = np.floor(BLOCKS_PER_E_FOLD * np.log(elapsed))
@@ -346,23 +390,30 @@ def _find_memories(
     time: Array,
     blocks: list[Index],
 ) -> Array:
-    """Return the memories of the pads as means of blocks (N, K, P).
+    """Return the readings after low-pass filters, averaged over blocks (N, K, P).
 
     Args:
-        seconds: Times of the readings, in s.
+        seconds: Times of the readings (S,), in s.
         reading: Readings of the pads (S, P), in Pa, of which the first is without load.
-        time: Relaxation times (K,), in s.
-        blocks: Numbers of the readings in each block.
+        time: Time constants of the filters, the relaxation times of the law (K,), in s.
+        blocks: Numbers of the readings in each of N blocks.
     """
     ratio = np.diff(seconds)[:, None, None] / time[:, None]
     share = relaxed_share(ratio)
     slope_share = 1 - share / ratio
     change = np.diff(reading, axis=0)
-    memory = np.zeros((len(seconds), len(time), reading.shape[1]))
+    shape = len(seconds), len(time), reading.shape[1]
+    memory = np.zeros(shape)
     for n, before in enumerate(memory[:-1]):
         relaxed = before + share[n] * (reading[n] - before)
         memory[n + 1] = relaxed + slope_share[n] * change[n]
-    return np.array([memory[block].mean(axis=0) for block in blocks])
+    return _average_blocks(memory, blocks)
+
+
+def _average_blocks(values: Array, blocks: list[Index]) -> Array:
+    """Return the mean of values (S, ...) over each of N blocks of indices, as (N, ...)."""
+    means = [values[block].mean(axis=0) for block in blocks]
+    return np.array(means)
 
 
 def _solve(
@@ -374,42 +425,58 @@ def _solve(
     growth: float,
     bend: float,
 ) -> _Solution:
-    """Fit amplitudes to the means of readings by least squares with smooth amplitudes.
+    """Fit the amplitudes of the law to averaged readings by regularised least squares.
+
+    The regularisation makes amplitudes of successive relaxation times a smooth sequence.
 
     Args:
-        means: Readings.
-        memory: Memories of the pads (N, K, P), in Pa.
-        load: Load of each pad (P,), in Pa.
+        means: Averaged readings.
+        memory: Averages of the low-passed readings (N, K, P), in Pa.
+        load: Mean reading of each pad under the load (P,), in Pa.
         noise: Standard deviation of a reading of each pad (P,), in Pa.
-        forecast: Memories (K,) of a reading of 1 that has lasted for the time of the forecast.
-        growth: Expected ratio of successive amplitudes.
-        bend: Standard deviation of second differences divided by the mean amplitude.
+        forecast: Low-passed readings (K,) at the end of a long load with a constant reading of 1.
+        growth: Expected ratio of an amplitude to that of the next shorter relaxation time.
+        bend: Standard deviation of second differences of the amplitudes, from which the growth is
+            divided out, relative to the mean amplitude.
     """
     n_times = memory.shape[1]
     held = means.reading[means.is_loaded > 0]
-    # The creep during the hold is that of about half the relaxation times.
+    # About half of the relaxation times are shorter than the load, and only these contribute to the
+    # creep under it. The scale of the regularisation follows from that.
     creep = np.abs(held[-1] / held[0] - 1).mean()
     mean_amplitude = 2 * creep / n_times
-    steps = np.eye(n_times)[1:] - growth * np.eye(n_times)[:-1]
+    identity = np.eye(n_times)
+    steps = identity[1:] - growth * identity[:-1]
     bends = steps[1:] - growth * steps[:-1]
-    smooth = np.concatenate([steps[:1], bends]) / (bend * mean_amplitude + 1e-9)
-    smooth = np.pad(smooth, ((0, 0), (1, 0)))
+    rows = np.concatenate([steps[:1], bends])
+    # The first column stands for the stress under the load, which the regularisation leaves free.
+    smooth = np.zeros((len(rows), 1 + n_times))
+    smooth[:, 1:] = rows / (bend * mean_amplitude + 1e-9)
 
     shape = len(load), n_times
-    found = _Solution(np.empty(shape), np.empty_like(means.reading), np.empty(shape))
+    found = _Solution(
+        amplitude=np.empty(shape),
+        error=np.empty_like(means.reading),
+        deviation=np.empty(shape),
+    )
     for pad, pad_load in enumerate(load):
         reading = means.reading[:, pad]
         mean_noise = noise[pad] / np.sqrt(means.n_readings)
         deviation = np.hypot(mean_noise, READING_ERROR * pad_load)
-        # Unknown are the stress under the load, and the amplitudes.
+        # The unknowns are the constant stress under the load, then the amplitudes.
         columns = np.column_stack([means.is_loaded, memory[..., pad]])
-        system = np.concatenate([columns / deviation[:, None], smooth])
-        right = np.concatenate([reading / deviation, np.zeros(len(smooth))])
-        solution = np.linalg.lstsq(system, right, rcond=None)[0]
+        weighted = columns / deviation[:, None]
+        system = np.concatenate([weighted, smooth])
+        right = np.zeros(len(system))
+        right[: len(reading)] = reading / deviation
+        solution, *_ = np.linalg.lstsq(system, right, rcond=None)
         found.amplitude[pad] = solution[1:]
         found.error[:, pad] = reading - columns @ solution
-        # The error of the amplitudes that makes the forecast wrong by its standard deviation, if
-        # the stress is known, in whose place gains are calibrated.
-        spread = np.linalg.solve(system[:, 1:].T @ system[:, 1:], forecast)
+        # With the covariance C of the amplitudes and the gradient g of the prediction, C g divided
+        # by sqrt(g' C g) changes the prediction by one standard deviation. The stress counts as
+        # known, because the calibration of gains determines it.
+        amplitudes = system[:, 1:]
+        normal = amplitudes.T @ amplitudes
+        spread = np.linalg.solve(normal, forecast)
         found.deviation[pad] = spread / np.sqrt(forecast @ spread)
     return found

@@ -42,40 +42,49 @@ MIN_BLOCKS = 120
 """Smallest number of blocks with data in all bags together."""
 
 MIN_RANGE = 3.0
-"""Smallest range of the temperature, in K: below, noise and creep would be taken for its effect."""
+"""Smallest difference between the highest and the lowest measured temperature, in K. With a smaller
+one, noise and creep would look like an effect of temperature."""
 
 MAX_RESIDUAL = 150.0
-"""Largest residual of a pad (quadratic mean), in Pa, with which nothing seems to have touched."""
+"""Largest rms difference between measured and fitted stress of a pad, in Pa. A larger one shows
+that something touched the skin during the recording."""
 
 MAX_SLOPE_DEVIATION = 0.2
-"""Largest deviation of the coefficients, relative to their quadratic mean over the pads."""
+"""Largest relative uncertainty (rms over the pads) of the effect of temperature, in Pa/K, with
+which a fit is accepted."""
 
 LAGS_S = np.geomspace(3.0, 1500.0, 26)
-"""Time constants, in s, among which the search for the best lags begins."""
+"""Time constants of low-pass filters, in s, with which the search for the best time constants of
+the elastomer's lag behind the thermometer begins."""
 
 MAX_LAG_STEP = 1.01
 """Ratio of successive estimates of a lag (time constant) below which the search for it ends."""
 
 LAG_ERROR = 0.05
-"""Error of the filters as a share of the lag, with which residuals are weighted."""
+"""Standard deviation of the elastomer's temperature after low-pass filters, divided by the
+difference to the measured temperature. It stands for conduction of heat, which filters only
+approximate."""
 
 MAX_FILTER_RATIO = 0.8
-"""Largest ratio of the residuals with and without a second filter with which the data demand it."""
+"""Ratio of the rms residual with two low-pass filters to the one with a single filter, below which
+two are used."""
 
 MAX_DEGREE_RATIO = 0.3
-"""Largest ratio of the residuals with and without a second degree with which the data demand it.
+"""Ratio of the rms residual with a quadratic effect of temperature to that with a linear one, below
+which the quadratic one is used.
 
-While the skin warms once, the conduction of heat, which is no low-pass filter, looks like a
-curvature: without any, the ratio is 0.4.
+The ratio can be as small as 0.4 although the effect is linear: conduction of heat, which low-pass
+filters only approximate, looks like a quadratic effect while the skin warms once.
 """
 
 MAX_LAG_PATTERNS = 3
-"""Number of patterns of the pads that describe how residuals grow with the lag."""
+"""Maximum number of independent errors of the pads that the model states in proportion to the lag
+of the elastomer (measured temperature minus its own): the largest principal components."""
 
 
 @dataclass(frozen=True, eq=False)
 class Warming:
-    """Means of N blocks of an unloaded cube with P pads.
+    """Temperatures and stresses of an unloaded cube with P pads, averaged over N blocks of time.
 
     Attributes:
         name: Bag and cube, for messages.
@@ -99,7 +108,7 @@ class ThermalFit:
     """Result of the fit for one cube.
 
     Attributes:
-        data: What it was fitted to.
+        data: Temperatures and stresses to which the model was fitted.
         model: Model for the calibration.
         offset: Stress on each pad (P,) at the reference temperature, in Pa.
         level: Temperature of the elastomer (N,), in K above the reference.
@@ -113,9 +122,15 @@ class ThermalFit:
     residual: Array
 
     def sizes(self) -> tuple[float, float, float]:
-        """Return quadratic means over the pads: stress without the load before and after the
-        compensation, in Pa, and deviation of the linear coefficient, in Pa/K."""
-        deviation = np.zeros(1) if self.model.deviation is None else self.model.deviation[:, 0]
+        """Return the rms effect on the pads, before and after compensation, and the uncertainty.
+
+        Returns:
+            Rms stress of the unloaded pads before and after the effect of temperature is
+            subtracted, in Pa, and rms deviation of the linear coefficient over the pads, in Pa/K.
+        """
+        deviation = np.zeros(1)
+        if self.model.deviation is not None:
+            deviation = self.model.deviation[:, 0]
         change = self.data.stress - self.offset
         return (
             root_mean_square(change),
@@ -124,7 +139,12 @@ class ThermalFit:
         )
 
     def calibration(self, base: Calibration, source: str) -> Calibration:
-        """Return a calibration with the model, whose rest frequencies hold at the reference."""
+        """Return a calibration with the model and with the rest frequencies at its reference.
+
+        Args:
+            base: Calibration with which the stresses were computed.
+            source: Text that states the origin of the values.
+        """
         rest = pad_frequency(self.offset, base.rest_frequency, base.beta, base.modulus)
         return replace(
             base, rest_frequency=rest, temperature=None, thermal=self.model, source=source
@@ -133,14 +153,16 @@ class ThermalFit:
 
 @dataclass(frozen=True, eq=False)
 class _Solution:
-    """Weighted least squares for given lags and degree.
+    """Solution by weighted least squares for given time constants and degree of the polynomial.
 
     Attributes:
-        lags, degree: Time constants in s, and highest power of u.
-        columns: Columns (N, K) of the design: 1, u, ..., u^degree, start.
-        weight: Square roots of the weights (N,).
+        lags: Time constants of the low-pass filters, in s.
+        degree: Highest power of the filtered temperature u.
+        columns: Design matrix (N, K): 1, u, ..., u^degree, then the decay of the unknown difference
+            between elastomer and thermometer at the start.
+        weight: Square roots of the weights (N,), in 1/Pa.
         values: Coefficients (K, P).
-        misfit: Logarithm of the residual that is typical with these weights.
+        misfit: Negative logarithm of the likelihood per stress, without constants.
     """
 
     lags: tuple[float, ...]
@@ -152,14 +174,14 @@ class _Solution:
 
 
 def read_warming(paths: Sequence[Path], name: str | None) -> dict[str, tuple[Calibration, Warming]]:
-    """Read bags of an unloaded skin while its temperature changes.
+    """Read bags that were recorded while the temperature of an unloaded skin changed.
 
     Args:
         paths: Bags of one skin, between which no tare was made.
         name: Name of the cube; None: all.
 
     Returns:
-        Calibration with the rest frequencies in use, and the means, by the name of the cube.
+        Calibration with the rest frequencies in use, and averages, by the name of the cube.
 
     Raises:
         BagError: A bag has no such cube or states no temperature, or the bags differ.
@@ -185,7 +207,8 @@ def read_warming(paths: Sequence[Path], name: str | None) -> dict[str, tuple[Cal
             pipeline = Pipeline(calibrations)
             blocks = BlockMeans(source, BLOCK_NS, pipeline.n_pads + 1)
             for rows in source:
-                # No pad is left out, because a constant set of pads is fitted.
+                # The stresses of all pads are computed, even of those that the device reports as
+                # broken, because every block must have the same pads.
                 left_out = np.zeros_like(rows.pad_fault)
                 stress = pipeline.pad_stress(rows, left_out)
                 values = np.nan_to_num(stress), rows.temperature[:, None]
@@ -241,7 +264,10 @@ def _join(
 
 
 def fit_thermal(data: Warming) -> ThermalFit:
-    """Fit lags and coefficients, with the number of filters and the degree that the data demand.
+    """Fit the lag of the elastomer and the effect of its temperature on each pad.
+
+    A second low-pass filter and a quadratic effect are used only where they reduce the residual
+    considerably.
 
     Raises:
         FitError: The bags are too short, the temperature varies too little, something touched the
@@ -256,7 +282,7 @@ def fit_thermal(data: Warming) -> ThermalFit:
     unweighted = _search(data, 1, 1, 0.0)
     slope = root_mean_square(unweighted.values[1])
     best = _search(data, 1, 1, slope)
-    # Where the weights decide on the result, the data do not.
+    # If the weights of the blocks change the result much, the data do not determine it.
     change = abs(root_mean_square(best.values[1]) / slope - 1)
 
     two = _search(data, 2, 1, slope)
@@ -282,7 +308,16 @@ def _search(
     degree: int,
     slope: float,
 ) -> _Solution:
-    """Return the solution with the best lags, from a grid that becomes finer around the best."""
+    """Return the solution with the most likely lags.
+
+    The search begins with the grid `LAGS_S`, which is refined around the best solution.
+
+    Args:
+        data: Averages of the blocks.
+        n_lags: Number of low-pass filters.
+        degree: Highest power of the temperature.
+        slope: Rms of the linear coefficients over the pads, in Pa/K; 0: not known yet.
+    """
 
     def solve(choices: Iterable[tuple[float, ...]]) -> _Solution:
         solutions = (_solve(data, lags, degree, slope) for lags in choices)
@@ -306,7 +341,14 @@ def _search(
 
 
 def _filter(data: Warming, lags: tuple[float, ...]) -> Array:
-    """Return the temperature (N,) after low-pass filters in a row, which start at rest."""
+    """Return the temperature (N,) after low-pass filters in series.
+
+    At the begin of each bag, the output of the filters equals the measured temperature.
+
+    Args:
+        data: Averages of the blocks.
+        lags: Time constants of the filters, in s.
+    """
     total = np.zeros(len(data.seconds))
     bounds = [*data.first, len(data.seconds)]
     weights = filter_weights(np.array(lags))
@@ -331,13 +373,13 @@ def _solve(
     degree: int,
     slope: float,
 ) -> _Solution:
-    """Solve for the coefficients.
+    """Compute the coefficients for given time constants by weighted least squares.
 
     Args:
-        data: Means of the blocks.
+        data: Averages of the blocks.
         lags: Time constants, in s, the longest first.
         degree: Highest power of the temperature.
-        slope: Quadratic mean of the coefficients over the pads, in Pa/K; 0: not known yet.
+        slope: Rms of the linear coefficients over the pads, in Pa/K; 0: not known yet.
     """
     filtered = _filter(data, lags)
     u = filtered - data.temperature[0]
@@ -352,7 +394,8 @@ def _solve(
     stress = data.stress * weight[:, None]
 
     normal = weighted.T @ weighted
-    # The start differs from rest by about 1 K.
+    # The prior of the last unknown: at the start, the temperature of the elastomer differs from the
+    # measured one by about 1 K.
     start_deviation = START_KELVIN * max(slope, 1.0)
     normal[-1, -1] += 1 / start_deviation**2
     values = np.linalg.solve(normal, weighted.T @ stress)
@@ -367,7 +410,13 @@ def _describe(
     best: _Solution,
     slope: float,
 ) -> ThermalFit:
-    """Return the model of a solution, with its deviations."""
+    """Return the model of a solution, with the standard deviations of its values.
+
+    Args:
+        data: Averages of the blocks.
+        best: The solution.
+        slope: Rms of the linear coefficients over the pads, in Pa/K.
+    """
     degrees = slice(1, 1 + best.degree)
     residual = data.stress - best.columns @ best.values
     level = best.columns[:, 1]
@@ -375,10 +424,11 @@ def _describe(
     covariance = residual.T @ residual / max(float((behind**2).sum()), 1e-12)
     variances, directions = np.linalg.eigh(covariance)
     patterns = directions * np.sqrt(np.maximum(variances, 0))
-    # The largest ones come last.
+    # `eigh` returns eigenvalues in rising order, so the largest errors come last.
     ramp = patterns[:, ::-1][:, :MAX_LAG_PATTERNS]
 
-    # A small change of each lag moves the temperature; this counts as one more unknown.
+    # The lags are uncertain, too. Each counts as one more unknown, whose column is the derivative
+    # of the filtered temperature with respect to the logarithm of the lag.
     moved = []
     for number, lag in enumerate(best.lags):
         changed = list(best.lags)
@@ -414,12 +464,13 @@ def _check(
     slope: float,
     change: float,
 ) -> None:
-    """Raise FitError where a result cannot be trusted.
+    """Raise FitError if the result is too uncertain or a load acted on the cube.
 
     Args:
         fit: The result.
-        slope: Quadratic mean of the coefficients over the pads, in Pa/K.
-        change: Relative difference of this mean with equal weights of all blocks.
+        slope: Rms of the linear coefficients over the pads, in Pa/K, with equal weights of all
+            blocks.
+        change: Relative difference of this value to that with the weights of the fit.
     """
     data, model = fit.data, fit.model
     worst = max(root_mean_square(pad) for pad in fit.residual.T)

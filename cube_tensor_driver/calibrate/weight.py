@@ -29,20 +29,22 @@ BLOCK_NS = 500_000_000
 
 MIN_SPREAD = 3.0
 """Smallest standard deviation of the specific force, in m/s², along the direction in which it
-varies least. Three poses with another axis upwards each have 4.6."""
+varies least. A recording of three poses, in each of which another axis points upwards, has 4.6."""
 
 MIN_BLOCKS = 20
-"""Smallest number of blocks of `BLOCK_NS`, four times the number of unknowns of a pad."""
+"""Smallest number of blocks (of 0.5 s) with data: four times the number of unknowns of a pad, which
+are three responses, a constant and a drift."""
 
 
 class WeightFit(NamedTuple):
-    """The response to specific force that a recording shows.
+    """Response of the pads to specific force (weight and inertia), fitted to a recording.
 
     Attributes:
         calibration: The recorded calibration with the response.
-        seconds: Times of the means of the first cube (N,), in s.
-        before: Its mean stresses of the pads without constant and drift (N, P), in Pa.
-        after: The same without the effect of weight (N, P), in Pa.
+        seconds: Times of the N blocks of the first cube (N,), in s.
+        before: Stresses on its pads, averaged over the blocks (N, P), in Pa, minus a fitted
+            constant and linear drift.
+        after: These stresses minus the fitted effect of weight (N, P), in Pa.
     """
 
     calibration: Calibration
@@ -100,7 +102,8 @@ def fit_weight(path: Path, name: str | None = None) -> WeightFit:
         shown.append((seconds, before - before.mean(axis=0), after))
 
     scatter = np.mean(variances, axis=0)
-    # Cubes of one kind differ, and the common response is wrong by that for each of them.
+    # Cubes of one kind differ, so the mean response differs from that of each cube. This variance
+    # between cubes is added to the variance of the mean.
     between = np.maximum(np.var(responses, axis=0) - scatter, 0)
     deviation = np.sqrt(scatter / len(responses) + between)
     model = WeightModel(np.mean(responses, axis=0), deviation)
@@ -117,12 +120,14 @@ def _fit_cube(
     """Fit the response of the pads of one cube.
 
     Args:
-        means: Means of the stresses of P pads, then of the specific force, of blocks (n, P + 3).
+        means: Averages over n blocks of the stresses on P pads, in Pa, then of the specific force,
+            in m/s² (n, P + 3).
         time: Times of the blocks (n,), in any unit.
         label: Bag and cube, for error messages.
 
     Returns:
-        Response with gains (P, 3), its variance (P, 3), and what it leaves of the stresses (n, P).
+        Response (P, 3), in Pa per m/s², including the gains of the pads; its variance (P, 3); and
+        the residual of the stresses (n, P), in Pa.
 
     Raises:
         BagError: The blocks are too few, or the specific force varies too little.

@@ -37,7 +37,8 @@ noise, modulus of the foam, gain, and beta (ratio of parasitic to active capacit
 EFFECTS: dict[str, type[EffectModel]] = {
     model.key: model for model in (WeightModel, CreepModel, ThermalModel)
 }
-"""Names of the attributes of a calibration with effects on the pads that are no load -> class."""
+"""Classes of the models of weight, creep and temperature, by the name of the attribute of a
+calibration that holds the model."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -164,7 +164,8 @@ def make_estimator(
         targets = modes.components
     targets = np.asarray(targets, dtype=float)
     n_pads, n_targets = len(response), len(targets)
-    all_pads, all_modes = np.arange(n_pads), np.arange(modes.n_modes)
+    all_pads = np.arange(n_pads)
+    all_modes = np.arange(modes.n_modes)
     present = np.setdiff1d(all_pads, np.asarray(missing, dtype=int))
     kept = np.setdiff1d(all_modes, modes.index(neglect))
 
@@ -173,14 +174,20 @@ def make_estimator(
     whitened = response[np.ix_(present, kept)] / noise[present, None]
     seen = _orthonormalise(whitened, len(present), RANK_TOLERANCE)
     rank = seen.shape[1]
-    # Orthonormalising the rows of R = Q' W A takes Q' along to G, with (W A)^+ = V G.
+    # The response divided by the noise is Q R, with orthonormal columns Q. The rows of R are
+    # orthonormalised to V', and the same operations on the rows of Q' yield G. V G is then the
+    # pseudo-inverse of Q R.
     reduced = multiply(seen.T, whitened)
-    both = _orthonormalise(np.concatenate([reduced.T, seen]), len(kept))
-    v, g = both[: len(kept)], both[len(kept) :].T
+    stacked = np.concatenate([reduced.T, seen])
+    n_kept = len(kept)
+    both = _orthonormalise(stacked, n_kept)
+    v = both[:n_kept]
+    g = both[n_kept:].T
 
     kept_targets = targets[:, kept]
     on_seen = multiply(kept_targets, v)
-    unseen = np.linalg.norm(kept_targets - multiply(on_seen, v.T), axis=1)
+    unseen_targets = kept_targets - multiply(on_seen, v.T)
+    unseen = np.linalg.norm(unseen_targets, axis=1)
     # Neglected modes are assumed to be zero and not measured, so a target with a part along them
     # counts as not observed.
     neglected_targets = np.delete(targets, kept, axis=1)
@@ -220,32 +227,36 @@ def _orthonormalise(
     tolerance: float = 0.0,
     count: int | None = None,
 ) -> Array:
-    """Combine columns to orthonormal ones, the longest remainder first (Gram-Schmidt).
+    """Orthonormalise the columns of a matrix by the Gram-Schmidt process with column pivoting.
 
-    LAPACK's decompositions would do it, but their last bits depend on the processor. Here, sums
-    have a fixed order.
+    The last bits of the decompositions of LAPACK depend on the processor. Here, sums have a fixed
+    order, so the result has the same bits everywhere.
 
     Args:
-        vectors: Columns (n, m).
-        length: Number of the first rows in which the results are orthonormal. The other rows are
-            combined in the same way.
-        tolerance: Smallest length of a remainder that is used, relative to the longest column.
-        count: Number of columns to return at most; by default the rank.
+        vectors: Matrix (n, m).
+        length: Number of leading rows of the matrix in which the resulting columns are orthonormal.
+            The same linear combinations are applied to the other rows.
+        tolerance: Smallest length that a column may have after its projection on earlier results
+            is subtracted, relative to the longest column.
+        count: Maximum number of columns to return; by default the rank.
 
     Returns:
-        Columns (n, r).
+        Matrix (n, r) with r columns.
     """
     remainder = np.array(vectors)
     result = np.zeros((len(remainder), 0))
     limit = 0.0
-    for _ in range(min(length, remainder.shape[1]) if count is None else count):
+    if count is None:
+        count = min(length, remainder.shape[1])
+    for _ in range(count):
         sizes = np.sqrt((remainder[:length] ** 2).sum(axis=0))
         longest = int(np.argmax(sizes))
         limit = limit or tolerance * sizes[longest]
         if sizes[longest] <= limit:
             break
         chosen = remainder[:, longest]
-        # Rounding errors of the earlier steps are removed by projecting once more.
+        # The part along earlier results was already subtracted. What rounding errors left of it is
+        # subtracted here.
         overlap = (result[:length] * chosen[:length, None]).sum(axis=0)
         chosen = chosen - (result * overlap).sum(axis=1)
         chosen = chosen / np.sqrt((chosen[:length] ** 2).sum())

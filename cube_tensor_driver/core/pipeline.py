@@ -127,7 +127,12 @@ class Effects(Protocol):
         """What is subtracted, with the state that the kernel changes."""
 
     def step(self, columns: Columns, row: int) -> None:
-        """Advance the effects to a scan, which begins with a row, and open the next step."""
+        """Compute the offsets for a scan, and for the interval of time after it in which they hold.
+
+        Args:
+            columns: Rows of frequencies.
+            row: Number of the first row of the scan.
+        """
 
 
 class Pipeline:
@@ -273,14 +278,16 @@ class Pipeline:
         return shifted
 
     def shift_of_zero(self, before: Array) -> Array:
-        """Return by how much the zero of older rest frequencies is wrong (cubes, P).
+        """Return the stress that unloaded pads have by older rest frequencies (cubes, P).
 
-        It is the stress / stiffness that they give for the present frequencies without load.
+        It is divided by the stiffness of the pads, and would be 0 if the older rest frequencies
+        were equal to the present ones.
 
         Args:
             before: The older rest frequencies (cubes, P), in Hz.
         """
-        ratio, beta = self._rest / before, self._beta[self._tables.calibration]
+        ratio = self._rest / before
+        beta = self._beta[self._tables.calibration]
         shift: Array = (ratio - 1) / ((1 + beta) / beta - ratio)
         return shift
 
@@ -305,8 +312,8 @@ class Pipeline:
             watch: Health, which is updated with each row before its stress is computed. It then
                 states the pads that are not used, and adds the conditions of the cube's pads to the
                 status.
-            known: Whether the health of a row is not found but given, by `left_out` and the
-                `status` of `out` (N,).
+            known: Whether the health of a row (pads that are not used, conditions) is given by
+                `left_out` and the `status` of `out`, and not by `watch` (N,). None: of no row.
             out: Rows to write into; None makes new ones.
             effects: Effects that are subtracted; None: none are, whatever columns the rows have.
             offset: Array for what is subtracted (N, P), stress / stiffness; None: not wanted.

@@ -192,15 +192,16 @@ class Reconstructor:
     def covariance(self, cube: int, left_out: int = 0) -> Array:
         """Return the covariance (15, 15) of the components of a cube's newest row.
 
-        It contains the noise of the pads, the deviations of what is compensated, and drift that
-        could not be followed. `Pipeline.covariance` states arguments and units.
+        It is caused by the noise of the pads, by errors of the compensation, and by drift that
+        could not be tracked. `Pipeline.covariance` states arguments and units.
         """
         covariance = self.pipeline.covariance(cube, left_out)
-        growth = self.compensation.growth(cube, left_out)
-        if growth is not None:
-            covariance = covariance + growth
+        compensation = self.compensation.covariance(cube, left_out)
+        if compensation is not None:
+            covariance = covariance + compensation
         if self._drift.deviation[cube]:
-            # All pads of a cube drift alike, which reads as pressure from all sides.
+            # The frequencies of all pads of a cube drift by about the same fraction, so the error
+            # looks like a pressure from all sides.
             one = self.calibrations[cube]
             pads = one.modulus * (1 + one.beta) * self._drift.deviation[cube]
             components = self.pipeline.matrix(cube, left_out) @ pads
@@ -244,8 +245,10 @@ class Reconstructor:
         self._check_cubes(cubes)
         present = self.rest_frequency
         measured = measure_rest(self.pipeline, self.health, cubes, duration, self.names)
-        # Creep has taken a part of a lasting error of the rest frequencies for a load.
-        return present + (measured - present) / self.compensation.creep.zero_share()
+        # The compensation of creep hides a part of a constant error of the rest frequencies, so
+        # the measured difference is smaller than the error.
+        visible_share = self.compensation.creep.find_visible_share()
+        return present + (measured - present) / visible_share
 
     def clear_tare(self, cubes: Sequence[int] | None = None) -> None:
         """Use the rest frequencies of the calibrations again, as before any tare.

@@ -38,8 +38,8 @@ like a clock.
 COMPENSATION = 4096
 """Status bit: a compensation that is asked for is missing, stale or uncertain.
 
-Weight, creep or temperature was not subtracted from the stresses on the pads, because an input or
-the calibration lacks what it takes, or the deviation of the compensation is larger than usual.
+Weight, creep or temperature was not subtracted from the stresses on the pads, because the rows or
+the calibration lack the data for it, or the compensation is more uncertain than usual.
 """
 
 WEIGHT = 8192

@@ -33,19 +33,22 @@ from .weight import Weight
 
 
 class Compensation:
-    """Subtracts the effects on the pads of one skin that are no load.
+    """Subtracts weight, creep and the effect of temperature from the readings of one skin's pads.
 
     Attributes:
-        creep: The compensation of creep, which a tare needs.
-        offsets: What is subtracted, and the newest row of each cube.
+        creep: Compensation of creep, which a tare needs.
+        offsets: Values that are subtracted, and the newest row of each cube.
     """
 
     def __init__(self, pipeline: Pipeline) -> None:
         self._pipeline = pipeline
         n_cubes = len(pipeline.calibrations)
-        shape, real = (n_cubes, pipeline.n_pads), pipeline.dtype
+        shape = n_cubes, pipeline.n_pads
+        real = pipeline.dtype
         self._weight = Weight(pipeline)
-        stiffness = np.where(pipeline.stiffness > 0, pipeline.stiffness, np.inf)
+        stiffness = pipeline.stiffness
+        # For a pad that the cube does not have, the quotient is 0.
+        stiffness = np.where(stiffness > 0, stiffness, np.inf)
         response = self._weight.response / stiffness[:, None]
         weighing = np.where(self._weight.has_model, WEIGHT, COMPENSATION)
         self.offsets = Offsets(
@@ -64,8 +67,9 @@ class Compensation:
         )
         self._thermal = Thermal(pipeline)
         self.creep = Creep(pipeline, self.offsets)
-        both = self._thermal, self.creep
-        self._lasting = [effect for effect in both if effect.has_model.any()]
+        # Effects that depend on earlier rows. Weight depends on the row itself only.
+        with_history = self._thermal, self.creep
+        self._lasting = [effect for effect in with_history if effect.has_model.any()]
         self._has_forces = False
 
     def process(
@@ -78,7 +82,10 @@ class Compensation:
         out: StressRows,
         offset: Real | None = None,
     ) -> StressRows:
-        """Compute the stress of rows without the effects; arguments as `Pipeline.process`."""
+        """Compute the stress of rows, from which weight, creep and temperature are subtracted.
+
+        The arguments are those of `Pipeline.process`.
+        """
         self._has_forces = rows.specific_force is not None
         is_active = self._has_forces or bool(self._lasting)
         if is_active and self.creep.follow_rest():
@@ -96,10 +103,16 @@ class Compensation:
         )
 
     def step(self, columns: Columns, row: int) -> None:
-        """Advance creep and temperature to the scan that begins with a row; see `STEP_NS`."""
+        """Compute creep and the effect of temperature for the step of `STEP_NS` from a scan on.
+
+        Args:
+            columns: Rows of frequencies.
+            row: Number of the first row of the scan.
+        """
         scan = columns.select(columns.find_scan(row))
         newest_ns = int(scan.stamp_ns.max())
-        self.offsets.step_ns[:] = newest_ns - STEP_NS, newest_ns + STEP_NS
+        self.offsets.step_ns[0] = newest_ns - STEP_NS
+        self.offsets.step_ns[1] = newest_ns + STEP_NS
         if not self._lasting:
             return
         self.offsets.since_ns[:] = self.offsets.newest_ns
@@ -110,78 +123,91 @@ class Compensation:
         self._fill_offsets()
 
     def _fill_offsets(self) -> None:
-        """Write the sums of the effects for the kernel."""
-        self.offsets.offset[:] = self._thermal.offset + self.creep.offset
-        # The gain applies to v with the effect of temperature, which is no reading of creep.
-        self.offsets.slope[:] = self.creep.slope - self.creep.gain * self._thermal.offset
+        """Write the sum of creep and the effect of temperature into the arrays of the kernel."""
+        thermal = self._thermal.offset
+        self.offsets.offset[:] = thermal + self.creep.offset
+        # The kernel multiplies the gain by the whole reading of a pad, but creep depends only on
+        # the reading minus the effect of temperature. The slope contains the difference.
+        correction = self.creep.gain * thermal
+        self.offsets.slope[:] = self.creep.slope - correction
         self.offsets.gain[:] = self.creep.gain
         self.offsets.lasting[:] = 0
         for effect in self._lasting:
             bits = np.where(effect.is_known, effect.bit, COMPENSATION)
             self.offsets.lasting[:] |= bits.astype(np.uint16)
 
-    def growth(self, cube: int, left_out: int = 0) -> Array | None:
-        """Return what the effects add to the covariance (15, 15) of a cube's newest row.
+    def covariance(self, cube: int, left_out: int = 0) -> Array | None:
+        """Return the covariance (15, 15) of a cube's newest row that errors of compensation cause.
 
-        An effect states patterns (P, k) of one standard deviation each of the stresses on the pads,
-        in Pa; the k patterns are independent of each other.
+        The covariance by the noise of the pads must be added to it.
 
         Args:
             cube: Number of the cube.
             left_out: Bit mask of the pads that are not used.
 
         Returns:
-            Covariance in the units of `Pipeline.covariance`; None: nothing.
+            Covariance in the units of `Pipeline.covariance`; None if no error is known.
         """
-        patterns = [effect.deviation(cube) for effect in self._lasting]
+        errors = [effect.deviation(cube) for effect in self._lasting]
         if self._has_forces:
-            patterns.append(self._weight.deviation(cube, self.offsets.newest_force[cube]))
-        if not any(pattern.any() for pattern in patterns):
+            force = self.offsets.newest_force[cube]
+            errors.append(self._weight.deviation(cube, force))
+        if not any(error.any() for error in errors):
             return None
         matrix = self._pipeline.matrix(cube, left_out)
-        components = matrix @ np.hstack(patterns)[: matrix.shape[1]]
-        growth: Array = components @ components.T
-        return growth
+        n_pads = matrix.shape[1]
+        on_pads = np.hstack(errors)[:n_pads]
+        on_components = matrix @ on_pads
+        covariance: Array = on_components @ on_components.T
+        return covariance
 
     def states(self) -> dict[str, Array]:
-        """Return the states that earlier rows left, as flat numbers, by the names of effects.
+        """Return the state of creep and of temperature that earlier rows caused, by name, as (n,).
 
-        From them, later rows give the same bits; effects without a state have none.
+        After `restore` has set such a state, later rows give the same bits.
         """
-        return {
-            effect.key: np.concatenate([part.ravel() for part in self._parts(effect)])
-            for effect in self._lasting
-        }
+        states: dict[str, Array] = {}
+        for effect in self._lasting:
+            parts = [part.ravel() for part in self._parts(effect)]
+            states[effect.key] = np.concatenate(parts)
+        return states
 
     def restore(self, states: Mapping[str, Array]) -> None:
         """Continue from recorded states, so that the next rows give the bits of the recording.
 
         Args:
-            states: States of effects by name; the others go on as they are.
+            states: States by name, as the method `states` returns them. An effect that is missing
+                keeps its present state.
 
         Raises:
-            LayoutError: A state is that of another skin.
+            LayoutError: A state has another size, because it is that of another skin.
         """
         restored = [effect for effect in self._lasting if effect.key in states]
         for effect in restored:
-            state, parts = states[effect.key], self._parts(effect)
+            state = states[effect.key]
+            parts = self._parts(effect)
             ends = np.cumsum([part.size for part in parts])
             if len(state) != ends[-1]:
                 raise LayoutError(
                     f"a state of {effect.key} has {len(state)} numbers; it must have {ends[-1]}: "
                     "use the skin of the recording"
                 )
-            for part, values in zip(parts, np.split(state, ends[:-1]), strict=True):
+            pieces = np.split(state, ends[:-1])
+            for part, values in zip(parts, pieces, strict=True):
                 part[:] = values.reshape(part.shape)
             effect.resume()
         if restored:
             self._fill_offsets()
 
     def _parts(self, effect: Thermal | Creep) -> list[Array]:
-        """Return the arrays of the state of an effect, which are changed in place.
+        """Return the arrays of the state of an effect. To restore a state, write into them.
 
-        Times stand there with their bits, because a float would round them.
+        The bits of times (int64) are viewed as float64, because a conversion would round them.
         """
         offsets = self.offsets
-        times = [offsets.step_ns, offsets.since_ns, offsets.newest_ns]
-        return [*(time.view(float) for time in times), *effect.parts()]
+        return [
+            offsets.step_ns.view(float),
+            offsets.since_ns.view(float),
+            offsets.newest_ns.view(float),
+            *effect.parts(),
+        ]

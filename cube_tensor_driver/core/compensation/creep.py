@@ -37,23 +37,30 @@ from ..kernel.contract import Offsets
 from ..pipeline import Pipeline
 from ..status import CREEP
 from .low_pass import MAX_STEP_NS, STEP_NS, LowPass
+from .models import CreepModel
 
 MAX_UNKNOWN = 100.0
-"""Deviation of the stress on a pad because of unknown earlier loads, in Pa, above which the
-compensation of creep counts as uncertain: the limit from which drift is a nuisance."""
+"""Standard deviation of the stress on a pad, in Pa, above which the compensation of creep counts as
+uncertain. Only the deviation that unknown earlier loads cause is compared with this limit, which is
+a third of the pressure of a contact (300 Pa)."""
 
 UNIFORM_DEVIATION = math.sqrt(1 / 3)
-"""Root mean square of numbers that are equally likely from 0 to 1."""
+"""Root mean square of a number that is uniformly distributed from 0 to 1. An unknown load is taken
+as uniformly distributed from 0 to a largest load."""
 
 
 class Creep:
-    """Computes what earlier loads still do to the pads of one skin.
+    """Computes the part of the pads' readings that is creep under earlier loads, for one skin.
+
+    A reading is the stress on a pad by the pad law, divided by the stiffness of the pad. At the
+    time t (in s) after the newest reading, creep is the part offset + (slope + gain u) t of the
+    next reading u.
 
     Attributes:
         has_model: Whether the calibration of a cube has a law of creep (C,).
-        offset: What is subtracted from the newest row of each cube at the last step (C, P).
-        slope: How fast it changes after this row (C, P), per second, for later readings of 0.
-        gain: Change of the slope with later readings (C, P), per second.
+        offset: Creep in the newest row of each cube at the last step (C, P).
+        slope: Factor of t (C, P), per second.
+        gain: Factor of u t (C, P), per second.
     """
 
     key = "creep"
@@ -71,158 +78,195 @@ class Creep:
         self._models = [calibration.creep for calibration in pipeline.calibrations]
         self.has_model = np.array([model is not None for model in self._models])
         n_cubes, n_pads = offsets.reading.shape
-        times = {time for model in self._models if model for time in model.time.tolist()}
+        present = [model for model in self._models if model is not None]
+        times: set[float] = set()
+        for model in present:
+            times.update(model.time.tolist())
         self._times = np.array(sorted(times))
-        self._memories = LowPass(self._times[:, None], n_cubes, n_pads)
+        time = self._times[:, None]
+        self._memories = LowPass(time, n_cubes, n_pads)
         self._amplitude = np.zeros_like(self._memories.lag)
         for cube, model in enumerate(self._models):
             if model is not None:
-                places = np.searchsorted(self._times, model.time)
-                self._amplitude[places, cube, : model.n_pads] = model.amplitude.T
-
+                self._fill_amplitude(cube, model)
         self._total = self._amplitude.sum(axis=0)
         self._stiffness = pipeline.stiffness
         self._rest = pipeline.rest_frequency
         self._rest_version = pipeline.rest_version
-        # State at the newest row of each cube at the last step: its time, its reading, the share of
-        # each memory that depends on unknown loads, and the larger reading beside times in which
-        # the load is not known.
+
+        shape = n_cubes, n_pads
+        # Time stamp, in ns, and readings of the newest row of each cube at the last step.
         self._time_ns = np.zeros(n_cubes, np.int64)
-        self._reading = np.zeros((n_cubes, n_pads))
-        self._unknown = np.ones((len(times), n_cubes))
-        self._scale = np.zeros((n_cubes, n_pads))
+        self._reading = np.zeros(shape)
+        # Fraction of each low-passed reading that depends on loads that were not measured.
+        n_times = len(times)
+        self._unknown = np.ones((n_times, n_cubes))
+        # Largest reading of each pad that such a load is assumed to have caused.
+        self._largest_unknown = np.zeros(shape)
         self._is_certain = np.ones(n_cubes, bool)
-        self.offset = np.zeros((n_cubes, n_pads))
-        self.slope = np.zeros((n_cubes, n_pads))
-        self.gain = np.zeros((n_cubes, n_pads))
+        self.offset = np.zeros(shape)
+        self.slope = np.zeros(shape)
+        self.gain = np.zeros(shape)
+
+    def _fill_amplitude(self, cube: int, model: CreepModel) -> None:
+        """Copy the amplitudes of a cube's law to the table of all relaxation times of the skin."""
+        places = np.searchsorted(self._times, model.time)
+        pads = slice(model.n_pads)
+        self._amplitude[places, cube, pads] = model.amplitude.T
 
     @property
     def is_known(self) -> Mask:
-        """Whether the effect on a cube is known and not too uncertain (C,)."""
+        """Whether a cube has a law of creep and unknown earlier loads matter little (C,)."""
         return self.has_model & self._is_certain
 
     def advance(self, thermal: Array, end_ns: int) -> None:
-        """Advance the memories to the newest row of each cube.
+        """Advance the low-pass filters of the readings to the newest row of each cube.
 
         Args:
-            thermal: What was subtracted from the readings because of temperature (C, P).
-            end_ns: Newest time stamp of the scan that comes next, in ns.
+            thermal: Effect of temperature (C, P), stress / stiffness, which the readings contain.
+            end_ns: Newest time stamp of the scan that is processed next, in ns.
         """
         elapsed_ns, is_lost, is_gap = self._find_gaps()
         newest = self._newest.reading.astype(float)
-        # Pads that are not used keep their last reading.
+        # The newest reading of a pad that is not used is NaN. The earlier one is kept instead.
         is_unused = np.isnan(newest)
         now = np.where(is_unused, self._reading, newest - thermal)
         change = now - self._reading
         share = self._memories.advance(elapsed_ns * 1e-9, change)
-        # A memory forgets what it was before the interval by this share.
+        # Over the interval, each filter replaces this share of its output by the readings of the
+        # interval. They are known (0) or, in a gap, unknown (1).
         self._unknown += share * (is_gap - self._unknown)
         self._unknown[:, is_lost] = 1.0
         if is_gap.any():
-            larger = np.maximum(np.abs(self._reading), np.abs(now))
-            np.maximum(self._scale, larger, out=self._scale, where=is_gap[:, None])
+            before = np.abs(self._reading)
+            larger = np.maximum(before, np.abs(now))
+            largest = self._largest_unknown
+            np.maximum(largest, larger, out=largest, where=is_gap[:, None])
             self._is_certain[is_gap] = False
         self._time_ns[:] = self._newest.newest_ns
         self._reading[:] = now
-        self._check_certainty()
+        self._update_certainty()
         ahead_ns = end_ns - self._time_ns
         duration_ns = np.maximum(ahead_ns, STEP_NS)
         self._set_line(duration_ns * 1e-9)
 
     def _find_gaps(self) -> tuple[Times, Mask, Mask]:
-        """Compare the newest row of each cube with that of the last step.
+        """Return the interval from each cube's newest row at the last step to its newest row now.
 
         Returns:
-            Time between them (C,), in ns, 0 if it is unknown; whether it is unknown (C,); and
-            whether the load between them is unknown (C,).
+            Length of the interval (C,), in ns, 0 if it is unknown; whether the length is unknown
+            (C,); and whether the load within the interval is unknown (C,).
         """
         elapsed_ns = self._newest.newest_ns - self._time_ns
         is_first = self._time_ns == 0
-        # A time stamp before the last one is from another clock.
+        # A time stamp that precedes the last one is from another clock.
         is_lost = is_first | (elapsed_ns < 0)
         is_gap = is_lost | (elapsed_ns > MAX_STEP_NS)
         elapsed_ns[is_lost] = 0
         return elapsed_ns, is_lost, is_gap
 
     def _set_line(self, duration_s: Array) -> None:
-        """Compute what is subtracted from cubes, for a straight line over durations (C,) in s."""
+        """Compute `offset`, `slope` and `gain`, which state creep as a linear function of time.
+
+        The function is exact at the end of the duration, if readings change linearly until then.
+
+        Args:
+            duration_s: Duration for each cube (C,), in s.
+        """
         share, mean = self._memories.find_shares(duration_s)
-        # Shares per second of a lag, and of a change of the reading, by which memories change.
+        # The low-passed reading changes, per second, by one fraction of its lag behind the reading
+        # and by another fraction of the change of the reading.
         of_lag = share / duration_s
         of_change = (1 - mean) / duration_s
-        # Before the first row of a cube, there was no reading that could change.
+        # A cube without any row so far has no earlier reading from which its first one differs.
         of_change[:, self._time_ns == 0] = 0
         self.offset[:] = self._total * self._reading
         self.slope[:] = 0
         self.gain[:] = 0
         for k, amplitude in enumerate(self._amplitude):
-            missing = amplitude * self._memories.lag[k]
-            self.offset -= missing
-            missing *= of_lag[k, :, None]
-            self.slope += missing
+            lagging = amplitude * self._memories.lag[k]
+            self.offset -= lagging
+            lagging *= of_lag[k, :, None]
+            self.slope += lagging
             self.gain += amplitude * of_change[k, :, None]
         self.slope -= self.gain * self._reading
 
     def deviation(self, cube: int) -> Array:
-        """Return patterns (P, k) of one standard deviation each, as `Compensation.growth` does."""
+        """Return the errors (P, k) of a cube's creep that its k independent causes make, in Pa.
+
+        Each column has the size of one standard deviation.
+        """
         model = self._models[cube]
-        if model is None:
-            return np.zeros((len(self._reading[cube]), 0))
-        stiffness = self._stiffness[cube]
         reading = self._reading[cube]
-        patterns = [self._find_unknown(np.array([cube]))[0]]
+        if model is None:
+            return np.zeros((len(reading), 0))
+        stiffness = self._stiffness[cube]
+        unknown = self._find_unknown(np.array([cube]))
+        errors = [unknown[0]]
         _, _, is_gap = self._find_gaps()
         if is_gap[cube]:
-            # The next step will find how much of the memories depends on the gap: at most all.
+            # The filters have not been advanced over this gap in the rows yet. Until they are, the
+            # whole of the creep counts as unknown.
             newest = np.nan_to_num(self._newest.reading[cube])
-            larger = np.maximum(np.abs(reading), np.abs(newest))
+            before = np.abs(reading)
+            larger = np.maximum(before, np.abs(newest))
             largest = self._total[cube] * larger * stiffness
-            patterns = [largest * UNIFORM_DEVIATION]
+            errors = [largest * UNIFORM_DEVIATION]
         if model.deviation is not None:
             places = np.searchsorted(self._times, model.time)
             memory = reading - self._memories.lag[places, cube]
             pads = slice(model.n_pads)
-            known = np.zeros((len(model.deviation), len(reading)))
-            products = model.deviation.swapaxes(1, 2) * memory[:, pads]
+            shape = len(model.deviation), len(reading)
+            known = np.zeros(shape)
+            amplitude = model.deviation.swapaxes(1, 2)
+            products = amplitude * memory[:, pads]
             known[:, pads] = products.sum(axis=1)
-            patterns += list(known * stiffness)
-        return np.stack(patterns, axis=1)
+            errors += list(known * stiffness)
+        return np.stack(errors, axis=1)
 
-    def _check_certainty(self) -> None:
-        """Find the cubes whose creep is no longer uncertain because of unknown earlier loads."""
+    def _update_certainty(self) -> None:
+        """Mark a cube as certain once the error by unknown loads is below `MAX_UNKNOWN` again."""
         doubtful = np.flatnonzero(~self._is_certain)
         if len(doubtful):
             is_small = self._find_unknown(doubtful) < MAX_UNKNOWN
             self._is_certain[doubtful] = is_small.all(axis=1)
 
     def _find_unknown(self, cube: Index) -> Array:
-        """Return the standard deviation of the pads' stresses by unknown loads (n, P), in Pa.
+        """Return the standard deviation of creep because of unknown loads (n, P), in Pa.
 
-        These loads are taken as equally likely from none to the larger reading before and after.
+        The reading in a gap is taken as uniformly distributed from 0 to the larger one of the
+        readings before and after the gap.
 
         Args:
             cube: Numbers of cubes (n,).
         """
-        share = multiply(self._unknown.T[cube], self._amplitude[:, cube].swapaxes(0, 1))
-        largest = share * self._scale[cube] * self._stiffness[cube]
+        amplitude = self._amplitude[:, cube].swapaxes(0, 1)
+        share = multiply(self._unknown.T[cube], amplitude)
+        largest = share * self._largest_unknown[cube]
+        largest = largest * self._stiffness[cube]
         deviation: Array = largest * UNIFORM_DEVIATION
         return deviation
 
-    def zero_share(self) -> Array:
-        """Return how much of a lasting error of the readings is not taken for creep (C, P).
+    def find_visible_share(self) -> Array:
+        """Return the fraction of a constant error of the readings that remains visible (C, P).
 
-        A rest frequency has to change by more than the compensated reading of an unloaded pad, as
-        the error of the reading has also crept into the memories.
+        A wrong rest frequency adds a constant to the readings. The compensation takes a part of it
+        for creep and subtracts this part, so an unloaded pad shows only the rest of the error. A
+        tare divides what it measures by the fraction, in order to correct the whole error.
         """
-        known = (1 - self._unknown)[..., None]
-        share: Array = 1 - (known * self._amplitude).sum(axis=0)
-        return share
+        known = 1 - self._unknown
+        creeping = known[..., None] * self._amplitude
+        visible: Array = 1 - creeping.sum(axis=0)
+        return visible
 
     def follow_rest(self) -> bool:
-        """Follow new rest frequencies: what they change has been wrong in earlier readings, too.
+        """Correct the earlier readings, and their low-passed values, by new rest frequencies.
+
+        The change of a rest frequency, for example by a tare, shows that earlier readings were
+        wrong by the same amount.
 
         Returns:
-            Whether something has changed, so that a step is due.
+            Whether a reading changed, so that `offset`, `slope` and `gain` must be computed again.
         """
         pipeline = self._pipeline
         if self._rest_version == pipeline.rest_version:
@@ -232,21 +276,23 @@ class Creep:
         self._rest_version = pipeline.rest_version
         self._reading -= shift
         self._newest.reading[:] -= shift
-        # The memories shift by their known share of it, so the lags by the other share.
+        # The known fraction of a low-passed reading shifts with the readings. So the lag, reading
+        # minus low-passed reading, changes by the unknown fraction of the shift.
         self._memories.lag -= self._unknown[..., None] * shift
         size = np.abs(self._reading)
-        np.minimum(self._scale, size, out=self._scale, where=shift != 0)
+        largest = self._largest_unknown
+        np.minimum(largest, size, out=largest, where=shift != 0)
         return bool(shift.any())
 
     def parts(self) -> list[Array]:
-        """Return the arrays of the state, which are changed in place."""
+        """Return the arrays of the state. To restore a recorded state, write into them."""
         return [
             self._newest.reading,
             self._time_ns.view(float),
             self._rest,
             self._reading,
             self._unknown,
-            self._scale,
+            self._largest_unknown,
             self._memories.lag,
             self.offset,
             self.slope,
@@ -254,8 +300,9 @@ class Creep:
         ]
 
     def resume(self) -> None:
-        """Continue from a state that was written to `parts`."""
+        """Continue from a recorded state that was written into the arrays of `parts`."""
         self._is_certain[:] = False
-        self._check_certainty()
-        # The state refers to the rest frequencies of its time.
+        self._update_certainty()
+        # The state may have been recorded with other rest frequencies. A version that never occurs
+        # makes `follow_rest` compare them.
         self._rest_version = -1

@@ -23,23 +23,28 @@ from ..arrays import Array, Real
 from ..kernel.contract import MAX_GAP_NS
 
 STEP_NS = 100_000_000
-"""Duration of a step, in ns, within which temperature counts as constant, and the readings of the
-pads as straight lines for creep.
+"""Duration of one step of the compensation, in ns. Within a step, the temperature counts as
+constant, and the readings of the pads as linear in time.
 
-With a lag of 100 s and 150 Pa/K, the effect of temperature changes by 2 Pa within a step after the
-skin warmed by 15 K at once, less than the noise of one sample (3 Pa).
+A skin that warms suddenly by 15 K, with a time constant of 100 s and an effect of 150 Pa/K, changes
+the stress on a pad by 2 Pa within one step, less than the noise of one sample (3 Pa).
 """
 
 MAX_STEP_NS = MAX_GAP_NS + STEP_NS
-"""Longest time between the rows of two steps, in ns, in which all rows of a cube can be at most
-`MAX_GAP_NS` apart."""
+"""Longest interval between a cube's newest rows at two successive steps, in ns, in which load and
+temperature count as known.
+
+It is the longest interval between two successive rows that allows this, plus one step, because more
+rows may follow a gap before the next step.
+"""
 
 HALVINGS = 10
-"""Number of times that the argument of the exponential function is halved for its series."""
+"""Number of times that the argument x is halved before 1 - exp(-x) is computed by a Taylor series,
+which converges quickly only for small arguments."""
 
 SERIES_TERMS = 9
-"""Number of terms of this series. With 64 / 2**10 as the largest argument, the first term that is
-left out is 1e-17 of the sum."""
+"""Number of terms of the Taylor series of the exponential function. Its argument is at most
+64 / 2**10, with which the first term that is left out is 1e-17 of the sum."""
 
 
 def relaxed_share(ratio: Array) -> Array:
@@ -47,13 +52,13 @@ def relaxed_share(ratio: Array) -> Array:
 
     The exponential function of a mathematical library differs in its last bit by processor.
     """
-    # exp(-64) is far below the resolution of the sum, so larger ratios need no other value.
+    # exp(-64) is 2e-28, so 1 - exp(-ratio) is 1 in double precision for all larger ratios.
     part = np.minimum(ratio, 64.0) / 2**HALVINGS
     share: Array = np.zeros_like(part)
     # Taylor series 1 - exp(-x) = x (1 - x/2 (1 - x/3 (1 - ...))).
     for n in range(SERIES_TERMS, 0, -1):
         share = part / n * (1 - share)
-    # 1 - exp(-2 x) = m (2 - m) with m = 1 - exp(-x).
+    # The halvings are undone: 1 - exp(-2 x) = m (2 - m) with m = 1 - exp(-x).
     for _ in range(HALVINGS):
         share *= 2 - share
     return share
@@ -69,7 +74,9 @@ class LowPass:
 
     def __init__(self, time: Array, n_cubes: int, n_signals: int) -> None:
         self.time = time
-        self.lag = np.zeros((len(time), n_cubes, n_signals))
+        n_filters = len(time)
+        shape = n_filters, n_cubes, n_signals
+        self.lag = np.zeros(shape)
 
     def advance(self, elapsed_s: Real, change: Real) -> Array:
         """Advance the filters by one interval for each cube.
@@ -79,26 +86,34 @@ class LowPass:
             change: Changes of the inputs (C, P), along straight lines.
 
         Returns:
-            Shares m of the intervals (K, C).
+            Fraction m = 1 - exp(-elapsed_s / time) of each output that the interval replaced, as an
+            array (K, C).
         """
         share, mean = self.find_shares(elapsed_s)
-        for lag, m, part in zip(self.lag, share[..., None], mean[..., None], strict=True):
-            lag *= 1 - m
-            lag += part * change
+        kept = 1 - share
+        for k, lag in enumerate(self.lag):
+            lag *= kept[k, :, None]
+            lag += mean[k, :, None] * change
         return share
 
     def find_shares(self, elapsed_s: Real) -> tuple[Array, Array]:
-        """Return the shares m and m time / t of intervals t (C,), in s, as (K, C)."""
+        """Return m = 1 - exp(-t / time) and m time / t, both (K, C), of intervals t (C,), in s."""
         if self.time.shape[1] > 1:
             return self._find_shares(elapsed_s)
-        # The cubes of a hub have equal intervals, so few shares are computed.
-        begins = np.flatnonzero(np.diff(elapsed_s, prepend=-1.0))
+        # The cubes of one hub follow each other and have equal intervals, so one computation serves
+        # them all.
+        steps = np.diff(elapsed_s, prepend=-1.0)
+        begins = np.flatnonzero(steps)
         counts = np.diff(begins, append=len(elapsed_s))
         share, mean = self._find_shares(elapsed_s[begins])
-        return np.repeat(share, counts, axis=1), np.repeat(mean, counts, axis=1)
+        share = np.repeat(share, counts, axis=1)
+        mean = np.repeat(mean, counts, axis=1)
+        return share, mean
 
     def _find_shares(self, elapsed_s: Real) -> tuple[Array, Array]:
         ratio = elapsed_s / self.time
         share = relaxed_share(ratio)
-        # A step without duration changes the lag as much as the input.
-        return share, np.where(ratio > 0, share / np.maximum(ratio, 1e-300), 1.0)
+        # The quotient share / ratio tends to 1 as the length of the interval tends to 0.
+        divisor = np.maximum(ratio, 1e-300)
+        mean = np.where(ratio > 0, share / divisor, 1.0)
+        return share, mean

@@ -21,11 +21,14 @@ from ..errors import CalibrationError
 
 @dataclass(frozen=True, eq=False)
 class EffectModel:
-    """Base class of the models, whose attributes are finite numbers of a stated number of axes.
+    """Base class of the models of weight, creep and temperature, which act on pads without a load.
+
+    The attributes of a model are arrays of finite numbers.
 
     Attributes:
-        key: Name of the block in the calibration.
-        axes: Number of axes of each attribute. The first axis of arrays with two axes is the pads.
+        key: Name of the model's block in a calibration file.
+        axes: Number of axes of each attribute, by its name. The first axis of an attribute with two
+            axes is the pads.
 
     Raises:
         CalibrationError: A value has the wrong shape, is not finite, or contradicts another.
@@ -44,12 +47,14 @@ class EffectModel:
                 array = np.array(value, dtype=float)
             except (TypeError, ValueError):
                 raise CalibrationError(f"{self.key}: {name} is {value!r}; give numbers") from None
-            if array.ndim != n_axes or not np.isfinite(array).all() or not array.size:
+            is_finite = np.isfinite(array).all()
+            if array.ndim != n_axes or not is_finite or not array.size:
                 raise CalibrationError(
                     f"{self.key}: {name} is {value!r}; it must be finite numbers "
                     f"with {n_axes} axes, one list per pad if there are two"
                 )
-            # Patterns of deviations may be more or fewer than the values that they are for.
+            # The second axis of `ramp` has a length of its own, so only its number of pads is
+            # compared with other attributes.
             shape = array.shape[:1] if name == "ramp" else array.shape
             wanted = shapes.setdefault(n_axes, array.shape)[: len(shape)]
             if shape != wanted:
@@ -60,13 +65,18 @@ class EffectModel:
     @property
     def n_pads(self) -> int:
         """Number of pads of the model."""
-        name = next(name for name, n_axes in self.axes.items() if n_axes == 2)
-        return len(getattr(self, name))
+        per_pad = [name for name, n_axes in self.axes.items() if n_axes == 2]
+        values = getattr(self, per_pad[0])
+        return len(values)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the model as a table of numbers and lists, which `from_dict` reads."""
-        values = ((name, getattr(self, name)) for name in self.axes)
-        return {name: value.tolist() for name, value in values if value is not None}
+        table: dict[str, Any] = {}
+        for name in self.axes:
+            value = getattr(self, name)
+            if value is not None:
+                table[name] = value.tolist()
+        return table
 
     @classmethod
     def from_dict(cls: type[_Model], data: Any) -> _Model:
@@ -115,14 +125,14 @@ class WeightModel(EffectModel):
 class CreepModel(EffectModel):
     """Linear viscoelastic law of the foam of each pad: a generalised Maxwell body.
 
-    The reading u of a pad is its strain times the modulus that it has at once. If a strain lasts
-    for the time t, the stress relaxes to u (1 - sum_k amplitude_pk (1 - exp(-t / time_k))).
+    The reading u of a pad is its strain times its instantaneous modulus. If a strain is held for
+    the time t, the stress relaxes from u to u (1 - sum_k amplitude_pk (1 - exp(-t / time_k))).
 
     Attributes:
         time: Relaxation times (K,), in s, in rising order.
-        amplitude: Amplitudes of each pad (P, K), relative to the stress at once.
-        deviation: Patterns (S, P, K) of one standard deviation of `amplitude` each, which are
-            independent of each other; None: they are not known.
+        amplitude: Amplitudes of each pad (P, K), relative to the instantaneous stress.
+        deviation: Errors of `amplitude` by S independent causes (S, P, K), each with the size of
+            one standard deviation; None: they are not known.
     """
 
     key = "creep"
@@ -141,7 +151,9 @@ class CreepModel(EffectModel):
                 f"creep: amplitude and deviation have the shapes {self.amplitude.shape} and "
                 f"{deviation.shape}; give {len(self.time)} numbers per pad, one for each time"
             )
-        if (np.diff(self.time, prepend=0) <= 0).any() or (self.amplitude.sum(axis=1) >= 1).any():
+        steps = np.diff(self.time, prepend=0)
+        total = self.amplitude.sum(axis=1)
+        if (steps <= 0).any() or (total >= 1).any():
             raise CalibrationError(
                 "creep: times must be above 0 and rise, and amplitudes of a pad add up to less "
                 "than 1, or the foam would flow away under a load"
@@ -150,20 +162,22 @@ class CreepModel(EffectModel):
 
 @dataclass(frozen=True, eq=False)
 class ThermalModel(EffectModel):
-    """Reading of each pad over temperature without load, in place, with the lag of the elastomer.
+    """Reading of each pad of a cube in the skin over temperature, without load.
 
     It contains the drift of the electronics and the thermal stress that the expansion of the
-    elastomer causes, so the readings are with the pads' gains. With u the measured temperature
-    minus `reference` after a low-pass filter, pad p reads sum_d coefficient_pd u^d, d = 1, 2, ...
+    elastomer causes. The readings include the gains (relative sensitivities) of the pads. With u
+    the measured temperature minus `reference` after low-pass filters, by which the elastomer lags
+    behind the thermometer, pad p reads sum_d coefficient_pd u^d, d = 1, 2, ...
 
     Attributes:
         reference: Temperature, in °C, at which the rest frequencies of the calibration hold.
-        lag: Time constants (L,), in s, of low-pass filters in a row, all different; 0: no lag.
+        lag: Time constants (L,), in s, of low-pass filters in series, all different; 0: no lag.
         coefficient: Coefficients of each pad (P, D), in Pa/K^d, the linear term first.
-        deviation: Standard deviation of `coefficient` (P, D), which is common to all pads up to its
-            sign; None: it is not known.
-        ramp: Patterns (P, K) of one standard deviation each, in Pa per K by which the temperature
-            after the filter lags behind the measured one; None: they are not known.
+        deviation: Standard deviations of `coefficient` (P, D), with a sign, because the errors of
+            all pads are fully correlated; None: they are not known.
+        ramp: Errors of the pads' stresses by K independent causes (P, K), in Pa per K by which the
+            filtered temperature lags behind the measured one, each with the size of one standard
+            deviation; None: they are not known.
     """
 
     key = "thermal"
@@ -183,7 +197,8 @@ class ThermalModel(EffectModel):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if len(np.unique(self.lag)) < len(self.lag) or self.lag.min() < 0:
+        n_different = len(np.unique(self.lag))
+        if n_different < len(self.lag) or self.lag.min() < 0:
             raise CalibrationError(
                 f"thermal: lag is {self.lag.tolist()} s; time constants are different, at least 0"
             )

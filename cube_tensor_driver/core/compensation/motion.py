@@ -34,8 +34,8 @@ class Motion(NamedTuple):
     """Motion of a skin at K instants, in the parent frame of the skin.
 
     Attributes:
-        time_ns: The instants (K,), in ns on the clock of the rows, in rising order. None: the
-            motion is unknown; a single one holds for all rows.
+        time_ns: The instants (K,), in ns on the clock of the rows, in rising order. If there are
+            none (K = 0), the motion is unknown; a single one holds at all times.
         specific_force: Specific force at the origin of the frame (K, 3), in m/s².
         gradient: Derivatives of its components with respect to position (K, 3, 3), in 1/s².
     """
@@ -45,24 +45,33 @@ class Motion(NamedTuple):
     gradient: Array
 
 
-UNKNOWN_MOTION = Motion(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+UNKNOWN_MOTION = Motion(
+    time_ns=np.zeros(0, np.int64),
+    specific_force=np.zeros((0, 3)),
+    gradient=np.zeros((0, 3, 3)),
+)
 """Motion of a skin of which nothing is known."""
 
 
 class ForcesAtCubes:
-    """Computes the specific forces at the cubes of one skin, with the same bits everywhere."""
+    """Computes the specific forces at the cubes of one skin, with the same bits on every processor.
+
+    The specific force is what an accelerometer at the cube measures: acceleration minus gravity.
+    """
 
     def __init__(self, poses: CubePoses) -> None:
-        """Take the poses of the cubes.
+        """Store the poses of the cubes in float32.
 
         Args:
             poses: Poses in the parent frame of the skin. For the same bits as a recording, they
                 must be those of its SkinInfo message.
         """
-        # With the axes first, numpy computes all rows in one loop.
+        # The axis of the cubes is the last one, so that numpy handles all rows in its inner loop.
         self._position = np.ascontiguousarray(poses.position.T, np.float32)
-        # The components in the frame of a cube are along the columns of its rotation.
-        self._axes = np.ascontiguousarray(poses.rotation.transpose(2, 1, 0), np.float32)
+        # A vector in the parent frame is transformed to the frame of a cube by the transpose of the
+        # rotation of the cube.
+        to_cube = poses.rotation.transpose(2, 1, 0)
+        self._to_cube = np.ascontiguousarray(to_cube, np.float32)
 
     def add_to(self, rows: FrequencyRows, motion: Motion) -> FrequencyRows:
         """Return rows with a column of specific forces.
@@ -82,7 +91,8 @@ class ForcesAtCubes:
         origin, gradient = _interpolate(motion, rows.stamp_ns)
         in_parent = _multiply(gradient, self._position[:, cube])
         in_parent += origin
-        in_cube = _multiply(self._axes[:, :, cube], in_parent)
+        to_cube = self._to_cube[:, :, cube]
+        in_cube = _multiply(to_cube, in_parent)
         in_cube[:, rows.cube >= n_cubes] = np.nan
         return np.ascontiguousarray(in_cube.T)
 
@@ -98,30 +108,44 @@ def _interpolate(motion: Motion, stamp_ns: Times) -> tuple[Single, Single]:
         Specific forces at the origin (3, N), in m/s², and their gradients (3, 3, N), in 1/s²; NaN
         where they are unknown.
     """
-    columns = motion.specific_force, motion.gradient.reshape(-1, 9)
-    known = np.concatenate(columns, axis=1).T.astype(np.float32)
+    flat_gradient = motion.gradient.reshape(-1, 9)
+    columns = np.hstack([motion.specific_force, flat_gradient])
+    known = columns.T.astype(np.float32)
     n_instants = len(motion.time_ns)
     if n_instants < 2:
-        state = np.full((12, len(stamp_ns)), known if n_instants else np.nan, np.float32)
-        return state[:3], state[3:].reshape(3, 3, -1)
-    # Number of the instant before each row. Few instants lie within a message, usually none.
+        shape = 12, len(stamp_ns)
+        constant = known if n_instants else np.nan
+        state = np.full(shape, constant, np.float32)
+        return _split_motion(state)
+    # Index of the interval between two instants that each row lies in, or is nearest to. With two
+    # instants, which is usual, there is one interval only.
     inner_ns = motion.time_ns[1:-1]
     first = np.zeros(1, int)
     if len(inner_ns):
         first = np.searchsorted(inner_ns, stamp_ns, side="right")
     length_ns = np.diff(motion.time_ns)[first]
     elapsed_ns = stamp_ns - motion.time_ns[first]
-    beyond_ns = np.maximum(-elapsed_ns, elapsed_ns - length_ns)
+    before_ns = -elapsed_ns
+    after_ns = elapsed_ns - length_ns
+    beyond_ns = np.maximum(before_ns, after_ns)
     max_beyond_ns = np.maximum(MAX_EXTRAPOLATION_NS, 2 * length_ns)
     is_near = beyond_ns <= max_beyond_ns
     # A damaged recording may state equal instants.
     is_usual = (length_ns > 0) & (length_ns <= MAX_INTERVAL_NS)
+    is_known = is_near & is_usual
     share = elapsed_ns / np.maximum(length_ns, 1)
-    share[~(is_near & is_usual)] = np.nan
+    share[~is_known] = np.nan
     change = np.diff(known)[:, first]
     state = change * share.astype(np.float32)
     state += known[:, first]
-    return state[:3], state[3:].reshape(3, 3, -1)
+    return _split_motion(state)
+
+
+def _split_motion(state: Single) -> tuple[Single, Single]:
+    """Split N states (12, N) into specific forces (3, N) and their gradients (3, 3, N)."""
+    force = state[:3]
+    gradient = state[3:].reshape(3, 3, -1)
+    return force, gradient
 
 
 def _multiply(matrix: Single, vector: Single) -> Single:

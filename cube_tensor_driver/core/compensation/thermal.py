@@ -29,24 +29,26 @@ deviation decays with the lag.
 """
 
 LOST_KELVIN = 5.0
-"""Standard deviation, in K, towards which that of the elastomer's temperature grows with the lag
-while no temperature is measured or no rows arrive."""
+"""Standard deviation of the elastomer's temperature, in K, after a long time in which no
+temperature was measured or no rows arrived. The deviation approaches it with the lag of the
+elastomer."""
 
 MAX_DEVIATION = 30.0
-"""Deviation of a pad's stress, in Pa, above which rows get the status bit COMPENSATION: a tenth of
-the pressure that counts as a contact (300 Pa)."""
+"""Standard deviation of a pad's stress, in Pa, above which rows get the status bit COMPENSATION: a
+tenth of the pressure that counts as a contact (300 Pa)."""
 
 MIN_LAG_S = 1e-3
-"""Smallest time constant, in s, that is computed with; a shorter one, such as 0, has this one."""
+"""Smallest time constant of a low-pass filter, in s. It replaces a shorter one in a calibration,
+such as 0 (no lag), because the filter divides by the time constant."""
 
 
 class Thermal:
-    """Computes what temperature does to the pads of one skin.
+    """Computes the effect of temperature on the readings of the pads of one skin.
 
     Attributes:
-        has_model: Whether the calibration of a cube has a model (C,).
-        is_known: Whether the effect on a cube is known and not too uncertain (C,).
-        offset: What is subtracted from the rows of each cube (C, P), stress / stiffness.
+        has_model: Whether the calibration of a cube has a model of this effect (C,).
+        is_known: Whether the effect is known up to `MAX_DEVIATION` (C,).
+        offset: The effect on each pad now (C, P), stress / stiffness.
     """
 
     key = "thermal"
@@ -60,47 +62,64 @@ class Thermal:
         """
         self._models = [calibration.thermal for calibration in pipeline.calibrations]
         self.has_model = np.array([model is not None for model in self._models])
-        present = [model for model in self._models if model is not None]
-        n_lags = max((len(model.lag) for model in present), default=0)
-        n_degrees = max((model.coefficient.shape[1] for model in present), default=0)
+        n_lags = n_degrees = 0
+        for model in self._models:
+            if model is not None:
+                n_lags = max(n_lags, len(model.lag))
+                n_degrees = max(n_degrees, model.coefficient.shape[1])
 
         stiffness = np.where(pipeline.stiffness > 0, pipeline.stiffness, np.inf)
         n = len(self._models)
-        self._filters = LowPass(np.full((n_lags, n), MIN_LAG_S), n, n_signals=1)
+        times = np.full((n_lags, n), MIN_LAG_S)
+        self._filters = LowPass(times, n, n_signals=1)
         self._reference = np.zeros(n)
         self._weight = np.zeros((n_lags, n))
         self._coefficient = np.zeros((n_degrees, *stiffness.shape))
-        # Pa per K of a pad (quadratic mean over the pads of a cube): slope, and deviation per lag.
+        # Effect of the elastomer's temperature on the stress of a pad, in Pa/K, as the root mean
+        # square over the pads of a cube.
         self._slope = np.zeros(n)
+        # Standard deviation of this stress, in Pa per K by which the elastomer lags behind the
+        # thermometer, likewise.
         self._ramp = np.zeros(n)
         for number, model in enumerate(self._models):
             if model is None:
                 continue
             lag = np.maximum(model.lag, MIN_LAG_S)
-            self._filters.time[: len(lag), number] = lag
-            self._weight[: len(lag), number] = filter_weights(lag)
+            filters = slice(len(lag))
+            self._filters.time[filters, number] = lag
+            self._weight[filters, number] = filter_weights(lag)
             self._reference[number] = model.reference
             pads, degrees = model.coefficient.shape
             self._coefficient[:degrees, number, :pads] = model.coefficient.T
-            self._slope[number] = np.sqrt((model.coefficient[:, 0] ** 2).mean())
+            linear = model.coefficient[:, 0]
+            mean_square = (linear**2).mean()
+            self._slope[number] = np.sqrt(mean_square)
             if model.ramp is not None:
-                self._ramp[number] = np.sqrt((model.ramp**2).sum() / pads)
+                total = (model.ramp**2).sum()
+                self._ramp[number] = np.sqrt(total / pads)
         self._coefficient /= stiffness
 
-        # State after the newest step: time of the row, measured temperature, and standard deviation
-        # of the elastomer's temperature because of what is unknown.
+        # Time stamp of each cube's row in the last step, in ns, and the last measured temperature,
+        # in °C.
         self._time_ns = np.zeros(n, np.int64)
         self._measured = np.full(n, np.nan)
+        # Standard deviation of the elastomer's temperature, in K, because temperatures before the
+        # first row or in a gap are unknown.
         self._unknown = np.full(n, START_KELVIN)
 
-        # Temperature of the elastomer above the reference, and how far it lags behind, in K.
+        # Temperature of the elastomer minus the reference temperature, in K.
         self._level = np.zeros(n)
+        # Measured temperature minus that of the elastomer, in K.
         self._lag = np.full(n, np.nan)
         self.offset = np.zeros_like(stiffness)
         self.is_known = np.zeros(n, bool)
 
     def advance(self, scan: Columns) -> None:
-        """Advance the filters of the cubes of one scan to its time stamps."""
+        """Advance the temperatures of the elastomer to the time stamps of a scan's rows.
+
+        Args:
+            scan: Rows of one scan, with time stamps and measured temperatures.
+        """
         n = len(self._models)
         cube = index_cubes(scan.cube, n)
         time_ns = self._time_ns.copy()
@@ -109,64 +128,81 @@ class Thermal:
         given[cube] = scan.temperature
         is_missing = np.isnan(given)
         is_first = np.isnan(self._measured) & ~is_missing
-        # A time that went back is no time. Before the first temperature nothing is filtered.
+        # If a time stamp precedes the last one, no time counts as elapsed. With its first measured
+        # temperature, the elastomer of a cube counts as equally warm.
         elapsed_ns = np.maximum(time_ns - self._time_ns, 0)
         elapsed_ns[is_first] = 0
-        change = np.where(is_missing, 0, given - self._measured)
-        change[is_first] = 0
-        share = self._filters.advance(elapsed_ns * 1e-9, change[:, None])
-        slowest = 1 - share.min(axis=0, initial=1.0)
-        is_lost = is_missing | (elapsed_ns > MAX_STEP_NS)
-        lost = np.where(is_lost, LOST_KELVIN, 0)
-        self._unknown *= slowest
-        self._unknown += lost * (1 - slowest)
+        change = given - self._measured
+        change[is_missing | is_first] = 0
+        elapsed_s = elapsed_ns * 1e-9
+        share = self._filters.advance(elapsed_s, change[:, None])
+        # The deviation decays like the slowest filter of the cube.
+        decay = 1 - share.min(axis=0, initial=1.0)
+        is_gap = elapsed_ns > MAX_STEP_NS
+        final = np.where(is_missing | is_gap, LOST_KELVIN, 0)
+        self._unknown *= decay
+        self._unknown += final * (1 - decay)
         self._measured[~is_missing] = given[~is_missing]
         self._time_ns[:] = time_ns
         self.resume()
 
     def resume(self) -> None:
-        """Compute from the state what is subtracted from cubes now, and whether it is known."""
-        lag = np.where(np.isnan(self._measured), np.nan, 0)
-        for weight, one in zip(self._weight, self._filters.lag, strict=True):
-            lag += weight * one[:, 0]
+        """Compute `offset` and `is_known` from the state, which may be one from a recording."""
+        is_unknown = np.isnan(self._measured)
+        lag = np.where(is_unknown, np.nan, 0)
+        for number, weight in enumerate(self._weight):
+            lag += weight * self._filters.lag[number, :, 0]
         self._lag[:] = lag
-        self._level[:] = np.nan_to_num(self._measured - lag - self._reference)
+        level = self._measured - lag - self._reference
+        self._level[:] = np.nan_to_num(level)
         self.offset[:] = 0
         for coefficient in self._coefficient[::-1]:
             self.offset += coefficient
             self.offset *= self._level[:, None]
 
-        deviation = self._ramp * abs(self._lag) + self._slope * self._unknown
-        # A temperature that has never been measured (NaN) fails the comparison.
-        self.is_known = self.has_model & (deviation <= MAX_DEVIATION)
+        lag_deviation = self._ramp * abs(self._lag)
+        start_deviation = self._slope * self._unknown
+        # The comparison is false for NaN, with which no temperature has been measured so far.
+        is_accurate = lag_deviation + start_deviation <= MAX_DEVIATION
+        self.is_known = self.has_model & is_accurate
 
     def deviation(self, cube: int) -> Array:
-        """Return patterns (P, k) of one standard deviation each, as `Compensation.growth` does.
+        """Return the errors (P, k) of the effect on a cube by k independent causes, in Pa.
 
-        An unknown temperature is taken as the reference, with a standard deviation of 5 K.
+        Each column has the size of one standard deviation. An unknown temperature is taken as the
+        reference temperature, with a standard deviation of 5 K.
         """
         model = self._models[cube]
-        n_pads = self.offset.shape[1]
+        _, n_pads = self.offset.shape
         if model is None:
             return np.zeros((n_pads, 0))
         lag = self._lag[cube]
         unknown = LOST_KELVIN if np.isnan(lag) else self._unknown[cube]
-        patterns = [model.coefficient[:, :1] * unknown]
+        errors = [model.coefficient[:, :1] * unknown]
         if model.ramp is not None:
-            patterns.append(model.ramp * np.nan_to_num(lag))
+            errors.append(model.ramp * np.nan_to_num(lag))
         if model.deviation is not None:
-            powers = 1 + np.arange(model.deviation.shape[1])
-            patterns.append(model.deviation * self._level[cube] ** powers)
-        found = np.hstack(patterns)
-        return np.pad(found, ((0, n_pads - len(found)), (0, 0)))
+            n_degrees = model.deviation.shape[1]
+            powers = 1 + np.arange(n_degrees)
+            errors.append(model.deviation * self._level[cube] ** powers)
+        found = np.hstack(errors)
+        shape = n_pads, found.shape[1]
+        padded = np.zeros(shape)
+        padded[: len(found)] = found
+        return padded
 
     def parts(self) -> list[Array]:
-        """Return the arrays of the state, which are changed in place."""
-        return [self._time_ns.view(float), self._measured, self._unknown, self._filters.lag]
+        """Return the arrays of the state. To restore a recorded state, write into them."""
+        return [
+            self._time_ns.view(float),
+            self._measured,
+            self._unknown,
+            self._filters.lag,
+        ]
 
 
 def filter_weights(lag: Array) -> Array:
-    """Return the weights (L,) of L low-pass filters side by side that equal them in a row.
+    """Return weights (L,) with which L parallel low-pass filters add up to the filters in series.
 
     Args:
         lag: Time constants (L,), in s, all different.

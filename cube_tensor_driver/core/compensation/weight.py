@@ -18,7 +18,7 @@ STANDARD_GRAVITY = 9.80665
 
 
 class Weight:
-    """Response of the pads of one skin to specific force.
+    """Response of the pads of one skin to specific force (acceleration minus gravity).
 
     Attributes:
         has_model: Whether the calibration of a cube states its response (C,).
@@ -28,28 +28,33 @@ class Weight:
     key = "weight"
 
     def __init__(self, pipeline: Pipeline) -> None:
-        models = [calibration.weight for calibration in pipeline.calibrations]
-        self.has_model = np.array([model is not None for model in models])
-        self.response = np.zeros((len(models), 3, pipeline.n_pads))
-        self._deviation = np.zeros_like(self.response)
-        for number, model in enumerate(models):
+        calibrations = pipeline.calibrations
+        shape = len(calibrations), 3, pipeline.n_pads
+        self.response = np.zeros(shape)
+        self._deviation = np.zeros(shape)
+        has_model = [calibration.weight is not None for calibration in calibrations]
+        self.has_model = np.array(has_model)
+        for number, calibration in enumerate(calibrations):
+            model = calibration.weight
             if model is None:
                 continue
-            gain = pipeline.calibrations[number].gain
-            self.response[number, :, : len(gain)] = gain * model.response.T
+            gain = calibration.gain
+            pads = slice(len(gain))
+            self.response[number, :, pads] = gain * model.response.T
             if model.deviation is not None:
-                self._deviation[number, :, : len(gain)] = gain * model.deviation.T
+                self._deviation[number, :, pads] = gain * model.deviation.T
 
     def deviation(self, cube: int, force: Array) -> Array:
-        """Return patterns (P, 3) of one standard deviation each, as `Compensation.growth` does.
+        """Return the errors (P, 3) of the compensation of weight by independent causes, in Pa.
 
-        An unknown specific force is taken as 0 with a standard deviation of 1 g along each axis.
+        The causes are the three axes. Each column has the size of one standard deviation. An
+        unknown specific force is taken as 0 with a standard deviation of 1 g along each axis.
 
         Args:
             cube: Number of the cube.
             force: Its newest specific force (3,), in m/s²; NaN: unknown.
         """
-        patterns: Array = self._deviation[cube].T * force
+        errors: Array = self._deviation[cube].T * force
         if np.isnan(force).any():
-            patterns = self.response[cube].T * STANDARD_GRAVITY
-        return patterns
+            errors = self.response[cube].T * STANDARD_GRAVITY
+        return errors

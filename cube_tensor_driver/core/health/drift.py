@@ -66,8 +66,8 @@ class DriftTracker:
     median of the unloaded cubes with its layout.
 
     Attributes:
-        deviation: Standard deviation of the drift that a loaded cube may have and that is not
-            followed (cubes,), relative to the rest frequencies; 0 for an unloaded cube.
+        deviation: Standard deviation of the drift of a loaded cube minus the drift that is
+            corrected (cubes,), relative to the rest frequencies; 0 for an unloaded cube.
     """
 
     def __init__(self, pipeline: Pipeline, health: Health) -> None:
@@ -78,8 +78,8 @@ class DriftTracker:
         n_cubes = len(pipeline.calibrations)
         self._unloaded_windows = np.zeros(n_cubes, int)
         self._windows = 0
-        # Rest frequencies at the last tare, windows since then in which a cube was unloaded, and
-        # windows since it was unloaded.
+        # Rest frequencies at the last tare, then two numbers of windows for each cube: those since
+        # the tare in which it was unloaded, and those since it was unloaded for the last time.
         self._tared_rest = self._rest_in_use
         self._followed_windows = np.zeros(n_cubes, int)
         self._loaded_windows = np.zeros(n_cubes, int)
@@ -117,15 +117,17 @@ class DriftTracker:
         return self._update_when_due()
 
     def _follow_others(self, change: Array, follows: Mask, follows_others: Mask) -> None:
-        """Let loaded cubes follow the median of unloaded ones, and state what may be wrong then.
+        """Correct the drift of loaded cubes by the median of unloaded ones, and set `deviation`.
 
-        The drift of a loaded cube is taken to differ from that of the others as the drifts of the
-        others differ since the last tare, and to grow with the time for which it is loaded.
+        The drift of a loaded cube is assumed to differ from the median by the standard deviation of
+        the rates of drift of the unloaded cubes since the last tare, times the time for which the
+        cube is loaded.
 
         Args:
-            change: Changes of the tracked rest frequencies (cubes, P), in Hz; loaded cubes get one.
-            follows: Whether a pad follows its own frequency (cubes, P).
-            follows_others: Whether a pad is to follow the other cubes (cubes, P).
+            change: Changes of the tracked rest frequencies in this window (cubes, P), in Hz. Those
+                of loaded cubes are 0 and are replaced.
+            follows: Whether the rest frequency of a pad follows its own frequency (cubes, P).
+            follows_others: Whether it follows the pads of other cubes instead (cubes, P).
         """
         is_unloaded: Mask = np.asarray(follows.any(axis=1))
         self._followed_windows += is_unloaded

@@ -88,9 +88,9 @@ class Health:
         self.history: deque[Window] = deque(maxlen=HISTORY_WINDOWS)
         self.closed = 0
         # Number of rows of each cube from the last call of `collect` to the begin of the present
-        # window; negative if the call was within this window. And whether the residual was high
-        # since that call.
+        # window; negative if the call was within this window.
         self._uncollected_rows = np.zeros(n_cubes, int)
+        # Whether the residual of a cube was high at any time since that call.
         self._had_high_residual = np.zeros(n_cubes, bool)
         self.refresh()
         self._set_bound()
@@ -184,8 +184,10 @@ class Health:
         cube, f = rows.cube.astype(np.intp), rows.frequency.astype(np.float32)
         reported = mask_bits(tables, tables.calibration[cube], rows.pad_fault)
         bits = np.where(f >= self._open[cube], OPEN, RANGE)
-        bits = np.where(f > 0, bits, SHORT)  # NaN is no frequency, too
-        low, high = self.sums.pads("low")[cube], self.sums.pads("high")[cube]
+        # The comparison is also false for NaN, which stands for a pad without a frequency.
+        bits = np.where(f > 0, bits, SHORT)
+        low = self.sums.pads("low")[cube]
+        high = self.sums.pads("high")[cube]
         bits[(f > low) & (f < high)] = 0
         bits |= reported * REPORTED
         bits[~find_impossible(tables, self.sums, rows, cube)] = 0

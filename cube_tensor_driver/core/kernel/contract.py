@@ -188,7 +188,7 @@ class HealthState(NamedTuple):
 
 
 class Offsets(NamedTuple):
-    """What is subtracted from v (pad stress / stiffness), because it is no load.
+    """Values that the kernel subtracts from v (pad stress / stiffness), because they are no load.
 
     For a row of cube c at the time t with the specific force s it is
 
@@ -198,15 +198,16 @@ class Offsets(NamedTuple):
     not have are 0. The kernel changes the last four arrays.
 
     Attributes:
-        step_ns: Begin and end of the time in which these values hold (2,), in ns.
-        since_ns: Times from which the slopes count (C,), in ns.
-        offset: Offsets (C, P).
-        slope: Their changes per second (C, P), for v = 0.
-        gain: Change of the slopes with v (C, P), per second.
-        lasting: Status bits of rows at most `MAX_GAP_NS` later than `since_ns` (C,). If it has any,
-            other rows get COMPENSATION.
+        step_ns: Begin and end of the interval of time in which these values hold (2,), in ns.
+        since_ns: Time for each cube from which t is counted in the equation (C,), in ns.
+        offset: Offsets of creep and temperature at this time (C, P).
+        slope: Change of the offset per second (C, P), for v = 0.
+        gain: Additional change of the offset per second and per v (C, P).
+        lasting: Status bits of creep and temperature (C,), for rows at most `MAX_GAP_NS` later than
+            `since_ns`. If there are any, later rows get COMPENSATION instead.
         response: Response of the pads to specific force (C, 3, P), per m/s².
-        weighing: Status bits of rows with a known specific force (C,); others get COMPENSATION.
+        weighing: Status bits of weight (C,), for rows with a known specific force. Other rows get
+            COMPENSATION instead.
         newest_ns: Time stamp of the newest row of each cube (C,), in ns; 0: none.
         reading: v of this row before the subtraction (C, P); NaN where a pad was not used.
         subtracted: What was subtracted from it (C, P).
@@ -252,7 +253,10 @@ class Columns(NamedTuple):
     force: Real | None
 
     def find_scan(self, row: int) -> slice:
-        """Return the rows from one on up to the end of its scan, where the cube number falls."""
+        """Return the rows from a given one to the end of its scan.
+
+        The cube numbers rise within a scan, so it ends before a row whose number does not.
+        """
         is_end = self.cube[row + 1 :] <= self.cube[row:-1]
         count = int(np.argmax(is_end)) if is_end.any() else len(is_end)
         return slice(row, row + 1 + count)

@@ -37,6 +37,7 @@ def run(
         n_residuals: Number of outputs of a matrix (see `Tables.matrix`) that are residuals.
         tables: Tables of the skin.
         health: State of the health, which is changed; None: health is not judged.
+        offsets: What is subtracted and its state, which is changed; None: nothing is.
         columns: Rows to process.
         results: Rows to write.
 

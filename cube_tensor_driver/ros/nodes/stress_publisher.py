@@ -279,9 +279,9 @@ class CubeTopics:
             self._covariances[key] = pipeline.covariance(cube, left_out)
         # The uncertainty of the compensation of weight, creep and temperature changes from row to
         # row, so its covariance is not cached but added here.
-        growth = self._reconstructor.compensation.growth(cube, left_out)
+        compensation = self._reconstructor.compensation.covariance(cube, left_out)
         noise = self._covariances[key]
-        return noise if growth is None else noise + growth
+        return noise if compensation is None else noise + compensation
 
 
 class _CubePublishers:
