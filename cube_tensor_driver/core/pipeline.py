@@ -178,8 +178,10 @@ class Pipeline:
         group = np.array([numbers[c.id] for c in self.calibrations], np.int32)
         # For pads that a cube does not have, these values give a stiffness of 0 without a division
         # by 0.
-        beta = pad_table([c.beta for c in self._groups], self.n_pads, fill=1)
-        modulus = pad_table([c.modulus for c in self._groups], self.n_pads, fill=0)
+        betas = [calibration.beta for calibration in self._groups]
+        moduli = [calibration.modulus for calibration in self._groups]
+        beta = pad_table(betas, self.n_pads, fill=1)
+        modulus = pad_table(moduli, self.n_pads, fill=0)
         self._beta = np.maximum(beta, MIN_BETA)
         self._stiffness = modulus * (1 + self._beta) / self._beta
         whole = [self._estimator(number, 0) for number in range(len(self._groups))]
@@ -274,7 +276,8 @@ class Pipeline:
         if offset is None:
             return factor
         beta = self._beta[self._tables.calibration[cube]]
-        shifted: Array = factor * (1 + offset * (1 + beta) / beta) / (1 + offset)
+        numerator = 1 + offset * (1 + beta) / beta
+        shifted: Array = factor * numerator / (1 + offset)
         return shifted
 
     def shift_of_zero(self, before: Array) -> Array:
@@ -288,7 +291,8 @@ class Pipeline:
         """
         ratio = self._rest / before
         beta = self._beta[self._tables.calibration]
-        shift: Array = (ratio - 1) / ((1 + beta) / beta - ratio)
+        highest_ratio = (1 + beta) / beta
+        shift: Array = (ratio - 1) / (highest_ratio - ratio)
         return shift
 
     def process(
@@ -329,14 +333,26 @@ class Pipeline:
         if watch is None or known is not None:
             out.left_out[:] = rows.pad_fault if left_out is None else left_out
         results = Results(
-            out.stress, out.gradient, out.residual, out.status, out.observed, out.left_out, offset
+            stress=out.stress,
+            gradient=out.gradient,
+            residual=out.residual,
+            status=out.status,
+            observed=out.observed,
+            left_out=out.left_out,
+            offset=offset,
         )
         sums = watch.sums if watch else None
         offsets = effects.offsets if effects else None
-        row, request = 0, DONE
+        row = 0
         while row < len(rows):
             row, request = run(
-                row, self._n_residuals, self._tables, sums, offsets, columns, results
+                row,
+                self._n_residuals,
+                self._tables,
+                sums,
+                offsets,
+                columns,
+                results,
             )
             if request == UNKNOWN_CUBE:
                 if watch:

@@ -335,7 +335,7 @@ def _apply_check(
     cube = int(chosen[row])
     pad_name = pipeline.calibrations[cube].layout.pads[pad]
     value = check.values[row, pad]
-    # Above 100, the form .3g has an exponent.
+    # The format .3g would show large numbers with an exponent, such as 1.23e+03.
     shown = f"{value:.0f}" if value > 100 else f"{value:.3g}"
     raise TareError(
         f"cube {names[cube]}: pad {pad_name} {check.problem}: {shown} {check.unit}, "

@@ -61,7 +61,9 @@ def run(
     unknown = np.flatnonzero(columns.cube[start:] >= len(tables.calibration))
     if health is not None and len(unknown):
         return start, UNKNOWN_CUBE
-    n_rows = start + int(unknown[0]) if len(unknown) else len(columns.cube)
+    n_rows = len(columns.cube)
+    if len(unknown):
+        n_rows = start + int(unknown[0])
     # A scan begins where the cube number does not rise.
     begins_scan = np.ones(len(columns.cube) + 1, bool)
     begins_scan[1:-1] = columns.cube[1:] <= columns.cube[:-1]
@@ -208,7 +210,8 @@ def _process(
     if health is not None:
         state = health.cubes[cube]
         is_known = np.zeros(len(cube), bool) if rows.known is None else rows.known
-        out.left_out[:] = np.where(is_known, out.left_out, rows.pad_fault | state["mask"])
+        left_out = rows.pad_fault | state["mask"]
+        out.left_out[:] = np.where(is_known, out.left_out, left_out)
         out.status[:] = np.where(is_known, out.status, state["status"])
         shown = pack_bits(find_impossible(tables, health, rows, cube))
         has_new_condition = shown & ~state["found"] != 0
@@ -278,12 +281,14 @@ def _find_offsets(
         status: Status bits of the rows (N,), to which those of the compensation are added.
     """
     elapsed_ns = rows.stamp_ns - offsets.since_ns[cube]
-    elapsed_s = (np.maximum(elapsed_ns, 0) * 1e-9).astype(v.dtype)
+    elapsed_s = np.maximum(elapsed_ns, 0) * 1e-9
+    elapsed_s = elapsed_s.astype(v.dtype)
     slope = offsets.slope[cube] + offsets.gain[cube] * v
     total: Real = offsets.offset[cube] + slope * elapsed_s[:, None]
     lasting = offsets.lasting[cube]
     is_near = (elapsed_ns >= 0) & (elapsed_ns <= MAX_GAP_NS)
-    status |= np.where(is_near | (lasting == 0), lasting, np.uint16(COMPENSATION))
+    is_valid = is_near | (lasting == 0)
+    status |= np.where(is_valid, lasting, np.uint16(COMPENSATION))
     if rows.force is not None:
         # NaN, which stands for an unknown force, fails the comparison.
         is_known: Mask = np.abs(rows.force).max(axis=1) < MAX_SPECIFIC_FORCE
@@ -328,9 +333,11 @@ def find_impossible(tables: Tables, health: HealthState, rows: Columns, cube: In
         cube: Numbers of their cubes, to index with.
     """
     f = rows.frequency.astype(np.float32)
-    low, high = health.pads("low")[cube], health.pads("high")[cube]
+    low = health.pads("low")[cube]
+    high = health.pads("high")[cube]
     calibration = tables.calibration[cube]
-    is_impossible = ~((f > low) & (f < high)) & find_existing(tables, calibration)
+    is_possible = (f > low) & (f < high)
+    is_impossible = ~is_possible & find_existing(tables, calibration)
     # The device may set the bit of a pad that the cube does not have.
     is_reported = mask_bits(tables, calibration, rows.pad_fault)
     return is_impossible | is_reported
@@ -386,7 +393,8 @@ def _measure_pace(health: HealthState, rows: Columns, cube: Index) -> tuple[Sing
     between = stamp_ns - state["time_ns"][cube]
     before = state["interval_ns"][cube]
     # An interval that begins or ends with a doubtful time stamp is unknown.
-    now = np.where(is_doubtful | (state["is_doubtful"][cube] > 0), 0, between)
+    was_doubtful = state["is_doubtful"][cube] > 0
+    now = np.where(is_doubtful | was_doubtful, 0, between)
     state["time_ns"][cube] = stamp_ns
     state["interval_ns"][cube] = now
     state["is_doubtful"][cube] = is_doubtful
@@ -400,10 +408,13 @@ def _measure_pace(health: HealthState, rows: Columns, cube: Index) -> tuple[Sing
     state["gap_before"][cube] = np.where(is_gap & is_first, between, state["gap_before"][cube])
     state["gap_within"][cube] = np.where(is_longest, between, within)
 
-    shorter, longer = np.minimum(now, before), np.maximum(now, before)
+    shorter = np.minimum(now, before)
+    longer = np.maximum(now, before)
     is_known = (shorter > 0) & (longer < GAP_NS)
     is_even = longer < MAX_JITTER_RATIO * shorter
     safe_before = np.where(is_known, before, 1)
     ratio = np.where(is_known & ~is_even, now / safe_before, 1.0)
     weight = is_known * 6 / (1 + (1 + ratio) * (1 + ratio) + ratio * ratio)
-    return ratio[:, None].astype(np.float32), weight[:, None].astype(np.float32)
+    ratio = ratio.astype(np.float32)
+    weight = weight.astype(np.float32)
+    return ratio[:, None], weight[:, None]
