@@ -78,10 +78,10 @@ class Creep:
         self._models = [calibration.creep for calibration in pipeline.calibrations]
         self.has_model = np.array([model is not None for model in self._models])
         n_cubes, n_pads = offsets.reading.shape
-        present = [model for model in self._models if model is not None]
         times: set[float] = set()
-        for model in present:
-            times.update(model.time.tolist())
+        for model in self._models:
+            if model is not None:
+                times.update(model.time.tolist())
         self._times = np.array(sorted(times))
         time = self._times[:, None]
         self._memories = LowPass(time, n_cubes, n_pads)
