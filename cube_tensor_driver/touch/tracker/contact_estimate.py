@@ -108,16 +108,17 @@ def estimate_contact(nodes: Array, forces: Array, root: Array, size: float) -> C
     normal_force = min(float(force[2]), -_MIN_NORMAL_FORCE)
     place = forces[2] @ nodes / normal_force
     arm = nodes - place
-    moment = arm[:, 0] @ forces[1] - arm[:, 1] @ forces[0]
+    arm_x, arm_y = arm.T
+    moment = arm_x @ forces[1] - arm_y @ forces[0]
 
     # Derivatives (4, 3, q) of the position (x, y), the moment and the area by the 3 components of
     # the force of each of q nodes.
     slopes = np.zeros((4, 3, len(nodes)))
     slopes[:2, 2] = arm.T / normal_force
-    slopes[2, 0] = -arm[:, 1]
-    slopes[2, 1] = arm[:, 0]
-    shear = force[:2] / normal_force
-    slopes[2, 2] = shear[0] * arm[:, 1] - shear[1] * arm[:, 0]
+    slopes[2, 0] = -arm_y
+    slopes[2, 1] = arm_x
+    ratio_x, ratio_y = force[:2] / normal_force
+    slopes[2, 2] = ratio_x * arm_y - ratio_y * arm_x
 
     # The second moment of the pressure is that of the forces at the nodes, plus that of the Hertz
     # pressure of one node about its own centre. Its eigenvectors are the axes of the ellipse.

@@ -27,7 +27,7 @@ from ..inverse import FieldDeviation, SurfaceInverse, TractionField
 from .contact_estimate import ContactEstimate, Discs
 from .fitted_field import add_fits, fit_variances
 from .hertz_fit import HertzFit, linearise
-from .local_values import CubeNoise
+from .local_values import CubeNoise, rotations_about_normal
 from .node_fit import NodeFit
 from .pressure_regions import PressureRegions
 from .tracked_region import MAX_START_SIZE, TrackedRegion, Work, update_responses
@@ -260,12 +260,12 @@ class ContactTracker:
             regions.append(region)
         self._regions = regions
         distances = self._region_distances(found)
-        for region, row in zip(regions, distances, strict=True):
+        for number, (region, row) in enumerate(zip(regions, distances, strict=True)):
             is_near = row < NEIGHBOUR_REACH_PITCHES * self._inverse.pitch
             within_reach = [regions[k] for k in np.flatnonzero(is_near)]
             region.near = [other for other in within_reach if other is not region]
-            # The smallest distance is that of the region from itself.
-            region.gap = float(np.partition(row, 1)[1]) if len(row) > 1 else np.inf
+            to_others = np.delete(row, number)
+            region.gap = float(to_others.min(initial=np.inf))
 
     def _region_distances(self, found: list[Index]) -> Array:
         """Return the distances (n, n), in m, of n regions: for each pair of regions, the smallest
@@ -343,7 +343,7 @@ class ContactTracker:
             if region is not excluded:
                 response = region.response[cubes]
                 total += response
-                # The error has the same relative size in all cubes, so deviations add linearly.
+                # Deviations add linearly, because the same errors of the elastomer cause them.
                 deviation += region.relative_error * np.abs(response)
         return total, deviation
 
@@ -356,7 +356,8 @@ class ContactTracker:
         """
         inverse = self._inverse
         above = inverse.poses.position + inverse.depth * inverse.poses.rotation[:, :, 2]
-        home = int(np.linalg.norm(above - contact.position, axis=1).argmin())
+        distance = np.linalg.norm(above - contact.position, axis=1)
+        home = int(distance.argmin())
         rotation = inverse.poses.rotation[home]
         place = (contact.position - above[home]) @ rotation[:, :2]
         # The area of the contact is that of its region of pressure at the depth of the cubes, where
@@ -366,7 +367,8 @@ class ContactTracker:
         largest = MAX_START_SIZE * inverse.depth
         squared_radius = np.clip(squared_radius, smallest**2, largest**2)
         force = contact.force @ rotation
-        return home, Discs(force[None], place[None], np.log([squared_radius]) / 2)
+        log_radius = np.log([squared_radius]) / 2
+        return home, Discs(force[None], place[None], log_radius)
 
     def _improve_fits(self, max_work: float) -> bool:
         """Make and improve fits of regions, the most urgent first (`Work`), up to a limit of work.
@@ -463,14 +465,14 @@ class ContactTracker:
         """
         inverse = self._inverse
         around = fit.values
-        nearest = int(np.argmin(np.linalg.norm(around.place - estimate.place, axis=1)))
-        cosine = np.cos(around.angle[nearest])
-        sine = np.sin(around.angle[nearest])
-        to_cube = np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1.0]])
+        distance = np.linalg.norm(around.place - estimate.place, axis=1)
+        nearest = int(distance.argmin())
+        to_cube = rotations_about_normal(around.angle[nearest])
         cube = around.cubes[nearest]
         rotation = inverse.poses.rotation[cube]
         local = to_cube[:2, :2] @ (estimate.place - around.place[nearest])
-        position = inverse.poses.position[cube] + rotation @ np.array([*local, inverse.depth])
+        from_cube = np.array([*local, inverse.depth])
+        position = inverse.poses.position[cube] + rotation @ from_cube
 
         shear = float(np.linalg.norm(estimate.force[:2]))
         # To first order, the length of the shear force only changes by errors along its direction.

@@ -15,7 +15,7 @@ from ...mechanics.layer import FIELD
 from ..inverse import SurfaceInverse, TractionField
 from .contact_estimate import ContactSum
 from .hertz_fit import HertzFit
-from .local_values import unroll_points
+from .local_values import rotations_about_normal, unroll_points
 from .node_fit import NodeFit
 
 _MIN_RINGS = 4
@@ -109,14 +109,9 @@ def _distribute(
         from_contacts = place[:, None] - contacts.places[of_this_size]
         stress = inverse.kernels.field(from_contacts.reshape(-1, 2), size)
         pressure = -stress[:, FIELD.index("zz")]
-        below[:, :, of_this_size] = pressure.reshape(len(points), -1, 3).swapaxes(1, 2)
+        by_contact = pressure.reshape(len(points), -1, 3)
+        below[:, :, of_this_size] = by_contact.swapaxes(1, 2)
 
     _, angle = inverse.unroll(fit.values.home, inverse.cube[points])
-    rotation = np.zeros((len(points), 3, 3))
-    cosine, sine = np.cos(angle), np.sin(angle)
-    rotation[:, 0, 0] = cosine
-    rotation[:, 0, 1] = sine
-    rotation[:, 1, 0] = -sine
-    rotation[:, 1, 1] = cosine
-    rotation[:, 2, 2] = 1.0
+    rotation = rotations_about_normal(angle)
     return points, share, below.reshape(len(points), -1), rotation

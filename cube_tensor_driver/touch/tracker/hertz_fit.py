@@ -24,7 +24,7 @@ from ...core.arrays import Array
 from ...mechanics.kernels import DISC_SIZES
 from ..inverse import SurfaceInverse
 from .contact_estimate import ContactEstimate, ContactSum, Discs
-from .local_values import LocalValues
+from .local_values import LocalValues, rotations_about_normal
 
 SIZE_DEVIATION = 1.0
 """Prior standard deviation of the natural logarithm of the radius of a Hertz contact."""
@@ -136,7 +136,8 @@ class HertzFit:
             flatness_deviation,
             moment_deviation,
         ]
-        self._contact_precision = np.tile(np.array(deviations) ** -2, len(starts.forces))
+        precision = np.array(deviations) ** -2
+        self._contact_precision = np.tile(precision, len(starts.forces))
         self._elastomer_errors = np.zeros(0)
 
     @property
@@ -236,8 +237,7 @@ class HertzFit:
         """
         (number,) = np.flatnonzero(self.values.cubes == values.home)
         place, angle = self.values.place[number], self.values.angle[number]
-        cosine, sine = np.cos(angle), np.sin(angle)
-        to_home = np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
+        to_home = rotations_about_normal(angle)
 
         def transform(discs: Discs) -> Discs:
             centres = (discs.centres - place) @ to_home[:2, :2].T
@@ -274,7 +274,8 @@ class HertzFit:
         # the difference of contact and mixture is h^2 (first - second / 2), to order h^2.
         first, second = derivatives[:, :, 5], derivatives[:, :, 6]
         derivatives[:, :, 6] = FLATNESS_STEP**2 * (first - second / 2)
-        by_contacts = derivatives.transpose(1, 3, 0, 2).reshape(*base_values.shape, -1)
+        by_contacts = derivatives.transpose(1, 3, 0, 2)
+        by_contacts = by_contacts.reshape(*base_values.shape, -1)
         by_elastomer = sensitivity.swapaxes(1, 2)
         self._base_values = base_values
         self._derivatives = np.concatenate([by_contacts, by_elastomer], axis=2)
@@ -357,15 +358,17 @@ class HertzFit:
         count = len(self.found.forces)
         shifts = np.concatenate([step * _STENCIL, np.zeros((2, 2))])
         places = self.found.centres[:, None] + shifts
-        factors = np.exp(FLATNESS_STEP * np.array([0, 0, 0, 0, 0, 1, -1]))
-        sizes = np.exp(self.found.log_sizes)[:, None] * factors
+        log_growth = FLATNESS_STEP * np.array([0, 0, 0, 0, 0, 1, -1])
+        radii = np.exp(self.found.log_sizes)
+        sizes = radii[:, None] * np.exp(log_growth)
 
         # Derivatives (3 axes, J, 7, J, 8) of the forces of all Hertz contacts of the sum by the 8
         # parameters of each of the J fitted contacts.
         slopes = np.zeros((3, count, 7, count, _N_PARAMETERS))
         wider_share = 1 / (1 + np.exp(2 * FLATNESS_STEP))
         narrower_share = 1 - wider_share
-        moment_arms = 4 * step
+        # Four forces of 1 / (4 step) at this arm have a moment of 1 N m.
+        unit_moment_force = np.array([1, -1]) / (4 * step)
         for j, force in enumerate(self.found.forces[:, :, None]):
             own = slopes[:, j, :, j]
             by_shift = force * [1, -1] / (2 * step)
@@ -374,8 +377,8 @@ class HertzFit:
             own[:, [3, 4], 4] = by_shift
             own[:, [5, 6], 5] = force * [1, -1] / (2 * FLATNESS_STEP)
             own[:, [0, 5, 6], 6] = force * [1, -wider_share, -narrower_share]
-            own[1, [1, 2], 7] = np.array([1, -1]) / moment_arms
-            own[0, [3, 4], 7] = np.array([-1, 1]) / moment_arms
+            own[1, [1, 2], 7] = unit_moment_force
+            own[0, [3, 4], 7] = -unit_moment_force
         by_flatness, by_moment = slopes[..., 6], slopes[..., 7]
         forces = np.einsum("ajkj,j->ajk", by_flatness, self._flatness)
         forces += np.einsum("ajkj,j->ajk", by_moment, self._moments)
@@ -431,7 +434,8 @@ def linearise(inverse: SurfaceInverse, fits: Sequence[HertzFit]) -> None:
         fit.values.refresh()
         values, found = fit.values, fit.found
         count, n = len(found.forces), len(values.cubes)
-        offsets.append((values.place - found.centres[:, None]).reshape(-1, 2))
+        from_centres = values.place - found.centres[:, None]
+        offsets.append(from_centres.reshape(-1, 2))
         angles.append(np.tile(values.angle, count))
         variants.append(np.tile(values.variant, count))
         sizes.append(np.repeat(np.exp(found.log_sizes), n))

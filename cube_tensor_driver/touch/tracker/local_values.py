@@ -80,7 +80,8 @@ class CubeNoise:
             self._to_pads[outdated] = np.linalg.pinv(by_pad)
             self._variance[outdated] = 0.0
         values = np.where(known, scaled[cubes], 0.0)
-        stresses = (self._to_pads[cubes] @ values[:, :, None])[:, :, 0]
+        as_columns = self._to_pads[cubes] @ values[:, :, None]
+        stresses = as_columns[:, :, 0]
 
         # The predicted stress of a pad is wrong by interpolation errors of the tabulated response
         # and by contacts that are not found yet. Both grow with the stress in the cubes around.
@@ -167,9 +168,10 @@ class LocalValues:
         self.variant = self._inverse.variant[self.cubes]
         whitening = self._noise.whitening[self.cubes]
         self._total_disturbance = float(self.disturbance.sum())
-        # The noise has variance 1 after whitening, so the disturbance increases it to this one.
-        white_disturbance = (whitening @ self.disturbance[:, :, None])[:, :, 0]
-        total_variance = 1 + (white_disturbance**2).mean(axis=1)
+        # The noise has variance 1 after whitening, to which the disturbance adds its own variance.
+        white_disturbance = whitening @ self.disturbance[:, :, None]
+        disturbance_variance = (white_disturbance[:, :, 0] ** 2).mean(axis=1)
+        total_variance = 1 + disturbance_variance
         weight = 1 / np.sqrt(total_variance)
         self.whitening = whitening * weight[:, None, None]
         self.known = self._noise.known[self.cubes]
@@ -247,6 +249,22 @@ class LocalValues:
         return np.asarray(by_contact.sum(axis=1).swapaxes(1, 2), float)
 
 
+def rotations_about_normal(angle: Array) -> Array:
+    """Return the matrices (..., 3, 3) from one frame to another that is rotated about z.
+
+    Args:
+        angle: Angles (...) in rad by which the second frame is rotated in the first one.
+    """
+    cosine, sine = np.cos(angle), np.sin(angle)
+    rotation = np.zeros((*np.shape(angle), 3, 3))
+    rotation[..., 0, 0] = cosine
+    rotation[..., 0, 1] = sine
+    rotation[..., 1, 0] = -sine
+    rotation[..., 1, 1] = cosine
+    rotation[..., 2, 2] = 1.0
+    return rotation
+
+
 def unroll_points(inverse: SurfaceInverse, home: int, points: Index) -> Array:
     """Return the positions (n, 2) in m of surface points on the skin laid flat around a cube.
 
@@ -258,9 +276,9 @@ def unroll_points(inverse: SurfaceInverse, home: int, points: Index) -> Array:
     cubes = inverse.cube[points]
     place, angle = inverse.unroll(home, cubes)
     from_cube = inverse.points[points] - inverse.poses.position[cubes]
-    local = np.einsum("nji,nj->ni", inverse.poses.rotation[cubes], from_cube)[:, :2]
-    cosine = np.cos(angle)
-    sine = np.sin(angle)
-    rotated_x = cosine * local[:, 0] - sine * local[:, 1]
-    rotated_y = sine * local[:, 0] + cosine * local[:, 1]
+    local = np.einsum("nji,nj->ni", inverse.poses.rotation[cubes], from_cube)
+    x, y = local[:, 0], local[:, 1]
+    cosine, sine = np.cos(angle), np.sin(angle)
+    rotated_x = cosine * x - sine * y
+    rotated_y = sine * x + cosine * y
     return np.asarray(place + np.stack([rotated_x, rotated_y], axis=1))

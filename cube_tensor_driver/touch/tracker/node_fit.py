@@ -191,8 +191,8 @@ class NodeFit:
         information = products[:, 2:, 2:] + np.eye(columns.shape[1] - 2)
         gradients = products[:, 2:, :2]
         errors = np.linalg.solve(information, gradients)
-        explained_by_errors = (errors[:, :, 0] * gradients[:, :, 0]).sum(axis=1)
-        chi_squared = np.maximum(products[:, 0, 0] - explained_by_errors, 0)
+        by_error = errors[:, :, 0] * gradients[:, :, 0]
+        chi_squared = np.maximum(products[:, 0, 0] - by_error.sum(axis=1), 0)
         count = self.values.count
         misfit = np.maximum(chi_squared / count, 1.0)
 

@@ -166,4 +166,5 @@ def split_peaks(pressure: Array, root: Array, is_neighbour: Mask) -> Index:
     # Nodes that are left have too little pressure for a peak and no neighbour that belongs to one.
     # They are assigned to the highest peak.
     owner[owner < 0] = 0
-    return np.asarray(np.unique(owner, return_inverse=True)[1].reshape(-1))
+    _, consecutive = np.unique(owner, return_inverse=True)
+    return np.asarray(consecutive.reshape(-1))

@@ -274,7 +274,8 @@ class TrackedRegion:
         if home != old_home or len(old.forces) != len(discs.forces):
             return True
         shift = np.abs(discs.centres - old.centres).max() / self.gap
-        change = np.abs(discs.forces - old.forces).max() / np.abs(discs.forces).max()
+        largest_force = np.abs(discs.forces).max()
+        change = np.abs(discs.forces - old.forces).max() / largest_force
         return bool(max(shift, change) > MAX_STALE_CHANGE)
 
     def take_response(self, cubes: Index, response: Array) -> None:
@@ -479,7 +480,8 @@ def update_responses(
             np.concatenate(sizes),
             np.concatenate(forces),
         )
-        by_disc = response[:, inverse.columns].reshape(len(offsets), len(cubes), -1)
+        measured = response[:, inverse.columns]
+        by_disc = measured.reshape(len(offsets), len(cubes), -1)
         for region in stale:
             count = len(region.discs[1].forces)
             region.take_response(cubes, by_disc[:count].sum(axis=0))
