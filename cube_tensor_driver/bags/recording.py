@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..config.skin import Skin, SkinCube, SkinLink
-from ..core.arrays import Array, pad_table
+from ..core.arrays import Array, Index, Times, pad_table
 from ..core.calibration import Calibration
 from ..core.errors import BagError, MessageError
 from ..core.reconstructor import Reconstructor, RecordedHealth
@@ -91,8 +91,8 @@ class Recording:
         """The skin (cubes, their poses and calibrations) in the last SkinInfo message."""
         return recorded_skin(self.infos[-1], self.settings[-1].calibrations)
 
-    def info_index_at(self, newest_ns: Any) -> Any:
-        """Return the index in `infos` of the SkinInfo that applies to a message of frequencies.
+    def info_index_at(self, newest_ns: Times) -> Index:
+        """Return the index in `infos` of the SkinInfo that applies to each message of frequencies.
 
         A SkinInfo message contains the cubes' poses, calibrations and rest frequencies.
 
@@ -100,23 +100,23 @@ class Recording:
         just after the last row that it reconstructed with the previous SkinInfo.
 
         Args:
-            newest_ns: Stamp of the newest row of the message, in ns since the Unix epoch; or an
-                array (M,) of such stamps for M messages.
+            newest_ns: Stamps (M,) of the newest row of each message, in ns since the Unix epoch.
 
         Returns:
-            An index, or an array (M,) of indices.
+            (M,) indices.
         """
         n_earlier = np.searchsorted(self._since_ns, newest_ns, side="right")
         # The first SkinInfo is the best known one for messages before it, too.
-        return np.maximum(n_earlier - 1, 0)
+        index: Index = np.maximum(n_earlier - 1, 0)
+        return index
 
     def settings_at(self, rows: FrequencyRows) -> Settings:
         """Return the calibrations and rest frequencies that applied to the rows of one message.
 
         A rest frequency is the frequency of a pad without load; a row is one sample of one cube.
         """
-        newest_ns = rows.stamp_ns.max(initial=0)
-        number = int(self.info_index_at(newest_ns))
+        newest_ns = rows.stamp_ns.max(initial=0, keepdims=True)
+        number = int(self.info_index_at(newest_ns)[0])
         return self.settings[number]
 
     def health_at(self, rows: FrequencyRows) -> RecordedHealth:

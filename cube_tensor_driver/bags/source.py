@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..config.skin import Skin
-from ..core.arrays import AnyArray, Array, Mask, Times
+from ..core.arrays import AnyArray, Array, Index, Mask, Times
 from ..core.errors import BagError
 from ..core.rows import FrequencyRows
 from ..messages.codec import Decoded
@@ -160,11 +160,11 @@ class BagSource:
                     states=recorded[first].states,
                 )
 
-    def _find_infos(self, messages: Decoded[FrequencyRows]) -> AnyArray:
+    def _find_infos(self, messages: Decoded[FrequencyRows]) -> Index:
         """Return the indices (M,) in `Recording.infos` of the SkinInfo for each of M messages."""
         times_ns = messages.by_message(messages.rows.stamp_ns)
         # A message without rows has no newest row, so the stamp in its header is used.
-        newest_ns = times_ns.max(axis=1) if times_ns.size else messages.stamp_ns
+        newest_ns: Times = times_ns.max(axis=1) if times_ns.size else messages.stamp_ns
         return self.recording.info_index_at(newest_ns)
 
 
@@ -186,9 +186,9 @@ def _begins_segment(
     """
     has_motion = np.array([one.motion is not None for one in recorded])
     has_states = np.array([bool(one.states) for one in recorded])
-    has_other_cubes = (cube[1:] != cube[:-1]).any(axis=1)
-    has_other_info = info_index[1:] != info_index[:-1]
-    has_other_effects = has_motion[1:] != has_motion[:-1]
+    has_other_cubes: Mask = (cube[1:] != cube[:-1]).any(axis=1)
+    has_other_info: Mask = info_index[1:] != info_index[:-1]
+    has_other_effects: Mask = has_motion[1:] != has_motion[:-1]
     return has_other_cubes | has_other_info | has_other_effects | has_states[1:]
 
 
