@@ -39,7 +39,8 @@ BLOCK_NS = 1_000_000_000
 """Duration, in ns, of the blocks whose mean temperatures and pad stresses are fitted."""
 
 MIN_BLOCKS = 120
-"""Smallest number of blocks with data in all bags together."""
+"""Smallest number of blocks (of 1 s) with data, in all bags together, with which temperature is
+fitted."""
 
 MIN_RANGE = 3.0
 """Smallest difference between the highest and the lowest measured temperature, in K. With a smaller
@@ -78,8 +79,9 @@ filters only approximate, looks like a quadratic effect while the skin warms onc
 """
 
 MAX_LAG_PATTERNS = 3
-"""Maximum number of independent errors of the pads that the model states in proportion to the lag
-of the elastomer (measured temperature minus its own): the largest principal components."""
+"""Maximum number of principal components of the residual stresses of the pads that become part of
+the model. They state its error in proportion to the difference between the measured temperature and
+that of the elastomer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +107,7 @@ class Warming:
 
 @dataclass(frozen=True, eq=False)
 class ThermalFit:
-    """Result of the fit for one cube.
+    """Effect of temperature on the pads of one cube, fitted to recorded stresses.
 
     Attributes:
         data: Temperatures and stresses to which the model was fitted.

@@ -328,7 +328,8 @@ def _squared_bound(noise: Array) -> Array:
     Args:
         noise: Usual noise (standard deviation of the frequency) of each pad, in Hz.
     """
-    bound: Array = ((MAX_SECOND_DIFFERENCE * noise) ** 2).astype(np.float32)
+    limit = MAX_SECOND_DIFFERENCE * noise
+    bound: Array = (limit**2).astype(np.float32)
     return bound
 
 
