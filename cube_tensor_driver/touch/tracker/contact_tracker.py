@@ -41,16 +41,18 @@ MAX_REGIONS = 32
 """Largest number of regions of contact on one skin; those with the largest pressure are kept."""
 
 MAX_WORK_PER_SCAN = 40
-"""Work after which no further fit is made or improved in the same scan (set of values of all
-cubes).
+"""Computing work after which no further fit is made or improved in the same scan (set of values of
+all cubes).
 
 The unit is a node, one of the small contacts whose sum is the traction of a region: a new fit of 80
-nodes is a work of 80. The limit bounds the time of a scan; what remains is done in the next scans.
+nodes is a work of 80. The limit bounds the time of a scan; the remaining fits are made in the next
+scans.
 """
 
 MAX_LINEARISED_FITS = 6
-"""Largest number of fits of Hertz contacts whose response is linearised again in one scan. Those
-whose contacts have moved farthest since the last time come first."""
+"""Largest number of fits of Hertz contacts for which the response of the cubes is linearised again
+in one scan (set of values of all cubes). Those whose contacts have moved farthest since their last
+linearisation come first."""
 
 MAX_FIT_STEPS = 12
 """Largest number of steps (new fits and improvements of fits) in one scan (set of values of all
@@ -134,11 +136,11 @@ class ContactTracker:
 
         Args:
             values: Components (cubes, 15) in Pa and Pa/m, NaN where unknown.
-            max_work: Number of nodes (see `MAX_WORK_PER_SCAN`) after which no further fit is
-                improved in this scan. Infinite: all fits are improved as far as possible.
+            max_work: Work, in the unit of `MAX_WORK_PER_SCAN`, after which no further fit is made
+                or improved in this scan. Infinite: all fits are improved as far as possible.
 
         Returns:
-            Contacts, strongest first.
+            Contacts, the one with the largest normal force first.
         """
         inverse = self._inverse
         scaled = inverse.scaled(values)
@@ -180,7 +182,7 @@ class ContactTracker:
         """Linearise the response of the cubes to the Hertz contacts that have moved farthest.
 
         At most `MAX_LINEARISED_FITS` fits are linearised, but always those whose cubes have lost or
-        regained values: a step with the noise of other values would compute with unknown ones.
+        regained values: a step from their old linearisation would use values that are unknown now.
         """
         moving = [
             one for one in self._fits if isinstance(one, HertzFit) and one.needs_linearisation
@@ -374,10 +376,11 @@ class ContactTracker:
         """Make and improve fits of regions, the most urgent first (`Work`), up to a limit of work.
 
         Args:
-            max_work: Work after which no further fit is improved.
+            max_work: Work, in the unit of `MAX_WORK_PER_SCAN`, after which no further fit is made
+                or improved in this scan.
 
         Returns:
-            Whether something has been improved.
+            Whether a fit has been made or improved.
         """
         regions = self._regions
         spent = 0

@@ -30,8 +30,8 @@ SIZE_DEVIATION = 1.0
 """Prior standard deviation of the natural logarithm of the radius of a Hertz contact."""
 
 USUAL_SIZE = 0.8
-"""Radius of a contact, divided by the depth of the cubes' centres below the surface, that the prior
-expects: its logarithm is the prior mean of the logarithm of this ratio."""
+"""Prior median of the radius of a contact, divided by the depth of the cubes' centres below the
+surface. The logarithm of the radius has a normal prior distribution."""
 
 FORCE_DEVIATION = 1e2
 """Prior standard deviation of each component of the force of a contact, in N; the prior mean is 0.
