@@ -184,12 +184,13 @@ def _begins_segment(
         (M - 1,) for all messages except the first: whether its cubes, its SkinInfo or the use of
         weight compensation change, or it begins with recorded states of creep and temperature.
     """
-    has_motion = np.array([one.motion is not None for one in recorded])
-    has_states = np.array([bool(one.states) for one in recorded])
-    has_other_cubes: Mask = (cube[1:] != cube[:-1]).any(axis=1)
-    has_other_info: Mask = info_index[1:] != info_index[:-1]
-    has_other_effects: Mask = has_motion[1:] != has_motion[:-1]
-    return has_other_cubes | has_other_info | has_other_effects | has_states[1:]
+    has_motion: Mask = np.array([one.motion is not None for one in recorded])
+    has_states: Mask = np.array([bool(one.states) for one in recorded])
+    has_other_cubes = (cube[1:] != cube[:-1]).any(axis=1)
+    has_other_info = info_index[1:] != info_index[:-1]
+    has_other_effects = has_motion[1:] != has_motion[:-1]
+    begins: Mask = has_other_cubes | has_other_info | has_other_effects | has_states[1:]
+    return begins
 
 
 def open_bag(path: Path | str, topic: str | None = None) -> BagSource:
