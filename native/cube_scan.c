@@ -6,8 +6,9 @@
 #include <math.h>
 #include <string.h>
 
-/* On x86, GCC also makes versions with the vector instructions of AVX-512 and AVX2, and the loader
- * chooses one. All give the same bits. LANES states that the passes of a loop are independent. */
+/* On x86, GCC also compiles versions of a function with the vector instructions of AVX-512 and AVX2.
+ * The loader chooses the best one that the processor has. All give the same bits.
+ * LANES tells the compiler that the iterations of the next loop are independent of each other. */
 #if defined(__GNUC__) && !defined(__clang__)
 #define INLINE static inline __attribute__((always_inline))
 #define LANES _Pragma("GCC ivdep") _Pragma("GCC unroll 1")
@@ -35,11 +36,11 @@ static const float MAX_SPECIFIC_FORCE = 1000;
 enum { LAST, DIFFERENCE, FIRST_SQUARES, SECOND_SQUARES, BOUNDED_SQUARES, SUM, LOWEST, HIGHEST };
 enum { BASE = HIGHEST + 1, BOUND, LOW, HIGH, QUANTITIES };
 
-enum { N, C, P, G, D, T, E, K, Q }; /* places of CUBE_SCAN_LETTERS */
+enum { N, C, P, G, D, T, E, K, Q }; /* index of each letter in CUBE_SCAN_LETTERS */
 enum { ROWS = 32, LANES_OF_BLOCK = ROWS * CUBE_SCAN_MAX_PADS };
 
-/* Rows that are processed together: successive cubes of a scan, so that their pads lie side by side
- * in all arrays. A step is a loop over all of them, in which a processor works on many at a time. */
+/* Rows that are processed together: successive cubes of one scan, whose pads are adjacent in all
+ * arrays. Each operation is one loop over the pads of all rows, which the compiler vectorises. */
 typedef struct {
     int64_t row, cube, n_rows; /* first row and its cube */
     float v[LANES_OF_BLOCK], rest[LANES_OF_BLOCK], highest[LANES_OF_BLOCK]; /* by row and pad */
@@ -73,8 +74,9 @@ static int32_t find_table(const cube_scan_call *call, int64_t key) {
     return low < call->length[E] && call->keys[low] == key ? call->numbers[low] : -1;
 }
 
-/* Returns what is due before the scan that begins here: the next window of health, if its newest
- * stamp lies outside the present one, or the next step of compensation likewise. */
+/* Returns the request that the caller must handle before the scan that begins with `row`: a new window
+ * of health or a new step of the compensation, if the newest time stamp of the scan lies outside the
+ * present one; otherwise CUBE_SCAN_DONE. */
 static int64_t find_due(const cube_scan_call *call, int64_t row) {
     const int64_t *window_ns = call->window_ns, *step_ns = call->step_ns;
     int64_t newest_ns = call->stamp_ns[row];
@@ -90,8 +92,9 @@ static int64_t find_due(const cube_scan_call *call, int64_t row) {
     return CUBE_SCAN_DONE;
 }
 
-/* f0 and f_highest at the temperature T of a row: both times
- * 1 + sum_d c_d (T - reference)^d, by Horner's scheme. Without a model or T, they stay as they are. */
+/* Multiplies the frequency without load f0 and the highest frequency f_highest of the pads of a row by
+ * 1 + sum_d c_d (T - reference)^d (Horner's scheme), with the temperature T of the row. Without a
+ * temperature model, or if T is unknown, they are not changed. */
 static void warm_row(const cube_scan_call *call, block *b, int64_t i) {
     const int64_t n = call->length[P], n_degrees = call->length[D];
     const int64_t row = b->row + i, at = (b->cube + i) * n, calibration = call->calibration[b->cube + i];
@@ -109,10 +112,11 @@ static void warm_row(const cube_scan_call *call, block *b, int64_t i) {
         call->status[row] |= TEMPERATURE;
 }
 
-/* Pad law (Kiyota & Shinoda, eq. 6): v = (f - f0) / (f_highest - f), the stress on a pad divided by
- * its stiffness; 0 without 0 < f < f_highest. NaN fails all comparisons.
+/* Computes v = (f - f0) / (f_highest - f), the stress on a pad divided by its stiffness, by the pad law
+ * (Kiyota & Shinoda, eq. 6). v is 0 unless 0 < f < f_highest, which is also false for NaN.
  *
- * Returns the number of pads with such a frequency and, with health, one in their possible range. */
+ * Returns the number of pads with 0 < f < f_highest and, if health is judged, with f between their
+ * lowest and highest possible frequency. */
 INLINE int64_t apply_law(const cube_scan_call *call, block *b, const float *rest, const float *highest) {
     const int64_t n_lanes = b->n_rows * call->length[P];
     const float *f = call->frequency + b->row * call->length[P];
@@ -131,8 +135,9 @@ INLINE int64_t apply_law(const cube_scan_call *call, block *b, const float *rest
     return n_good < n_possible ? n_good : n_possible;
 }
 
-/* Subtracts from v of a row what is no load: offset + (slope + gain * v) * (time since since_ns) for
- * creep and temperature, and response * force for weight. Sets the bits of what is subtracted. */
+/* Subtracts from v (pad stress / stiffness) of a row what is no load: offset + (slope + gain * v) *
+ * (time since since_ns) for creep and temperature, and response * force for weight. Sets the status
+ * bits of the effects that are subtracted. */
 INLINE void subtract_offsets(const cube_scan_call *call, block *b, int64_t i) {
     const int64_t n = call->length[P], row = b->row + i, cube = b->cube + i;
     const float *offset = call->offset + cube * n, *slope = call->slope + cube * n;
@@ -172,7 +177,8 @@ INLINE void subtract_offsets(const cube_scan_call *call, block *b, int64_t i) {
         memcpy(call->row_offset + row * n, sum, (size_t)n * sizeof *sum);
 }
 
-/* Gets mask and conditions of a row. Returns whether a pad may be bad. */
+/* Sets `left_out` (mask of pads that are not used) and `status` (conditions of the pads) of a row from
+ * the health of its cube. Returns whether a pad may be bad. */
 INLINE bool get_health(const cube_scan_call *call, int64_t row, int64_t cube) {
     const bool has_health = call->words != NULL;
     if (has_health && (call->known == NULL || !call->known[row])) {
@@ -183,7 +189,8 @@ INLINE bool get_health(const cube_scan_call *call, int64_t row, int64_t cube) {
     return call->left_out[row] != 0 || (has_health && call->pad_fault[row] != 0);
 }
 
-/* Finds the table of a row whose pads may be bad, and sets v of bad pads to 0. Returns a request. */
+/* Finds the table of a row whose pads may be bad, and sets v of the bad pads to 0. Returns the request
+ * that the caller must handle before this row can be processed, or CUBE_SCAN_DONE. */
 static int64_t leave_out(const cube_scan_call *call, block *b, int64_t i, const float *highest) {
     const int64_t n = call->length[P], row = b->row + i, cube = b->cube + i;
     const int32_t calibration = b->table[i];
@@ -219,7 +226,8 @@ static int64_t leave_out(const cube_scan_call *call, block *b, int64_t i, const 
     return CUBE_SCAN_DONE;
 }
 
-/* Outputs of a row: out_k = sum over pads p of v_p * matrix_pk, in the order of the pads. */
+/* Computes the outputs of a row: out_k = sum over pads p of v_p * matrix_pk. The terms are added in
+ * the order of the pads, so that all processors give the same bits. */
 INLINE void multiply(const cube_scan_call *call, const float *restrict v, int32_t table, float *restrict out) {
     const int64_t n = call->length[P], n_outputs = call->length[K];
     for (int64_t k = 0; k < n_outputs; k += CUBE_SCAN_BLOCK) {
@@ -237,8 +245,8 @@ INLINE void multiply(const cube_scan_call *call, const float *restrict v, int32_
     }
 }
 
-/* Writes a row, with residual = sqrt(chi-square / degrees of freedom), the root of a sum of squares.
- * Returns whether the residual is above its limit. */
+/* Writes the results of a row. The residual, sqrt(chi-square / degrees of freedom), is the root of the
+ * sum of squares of the outputs after the 15 components. Returns whether it is above its limit. */
 INLINE bool write_row(const cube_scan_call *call, int64_t row, const float *out, int32_t table) {
     float squares = 0;
     for (int64_t k = CUBE_SCAN_COMPONENTS; k < CUBE_SCAN_COMPONENTS + call->n_residuals; k++)
@@ -259,11 +267,13 @@ INLINE uint64_t magnitude(int64_t value) {
     return value < 0 ? 0 - (uint64_t)value : (uint64_t)value;
 }
 
-/* Ratio r and weight w of a second difference, from the last two intervals between rows:
+/* Computes ratio r and weight w of the second difference of a frequency, from the last two intervals
+ * between rows of a cube:
  *
  *     r = interval / interval before,   w = 6 / (1 + (1 + r)^2 + r^2)
  *
- * r = 1 if both are equal up to jitter. w = 0 if an interval is a gap, or a stamp doubtful. */
+ * r = 1 if both intervals are equal except for jitter. w = 0 if an interval is a gap, or a time stamp
+ * at one of its ends is doubtful. */
 INLINE void measure_pace(cube_state *state, int64_t stamp_ns, bool is_doubtful, float *r, float *w) {
     const int64_t between = (int64_t)((uint64_t)stamp_ns - (uint64_t)state->time_ns);
     const int64_t before = state->interval_ns;
@@ -288,12 +298,12 @@ INLINE void measure_pace(cube_state *state, int64_t stamp_ns, bool is_doubtful, 
     }
 }
 
-/* Sums of the window of health; core/health/statistics.py has the equations.
- *
- * d = f[n] - f[n-1],   e = d[n] - r d[n-1],   sums of d^2, w e^2, min(w e^2, bound) and f - base. */
+/* Adds the rows of a block to the sums of the present window of health: with the first difference
+ * d[n] = f[n] - f[n-1] and the second difference e[n] = d[n] - r d[n-1] of a frequency f, the sums of
+ * d^2, w e^2, min(w e^2, bound) and f - base. core/health/statistics.py derives them. */
 INLINE void add_to_window(const cube_scan_call *call, block *b) {
     const int64_t n = call->length[P], n_lanes = b->n_rows * n, cube = b->cube;
-    float *ratio = b->rest, *weight = b->highest; /* not used any more */
+    float *ratio = b->rest, *weight = b->highest; /* `rest` and `highest` are no longer needed */
     for (int64_t i = 0; i < b->n_rows; i++) {
         cube_state *state = state_of(call, cube + i);
         const int64_t row = b->row + i;
@@ -328,7 +338,7 @@ INLINE void add_to_window(const cube_scan_call *call, block *b) {
     }
 }
 
-/* Processes the rows of a block, or those before the first whose table is missing. */
+/* Processes the rows of a block, up to the first one whose table is missing. */
 INLINE int64_t process_block(const cube_scan_call *call, block *b) {
     const int64_t n = call->length[P];
     const float *rest = call->rest + b->cube * n, *highest = call->highest + b->cube * n;

@@ -30,7 +30,8 @@
 #define CUBE_SCAN_COMPONENTS 15
 #define CUBE_SCAN_STRESS 6
 
-/* Requests of `cube_scan`; any other is the key of a missing table (see `keys`). */
+/* Requests of `cube_scan` to its caller. Any other value is the key of a missing table, which the
+ * caller must add (see `keys`). */
 #define CUBE_SCAN_DONE (-1)
 #define CUBE_SCAN_WINDOW (-2)       /* the next scan lies outside the window of health */
 #define CUBE_SCAN_CONDITION (-3)    /* a pad of this row has a condition that is not found yet */
@@ -39,7 +40,7 @@
 
 /* State of the health of one cube: CUBE_STATE in core/kernel/contract.py. */
 typedef struct {
-    int64_t time_ns, interval_ns;    /* newest stamp, and the time between the newest two */
+    int64_t time_ns, interval_ns;    /* newest time stamp, and its distance from the one before */
     int64_t gap_before, gap_within;  /* of the window, in ns */
     int64_t rows, over_limit;        /* of the window */
     uint32_t mask, found;            /* pads not used; pads with a condition in this window */
@@ -93,14 +94,15 @@ typedef struct {
     X(uint32_t, left_out, 'u', "N", RESULT)          \
     X(float, row_offset, 'f', "NP", STATE)
 
-/* OPTION and STATE may be absent; STATE and RESULT are written. */
+/* Use of an array: INPUT and OPTION are read, STATE is read and written, RESULT is written. OPTION and
+ * STATE may be absent. */
 enum cube_scan_use { CUBE_SCAN_INPUT, CUBE_SCAN_OPTION, CUBE_SCAN_STATE, CUBE_SCAN_RESULT };
 #define CUBE_SCAN_LETTERS "NCPGDTEKQ"
 
 typedef struct {
 #define CUBE_SCAN_FIELD(type, name, kind, shape, use) type *name;
     CUBE_SCAN_ARRAYS(CUBE_SCAN_FIELD)
-    int64_t length[sizeof CUBE_SCAN_LETTERS]; /* by letter */
+    int64_t length[sizeof CUBE_SCAN_LETTERS]; /* length of each axis, indexed by its letter */
     int64_t n_residuals; /* outputs 15 to 15 + n_residuals - 1 are residuals */
 } cube_scan_call;
 
@@ -114,16 +116,18 @@ typedef struct {
 #define CUBE_SCAN_N_ARRAYS 41
 extern const cube_scan_array cube_scan_arrays[CUBE_SCAN_N_ARRAYS];
 
-/* Makes a call without arrays; the caller sets them and n_residuals. */
+/* Returns a call without arrays. The caller sets the arrays (`cube_scan_set`) and n_residuals. */
 cube_scan_call cube_scan_begin(void);
 
-/* Stores the address and shape of an array. false: lengths contradict those of other arrays. */
+/* Stores the address and shape of an array. Returns false if its lengths contradict those of other
+ * arrays. */
 bool cube_scan_set(
     cube_scan_call *call, size_t number, void *address, const int64_t *shape, size_t n_axes);
 
 /* Processes rows from `start` on. Returns the first row that is not processed, or -1 if the arrays do
  * not fit together; `*request` states what the caller has to do before it calls again from there.
- * The numbers in `calibration`, `pads` and `numbers` are the caller's duty. */
+ * The numbers in `calibration`, `pads` and `numbers` are not checked: the caller must ensure that they
+ * are in range. */
 int64_t cube_scan(const cube_scan_call *call, int64_t start, int64_t *request);
 
 #endif

@@ -6,7 +6,7 @@
 
 #include <math.h>
 
-/* Constants of the same names in device/clock and device/track.py, where they have their reasons. */
+/* device/clock and device/track.py define the same constants and give the reasons for the values. */
 #define MAX_DEVICE_US ((uint64_t)1 << 51)
 #define MIN_STEP_US 4000.0
 #define PERIOD_TOLERANCE 1e-3
@@ -15,7 +15,8 @@
 #define MAX_DELAY_NS 60000000000
 #define MAX_PAUSE_NS 60000000000
 
-/* Follows the sample period, as `find_step` of steps.py. false: the device time deviates. */
+/* Updates the estimate of the sample period, as `find_step` in device/clock/steps.py does. Returns
+ * false if the device time deviates from what this period predicts. */
 static bool follow_period(cube_track_head *track, const cube_sample *sample) {
     uint32_t n_periods = sample->sequence - (uint32_t)track->reference;
     double interval = (double)((int64_t)sample->device_us - track->reference_us);
@@ -29,8 +30,9 @@ static bool follow_period(cube_track_head *track, const cube_sample *sample) {
     return true;
 }
 
-/* Adds the point (device time, arrival) to the clock line, as `ClockLine.add`. false: it lies below
- * the line, or ends the second whose earliest point is sought. */
+/* Adds a point (device time, arrival time) to the line that converts device time to host time, as
+ * `ClockLine.add` does. Returns false if the line must change: the point lies below it, or is the
+ * first after a second of points, of which the earliest is then added. */
 static bool follow_line(
     cube_track_head *track, int64_t device_ns, int64_t arrival_ns, bool is_late) {
     double delay = (double)(arrival_ns - device_ns);
@@ -47,10 +49,11 @@ static bool follow_line(
     return true;
 }
 
-/* Host time of a device time, as `HubClock._convert`. false: it is not credible or goes back. */
+/* Converts a device time to host time, as `HubClock._convert` does. Returns false if the result is not
+ * credible or precedes the last time stamp. */
 static bool stamp(cube_track_head *track, int64_t device_ns, int64_t arrival_ns, int64_t *stamp_ns) {
     double correction = track->bounded_offset + track->drift * (double)device_ns;
-    *stamp_ns = track->first_ns + device_ns + llrint(correction); /* to even, as Python's round */
+    *stamp_ns = track->first_ns + device_ns + llrint(correction); /* rounds halves to even, as Python does */
     int64_t delay_ns = arrival_ns - *stamp_ns;
     if (delay_ns < 0 || delay_ns > MAX_DELAY_NS || *stamp_ns < track->last_stamp_ns)
         return false;

@@ -1,7 +1,7 @@
 // Copyright 2026 cube_tensor_driver authors
 // SPDX-License-Identifier: Apache-2.0
 
-/* Numbers and clock of the samples of one link: what the usual sample changes.
+/* Counts and time stamps the samples of one link, as long as they are usual (defined below).
  *
  * The structure is cube_tensor_driver/device/track.py's `LinkTrack`, whose memory the interpreter
  * and this code share. The equations are those of device/scans/sequence.py and device/clock/, which
@@ -31,15 +31,18 @@ typedef struct {
 
 typedef struct {
     cube_track_head head;
-    int64_t seen[CUBE_TRACK_SEEN][2]; /* number, device time in us; number % 64 is the place */
+    int64_t seen[CUBE_TRACK_SEEN][2]; /* sequence number n and device time in us, at index n % 64 */
 } cube_track;
 
-/* Takes the samples of one read. false: one of them is not usual, and nothing was changed.
+/* Counts and time stamps the samples of one read. Returns false if one of them is not usual; nothing
+ * is changed then.
  *
- * A sample is usual if it has the next number, all cubes of the hub, a device time as its number
- * lets expect, and a delay that does not change the clock line.
- * samples: count of them, in order. is_late: the host reads late.
- * stamps_ns: host time at which each sample was taken. */
+ * A sample is usual if it has the next sequence number, all cubes of the hub, a device time that its
+ * number predicts, and a delay that does not change the line from device time to host time.
+ *
+ * samples: `count` samples, in their order.
+ * is_late: whether the host reads late, so that arrival_ns is no measure of the delay.
+ * stamps_ns: written; the host time at which each sample was measured. */
 bool cube_follow(
     cube_track *track, const cube_sample *samples, size_t count, int64_t arrival_ns, bool is_late,
     int64_t *stamps_ns);

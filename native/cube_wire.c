@@ -20,7 +20,7 @@ static uint64_t load_u64(const uint8_t *at) {
     return (uint64_t)load_u32(at) | (uint64_t)load_u32(at + 4) << 32;
 }
 
-/* Each function returns the place of the next number. */
+/* Each function writes a number and returns the address after it. */
 
 static uint8_t *store_u8(uint8_t *at, uint8_t value) {
     *at = value;
@@ -41,8 +41,9 @@ static uint8_t *store_u64(uint8_t *at, uint64_t value) {
 
 /* --------------------------------------------------------------------------------- CRC-32 ---- */
 
-/* Row k has the CRC of each byte with k zero bytes behind it. A CRC is linear: that of a byte is
- * the exclusive or of those of its bits, so eight constants make 256 entries. */
+/* Row k holds, for each value of a byte, the CRC of this byte and k zero bytes after it. A CRC is
+ * linear: the CRC of a byte is the exclusive or of the CRCs of its bits, so eight constants determine
+ * the 256 entries of a row. */
 #define ENTRIES(a, b, c, d, e, f, g, h) E8(0u, a, b, c, d, e, f, g, h)
 #define E1(v, a) (v), ((v) ^ (a))
 #define E2(v, a, b) E1(v, a), E1((v) ^ (b), a)
@@ -96,7 +97,7 @@ static const uint32_t crc_table[][256] = {
 #define CRC_RESIDUE 0x2144DF1Cu
 
 #ifndef CUBE_WIRE_SMALL
-/* What four bytes contribute that have `behind` further bytes behind them. */
+/* Returns the contribution of four bytes to the CRC of data in which `behind` bytes follow them. */
 static uint32_t crc_of_four(uint32_t bytes, int behind) {
     return crc_table[behind + 3][bytes & 0xFF] ^ crc_table[behind + 2][bytes >> 8 & 0xFF] ^
            crc_table[behind + 1][bytes >> 16 & 0xFF] ^ crc_table[behind][bytes >> 24];
@@ -120,7 +121,7 @@ uint32_t cube_crc32(uint32_t crc, const uint8_t *data, size_t size) {
 /* ----------------------------------------------------------------------------------- COBS ---- */
 
 size_t cube_cobs_encode(const uint8_t *data, size_t size, uint8_t *out) {
-    size_t code = 0; /* where the code of the present block goes */
+    size_t code = 0; /* index at which the code byte of the present block is written */
     size_t at = 1;
     for (size_t i = 0; i < size; i++) {
         if (at - code == 255) { /* the block is full, and more follows */
@@ -143,7 +144,7 @@ size_t cube_cobs_decode(const uint8_t *code, size_t size, uint8_t *out) {
     const uint8_t *end = code + size;
     uint8_t *to = out;
     while (code < end) {
-        if (*code == 1) { /* zeros in a row are common, and quicker so */
+        if (*code == 1) { /* successive zeros are common, and this branch is faster for them */
             code++;
             *to = 0;
             to += code < end;
@@ -154,8 +155,8 @@ size_t cube_cobs_decode(const uint8_t *code, size_t size, uint8_t *out) {
         if (length > left)
             return CUBE_NOT_COBS;
         size_t i = 0;
-        /* By words, which is quick for short blocks. The last one may have bytes of the next block,
-         * which are written again. */
+        /* Short blocks are copied faster in words of 8 bytes. The last word may contain bytes of the
+         * next block, which are overwritten when that block is decoded. */
         for (; i < length && i + 8 <= left; i += 8) {
             uint64_t word;
             memcpy(&word, code + i, 8);
@@ -191,7 +192,8 @@ void cube_decoder_reset(cube_decoder *decoder) {
     decoder->discarding = false;
 }
 
-/* Reads the fields of a frame with a right checksum. false: its length does not fit them. */
+/* Reads the fields of a frame with a correct checksum. Returns false if the length of the frame
+ * contradicts its fields. */
 static bool parse(cube_frame *frame) {
     const uint8_t *at = frame->raw + CUBE_HEADER;
     size_t size = load_u16(frame->raw + 2);
@@ -261,13 +263,16 @@ static bool is_known(uint8_t type) {
     return (type >= CUBE_HELLO && type <= CUBE_TIME) || type == CUBE_REQUEST || type == CUBE_ACK;
 }
 
-/* Returns the place of an unfinished run: CUBE_GAP bytes after the place of its decoded bytes. */
+/* Returns the address of the bytes of an unfinished run. They are kept CUBE_GAP bytes after the address
+ * to which they will be decoded. */
 static uint8_t *kept(cube_decoder *decoder) {
     return decoder->buffer + CUBE_GAP;
 }
 
-/* Decodes a run of CUBE_MIN_RUN to `limit` bytes to a frame, or counts what is wrong with it.
- * run: in the caller's data, or `kept`. */
+/* Decodes a run (bytes between two zeros) of CUBE_MIN_RUN to `limit` bytes to a frame, or counts the
+ * kind of error.
+ *
+ * run: bytes in the caller's data, or those that `kept` returns. */
 static uint8_t check_run(
     cube_decoder *decoder, const uint8_t *run, size_t length, cube_frame *frame) {
     cube_counters *counters = &decoder->counters;
@@ -309,7 +314,7 @@ static void keep(cube_decoder *decoder, const uint8_t *data, size_t size) {
     decoder->length += size;
 }
 
-/* Ends the run whose last bytes these are, because a zero follows. */
+/* Adds the last bytes of a run, after which a zero follows, and decodes the run. */
 static uint8_t close_run(
     cube_decoder *decoder, const uint8_t *data, size_t size, cube_frame *frame) {
     if (decoder->length > 0 || decoder->discarding || size > decoder->limit) {
@@ -328,16 +333,18 @@ static uint8_t close_run(
 #define LOW_BITS 0x7F7F7F7F7F7F7F7Fu
 #define ONES 0x0101010101010101u
 
-/* Skips runs that end within the next 8 bytes, so shorter than any frame; returns how many bytes
- * it took, 0 if there is no zero among them.
+/* Skips runs that end within the next 8 bytes and are therefore shorter than any frame. Returns the
+ * number of skipped bytes, which is 0 if there is no zero among the 8 bytes.
  *
- * data: 8 bytes that begin a run. Noise may have a zero at every other byte: it would take longer
- * than good frames if each zero were looked for. */
+ * Noise may contain a zero at every other byte. A search for each zero would make it slower to decode
+ * than good frames.
+ *
+ * data: 8 bytes at the begin of a run. */
 static size_t skip_short_runs(cube_decoder *decoder, const uint8_t *data) {
     uint64_t word = load_u64(data);
-    /* The high bit of each byte that is zero. */
+    /* The high bit is set in each byte that is zero in `word`, and all other bits are 0. */
     uint64_t zeros = ~(((word & LOW_BITS) + LOW_BITS) | word | LOW_BITS);
-    /* A run ends at a zero that has no zero before it; before the first byte there is one. */
+    /* A run ends at a zero whose preceding byte is not zero. The byte before `data` is a zero. */
     uint64_t ends = (zeros & ~(zeros << 8 | 0x80)) >> 7;
     decoder->counters.length += ends * ONES >> 56;
     size_t taken = zeros != 0;
@@ -408,14 +415,15 @@ int16_t cube_temperature(const cube_frame *sample, size_t cube) {
 
 /* ------------------------------------------------------------------------------- building ---- */
 
-/* Where the bytes of a frame before COBS lie in `out`: so far back that the code, which is written
- * from the second byte on, never overtakes them. */
+/* Returns the offset in `out` of the bytes of a frame before their COBS encoding. The encoding is
+ * written into `out` from the second byte on, and the offset is so large that it never overwrites
+ * bytes that are not encoded yet. */
 static size_t raw_offset(size_t payload) {
     size_t raw = CUBE_HEADER + payload + CUBE_CRC;
     return 1 + CUBE_COBS_SIZE(raw) - raw;
 }
 
-/* Writes the header; returns where the payload goes, NULL if it does not fit. */
+/* Writes the header of a frame. Returns the address for the payload, or NULL if it does not fit. */
 static uint8_t *open_frame(uint8_t *out, size_t capacity, uint8_t type, size_t payload) {
     if (payload > CUBE_MAX_PAYLOAD || capacity < CUBE_WIRE_SIZE(payload))
         return NULL;
@@ -423,8 +431,10 @@ static uint8_t *open_frame(uint8_t *out, size_t capacity, uint8_t type, size_t p
     return store_u16(store_u8(at, CUBE_VERSION), (uint16_t)payload);
 }
 
-/* Adds the CRC, makes COBS of the frame in place, and puts it between two zeros.
- * end: of the payload. Returns the frame's bytes on the wire. */
+/* Adds the CRC, encodes the frame with COBS in place, and puts it between two zeros. Returns the number
+ * of bytes on the wire.
+ *
+ * end: address after the payload. */
 static size_t close_frame(uint8_t *out, uint8_t *end, size_t payload) {
     uint8_t *raw = out + raw_offset(payload);
     store_u32(end, cube_crc32(0, raw, CUBE_HEADER + payload));
