@@ -23,8 +23,8 @@ import numpy as np
 from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.core.modes import PLANE
-from cube_tensor_driver.mechanics.kernels import PRIOR_LENGTHS, SHEAR_RATIO
 from cube_tensor_driver.mechanics.layer import Layer
+from cube_tensor_driver.mechanics.traction_prior import PRIOR_LENGTHS, SHEAR_RATIO
 from cube_tensor_driver.touch.posterior import MODEL_ERROR
 
 from ..fem.body import Body

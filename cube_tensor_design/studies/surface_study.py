@@ -28,9 +28,10 @@ from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.layout import Layout
 from cube_tensor_driver.core.modes import PLANE
 from cube_tensor_driver.core.symmetry import largest_symmetry
+from cube_tensor_driver.mechanics.contact_response import ContactResponse
 from cube_tensor_driver.mechanics.influence import Influence
-from cube_tensor_driver.mechanics.kernels import Kernels
 from cube_tensor_driver.mechanics.layer import FIELD, Layer
+from cube_tensor_driver.mechanics.measurement_model import CubeMeasurement
 
 from ..fem.body import Body
 from ..fem.fem import Progress, compute_response, count_steps
@@ -204,9 +205,9 @@ def _true_stress_in_space(
 ) -> dict[str, Array]:
     """Return, by component, the stress (3,) at the cube's centre under a ball's unit force."""
     layer = Layer(body.height, body.poisson)
-    kernels = Kernels(layer, body.depth_of_cube, body.side / 2)
+    cubes = CubeMeasurement(layer, body.depth_of_cube, body.side / 2)
     from_load = np.array([[-offset, 0.0]])
-    field = kernels.field(from_load, width / 2)[0]
+    field = ContactResponse(cubes).field(from_load, width / 2)[0]
     return {name: field[FIELD.index(name)] for name in COMPONENTS}
 
 

@@ -34,9 +34,10 @@ from cube_tensor_driver.core.poses import CubePoses
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.core.tensor import rotate_gradient, rotate_stress, rotation_from_rpy
 from cube_tensor_driver.mechanics import contact
+from cube_tensor_driver.mechanics.contact_response import ContactResponse
 from cube_tensor_driver.mechanics.influence import Influence
-from cube_tensor_driver.mechanics.kernels import Kernels
 from cube_tensor_driver.mechanics.layer import Layer
+from cube_tensor_driver.mechanics.measurement_model import CubeMeasurement
 from cube_tensor_driver.touch.inverse import SurfaceInverse
 from cube_tensor_driver.touch.pad_measurement import model_pads
 from cube_tensor_driver.touch.pad_noise import noise_of_all_pads
@@ -185,10 +186,11 @@ class TractionBench:
         from_centre = points.max(axis=1)
         self.window = from_centre < WINDOW / 2
 
-        self._true_layer: Kernels | None = None
+        self._true_layer: ContactResponse | None = None
         if np.isfinite(setting.thickness):
             layer = Layer(setting.thickness, setting.poisson)
-            self._true_layer = Kernels(layer, setting.depth, 1.0)
+            cubes = CubeMeasurement(layer, setting.depth, 1.0)
+            self._true_layer = ContactResponse(cubes)
 
     def truth(
         self,

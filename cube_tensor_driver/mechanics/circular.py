@@ -36,7 +36,7 @@ def _define_components() -> tuple[Complex, Orders]:
     Returns:
         Matrix (14, 24) of the components as combinations of `FIELD`, and their orders (14,).
     """
-    # Unit vector (24,) of each quantity, by its name in `FIELD`
+    # `unit` maps the name of each of the 24 quantities `FIELD` to its unit vector (24,).
     unit = dict(zip(FIELD, np.eye(len(FIELD)), strict=True))
 
     def combine_stresses(suffix: str) -> list[tuple[int, Complex]]:
@@ -64,7 +64,8 @@ def _define_components() -> tuple[Complex, Orders]:
     by_y = combine_stresses("_y")
     for (order, along_x), (_, along_y) in zip(by_x, by_y, strict=True):
         components.append((order + 1, along_x + 1j * along_y))
-        # At order 0, the second combination would be the complex conjugate of the first one.
+        # If the order is 0, the component is real. Its two combinations are then complex conjugates
+        # of each other, and one of them is enough.
         if order > 0:
             components.append((order - 1, along_x - 1j * along_y))
 
@@ -107,11 +108,11 @@ def rotate_loads(
     angle: Array,
     order: Orders,
 ) -> Array:
-    """Return circular components in rotated frames under unit loads along x, y and z.
+    """Compute circular components at N cubes, each in its own frame, under unit loads.
 
     Args:
-        parts: Functions R, Z and T (N, 3, n) of the file head at the distances of N cubes from
-            their load.
+        parts: Radial functions R, Z and T (N, 3, n) at the distances of N cubes from their load:
+            factors of the radial, normal and tangential force (head of this file).
         direction: Directions (N,) from the load to the cube, from the x axis on, in rad.
         angle: The same directions (N,) in the frame of the cube, in rad.
         order: Orders m (n,) of the circular components.
@@ -123,7 +124,8 @@ def rotate_loads(
     normal = parts[:, 1]
     across = 1j * parts[:, 2]
 
-    # A force along x has the components F_r = cos(phi) and F_t = -sin(phi).
+    # A unit force along x has the radial component F_r = cos(phi) and the tangential component
+    # F_t = -sin(phi), where phi is the direction from the load to the cube.
     cosine = np.cos(direction)[:, None]
     sine = np.sin(direction)[:, None]
     along_x = cosine * radial - sine * across

@@ -37,7 +37,7 @@ from scipy.interpolate import CubicSpline
 from ..core.arrays import Array, Complex, Index, Single
 from .cache import Arrays, load_or_compute
 from .circular import ORDERS, sum_rotated
-from .kernels import POINTS_PER_DEPTH, REACH_DEPTHS
+from .distance_table import POINTS_PER_DEPTH, REACH_DEPTHS
 from .layer import Layer
 from .load_response import disc_spectrum
 from .spectra import layer_spectra, tabulate_bessel
@@ -79,7 +79,7 @@ _GRID_COLUMNS = 2 * _CENTRE_COLUMN + 1
 """Number of columns of the polygon tables, one for each value of t, the length along the line
 through a polygon's edge. t is negative on one side of the point that is nearest to the cube."""
 
-_ORIGIN_TOLERANCE = 1e-12
+_MIN_EDGE_LENGTH = 1e-12
 """Length of a polygon's edge, divided by the depth of the cubes' centres below the surface, below
 which the edge counts as a point and has no effect. The limit avoids a division by 0."""
 
@@ -197,7 +197,9 @@ class DiscTables(_ContactTables):
             offset / np.where(is_centred, 1.0, distance),
         )
 
-        polar_force = _to_complex(forces) * direction.conj()  # F_r + i F_t
+        # The real part is the force along the direction from contact to cube, the imaginary part
+        # the force across it.
+        polar_force = _to_complex(forces) * direction.conj()
         loads = np.stack(
             [
                 polar_force.real,
@@ -207,7 +209,7 @@ class DiscTables(_ContactTables):
             axis=-1,
         )
 
-        # Linear interpolation between the two nearest tabulated distances
+        # The table is interpolated linearly between the two nearest distances.
         index = distance / self.depth * POINTS_PER_DEPTH
         is_near = index < _LAST_DISTANCE
         below = np.minimum(index, _LAST_DISTANCE - 1).astype(np.intp)
@@ -255,18 +257,21 @@ class PolygonTables(_ContactTables):
         """Tabulate the circular components of right triangles.
 
         Returns:
-            Functions A, B, Z and W of the file head (rows of d, columns of t, 4, 14).
+            Functions A, B, Z and W (rows, columns, 4, 14) of the triangle's legs d (rows) and t
+            (columns), which the head of this file defines.
         """
         over_distance = self._integrate_distance()
 
-        # Grid of d (rows) and t (columns), divided by the depth.
+        # The rows of the grid are for the leg d of the triangle, the columns for the leg t, both
+        # divided by the depth; r is the length of the hypotenuse.
         eta = np.arange(-_CENTRE_COLUMN, _CENTRE_COLUMN + 1) * GRID_STEP
         d = np.sinh(np.arange(_GRID_ROWS) * GRID_STEP)[:, None]
         t = np.hypot(1.0, d) * np.sinh(eta)
         r = np.hypot(d, t)
         is_origin = r == 0
         r_safe = np.where(is_origin, 1.0, r)
-        direction = np.where(is_origin, 1.0, (d + 1j * t) / r_safe)  # exp(i alpha)
+        # The angle alpha between leg d and hypotenuse is represented as exp(i alpha).
+        direction = np.where(is_origin, 1.0, (d + 1j * t) / r_safe)
 
         # The integral over the angle alpha = atan(t / d) is computed as an integral over the grid
         # variable eta, with t = sqrt(1 + d^2) sinh(eta).
@@ -295,10 +300,11 @@ class PolygonTables(_ContactTables):
         return {"table": (table * sign * unit).astype(np.complex64)}
 
     def _integrate_distance(self) -> CubicSpline:
-        """Return the inner integrals over r in the functions A, B, Z and W of the file head.
+        """Integrate the response to a point force over the distance r (for A, B, Z and W).
 
         Returns:
-            Spline of the integrals (..., 4, 14) from 0 to r, over r divided by the depth.
+            Spline over r (divided by the depth) of the integrals (..., 4, 14) from 0 to r: the
+            inner integrals of A, B, Z and W at the head of this file.
         """
         spectra = layer_spectra(self.layer, self.depth)
         r = np.arange(_LAST_DISTANCE + 2) / POINTS_PER_DEPTH
@@ -340,16 +346,19 @@ class PolygonTables(_ContactTables):
         """
         first = _to_complex(np.asarray(start, float)) / self.depth
         second = _to_complex(np.asarray(end, float)) / self.depth
-        # Unit vector along the edge, as a complex number
+        # `edge` is the unit vector along the edge as a complex number x + i y.
         edge = second - first
-        edge /= np.maximum(np.abs(edge), _ORIGIN_TOLERANCE)
+        edge /= np.maximum(np.abs(edge), _MIN_EDGE_LENGTH)
 
-        # In axes along and across the edge, both ends of the edge have the coordinates t - i d.
+        # The ends are rotated into axes along and across the edge. There, the real parts are their
+        # positions t along the edge, and the imaginary part of both is -d, with the signed distance
+        # d of the edge's line from the origin.
         ends = np.stack([first, second], axis=-1)
         local = ends * edge.conj()[..., None]
         signed_distance = -local[..., 0].imag
         side = np.where(signed_distance < 0, -1.0, 1.0)
-        direction = -1j * edge * side  # exp(i beta)
+        # `direction` is the unit vector exp(i beta) from the origin towards the line of the edge.
+        direction = -1j * edge * side
         d = np.abs(signed_distance)
         t = local.real * side[..., None]
 
@@ -380,15 +389,16 @@ def _to_complex(vectors: Array) -> Complex:
 
 
 def _triangle_neighbours(d: Array, t: Array) -> tuple[Single, Index]:
-    """Return the weights and table rows (..., 8) of the triangle between a cube and an edge.
+    """Return weights and rows with which a polygon's edge is looked up in the tables.
 
     Args:
         d: Distance (...) of the edge's line, divided by the depth.
         t: Start and end (..., 2) of the edge along this line, divided by the depth.
 
     Returns:
-        Weights of bilinear interpolation and rows in the table: four grid points for the start of
-        the edge, whose weights are negative, then four for its end.
+        Weights (..., 8) of bilinear interpolation, and the rows (..., 8) of the table to which they
+        belong. The first four are for the triangle up to the start of the edge, which is subtracted
+        and so has negative weights, the others for the triangle up to its end.
     """
     ratio = t / np.hypot(1.0, d)[..., None]
     column = np.arcsinh(ratio) / GRID_STEP + _CENTRE_COLUMN

@@ -107,7 +107,8 @@ class Layer:
         kx = np.asarray(kx, float)
         ky = np.asarray(ky, float)
         kx, ky = np.broadcast_arrays(kx, ky)
-        # Axis along the wave vector: L = (cosine, sine, 0). Any direction will do where k is 0.
+        # L = (cosine, sine, 0) is the unit vector along the wave vector (kx, ky). Where k is 0, its
+        # direction is arbitrary, because `_uniform` replaces the result there.
         k = np.hypot(kx, ky)
         is_zero = k == 0
         k_safe = np.where(is_zero, 1.0, k)
@@ -123,7 +124,7 @@ class Layer:
         stress[is_zero] = self._uniform()
         slope[is_zero] = 0.0
 
-        # d/dx exp(i k.x) = i kx exp(i k.x)
+        # All stresses vary as exp(i k.x), so that a derivative along x is a product with i kx.
         by_x = 1j * kx[..., None, None] * stress
         by_y = 1j * ky[..., None, None] * stress
         gradient = np.stack([by_x, by_y, slope], axis=-2)
@@ -139,15 +140,17 @@ class Layer:
             k: Wavenumbers (...) in 1/m, greater than 0.
             depth: Distance below the surface in m.
         """
-        # The first axis of `psi` is for the function psi and its first three derivatives by zeta.
-        # The last axis is for two boundary conditions: psi(0) = 1 (other one 0), psi'(0) = 1.
+        # The first axis of `psi` is for the function psi and its first three derivatives by
+        # zeta = k z. The last axis is for the boundary conditions at the surface: psi = 1 and
+        # psi' = 0 (normal traction), then psi = 0 and psi' = 1 (shear traction).
         psi = self._airy(k, -k * depth)
         by_load = {"L": 1j * psi[..., 1], "z": -psi[..., 0]}
 
         nu = self.poisson
         waves: _WaveStress = {}
         for load, p in by_load.items():
-            # Each pair is a stress and its derivative by zeta, from the formulas of the file head.
+            # Each pair is a stress component, from the formulas at the head of this file, and its
+            # derivative by zeta = k z.
             parts = {
                 "zz": (-p[0], -p[1]),
                 "Lz": (-1j * p[1], -1j * p[2]),
@@ -159,9 +162,10 @@ class Layer:
         return waves
 
     def _airy(self, k: Array, zeta: Array) -> Array:
-        """Return the function psi of the file head and its first three derivatives by zeta.
+        """Return the amplitude psi of the Airy function of a wave, and its first three derivatives.
 
-        The Airy function psi / k^2 gives the stress of a wave; psi = -sigma_zz.
+        The Airy function of the plane strain is psi / k^2, so that psi = -sigma_zz. The derivatives
+        are by zeta = k z.
 
         Args:
             k: Wavenumbers (...) in 1/m.
@@ -176,7 +180,7 @@ class Layer:
         h = k * self.thickness
 
         def differentiate(n: int, zeta: Array) -> Array:
-            """Return the factors (..., 4) of the constants A to D in the n-th derivative of psi."""
+            """Return the n-th derivatives (..., 4) of the four solutions of which psi is a sum."""
             eta = zeta + h
             rise = np.exp(zeta)
             fall = (-1) ** n * np.exp(-eta)
@@ -190,7 +194,8 @@ class Layer:
                 axis=-1,
             )
 
-        # Four boundary conditions: psi and psi' at the surface, u_L and u_z at the bottom.
+        # The four constants follow from four boundary conditions: psi and psi' at the surface, and
+        # the displacements u_L and u_z, which are 0 at the bottom.
         nu = self.poisson
         psi, psi1, psi2, psi3 = (differentiate(n, -h) for n in range(4))
         conditions = [
@@ -210,11 +215,11 @@ class Layer:
     def _airy_half_space(zeta: Array) -> Array:
         """Return psi and its derivatives as `_airy`, for a layer of infinite thickness.
 
-        The terms of psi that grow with the depth, those with the constants C and D, are then 0.
+        Of the four solutions of which psi is a sum, the two that grow with the depth are 0 then.
         """
         decay = np.exp(zeta)[..., None]
         a = np.array([1.0, 0.0])
-        b = np.array([-1.0, 1.0])  # psi'(0) = A + B
+        b = np.array([-1.0, 1.0])  # because psi'(0) = a + b
         depth_factor = zeta[..., None]
         derivatives = [(a + (n + depth_factor) * b) * decay for n in range(4)]
         return np.stack(derivatives)
@@ -245,8 +250,9 @@ class Layer:
 
     def _uniform(self) -> Array:
         """Return the stress (6, 3) in Pa under a uniform traction of 1 Pa along x, y and z."""
-        # Ratio of lateral to normal stress: in a half space, the mean over all directions of k; in
-        # a layer, the value without lateral strain.
+        # `lateral` is the ratio of lateral to normal stress. In a half space, it depends on the
+        # direction of the wave vector k, and the mean over all directions is taken. In a layer
+        # under a uniform traction, there is no lateral strain, which determines the ratio.
         lateral = (1 + 2 * self.poisson) / 2
         if np.isfinite(self.thickness):
             lateral = self.poisson / (1 - self.poisson)
@@ -277,7 +283,8 @@ def _add_rotated(
         value: Amplitude (...) of the component in Pa.
     """
     c, s = cosine, sine
-    # Contribution of a stress component in the wave's axes to the rows xx, yy, zz, yz, zx, xy.
+    # `stress_rows` has the factors with which a stress component in the wave's axes contributes to
+    # the stresses xx, yy, zz, yz, zx and xy (indices 0 to 5).
     stress_rows: dict[str, dict[int, Any]] = {
         "LL": {0: c * c, 1: s * s, 5: c * s},
         "TT": {0: s * s, 1: c * c, 5: -c * s},
@@ -290,7 +297,8 @@ def _add_rotated(
         "Lz": {4: c, 3: s},
         "Tz": {4: -s, 3: c},
     }
-    # Components in the wave's axes of a unit traction along x, y and z (columns).
+    # `load_columns` has the components along L, T and z of unit tractions along x, y and z (indices
+    # 0 to 2).
     load_columns: dict[str, dict[int, Any]] = {
         "L": {0: c, 1: s},
         "T": {0: -s, 1: c},

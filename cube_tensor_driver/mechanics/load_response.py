@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Response of cubes to one small load on the surface of a layer, with numpy alone.
 
-`Kernels` tabulates the same responses for loads of all sizes, but it needs scipy, which the
+`ContactResponse` tabulates the same responses for loads of all sizes, but it needs scipy, which the
 reconstruction node does not load. Here the wave vectors k are a square grid of finite spacing, so
 that the load repeats `PERIOD_DEPTHS` away. The response at the distance r along x is the sum
 
@@ -21,12 +21,13 @@ from .circular import CIRCULAR_FROM_FIELD, FIELD_FROM_CIRCULAR, ORDERS, rotate_l
 from .layer import FIELD, Layer
 
 PERIOD_DEPTHS = 64
-"""Distance at which the load repeats, divided by the depth of the cubes' centres. At half of it,
-the stress has fallen below a thousandth of that below the load."""
+"""Period of the load along x and along y, divided by the depth of the cubes' centres. The load is
+periodic because its wavenumbers are equally spaced. At a distance of half a period, the stress is
+less than a thousandth of that below the load, so that the repetitions hardly matter."""
 
 MAX_WAVENUMBER = 14.0
-"""Largest wavenumber of the sum over waves, times the depth of the cubes' centres. There, the
-stress has fallen to 1e-5 of that on the surface."""
+"""Largest wavenumber in the Fourier sum of the load, multiplied by the depth of the cubes' centres.
+The stress that a wave with this wavenumber causes at this depth is 1e-5 of that on the surface."""
 
 POINTS_PER_DEPTH = 32
 """Number of tabulated distances per length of one depth of the cubes' centres. The error of the
@@ -36,7 +37,7 @@ _OBSERVED = [FIELD.index(name) for name in COMPONENTS]
 
 
 class LoadResponse:
-    """Components that cubes at one depth measure under a small load with a force of 1 N."""
+    """Table of the components that cubes at one depth measure under a Hertz contact with 1 N."""
 
     def __init__(
         self,
@@ -44,12 +45,12 @@ class LoadResponse:
         depth: float,
         width: float,
     ) -> None:
-        """Tabulate the response over the distance, which takes about a half a second.
+        """Tabulate the response over the distance, which takes about half a second.
 
         Args:
             layer: Elastic layer that contains the cubes.
             depth: Distance from the centres of the cubes to the surface, in m.
-            width: Diameter in m of the contact (Hertz) of a ball.
+            width: Diameter in m of the contact of a ball (Hertz contact).
 
         Raises:
             ElasticError: The layer does not contain this depth.
@@ -62,8 +63,9 @@ class LoadResponse:
         n_points = PERIOD_DEPTHS // 2 * POINTS_PER_DEPTH
         distance = self._step * np.arange(n_points)
 
-        # The waves of -k_x are the complex conjugates of those of k_x, so half of them suffice. One
-        # k_x at a time saves memory.
+        # The term of the sum for -k_x is the complex conjugate of the term for k_x. So only those
+        # for k_x >= 0 are computed, and their real parts are counted twice. A loop over k_x takes
+        # much less memory than an array of all terms.
         field = np.zeros((len(distance), len(FIELD), 3))
         cell = (spacing / (2 * np.pi)) ** 2
         for kx in k[count:, None]:
@@ -77,23 +79,24 @@ class LoadResponse:
             field += np.multiply.outer(waves, amplitude).real
 
         circular = CIRCULAR_FROM_FIELD @ field
-        # Towards +x, a force along x is radial, and one along y is across (circular.py).
+        # All distances are along x. So a force along x is the radial force F_r of circular.py, and
+        # a force along y is the tangential force F_t.
         radial = circular[..., 0].real
-        across = circular[..., 1].imag
+        tangential = circular[..., 1].imag
         along_z = circular[..., 2].real
-        parts = [radial, along_z, across]
+        parts = [radial, along_z, tangential]
         self._table = np.stack(parts, axis=1)
 
     def __call__(self, offset: Array, angle: Array) -> Array:
-        """Compute the components that N cubes measure.
+        """Compute the components that N cubes measure, by linear interpolation of the table.
 
         Args:
             offset: Positions (N, 2) of the cubes from the centre of their load, in m.
             angle: Rotations (N,) of the cubes about z, in rad.
 
         Returns:
-            Components (N, 15, 3) in Pa/N and Pa/(m N), for a force along x, y and z; 0 beyond half
-            of the period of the load.
+            Components (N, 15, 3) in Pa/N and Pa/(m N), for a force along x, y and z; 0 at
+            distances of more than half a period, `PERIOD_DEPTHS` / 2 depths.
         """
         x, y = offset.T
         index = np.hypot(x, y) / self._step

@@ -33,19 +33,19 @@ the thickness."""
 
 
 def sensitivities(layer: Layer, depth: float) -> list[Spectra]:
-    """Return how the spectra of `layer_spectra` change by one standard deviation of each quantity.
+    """Return the changes of a layer's spectra by errors of depth, thickness and Poisson's ratio.
 
     Args:
         layer: Elastic layer.
         depth: Distance from the cubes' centres to the surface, in m.
 
     Returns:
-        Differences of the spectra for the depth, Poisson's ratio and, in a layer of finite
-        thickness, the thickness.
+        Changes of the spectra from `layer_spectra` for one standard deviation of the depth, of
+        Poisson's ratio and, in a layer of finite thickness, of the thickness.
     """
     base = layer_spectra(layer, depth)
-    # A smaller depth is always within the layer, and one of the two steps of Poisson's ratio in
-    # its range.
+    # The finite differences are one-sided, and their steps do not leave the allowed ranges: the
+    # depth is reduced, and Poisson's ratio (0 to 0.5) is changed towards 0.25.
     poisson_step = _STEP if layer.poisson < 0.25 else -_STEP
     softer = replace(layer, poisson=layer.poisson + poisson_step)
     other = [

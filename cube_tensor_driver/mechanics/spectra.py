@@ -56,15 +56,15 @@ J(k r) up to distances r from the load of 20 depths (of the cubes' centres below
 
 @dataclass(frozen=True, eq=False)
 class Spectra:
-    """Spectra P, M and N (file head) of n circular components over the wavenumber k.
+    """Responses of n circular components (circular.py) to waves of traction F on the surface.
 
     Attributes:
         k: Wavenumbers (waves,) in 1/m.
         weight: Weights (waves,) of integrals over k dk / 2 pi, in 1/m^2.
         order: Order (n,) m of each component.
-        plus: Spectra P (waves, n): response to F+ = F_x + i F_y.
-        minus: Spectra M (waves, n): response to F- = F_x - i F_y.
-        normal: Spectra N (waves, n): response to F_z.
+        plus: Spectra P (waves, n): factor of F+ = F_x + i F_y.
+        minus: Spectra M (waves, n): factor of F- = F_x - i F_y.
+        normal: Spectra N (waves, n): factor of F_z.
     """
 
     k: Array
@@ -75,14 +75,15 @@ class Spectra:
     normal: Array
 
     def radial(self, bessel: BesselTable, load_spectra: Array) -> Array:
-        """Compute the functions R, Z and T of circular.py for distributed forces on the surface.
+        """Compute the response at given distances from forces distributed over the surface.
 
         Args:
             bessel: Bessel functions at the distances from the load at which to compute them.
             load_spectra: Spectra S (loads, waves) of the distributions of the forces.
 
         Returns:
-            R, Z and T (loads, distances, 3, n), in this order, in units of the component per N.
+            Radial functions R, Z and T of circular.py (loads, distances, 3, n), which multiply the
+            radial, normal and tangential force; in units of the component per N.
         """
         n_distances = len(bessel(0))
         shape = (len(load_spectra), n_distances, len(self.order))
@@ -90,7 +91,8 @@ class Spectra:
         minus = np.zeros(shape)
         normal = np.zeros(shape)
 
-        # Components of one order share their Bessel functions: one product for all of them.
+        # Components of one order have the same Bessel functions, so that one matrix product per
+        # order computes all of them.
         for order in np.unique(self.order):
             chosen = self.order == order
             parts = (
@@ -104,7 +106,7 @@ class Spectra:
                     weighted = spectrum[:, chosen] * load_spectrum[:, None]
                     total[load][:, chosen] = wave @ weighted
 
-        # plus = R + T, minus = R - T
+        # `plus` is the sum R + T of two of the functions, and `minus` is their difference R - T.
         return np.stack(
             [
                 (plus + minus) / 2,
@@ -141,7 +143,8 @@ class Spectra:
         crossed = _outer(self.plus, other.minus) + _outer(self.minus, other.plus)
         half = shear**2 / 2
 
-        # Covariances <c d*> and <c d> of the file head, for the direction phi = 0.
+        # These are the covariances <c d*> and <c d> of two complex components c and d (formulas at
+        # the head of this file), for the direction phi = 0 from one position to the other.
         order_difference = self.order[:, None] - other.order
         order_sum = self.order[:, None] + other.order
         sign = (-1.0) ** other.order
@@ -153,7 +156,8 @@ class Spectra:
             prior,
         )
 
-        # Re c Re d = Re(c d* + c d) / 2 and Im c Im d = Re(c d* - c d) / 2
+        # The covariances of real and imaginary parts follow from those of the complex components:
+        # Re c Re d = Re(c d* + c d) / 2 and Im c Im d = Re(c d* - c d) / 2.
         return (conjugate + direct) / 2, (conjugate - direct) / 2
 
     def _integrate(
@@ -238,8 +242,8 @@ def layer_spectra(layer: Layer, depth: float, waves_of: float | None = None) -> 
     Args:
         layer: Elastic layer.
         depth: Distance from the point to the surface, in m.
-        waves_of: Depth in m whose wavenumbers are used, so that the spectra at two depths can be
-            subtracted; None: those of `depth`.
+        waves_of: Depth in m for which the wavenumbers are chosen (`wavenumber_quadrature`); None:
+            `depth`. Only spectra with the same wavenumbers can be subtracted.
 
     Raises:
         ElasticError: The layer does not contain this depth.
@@ -248,7 +252,8 @@ def layer_spectra(layer: Layer, depth: float, waves_of: float | None = None) -> 
     along_x = layer.transfer(k, np.zeros_like(k), depth)
     circular = np.einsum("cf,kfi->kci", CIRCULAR_FROM_FIELD, along_x)
 
-    # For a wave along x (phi = 0), i^m c = N F_z + (i/2) P (F_x + i F_y) - (i/2) M (F_x - i F_y).
+    # Under a traction F that is a wave along x, a component c of order m is given by
+    # i^m c = N F_z + (i/2) P (F_x + i F_y) - (i/2) M (F_x - i F_y).
     rotated = 1j ** ORDERS[:, None] * circular
     x, y, z = np.moveaxis(rotated, -1, 0)
     plus = x.imag - y.real

@@ -28,8 +28,8 @@ from .tracker.contact_tracker import ContactTracker, TrackedContact
 
 AUTO, INTERPOLATION, INVERSE = CONTACT_METHODS
 """Names of the methods that find contacts: interpolation of the pressure between the cubes, and
-fits of the traction in each contact to the values of the cubes around it. `AUTO` stands for the
-second if the elastomer is known, otherwise for the first."""
+fits of the traction in each contact to the values of the cubes around it (inverse). `AUTO` stands
+for `INVERSE` if the skin file describes the elastomer, otherwise for `INTERPOLATION`."""
 
 
 @dataclass(frozen=True)

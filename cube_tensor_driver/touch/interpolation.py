@@ -30,9 +30,9 @@ NEIGHBOURS = 9
 patch and those nearest to it."""
 
 RIDGE = 1e-6
-"""Variance added to the diagonal of the covariance matrix of the values, whose entries there are
-φ(0) = 1. It keeps the equations solvable if two cubes are close to each other, and is equal to
-noise with a standard deviation of a thousandth of the values'."""
+"""Noise variance of each value, divided by the prior variance of the values. It is added to the
+diagonal of their covariance matrix, so that the matrix stays invertible if two cubes are close to
+each other."""
 
 
 class Interpolation:
@@ -75,7 +75,8 @@ class Interpolation:
             return np.full(n_cubes * n_points, np.nan)
 
         weights = self._solve_weights(known, columns)
-        # Lengths are divided by c, so derivatives are multiplied by it.
+        # Positions are divided by the length c of the radial basis function. So derivatives by the
+        # position are multiplied by c.
         scale = np.full(len(columns), self._length)
         scale[0] = 1.0
         scaled = np.where(known, values, 0)[:, columns] * scale
@@ -139,7 +140,8 @@ class Interpolation:
 
         cubes = self._poses.position[near] / self._length
         points = self._patches[chosen] / self._length
-        # Directions (n, neighbours, 2 or 0, 3) of the derivatives: the cubes' x and y axes.
+        # `axes` (n, neighbours, 2 or 0, 3) are the directions of the derivatives that are used: the
+        # x and y axes of the cubes, or none.
         columns = self._poses.rotation[:, :, : width - 1]
         axes = np.swapaxes(columns, 1, 2)[near]
 
@@ -257,7 +259,7 @@ def _covariance(
         Covariances (..., 1 + A, 1 + B). Rows: value and A derivatives at the first position;
         columns: value and B derivatives at the second one. Derivatives are by position / c.
     """
-    # φ = b^(-5/2) and its first two derivatives by b
+    # The covariance φ = b^(-5/2) depends on b = 1 + |d|². Its derivatives by b follow below.
     b = 1 + np.einsum("...i,...i->...", d, d)
     phi = b**-2.5
     phi1 = -2.5 * b**-3.5

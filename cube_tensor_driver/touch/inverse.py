@@ -20,9 +20,11 @@ from ..core.defaults import SURFACE_DEPTH
 from ..core.errors import ElasticError
 from ..core.modes import STRESS
 from ..core.poses import CubePoses
+from ..mechanics.contact_response import ContactResponse
 from ..mechanics.influence import Influence
-from ..mechanics.kernels import Kernels, MeasurementModel
 from ..mechanics.layer import Layer
+from ..mechanics.measurement_model import CubeMeasurement, MeasurementModel
+from ..mechanics.traction_prior import TractionPrior
 from .pad_measurement import model_pads
 from .pad_noise import GAIN_ERROR, noise_of_all_pads, pad_stresses
 from .posterior import ObservationModel, WindowPosteriors
@@ -73,7 +75,8 @@ class SurfaceInverse:
         cube: Index (M,) of the cube on whose patch a point lies.
         spacing: Distance of neighbouring points, in m.
         area: Area of the square that each point represents in integrals, in m^2.
-        kernels: Covariances between components and traction in the elastic layer.
+        layer: Elastic layer that contains the cubes.
+        contact_response: Components that cubes measure under Hertz contacts.
         columns: Indices (C,) in `COMPONENTS` of the components that some cube observes.
         observed: Whether each cube observes each of these components (cubes, C) if it uses all of
             its pads.
@@ -178,7 +181,9 @@ class SurfaceInverse:
         self.depth = depth
         self.pitch = poses.pitch
         scale = float(np.median(poses.half_side))
-        self.kernels = Kernels(layer, depth, scale, model)
+        self.layer = layer
+        self._cubes = CubeMeasurement(layer, depth, scale, model)
+        self.contact_response = ContactResponse(self._cubes)
 
         self.spacing = self.pitch / side
         self.area = self.spacing**2
@@ -197,8 +202,8 @@ class SurfaceInverse:
         self.by_pad = by_pad[:, self.columns] * self._unit_factors[:, None]
         self._all_pads = self.by_pad.copy()
 
-        # `_whole_variant` are the variants of the measurement model with all pads. A cube gets
-        # another variant when some of its pads are left out.
+        # `_whole_variant` is the variant of each cube in the measurement model while it uses all of
+        # its pads. A cube gets another variant when some of its pads are left out.
         self._whole_variant = np.zeros(n, np.intp) if model is None else model.variant
         self._variant_pads = None if model is None else model.pads
         self.variant = self._whole_variant.copy()
@@ -208,7 +213,7 @@ class SurfaceInverse:
             self.columns, self.observed, self._all_pads, self._whole_variant
         )
         self._windows = WindowPosteriors(
-            self.kernels,
+            TractionPrior(self._cubes),
             poses,
             observation,
             self.spacing,
@@ -270,7 +275,7 @@ class SurfaceInverse:
         for cube, own in zip(cubes.tolist(), by_pad, strict=True):
             pads = self._variant_pads[self._whole_variant[cube]]
             components = pads @ np.nan_to_num(own).T
-            self.variant[cube] = self.kernels.add_variant(components)
+            self.variant[cube] = self._cubes.add_variant(components)
             self._has_other_pads[cube] = not np.array_equal(
                 self.by_pad[cube], self._all_pads[cube], equal_nan=True
             )

@@ -35,7 +35,7 @@ from ..core.calibration import Calibration
 from ..core.errors import ElasticError
 from ..core.pipeline import Pipeline
 from ..mechanics.influence import Influence
-from ..mechanics.kernels import MeasurementModel
+from ..mechanics.measurement_model import MeasurementModel
 from ..mechanics.spectra import BesselTable, Spectra, tabulate_bessel, wavenumber_quadrature
 
 N_DIRECTIONS = 32
@@ -151,8 +151,8 @@ def _decompose(influence: Influence) -> tuple[Spectra, Array]:
     r = (nodes + 1) * half_reach
     weight = weights * half_reach
 
-    # The functions are weighted with sqrt(r dr), so that the singular values are norms over the
-    # whole plane of positions of the force.
+    # The functions of the distance r are weighted with sqrt(r dr). The square of a singular value
+    # is then an integral over the plane in which the force is moved.
     root = np.sqrt(r * weight)
     decompositions = [
         np.linalg.svd(
@@ -179,7 +179,7 @@ def _decompose(influence: Influence) -> tuple[Spectra, Array]:
 
     by_kind = zip(*spectra, strict=True)
     plus, minus, normal = (np.concatenate(parts, axis=1) for parts in by_kind)
-    to_pads = np.concatenate(pads, axis=2).swapaxes(1, 2)  # (real or imaginary, n, P)
+    to_pads = np.concatenate(pads, axis=2).swapaxes(1, 2)  # (2: real and imaginary, n, P)
     to_pads = to_pads.reshape(2 * len(orders), -1)
     return Spectra(
         k,
@@ -200,7 +200,8 @@ def _hankel_transforms(
     """Compute the spectra of n circular components of one order m.
 
     Args:
-        functions: Radial functions R, Z and T (n, 3, distances), see the head of this file.
+        functions: Radial functions R, Z and T (n, 3, distances): response to a radial, normal and
+            tangential force (circular.py).
         order: Order m.
         bessel: Function that returns the Bessel function J_m(k r) (distances, waves) of an order.
         weight: Quadrature weights r dr (distances,) in m^2.
@@ -220,15 +221,16 @@ def _hankel_transforms(
 
 
 def _fourier_series(influence: Influence, r: Array) -> list[Array]:
-    """Compute the Fourier series of the influence functions over the direction.
+    """Compute the Fourier series of the influence functions over the direction from force to cube.
 
     Args:
         influence: Influence functions of P pads.
         r: Distances (distances,) between force and cube, in m.
 
     Returns:
-        For each order m, the functions R, Z and T (2 P, 3, distances): of all pads for the real
-        part of the weight w, then of all pads for its imaginary part.
+        For each order m, the radial functions R, Z and T (2 P, 3, distances) of two circular
+        components c and c' for each of P pads: those of all c, then those of all c'. The stress of
+        a pad is the sum of Re(c) + Im(c') over the orders.
     """
     angle = 2 * np.pi * np.arange(N_DIRECTIONS) / N_DIRECTIONS
     cosine = np.cos(angle)

@@ -93,7 +93,8 @@ def pad_stresses(
     by_pad = np.where(known[:, :, None], by_pad, 0.0)
     transposed = by_pad.swapaxes(1, 2)
 
-    # An unknown component has a row of zeros in B. A 1 on the diagonal keeps B B' invertible.
+    # The rows of unknown components in the noise matrix B are zero. A 1 on the diagonal keeps B B'
+    # invertible.
     unknown = np.eye(known.shape[1]) * ~known[:, None, :]
     right = np.where(known, values, 0.0)[..., None]
     weights = np.linalg.solve(by_pad @ transposed + unknown, right)

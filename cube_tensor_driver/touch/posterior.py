@@ -35,7 +35,7 @@ from scipy.spatial import cKDTree
 from ..core.arrays import AnyArray, Array, Index, Mask, Single
 from ..core.poses import CubePoses
 from ..mechanics.cache import Arrays, load_or_compute
-from ..mechanics.kernels import Kernels
+from ..mechanics.traction_prior import TractionPrior
 from .prior import AMPLITUDE, covariance_matrix
 from .surface import square_points
 from .unrolled_skin import unroll
@@ -116,7 +116,7 @@ class WindowPosteriors:
 
     def __init__(
         self,
-        kernels: Kernels,
+        traction_prior: TractionPrior,
         poses: CubePoses,
         model: ObservationModel,
         spacing: float,
@@ -125,7 +125,7 @@ class WindowPosteriors:
         """Compute the matrices, or load them from the cache on disk.
 
         Args:
-            kernels: Covariances between components and traction in the elastic layer.
+            traction_prior: Prior covariances of traction and measured components.
             poses: Poses of the cubes.
             model: Components that the cubes observe, and their noise.
             spacing: Distance of the points on the patch of a cube, in m.
@@ -142,7 +142,7 @@ class WindowPosteriors:
         kinds, first = np.unique(self.kind, return_index=True)
         example = model.select(self.near[first])
         inputs: list[Any] = [
-            *kernels.inputs,
+            *traction_prior.inputs,
             spacing,
             side,
             place[first],
@@ -162,7 +162,7 @@ class WindowPosteriors:
             # because a list of all of them would double the memory.
             for number, one in enumerate(first):
                 own = model.select(self.near[one])
-                window = _solve_window(kernels, own, place[one], angle[one], points)
+                window = _solve_window(traction_prior, own, place[one], angle[one], points)
                 for name, array in window._asdict().items():
                     if name not in solved:
                         shape = (len(first), *array.shape)
@@ -266,7 +266,9 @@ class WindowPosteriors:
         gathered = y[inner].reshape(n, -1)
         pads = pad_variance[inner].reshape(n, -1)
 
-        excess = np.empty(n)  # y' P y - tr P M
+        # `excess` is y' P y - tr P M: the squared values, weighted with their inverse covariance P,
+        # minus the part that the errors of the pads are expected to cause.
+        excess = np.empty(n)
         for kind, rows in self._rows:
             own = gathered[rows]
             weighted = own @ self.precision[kind]
@@ -308,7 +310,7 @@ class _Window(NamedTuple):
 
 
 def _solve_window(
-    kernels: Kernels,
+    traction_prior: TractionPrior,
     model: ObservationModel,
     place: Array,
     angle: Array,
@@ -319,7 +321,7 @@ def _solve_window(
     Positions and rotations are in the frame of the centre cube, around which the skin is laid flat.
 
     Args:
-        kernels: Covariances between components and traction in the elastic layer.
+        traction_prior: Prior covariances of traction and measured components.
         model: Components that the W cubes of the window observe, and their noise.
         place: Positions (W, 2) of the cubes in m.
         angle: Rotations (W,) of the cubes in rad.
@@ -331,19 +333,20 @@ def _solve_window(
     known = model.known.ravel()
     pads = np.nan_to_num(model.by_pad)
 
-    prior = AMPLITUDE**2 * covariance_matrix(kernels, columns, place, angle, model.variant)
-    total = prior.copy()  # K_yy + N
+    prior = AMPLITUDE**2 * covariance_matrix(traction_prior, columns, place, angle, model.variant)
+    total = prior.copy()  # becomes the covariance K_yy + N of the measured values
     for cube, own in enumerate(pads):
         part = slice(cube * width, (cube + 1) * width)
         total[part, part] += own @ own.T
     total[np.diag_indices(n * width)] += MODEL_ERROR**2 * np.diag(prior)
 
-    # G = K_ty (K_yy + N)^-1 and diag(K_tt - G K_yt)
-    cross = _cross_covariance(kernels, model, place, angle, points)[:, known]
+    # `known_gain` is the gain matrix G = K_ty (K_yy + N)^-1 for the known values, and `variance`
+    # the posterior variance diag(K_tt - G K_yt) of the traction.
+    cross = _cross_covariance(traction_prior, model, place, angle, points)[:, known]
     # Cholesky takes a quarter of the time of numpy's general solver.
     factor = cho_factor(total[np.ix_(known, known)])
     known_gain = cho_solve(factor, cross.T).T
-    per_point = np.array([*kernels.variance, kernels.pressure_variance])
+    per_point = np.array([*traction_prior.variance, traction_prior.pressure_variance])
     prior_variance = AMPLITUDE**2 * np.tile(per_point, len(points))
     variance = prior_variance - (known_gain * cross).sum(axis=1)
     gain = np.zeros((len(cross), n * width), np.float32)
@@ -351,8 +354,8 @@ def _solve_window(
 
     # With the noise matrix B of the pads, diag(G M G') is a sum of (G B)^2 over the pads.
     by_point = gain.reshape(-1, ROWS_PER_POINT, n, width)
-    rows = by_point[:, 2:].reshape(-1, n, width)  # on the surface and at depth
-    by_pad = np.einsum("rwc,wcp->rwp", rows, pads, optimize=True) ** 2
+    pressure_gain = by_point[:, 2:].reshape(-1, n, width)
+    by_pad = np.einsum("rwc,wcp->rwp", pressure_gain, pads, optimize=True) ** 2
 
     inner = min(INNER_CUBES, n)
     size = inner * width
@@ -367,13 +370,13 @@ def _solve_window(
         gain=gain,
         precision=precision.astype(np.float32),
         variance=np.maximum(select_pressure(variance), 0),
-        by_pad=by_pad.reshape(len(rows), -1).astype(np.float32),
+        by_pad=by_pad.reshape(len(pressure_gain), -1).astype(np.float32),
         trace=trace.ravel().astype(np.float32),
     )
 
 
 def _cross_covariance(
-    kernels: Kernels,
+    traction_prior: TractionPrior,
     model: ObservationModel,
     place: Array,
     angle: Array,
@@ -384,7 +387,7 @@ def _cross_covariance(
     Positions and rotations are in the frame of the centre cube, around which the skin is laid flat.
 
     Args:
-        kernels: Covariances between components and traction in the elastic layer.
+        traction_prior: Prior covariances of traction and measured components.
         model: Components that the W cubes of the window observe.
         place: Positions (W, 2) of the cubes in m.
         angle: Rotations (W,) of the cubes in rad.
@@ -400,8 +403,8 @@ def _cross_covariance(
     angles = np.repeat(angle, n_points)
     variants = np.repeat(model.variant, n_points)
 
-    traction = kernels.cross(offset, angles, variants)[:, columns]
-    pressure = kernels.pressure(offset, angles, variants)[:, columns]
+    traction = traction_prior.cross(offset, angles, variants)[:, columns]
+    pressure = traction_prior.pressure(offset, angles, variants)[:, columns]
     cross = np.empty((n_points, ROWS_PER_POINT, n, len(columns)))
     traction = traction.reshape(n, n_points, -1, 3)
     pressure = pressure.reshape(n, n_points, -1)
@@ -459,7 +462,8 @@ def _nearest_cubes(poses: CubePoses) -> Index:
 
     offset = poses.position[near] - poses.position[:, None]
     local = np.einsum("nji,nkj->nki", poses.rotation, offset)
-    # Rounded, because otherwise rounding errors would decide the order of equally distant cubes.
+    # Positions are rounded, because otherwise rounding errors would decide the order of equally
+    # distant cubes.
     local = np.round(local / poses.pitch, 4)
     distance = np.round(np.linalg.norm(local, axis=2), 4)
     order = np.lexsort(

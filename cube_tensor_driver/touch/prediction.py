@@ -104,7 +104,8 @@ class MissingValuePrediction:
         weights = -covariance.T @ precision[is_missing]
         weights[:, is_missing] = 0.0
 
-        # All windows that contain the cube, and the cube's position in the list of each window.
+        # `rows` are the windows that contain the cube, and `place` is its position in the list of
+        # cubes of each of these windows.
         rows, place = np.nonzero(windows.near == cube)
         columns = place[:, None] * width + own
         kinds = windows.kind[rows][:, None]

@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..core.arrays import Array, Index
-from ..mechanics.kernels import Kernels
+from ..mechanics.traction_prior import TractionPrior
 
 AMPLITUDE = 20e3
 """Prior standard deviation of the pressure on the surface, in Pa, before any value is measured. The
@@ -15,7 +15,7 @@ value is the pressure of a firm touch."""
 
 
 def covariance_matrix(
-    kernels: Kernels,
+    traction_prior: TractionPrior,
     columns: Index,
     place: Array,
     angle: Array,
@@ -24,11 +24,11 @@ def covariance_matrix(
     """Compute the prior covariance of C components of n cubes.
 
     Args:
-        kernels: Covariances between components and traction in the elastic layer.
+        traction_prior: Prior covariances of traction and measured components.
         columns: Indices (C,) of the components in `COMPONENTS`.
         place: Positions (n, 2) of the cubes in m, on the skin laid flat in the x-y plane of a cube.
         angle: Rotations (n,) of the cubes about z, the normal of this plane, in rad.
-        variant: Index (n,) of each cube's calibration in the measurement model of `kernels`.
+        variant: Index (n,) of each cube's calibration in the measurement model of `traction_prior`.
 
     Returns:
         Covariance matrix (n C, n C) for a surface pressure of variance 1 Pa^2; all components of
@@ -37,7 +37,7 @@ def covariance_matrix(
     n = len(place)
     width = len(columns)
     first, second = np.triu_indices(n)
-    pairs = kernels.covariance(
+    pairs = traction_prior.covariance(
         place[first] - place[second],
         angle[first],
         variant[first],

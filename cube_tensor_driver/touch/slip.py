@@ -62,12 +62,12 @@ pads. With Gaussian noise, 6 lags and 1000 scans a second exceed it by chance on
 direction and `MIN_DISTANCE_M` must agree, too."""
 
 LEVER_M = 0.1
-"""Largest height in m above the surface at which a small shear force on a sticking body acts. It
-shifts the centre of pressure by the height times the ratio of shear and normal force.
+"""Largest height in m above the surface at which an external shear force on a sticking body acts.
+The force tilts the body, which shifts the centre of pressure by the height times the ratio q of
+shear and normal force. Such a shift must not count as slip.
 
-For larger ratios q the assumed height is smaller, `LEVER_M` / (1 + 2 q): a body that is pulled far
-above the surface tips over before the ratio gets large, and errors of the followed ratio are
-proportional to it.
+The assumed height is `LEVER_M` / (1 + 2 q). It is smaller for larger ratios, because a body that is
+pulled far above the surface tips over before the ratio gets large.
 """
 
 LEAK_M = 0.01
@@ -160,7 +160,7 @@ NO_CONTACTS = Slip(
 
 
 class SlipEstimator:
-    """Follows the contacts that a contact tracker has found from scan to scan.
+    """Estimates in every scan whether contacts slip that the contact tracker has found before.
 
     Attributes:
         slip: State and friction of the contacts in the newest scan, in the order of the contacts
@@ -181,8 +181,8 @@ class SlipEstimator:
         count = min(N_CUBES, len(self._above_cubes))
         n_values = count * len(inverse.columns)
         n_scans = LAGS[-1] + 1
-        # A load consists of force (3) in N and position (3) in m. A row of `past` is position,
-        # force divided by normal force along the surface (3), and logarithm of the normal force.
+        # These are the fields of a contact. A load consists of force (3) in N and position (3) in
+        # m. `past` has the motion states (`_motion_state`) of the last scans, newest first.
         fields: list[tuple[str, type, tuple[int, ...]]] = [
             ("id", int, ()),
             ("normal", float, (3,)),
@@ -233,15 +233,17 @@ class SlipEstimator:
             return
 
         followed = self._follow(scaled)
-        before = _describe(followed, contacts["normal"])
+        before = _motion_state(followed, contacts["normal"])
         contacts["load"] = [[*one.force, *one.position] for one in found]
         contacts["values"] = self._gather(scaled)
-        after = _describe(contacts["load"], contacts["normal"])
-        # The difference of the followed and the fitted load is no motion.
+        after = _motion_state(contacts["load"], contacts["normal"])
+        # The tracker has fitted the loads again, which corrects errors of the followed ones. The
+        # past states get the same correction, so that it does not look like motion.
         correction = after - before
         contacts["past"] += correction[:, None]
 
-        # As soon as the tracker has seen a contact slip, its exact ratios replace followed ones.
+        # The friction coefficient is a mean of force ratios during slip. When the tracker fits a
+        # contact for the first time while it slips, the ratios that were only followed are dropped.
         slips = contacts["slips"]
         is_new = slips & ~contacts["is_fitted"]
         contacts["sums"][is_new] = 0.0
@@ -266,7 +268,7 @@ class SlipEstimator:
         scaled = self._inverse.scaled(values)
         loads = self._follow(scaled)
         self._linearise_changed(loads, scaled)
-        newest = _describe(loads, contacts["normal"])
+        newest = _motion_state(loads, contacts["normal"])
         self._remember(time_s, newest)
 
         earlier = contacts["past"][:, LAGS]
@@ -295,7 +297,9 @@ class SlipEstimator:
         velocity[state == STICK] = 0.0
         velocity[state == UNKNOWN] = np.nan
 
-        with np.errstate(invalid="ignore"):  # no slip so far: 0 / 0 is NaN, unknown
+        # Before the first slip of a contact all of its sums are 0, so that its friction coefficient
+        # becomes NaN.
+        with np.errstate(invalid="ignore"):
             inverse_sum, weight_sum, ratio_sum = contacts["sums"].T
             friction = ratio_sum / weight_sum
             uncertainty = inverse_sum / weight_sum
@@ -314,12 +318,15 @@ class SlipEstimator:
         change: Array,
         duration: Array,
     ) -> tuple[Mask, Mask]:
-        """Return whether each contact has moved, and slipped, over each lag (n, lags).
+        """Test whether each contact has moved, and whether it has slipped, over each of the `LAGS`.
 
         Args:
-            newest: Descriptions (n, 7) of the loads in this scan.
-            change: Their changes (n, lags, 7) over each lag.
+            newest: Motion states (n, 7) in this scan, as from `_motion_state`.
+            change: Changes (n, lags, 7) of the motion states over each lag.
             duration: Durations (lags,) of the lags in s.
+
+        Returns:
+            Whether each contact has moved (n, lags), and whether it has slipped (n, lags).
         """
         moved = change[..., :3]
         turned = change[..., 3:6]
@@ -332,13 +339,15 @@ class SlipEstimator:
         lever = LEVER_M / (1 + 2 * size)
         tilt = lever * np.maximum(growth, 0)
         leak = LEAK_M * _lengths(change[..., 3:])
-        # The force may have changed and returned within a lag.
+        # A change of force within a short lag may be undone within a longer one, but may still have
+        # shifted the contact. So the shift of the shorter lags is allowed for the longer ones, too.
         explained = np.maximum.accumulate(tilt + leak, axis=1)
         noise = SIGNIFICANCE * np.sqrt(2) * self._contacts["noise"]
         threshold = np.maximum(noise, MIN_DISTANCE_M)[:, None]
         moves = distance > threshold + explained
         moves &= distance > MIN_SPEED * duration
-        # Each lag is twice the one before.
+        # A lag is twice the one before. The motion over the lag before is therefore the motion in
+        # the second half of a lag; if it is small, the contact has stopped.
         moves[:, 1:] &= distance[:, :-1] > MIN_LATE_SHARE * distance[:, 1:]
 
         along = np.einsum("nlk,nk->nl", moved, ratio)
@@ -352,7 +361,7 @@ class SlipEstimator:
         return moves, slips
 
     def _remember(self, time_s: float, newest: Array) -> None:
-        """Store the descriptions (n, 7) of the loads of a scan at a time in s."""
+        """Store the motion states (n, 7) of the contacts in a scan at a time in s."""
         past = self._contacts["past"]
         if time_s < self._times[0]:
             # The time has jumped back, as at the start of another recording.
@@ -393,7 +402,9 @@ class SlipEstimator:
         has_changed = force_change > MAX_FORCE_CHANGE * force
         has_changed |= shift > MAX_SHIFT_DEPTHS * self._inverse.depth
 
-        # After a sudden change, as in a bounce, the derivatives tell no position.
+        # After a sudden change, as of a body that bounces, linear extrapolation with the
+        # derivatives gives no useful position. The contact then keeps the position of the last
+        # linearisation, and its past counts as unknown.
         is_lost = (force_change > MAX_JUMP * force) | (shift > self._inverse.depth)
         is_lost &= contacts["noise"] > 0
         loads[is_lost, 3:] = contacts["linearised"][is_lost, 3:]
@@ -409,7 +420,7 @@ class SlipEstimator:
         loads: Array,
         scaled: Array,
     ) -> None:
-        """Compute the weights with which one contact follows from the values of the cubes near it.
+        """Compute the weights from changes of the cubes' values to changes of one contact's load.
 
         Args:
             row: Number of the contact.
@@ -430,7 +441,8 @@ class SlipEstimator:
         self._noise.update(usable, cubes)
         local = LocalValues(inverse, self._noise, home, cubes)
 
-        # All derivatives are in the frame of the home cube. Those of this contact come first.
+        # Derivatives are computed in the frame of `home`, the cube nearest to the contact. They are
+        # sorted by distance, so that those of this contact come first.
         rotation = poses.rotation[home]
         apart = _lengths(loads[:, 3:] - place)
         n_near = np.sum(apart < NEIGHBOUR_PITCHES * inverse.pitch)
@@ -463,8 +475,11 @@ def _lengths(vectors: Array) -> Array:
     return lengths
 
 
-def _describe(loads: Array, normal: Array) -> Array:
-    """Return position, force ratio along the surface, and logarithm of the normal force (n, 7).
+def _motion_state(loads: Array, normal: Array) -> Array:
+    """Return the motion states (n, 7) of contacts: the quantities whose changes show slip.
+
+    They are the position (3) in m, the shear force divided by the normal force (3), and the natural
+    logarithm of the normal force in N.
 
     Args:
         loads: Force in N and position in m (n, 6) of the contacts.

@@ -138,7 +138,8 @@ class Surface:
 
         self._interpolation = Interpolation(poses, self._patches, LENGTH_PER_DEPTH * depth)
         self._pressure_columns = PRESSURE if gradients else PRESSURE[:1]
-        # Pairs (pairs, 2) of neighbouring points. A distance of 1.5 includes diagonal neighbours.
+        # `_pairs` (pairs, 2) are the indices of neighbouring points. A distance of 1.5 times the
+        # spacing includes diagonal neighbours.
         tree = cKDTree(self.points)
         self._pairs = tree.query_pairs(1.5 * self.spacing, output_type="ndarray")
 
@@ -174,8 +175,9 @@ class Surface:
         away from the force, so that each single cube gives the correct position, and so does every
         weighted mean over cubes.
 
-        The part of the stress that spreads beyond the edge of the skin is not measured: hardly any
-        of the pressure, but a fraction of about 1.5 depth / distance to the edge of the shear.
+        The stress that spreads beyond the edge of the skin is not measured. The pressure loses
+        little by this, the shear force a fraction of about 1.5 times the ratio of the depth to the
+        distance from the edge.
 
         Args:
             values: Components (cubes, 15) as in `field`.

@@ -41,17 +41,17 @@ DEFAULT_RATE_HZ = 1000.0
 """Sampling rate of each cube, in Hz, that is assumed if the skin file states none."""
 
 TIME_CONSTANT_S = 1.0
-"""Time constant of the high-pass, in s. The pressure of a load that grows by less than `MAX_DRIFT`
-plus 2 standard deviations of its noise in this time (2.3 Pa/s with 24 pads) counts as drift."""
+"""Time constant, in s, of the high-pass that removes slow drift from the pressure of a cube. It
+also removes loads that grow slowly, by less than about 2.3 Pa/s on a cube with 24 pads."""
 
 REFERENCE = 2.0
 """Reference value of the CUSUM, in standard deviations of the noise. It is half of the smallest
 change of the pressure that is to be found in two scans (samples of every cube)."""
 
 OVERSHOOT = 1.04
-"""Reduction of the limit of the CUSUM, in standard deviations, because the sum does not end at the
-limit but beyond it. With `REFERENCE` = 2 the true mean time between false alarms, from its integral
-equation, is 1.05 to 1.15 times the stated one."""
+"""Correction of the limit of the CUSUM, in standard deviations of the noise. It is subtracted from
+the limit that holds for a continuous sum, because a sum of samples jumps beyond the limit. With
+`REFERENCE` = 2, the mean time between false alarms then is 1.05 to 1.15 times the wanted one."""
 
 SETTLING_ROWS = 10
 """Number of first samples of a cube whose mean is the start of the slowly drifting part of its
@@ -63,8 +63,9 @@ NEIGHBOURS = 9
 cube of the touch and those nearest to it."""
 
 SPREAD = 0.25
-"""Largest ratio of the pressures, other than by noise, of a cube and of a neighbour nearer to the
-load by one pitch, if both are far from the load. It limits how far a load is felt."""
+"""Largest ratio of the pressures that a load causes at two neighbouring cubes far from it, of which
+one is farther away by one pitch. From it follows an upper limit of the pressure that a load causes
+at other cubes, which a touch there must exceed."""
 
 FAR = 1e-4
 """Largest ratio of the pressure of a cube at least seven pitches away from a load to the largest
@@ -79,14 +80,15 @@ REMAINDER = 0.02
 gone, because the foam of the pads creeps."""
 
 RESTART_MARGIN = 4.0
-"""Pressure, in standard deviations of the noise, that does not count as touch for some time after a
-cube's slow part (the average that follows slow drift, which is subtracted) has started again under
-a load. The slow part is then the mean of few samples, and so is less exact."""
+"""Pressure, in standard deviations of the noise, that does not count as touch after a cube's slow
+part has started again under a load. The slow part is the average that follows slow drift and is
+subtracted from the pressure. At first, it is a mean of few samples, and its error looks like a
+small touch."""
 
 OTHER_LOADS = 1.0
-"""Error of a force due to another load, divided by the force of the other load and by the cube of
-the ratio of the pitch to its distance. At a pitch of 8 to 12 mm and depths of 4 and 5 mm, layouts
-of 8 and 24 pads have 0.5 to 1.7 at two to three pitches and less farther away."""
+"""Factor f in the error f F (pitch / distance)^3 that another load with the force F causes in an
+estimated force. At pitches of 8 to 12 mm and depths of 4 and 5 mm, f is 0.5 to 1.7 for layouts of 8
+and 24 pads at distances of two to three pitches, and less farther away."""
 
 MIN_RELEASE = 8.0
 """Smallest fall of a cube's pressure below its slow part (the average that follows slow drift), in
@@ -180,7 +182,8 @@ class Touch:
 
         # The largest value of the neighbours is found faster if they are the first axis.
         self._near = near.T.copy()
-        # Slow part of the values, and difference of the values from it; NaN where unknown
+        # `_slow` is the slow part of each value (NaN where unknown), `_change` the difference of
+        # the value from it.
         self._slow = np.full(variance.shape, np.nan)
         self._change = np.zeros(variance.shape)
         self._left_out = np.zeros(n, np.uint32)
@@ -189,14 +192,16 @@ class Touch:
         self._margin = np.zeros(n)
         self._sum = np.zeros(n)
         self._touched = np.zeros(n, bool)
-        # Upper limit of the pressure that touches cause at each cube, and whether it is above noise
+        # `_reach` is an upper limit of the pressure that touches cause at each cube. Where it is
+        # above the noise, the slow part is held (`_held`), so that it does not adapt to the load.
         self._reach = np.zeros(n)
         self._held = np.zeros(n, bool)
 
     def restart(self) -> None:
         """Start the slow parts again after a tare, which changes all values.
 
-        The present pressures stay. A new touch is found after `SETTLING_ROWS` samples.
+        Pressures without their slow parts do not change, so that touches continue. A new touch is
+        found after `SETTLING_ROWS` samples.
         """
         self._restart(np.arange(len(self._sum)))
 
@@ -204,11 +209,11 @@ class Touch:
         """Find the touches in rows (samples of one cube each).
 
         Args:
-            rows: Rows of one scan, or of several scans one after the other. Within a scan the
-                number of the cube increases.
+            rows: Rows of one scan, or of several scans one after the other. Within a scan, they are
+                sorted by the number of the cube.
 
         Returns:
-            The touches of each scan, the same in one call and in one call for each scan.
+            The touches of each scan. They do not depend on how many scans are given in one call.
         """
         is_first = rows.cube[1:] <= rows.cube[:-1]
         starts = np.flatnonzero(is_first) + 1
@@ -219,7 +224,8 @@ class Touch:
     __call__ = update
 
     def _update_scan(self, rows: StressRows) -> Touches:
-        # A scan of all cubes is the usual case, in which parts of arrays need no copies.
+        # Most scans contain all cubes. Then a slice is used instead of indices, because it needs no
+        # copies of the arrays.
         is_complete = len(rows) == len(self._sum)
         cube = slice(None) if is_complete else rows.cube.astype(np.intp)
         changed = rows.left_out != self._left_out[cube]
@@ -238,7 +244,8 @@ class Touch:
         slow = self._slow[cube]
         is_unknown = np.isnan(slow)
         if is_unknown.any():
-            # Where a slow part starts again, a load that is there stays.
+            # Where a slow part starts again, it is the newest value minus the pressure of the load
+            # so far, so that this load is still seen.
             load = np.nan_to_num(self._change[cube])
             slow = np.where(is_unknown, values - load, slow)
         change = values - slow
@@ -260,10 +267,11 @@ class Touch:
         return self._locate(int(rows.stamp_ns.min()))
 
     def _restart(self, cubes: Index) -> None:
-        """Start the slow parts of cubes again."""
+        """Forget the slow parts of cubes; the next samples of the cubes start them again."""
         self._slow[cubes] = np.nan
         self._count[cubes] = 0
-        # Where slow parts are held, they take over the noise of two samples.
+        # A slow part that is held is not averaged over the next samples. It keeps the noise of two
+        # samples: the one before and the one after the restart.
         self._margin[cubes] += RESTART_MARGIN * self._held[cubes] * self._deviation[cubes]
 
     def _use_pads(self, cubes: Index, left_out: PadMasks) -> None:
@@ -280,14 +288,18 @@ class Touch:
         pressure: Array,
         elapsed_s: Array,
     ) -> Array:
-        """Return the share (k,) of the difference by which the slow part of k cubes follows.
+        """Return the gain (k,) of the low-pass with which the slow parts of k cubes follow.
 
-        The arguments are those of `_test`, which is called before.
+        `_test` has to be called before, with the same arguments.
+
+        Returns:
+            Fraction (k,) of the difference between value and slow part that is added to the slow
+            part; 0 where the slow part is held.
         """
         if not self._touched.any():
             has_gone = pressure < -MIN_RELEASE * self._deviation[cube]
             self._count[cube] *= ~has_gone
-        # The first samples are averaged.
+        # With the gain 1 / n of the n-th sample, the slow part is the mean of the first samples.
         mean_gain = 1 / (self._count[cube] + 1)
         gain = np.maximum(elapsed_s / TIME_CONSTANT_S, mean_gain)
         is_kept = self._held | self._touched
@@ -299,7 +311,7 @@ class Touch:
         pressure: Array,
         elapsed_s: Array,
     ) -> None:
-        """Add the pressures of k cubes to their sums.
+        """Add the pressures of k cubes to their CUSUM sums, and find which cubes are touched.
 
         Args:
             cube: Indices (k,) of the cubes; `slice(None)` if these are all cubes.
@@ -317,10 +329,11 @@ class Touch:
             self._margin[cube] = margin
 
         before = self._sum[cube]
-        # A pressure that drifts steadily is ahead of its slow part by one time constant.
+        # The slow part of a pressure that drifts steadily lags behind by one time constant. The
+        # largest difference that drift causes is subtracted.
         excess = pressure - margin - MAX_DRIFT * TIME_CONSTANT_S
         score = excess / self._deviation[cube]
-        # The upper limit makes a touch end within a few scans after any load.
+        # The sum is limited from above, so that it falls to 0 within a few scans after any load.
         after = (before + score - REFERENCE).clip(0, self.limit + REFERENCE)
         after = np.where(self._count[cube] < SETTLING_ROWS, before, after)
         self._sum[cube] = np.where(np.isnan(pressure), 0, after)
@@ -346,7 +359,8 @@ class Touch:
         strength = np.where(self._touched, pressure, 0)
         neighbours = strength[self._near].max(axis=0)
         is_largest = self._touched & (strength >= neighbours)
-        # Each scan spreads the reach by one pitch, which is fast compared with the high-pass.
+        # In each scan, the upper limit of the pressure spreads to the neighbours of a cube. This is
+        # fast enough: slow parts change little in the scans until the limit has reached all cubes.
         spread = SPREAD * self._reach[self._near].max(axis=0)
         felt = np.maximum(spread, FAR * strength.max())
         is_own = strength > felt
@@ -378,7 +392,7 @@ class Touch:
 
         Args:
             cube: Indices (m,) of the cubes.
-            share: Possible share (m, 1) of drift and of earlier loads in the force.
+            share: Fraction (m, 1) of the force that drift and earlier loads may have caused.
         """
         estimate = self._estimate
         if estimate is None:
@@ -395,8 +409,9 @@ class Touch:
 
         place = self._place[cube]
         pitches = np.linalg.norm(place[:, None] - place, axis=2)
-        # A force does not disturb itself.
+        # The distance of a load from itself is infinite: only other loads disturb its force.
         np.fill_diagonal(pitches, np.inf)
+        # The errors due to other loads decrease with the distance^-3, their squares with ^-6.
         others = pitches**-6
 
         variance = estimate.noise[kind] ** 2
@@ -421,7 +436,8 @@ def _find_neighbours(position: Array) -> Index:
     """
     near = []
     for one in position:
-        # Rounding keeps neighbours at the same distance in the order of their numbers.
+        # Distances are rounded, because otherwise their rounding errors would decide the order of
+        # equally distant cubes.
         distance = np.linalg.norm(position - one, axis=1).round(6)
         order = np.argsort(distance, kind="stable")
         near.append(order[:NEIGHBOURS])

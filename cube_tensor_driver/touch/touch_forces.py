@@ -27,17 +27,17 @@ from ..mechanics.load_response import LoadResponse
 from .unrolled_skin import unroll
 
 LOAD_WIDTH = 5e-3
-"""Diameter, in m, of the round contacts for which the estimate is made. Wider contacts are sums of
-such contacts."""
+"""Diameter, in m, of the Hertz contacts for which the estimate is computed. The estimate is linear,
+and wider contacts are sums of such contacts."""
 
-FORCE = 0.1
-"""Standard deviation s, in N, that each component of the force has before the measurement. For
-smaller forces the noise would count more, for larger ones the unknown position."""
+FORCE_DEVIATION = 0.1
+"""Prior standard deviation s, in N, of each component of the force of the load. If it were smaller,
+the estimate would suppress the noise more, and the error due to the unknown position less."""
 
-OTHER_FORCE = 0.03
-"""Standard deviation t, in N, of the components of the forces of other loads. The larger it is, the
-less another load changes the estimate, and the larger is the error that noise and position
-cause."""
+OTHER_FORCE_DEVIATION = 0.03
+"""Prior standard deviation t, in N, of each component of the forces of other loads. If it were
+larger, other loads would change the estimate less, but noise and the unknown position would change
+it more."""
 
 MAX_PITCHES = 1.0
 """Largest distance of the load from the cube along x and along y, in pitches (distances of
@@ -49,17 +49,17 @@ neighbouring cubes)."""
 
 
 class ForceEstimate(NamedTuple):
-    """Matrices that estimate the force of a load from the 15 components of W neighbouring cubes.
+    """Matrices that estimate the force of a load from the 15 components of n neighbouring cubes.
 
     Cubes whose neighbours have the same relative poses and noise are of one kind.
 
     Attributes:
         kind: Number (cubes,) of the kind of each cube.
-        weights: Matrix W (kinds, W 15, 3) from the components, in Pa and Pa/m, to the force on the
+        weights: Matrix W (kinds, n 15, 3) from the components, in Pa and Pa/m, to the force on the
             skin along x, y and z of the cube in the middle, in N.
         noise: Standard deviations (kinds, 3) of the force due to the noise of the pads, in N.
-        error: Root mean square errors (kinds, 3, 3) of the three components of the estimate due to
-            the unknown position, for a force of 1 N along x, y and z.
+        error: Root mean square error (kinds, 3, 3) of each component of the estimate (last axis but
+            one) due to the unknown position, for a force of 1 N along x, y and z (last axis).
     """
 
     kind: Index
@@ -123,7 +123,7 @@ def estimate_forces(
 
 
 def _grid(line: Array) -> Array:
-    """Return the positions (n^2, 2) of a square grid from those (n,) along one side."""
+    """Return the points (n^2, 2) of a grid with the coordinates `line` (n,) along both x and y."""
     x, y = np.meshgrid(line, line)
     return np.column_stack([x.ravel(), y.ravel()])
 
@@ -137,7 +137,8 @@ def _solve(
 
     Args:
         signal: Components (W, 15, S, 3) of W cubes for a force of 1 N at each of S positions.
-        n_own: Number of the first positions, at which the load may be. Other loads are at the rest.
+        n_own: Number of positions at which the load may be. They come first; the other positions
+            are those of other loads.
         covariance: Covariances (W, 15, 15) of the noise, NaN where a component is not observed.
     """
     variance = np.diagonal(covariance, axis1=1, axis2=2)
@@ -148,10 +149,10 @@ def _solve(
     noise = noise[observed][:, observed]
 
     own, other = np.split(signal[observed], [n_own], axis=1)
-    total = FORCE**2 * _mean_square(own)
-    total += OTHER_FORCE**2 * _mean_square(other)
+    total = FORCE_DEVIATION**2 * _mean_square(own)
+    total += OTHER_FORCE_DEVIATION**2 * _mean_square(other)
     total += noise
-    expected = FORCE**2 * own.mean(axis=1)
+    expected = FORCE_DEVIATION**2 * own.mean(axis=1)
     solution = np.linalg.solve(total, expected)
     weights = np.zeros((*observed.shape, 3))
     weights[observed] = solution
@@ -163,6 +164,10 @@ def _solve(
 
 
 def _mean_square(signal: Array) -> Array:
-    """Return the mean (n, n) over S positions of the products of n components (n, S, 3)."""
+    """Return the mean <H H'> (n, n) of responses H over S positions of the load.
+
+    Args:
+        signal: Components (n, S, 3) for a force of 1 N along x, y and z at each position.
+    """
     flat = signal.reshape(len(signal), -1)
     return np.asarray(flat @ flat.T / signal.shape[1])

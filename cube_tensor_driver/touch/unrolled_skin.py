@@ -17,8 +17,8 @@ def unroll(
 ) -> tuple[Array, Array]:
     """Lay the neighbours of n cubes flat, each time in the x-y plane of the cube in the centre.
 
-    The skin has to be laid flat, because the kernels (covariances between the cubes' values and the
-    surface traction) hold for a flat layer. A neighbour keeps its distance from the centre cube,
+    The skin has to be laid flat, because the covariances between the cubes' values and the
+    surface traction hold for a flat layer. A neighbour keeps its distance from the centre cube,
     and its direction within the x-y plane. On a flat skin, nothing changes.
 
     Args:

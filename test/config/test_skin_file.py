@@ -88,7 +88,7 @@ def test_the_inverse_of_a_skin_takes_its_elastomer(tmp_path, thickness, expected
     skin = read(tmp_path, data)
     assert skin.elastomer == Elastomer(0.005, expected, 0.48)
     inverse = SurfaceInverse(skin)
-    assert (inverse.depth, inverse.kernels.layer.thickness) == (0.005, expected)
+    assert (inverse.depth, inverse.layer.thickness) == (0.005, expected)
     assert read(tmp_path, GOOD).elastomer is None
 
 

@@ -14,8 +14,10 @@ from pressed_layer import press_layer
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.modes import COMPONENTS, STRESS, to_matrix
 from cube_tensor_driver.mechanics import contact
-from cube_tensor_driver.mechanics.kernels import PRIOR_LENGTHS, SHEAR_RATIO, Kernels
+from cube_tensor_driver.mechanics.contact_response import ContactResponse
 from cube_tensor_driver.mechanics.layer import FIELD, Layer
+from cube_tensor_driver.mechanics.measurement_model import CubeMeasurement
+from cube_tensor_driver.mechanics.traction_prior import PRIOR_LENGTHS, SHEAR_RATIO, TractionPrior
 
 DEPTH, SCALE = 4e-3, 2e-3
 POINTS = np.zeros(48, np.intp)
@@ -24,7 +26,7 @@ POINTS = np.zeros(48, np.intp)
 
 @pytest.fixture(scope="module")
 def half_space():
-    return Kernels(Layer(poisson=0.3), DEPTH, SCALE)
+    return CubeMeasurement(Layer(poisson=0.3), DEPTH, SCALE)
 
 
 def in_cube_frames(stress, gradient, angle):
@@ -46,7 +48,7 @@ def test_hertz_contact_on_a_half_space_is_that_of_point_forces(half_space, size,
     random = np.random.default_rng(1)
     place, angle = random.uniform(-0.02, 0.02, (30, 2)), random.uniform(-3, 3, 30)
     below = np.column_stack([place, np.full(30, -DEPTH)])
-    seen = half_space.response(place, angle, POINTS[:30], size)
+    seen = ContactResponse(half_space).response(place, angle, POINTS[:30], size)
     for axis in range(3):
         stress, gradient = contact.field(
             below, *contact.hertz(size, np.eye(3)[axis], order=20), 0.3
@@ -87,14 +89,14 @@ def test_stress_in_a_layer_is_that_of_finite_elements():
     """A rigid flat punch without friction on a bonded layer: its contact pressure, from the
     elements, makes at depth the stress that the elements have there."""
     punch = press_layer(thickness=8e-3, radius=3e-3, poisson=0.45, width=40e-3)
-    kernels = Kernels(Layer(8e-3, 0.45), 4e-3, SCALE)
+    responses = ContactResponse(CubeMeasurement(Layer(8e-3, 0.45), 4e-3, SCALE))
     at = np.array([0.5e-3, 2e-3, 5e-3, 9e-3])
     seen = np.zeros((len(at), 15))
     for radius, force in zip(punch.radius, punch.force, strict=True):  # rings of small discs
         angle = 2 * np.pi * np.arange(48) / 48
         ring = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         for place, row in zip(at, seen, strict=True):
-            response = kernels.response(
+            response = responses.response(
                 np.array([place, 0.0]) - ring, 0 * angle, POINTS[:48], 0.5e-3
             )
             row += response.mean(axis=0) @ [0, 0, -force]
@@ -123,7 +125,7 @@ def test_covariances_of_the_prior_are_sums_over_its_waves(half_space):
         unit = np.eye(24)
         views.append(in_cube_frames(unit[:, :6], unit[:, 6:].reshape(-1, 6, 3), np.full(24, one)).T)
     expected = views[0] @ matrix @ views[1].T
-    found = half_space.covariance(
+    found = TractionPrior(half_space).covariance(
         place[:1] - place[1:], angle[:1], POINTS[:1], angle[1:], POINTS[:1]
     )[0]
     assert np.abs(found - expected).max() < 2e-3 * np.abs(expected).max()

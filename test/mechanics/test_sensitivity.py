@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from cube_tensor_driver.mechanics import contact
-from cube_tensor_driver.mechanics.kernels import Kernels
+from cube_tensor_driver.mechanics.contact_response import ContactResponse
 from cube_tensor_driver.mechanics.layer import Layer
 from cube_tensor_driver.mechanics.load_response import LoadResponse
+from cube_tensor_driver.mechanics.measurement_model import CubeMeasurement
 from cube_tensor_driver.mechanics.sensitivity import (
     DEPTH_DEVIATION,
     POISSON_DEVIATION,
@@ -34,9 +35,9 @@ def place():
 def changes_at(place, layer) -> np.ndarray:
     """(S, 20, 15) in cubes that are turned by 0.5 rad."""
     n = len(place)
-    kernels = Kernels(layer, DEPTH, HALF_SIDE)
+    responses = ContactResponse(CubeMeasurement(layer, DEPTH, HALF_SIDE))
     turned, size = np.full(n, 0.5), np.full(n, RADIUS)
-    return kernels.sensitivity(place, turned, size, np.tile(FORCE, (n, 1))).swapaxes(0, 1)
+    return responses.sensitivity(place, turned, size, np.tile(FORCE, (n, 1))).swapaxes(0, 1)
 
 
 def below_a_ball(place, depth, poisson) -> np.ndarray:

@@ -21,8 +21,10 @@ from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.core.modes import COMPONENTS, STRESS
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.mechanics import contact
+from cube_tensor_driver.mechanics.contact_response import ContactResponse
 from cube_tensor_driver.mechanics.influence_file import read_influence, write_influence
-from cube_tensor_driver.mechanics.kernels import PRIOR_LENGTHS, SHEAR_RATIO, Kernels
+from cube_tensor_driver.mechanics.measurement_model import CubeMeasurement
+from cube_tensor_driver.mechanics.traction_prior import PRIOR_LENGTHS, SHEAR_RATIO, TractionPrior
 from cube_tensor_driver.touch.contact_finder import ContactSettings, contact_finder
 from cube_tensor_driver.touch.pad_measurement import model_pads
 from cube_tensor_driver.touch.pad_noise import noise_by_pad
@@ -42,11 +44,11 @@ def influence():
 
 
 @pytest.fixture(scope="module")
-def kernels(influence):
+def cubes(influence):
     """Of two cubes, the second one planar."""
     reading = model_pads(influence, [CUBE, PLANAR])
     assert reading.variant.tolist() == [0, 1]
-    return Kernels(influence.layer, influence.depth, SCALE, reading)
+    return CubeMeasurement(influence.layer, influence.depth, SCALE, reading)
 
 
 def said(influence, number: int, place: np.ndarray, angle: float) -> np.ndarray:
@@ -62,12 +64,12 @@ def said(influence, number: int, place: np.ndarray, angle: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("size", [1e-3, 5e-3])
-def test_a_contact_is_the_sum_of_its_forces(influence, kernels, size):
+def test_a_contact_is_the_sum_of_its_forces(influence, cubes, size):
     """Cubes of both kinds at any place, turned by any angle, under Hertz's point forces."""
     random = np.random.default_rng(3)
     place, angle = random.uniform(-0.012, 0.012, (12, 2)), random.uniform(-3, 3, 12)
     which = np.arange(12) % 2
-    found = kernels.response(place, angle, which, size)
+    found = ContactResponse(cubes).response(place, angle, which, size)
     sources, forces = contact.hertz(size, [0, 0, 1.0], order=8)
     expected = np.stack(
         [
@@ -79,7 +81,7 @@ def test_a_contact_is_the_sum_of_its_forces(influence, kernels, size):
     assert (np.abs(found - expected) <= LEFT_OUT * greatest).all()
 
 
-def test_covariances_of_the_prior_are_sums_over_the_surface(influence, kernels):
+def test_covariances_of_the_prior_are_sums_over_the_surface(influence, cubes):
     """sum g S g' and S g on a square grid of forces, without waves and circular components."""
     place, angle = np.array([[2e-3, 1e-3], [-3e-3, 4e-3]]), np.array([0.4, -1.0])
     step = influence.depth / 4  # resolves the shorter length of the prior
@@ -91,9 +93,10 @@ def test_covariances_of_the_prior_are_sums_over_the_surface(influence, kernels):
     cross = np.einsum("nm,mci->nci", prior, seen[0]) * [SHEAR_RATIO**2, SHEAR_RATIO**2, 1.0]
     expected = np.einsum("nci,ndi->cd", cross, seen[1])
     first, second = np.array([0]), np.array([1])
-    found = kernels.covariance(place[:1] - place[1:], angle[:1], first, angle[1:], second)[0]
+    covariances = TractionPrior(cubes)
+    found = covariances.covariance(place[:1] - place[1:], angle[:1], first, angle[1:], second)[0]
     own = [
-        np.diag(kernels.covariance(np.zeros((1, 2)), angle[:1], k, angle[:1], k)[0])
+        np.diag(covariances.covariance(np.zeros((1, 2)), angle[:1], k, angle[:1], k)[0])
         for k in (first, second)
     ]
     observed = np.outer(*own) > 0
@@ -101,7 +104,7 @@ def test_covariances_of_the_prior_are_sums_over_the_surface(influence, kernels):
     assert (np.abs(found - expected) <= 4e-3 * np.sqrt(np.outer(*own)))[observed].all()
     assert not found[~observed].any()
     (here,) = np.flatnonzero((np.abs(points - [0.0, 2 * step]) < 1e-9).all(axis=1))
-    found = kernels.cross(place[:1] - points[here], angle[:1], first)[0]
+    found = covariances.cross(place[:1] - points[here], angle[:1], first)[0]
     assert np.abs(found - cross[here]).max() < 2e-3 * np.abs(cross[here]).max()
 
 

@@ -18,9 +18,10 @@ from cube_tensor_driver.config.yaml import write_yaml
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.core.rows import StressRows, concatenate
 from cube_tensor_driver.mechanics import contact
-from cube_tensor_driver.mechanics.kernels import Kernels
+from cube_tensor_driver.mechanics.contact_response import ContactResponse
 from cube_tensor_driver.mechanics.layer import Layer
 from cube_tensor_driver.mechanics.load_response import LoadResponse
+from cube_tensor_driver.mechanics.measurement_model import CubeMeasurement
 from cube_tensor_driver.touch.pad_noise import GAIN_ERROR, noise_of_all_pads
 from cube_tensor_driver.touch.touch_detection import MAX_DRIFT, OVERSHOOT, REFERENCE, Touch
 
@@ -283,12 +284,12 @@ def test_response_of_a_small_load_is_that_of_point_forces_and_of_the_tables():
         stress, slope = contact.field(below, *contact.hertz(2.5e-3, force, (0, 0), 12), 0.48)
         expected[:, :, axis] = np.hstack([stress, slope[:, :3].reshape(200, 9)])
     layer = Layer(11e-3)
-    kernels = Kernels(layer, DEPTH, 1.0)
+    responses = ContactResponse(CubeMeasurement(layer, DEPTH, 1.0))
     for found, truth in (
         (LoadResponse(Layer(), DEPTH, 5e-3)(offset, np.zeros(200)), expected),
         (
             LoadResponse(layer, DEPTH, 5e-3)(offset, angle),
-            kernels.response(offset, angle, np.zeros(200, int), 2.5e-3),
+            responses.response(offset, angle, np.zeros(200, int), 2.5e-3),
         ),
     ):
         largest = np.abs(truth).max(axis=(0, 2), keepdims=True)

@@ -107,7 +107,7 @@ def _distribute(
     for size in np.unique(contacts.sizes):
         of_this_size = np.flatnonzero(contacts.sizes == size)
         from_contacts = place[:, None] - contacts.places[of_this_size]
-        stress = inverse.kernels.field(from_contacts.reshape(-1, 2), size)
+        stress = inverse.contact_response.field(from_contacts.reshape(-1, 2), size)
         pressure = -stress[:, FIELD.index("zz")]
         by_contact = pressure.reshape(len(points), -1, 3)
         below[:, :, of_this_size] = by_contact.swapaxes(1, 2)

@@ -21,7 +21,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...core.arrays import Array
-from ...mechanics.kernels import DISC_SIZES
+from ...mechanics.contact_response import DISC_SIZES
 from ..inverse import SurfaceInverse
 from .contact_estimate import ContactEstimate, ContactSum, Discs
 from .local_values import LocalValues, rotations_about_normal
@@ -111,13 +111,13 @@ class HertzFit:
         """Start without a step; `linearise` and `step` have to follow.
 
         Args:
-            inverse: Depth and kernels of the skin.
+            inverse: Depth and responses of the skin.
             values: Values of the cubes around the region.
             starts: Contacts at which the fit begins.
         """
         self.values = values
         self._depth = depth = inverse.depth
-        # The cubic interpolation of `Kernels` needs one tabulated radius below and two above.
+        # The cubic interpolation of `ContactResponse` needs one tabulated radius below and two above.
         self._log_range = np.log(DISC_SIZES[[1, -3]] * depth)
         self.found = starts._replace(log_sizes=np.clip(starts.log_sizes, *self._log_range))
         self.misfit = 1.0
@@ -424,7 +424,7 @@ def linearise(inverse: SurfaceInverse, fits: Sequence[HertzFit]) -> None:
     computed and stored, too. All fits together take little longer than one.
 
     Args:
-        inverse: Kernels (stress in the skin under contacts of unit force).
+        inverse: Responses (stress in the skin under contacts of unit force).
         fits: Fits, whose `linearise` gets the results.
     """
     if not fits:
@@ -445,9 +445,9 @@ def linearise(inverse: SurfaceInverse, fits: Sequence[HertzFit]) -> None:
     variant = np.concatenate(variants)
     size = np.concatenate(sizes)
     force = np.concatenate(forces)
-    kernels, observed = inverse.kernels, inverse.columns
-    slopes = kernels.response_slopes(offset, angle, variant, size, force)[:, :, observed]
-    sensitivity = kernels.sensitivity(offset, angle, size, force)[:, :, observed]
+    response, observed = inverse.contact_response, inverse.columns
+    slopes = response.response_slopes(offset, angle, variant, size, force)[:, :, observed]
+    sensitivity = response.sensitivity(offset, angle, size, force)[:, :, observed]
     starts = np.cumsum([len(one) for one in angles])[:-1]
     slopes_by_fit = np.split(slopes, starts)
     sensitivity_by_fit = np.split(sensitivity, starts)

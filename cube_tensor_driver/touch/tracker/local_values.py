@@ -145,7 +145,7 @@ class LocalValues:
         """Collect the noise of the cubes.
 
         Args:
-            inverse: Poses and kernels of the skin.
+            inverse: Poses and responses of the skin.
             noise: Noise of all cubes, up to date for these cubes.
             home: Index of the cube around which the skin is laid flat.
             cubes: Indices (n,) of the cubes.
@@ -217,7 +217,9 @@ class LocalValues:
         angle = np.repeat(self.angle, count)
         variant = np.repeat(self.variant, count)
         inverse = self._inverse
-        response = inverse.kernels.response(offset, angle, variant, size)[:, inverse.columns]
+        response = inverse.contact_response.response(offset, angle, variant, size)[
+            :, inverse.columns
+        ]
         by_contact = response.reshape(len(self.place), count, -1, 3)
         by_axis = by_contact.transpose(0, 2, 3, 1)
         values = by_axis.reshape(*self.known.shape, -1)
@@ -243,7 +245,7 @@ class LocalValues:
         angle = np.repeat(self.angle, count)
         sizes = np.full(n * count, size)
         all_forces = np.tile(forces.T, (n, 1))
-        changes = inverse.kernels.sensitivity(offset, angle, sizes, all_forces)
+        changes = inverse.contact_response.sensitivity(offset, angle, sizes, all_forces)
         changes = changes[:, :, inverse.columns]
         by_contact = changes.reshape(n, count, *changes.shape[1:])
         return np.asarray(by_contact.sum(axis=1).swapaxes(1, 2), float)

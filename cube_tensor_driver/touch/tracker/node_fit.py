@@ -31,7 +31,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from ...core.arrays import Array, Index
-from ...mechanics.kernels import SHEAR_RATIO
+from ...mechanics.traction_prior import SHEAR_RATIO
 from ..inverse import SurfaceInverse
 from ..prior import AMPLITUDE
 from ..surface import square_points
@@ -136,7 +136,7 @@ class NodeFit:
         """Compute the response of the cubes to the nodes.
 
         Args:
-            inverse: Poses, points, noise and kernels of the skin.
+            inverse: Poses, points, noise and responses of the skin.
             points: Indices of the points of the surface that form the region.
             values: Values of the cubes around the region.
         """

@@ -454,7 +454,7 @@ def update_responses(
     of a region's own fit, it is the response that this fit predicts.
 
     Args:
-        inverse: Poses and kernels of the skin.
+        inverse: Poses and responses of the skin.
         regions: Regions whose `response` is computed.
         cubes: Indices (n,) of the cubes.
     """
@@ -473,7 +473,7 @@ def update_responses(
             forces.append(is_facing[:, None] * force)
     if stale:
         variants = np.tile(inverse.variant[cubes], len(offsets))
-        response = inverse.kernels.response_to_forces(
+        response = inverse.contact_response.response_to_forces(
             np.concatenate(offsets),
             np.concatenate(angles),
             variants,

@@ -7,8 +7,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cube_tensor_driver.mechanics.kernels import Kernels
+from cube_tensor_driver.mechanics.contact_response import ContactResponse
 from cube_tensor_driver.mechanics.layer import Layer
+from cube_tensor_driver.mechanics.measurement_model import CubeMeasurement
 
 DEPTH = 4e-3
 """Depth of the cubes' centres below the surface, in m."""
@@ -17,11 +18,11 @@ FORCE = np.array([0.4, -0.3, -1.5])
 
 
 @pytest.fixture(scope="module")
-def kernels():
-    return Kernels(Layer(8e-3, 0.45), DEPTH, 2e-3)
+def responses():
+    return ContactResponse(CubeMeasurement(Layer(8e-3, 0.45), DEPTH, 2e-3))
 
 
-def test_slopes_are_differences_of_the_response(kernels):
+def test_slopes_are_differences_of_the_response(responses):
     """The tolerances are ten times what central differences and single precision leave.
 
     The steps are a thousandth of the depth, and 2 % of the radius.
@@ -31,18 +32,18 @@ def test_slopes_are_differences_of_the_response(kernels):
     angle = random.uniform(-3, 3, 20)
     variant = np.zeros(20, np.intp)
     step, size = 1e-3 * DEPTH, 0.7 * DEPTH
-    slopes = kernels.response_slopes(
+    slopes = responses.response_slopes(
         place, angle, variant, np.full(20, size), np.tile(FORCE, (20, 1))
     )
 
     def under_force(place: np.ndarray, size: float = size) -> np.ndarray:
-        return kernels.response(place, angle, variant, size) @ FORCE
+        return responses.response(place, angle, variant, size) @ FORCE
 
     def assert_close(found: np.ndarray, expected: np.ndarray, tolerance: float) -> None:
         largest = np.abs(expected).max()
         np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance * largest)
 
-    unit = kernels.response(place, angle, variant, size).swapaxes(1, 2)
+    unit = responses.response(place, angle, variant, size).swapaxes(1, 2)
     assert_close(slopes[:, :3], unit, 1e-6)
     for axis in range(2):
         shift = step * np.eye(2)[axis]
@@ -54,7 +55,7 @@ def test_slopes_are_differences_of_the_response(kernels):
     assert_close(slopes[:, 6], (wider + narrower - 2 * under_force(place)) / 0.02**2, 1e-4)
 
 
-def test_a_moment_is_a_pair_of_forces(kernels):
+def test_a_moment_is_a_pair_of_forces(responses):
     """A moment of 1 N m about z is that of four forces of 1 / (4 h), each at the distance h.
 
     Two act along y at x = h and against y at x = -h, the others along x and against it.
@@ -63,13 +64,13 @@ def test_a_moment_is_a_pair_of_forces(kernels):
     place = random.uniform(-2, 2, (20, 2)) * DEPTH
     angle, variant = np.zeros(20), np.zeros(20, np.intp)
     size, h = 0.7 * DEPTH, 1e-3 * DEPTH
-    slopes = kernels.response_slopes(
+    slopes = responses.response_slopes(
         place, angle, variant, np.full(20, size), np.tile(FORCE, (20, 1))
     )
     moment = 0.0
     for sign in (1, -1):
         for axis, across, turn in ((0, 1, 1), (1, 0, -1)):
             centre = sign * h * np.eye(2)[axis]
-            unit = kernels.response(place - centre, angle, variant, size)
+            unit = responses.response(place - centre, angle, variant, size)
             moment = moment + sign * turn * unit[:, :, across] / (4 * h)
     np.testing.assert_allclose(slopes[:, 7], moment, rtol=0, atol=2e-5 * np.abs(moment).max())

@@ -1,0 +1,409 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
+"""Response of cubes at one depth to Hertz contacts on the surface.
+
+The response at the offset p = r (cos phi, sin phi) of cube and contact is an integral over the wave
+vector k of the spectra c(k) of the circular components (spectra.py)::
+
+    response(p) = int c exp(i k.p) B_a,     B_a = 3 (sin ka - ka cos ka) / (ka)^3     [d2k / 4 pi2]
+
+B_a is the spectrum of Hertz's pressure on a disc of radius a with a force of 1 N.
+
+Source: K. L. Johnson, Contact Mechanics (1985), 4.2 (Hertz).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..core.arrays import Array, Complex, Index, Single
+from .cache import Arrays, load_or_compute
+from .circular import FIELD_FROM_CIRCULAR, ORDERS, Orders, rotate_loads
+from .distance_table import DistanceTable, cubic_weights, to_polar
+from .load_response import disc_spectrum
+from .measurement_model import CubeMeasurement
+from .sensitivity import sensitivities
+from .spectra import BesselTable, Spectra, tabulate_bessel
+
+DISC_SIZES = np.geomspace(0.1, 5.0, 44)
+"""Radii of the tabulated round contacts (discs), divided by the depth of the cubes' centres below
+the surface. The error of the interpolation between them in `ContactResponse.response` is at most a
+hundredth of the largest value; it is largest for wide discs."""
+
+_SIZE_LOG_STEP = float(np.log(DISC_SIZES[1] / DISC_SIZES[0]))
+"""Difference of the natural logarithms of two neighbouring radii in `DISC_SIZES`."""
+
+_MIN_DISTANCE = 1 / 50
+"""Smallest distance along the surface between a contact and a cube, divided by the depth of the
+cubes' centres, at which derivatives are computed. Nearer contacts get the derivatives at this
+distance, because the direction from the contact to the cube is undefined at distance 0."""
+
+
+class ContactResponse:
+    """Tabulated responses of cubes to Hertz contacts.
+
+    In the methods, positions (N, 2) are in m. Measured components are in Pa (`CubeMeasurement`), in
+    the frame of a cube that is rotated about z by `angle` (N,) in rad and has the index `variant`
+    (N,) in the measurement model. Forces are along x, y and z.
+
+    The first set-up for a layer takes a few seconds; later ones load the tables from the cache.
+    """
+
+    def __init__(self, cubes: CubeMeasurement) -> None:
+        """Compute the tables or load them from the cache.
+
+        Args:
+            cubes: Layer, depth and measurement model of the cubes.
+        """
+        self._cubes = cubes
+        self._depth = cubes.depth
+        self._order = cubes.spectra.order
+        self._table = DistanceTable(cubes.depth)
+        bessel = tabulate_bessel(cubes.spectra.k, self._table.distances)
+        self._field = self._tabulate_discs(cubes.point_spectra, bessel)
+        self._response = self._field
+        if cubes.spectra is not cubes.point_spectra:
+            self._response = self._tabulate_discs(cubes.spectra, bessel)
+
+        # For `response_to_forces` and `sensitivity`, the tables are matrices with one row for each
+        # pair of a radius and a distance.
+        self._rows = self._response.reshape(-1, 3 * len(self._order)).astype(np.float32)
+        self._point_matrix = cubes.point_matrix.astype(np.float32)
+        changes = [
+            self._tabulate_discs(spectra, bessel)
+            for spectra in sensitivities(cubes.layer, cubes.depth)
+        ]
+        by_quantity = np.stack(changes, axis=2).astype(np.float32)
+        self._sensitivity_rows = by_quantity.reshape(len(self._rows), -1)
+
+    def _tabulate_discs(self, spectra: Spectra, bessel: BesselTable) -> Array:
+        """Tabulate the response to forces on discs of all radii `DISC_SIZES`.
+
+        Args:
+            spectra: Spectra of the n circular components.
+            bessel: Bessel functions at the tabulated distances.
+
+        Returns:
+            Radial functions R, Z and T (radii, distances, 3, n) (circular.py).
+        """
+        inputs = [self._depth, *vars(spectra).values()]
+
+        def compute() -> Arrays:
+            radii = DISC_SIZES * self._depth
+            loads = np.stack([disc_spectrum(spectra.k * radius) for radius in radii])
+            return {"discs": spectra.radial(bessel, loads)}
+
+        return load_or_compute("discs", inputs, compute)["discs"]
+
+    def response(
+        self,
+        place: Array,
+        angle: Array,
+        variant: Index,
+        size: float,
+    ) -> Array:
+        """Compute the measured components under a Hertz contact with a force of 1 N.
+
+        Args:
+            place: Positions (N, 2) of the cubes from the centre of the contact, in m.
+            angle: Rotations (N,) of the cubes about z, in rad.
+            variant: Index (N,) of each cube's variant in the measurement model.
+            size: Radius of the contact in m.
+
+        Returns:
+            Components (N, 15, 3) in Pa/N, for a force along x, y and z.
+        """
+        table = self._interpolate_size(self._response, size, place)
+        return self._cubes.measure(
+            self._rotate_loads(table, place, angle, self._order),
+            variant,
+        )
+
+    def response_slopes(
+        self,
+        place: Array,
+        angle: Array,
+        variant: Index,
+        size: Array,
+        force: Array,
+    ) -> Array:
+        """Compute the measured components under Hertz contacts, and their derivatives.
+
+        Args:
+            place: Positions (N, 2) of the cubes from the centre of a contact, in m.
+            angle: Rotations (N,) of the cubes about z, in rad.
+            variant: Index (N,) of each cube's variant in the measurement model.
+            size: Radius (N,) of the contact in m.
+            force: Force (N, 3) in N of the contact, along x, y and z.
+
+        Returns:
+            Components (N, 8, 15). The first three are those under a force of 1 N along x, y and z.
+            The next four are derivatives of those under `force`: by x and y of the contact's
+            centre, and first and second derivative by the logarithm of the radius. The last are
+            those under a moment of 1 N m about z.
+        """
+        true_distance, direction = to_polar(place)
+        distance = np.maximum(true_distance, _MIN_DISTANCE * self._depth)
+        parts = self._interpolate_slopes(distance, size)
+
+        # A force with the components F_r from the contact to the cube, F_t across and F_z causes
+        # the circular components c = exp(i m phi) (R F_r + Z F_z + i T F_t), with the radial
+        # functions R, Z and T (circular.py). `loads` are c / exp(i m phi) and its derivatives.
+        cosine = np.cos(direction).astype(np.float32)[:, None]
+        sine = np.sin(direction).astype(np.float32)[:, None]
+        force_x, force_y, force_z = force.astype(np.float32).T[..., None]
+        radial = cosine * force_x + sine * force_y
+        tangential = cosine * force_y - sine * force_x
+        loads = np.empty((len(place), 4, len(self._order)), np.complex64)
+        loads.real = radial[:, None] * parts[:, :, 0] + force_z[:, None] * parts[:, :, 1]
+        loads.imag = tangential[:, None] * parts[:, :, 2]
+        value, by_r, by_log, by_log_twice = loads.swapaxes(0, 1)
+        order = self._order.astype(np.float32)
+        inverse = (1 / distance).astype(np.float32)[:, None]
+        r, z, t = parts[:, 0].swapaxes(0, 1)
+        r_slope, z_slope, t_slope = parts[:, 1].swapaxes(0, 1)
+        by_phi = 1j * (order * value - radial * t) + tangential * r
+        moment = 0.5j * (inverse * (order * r - t) - t_slope)
+        # R, Z and T were interpolated at `_MIN_DISTANCE` if the contact is nearer. Their values at
+        # the true distance are extrapolated linearly from there.
+        below = (true_distance - distance).astype(np.float32)[:, None]
+        r = r + below * r_slope
+        z = z + below * z_slope
+        t = 1j * (t + below * t_slope)
+
+        circular: Complex = np.empty((len(place), 8, len(self._order)), np.complex64)
+        circular[:, 0] = cosine * r - sine * t
+        circular[:, 1] = sine * r + cosine * t
+        circular[:, 2] = z
+        circular[:, 3] = sine * inverse * by_phi - cosine * by_r
+        circular[:, 4] = -cosine * inverse * by_phi - sine * by_r
+        circular[:, 5] = by_log
+        circular[:, 6] = by_log_twice
+        circular[:, 7] = moment
+        circular *= _fast_phases(direction - angle, self._order)[:, None]
+        measured: Array = self._cubes.measure(_split(circular), variant).swapaxes(1, 2)
+        return measured
+
+    def _interpolate_slopes(self, distance: Array, size: Array) -> Single:
+        """Interpolate the radial functions R, Z and T (circular.py), and their derivatives.
+
+        Args:
+            distance: Distances (N,) of the cubes from the centre of a contact, in m.
+            size: Radius (N,) of the contact in m.
+
+        Returns:
+            Functions (N, 4, 3, n) and their derivatives: value, slope over the distance, first and
+            second derivative by the logarithm of the radius.
+        """
+        first, by_distance, distance_slope = self._table.weights(distance, 2)
+        size_row, *by_size = cubic_weights(_size_index(size, self._depth), 3)
+
+        # Bicubic interpolation uses 16 rows of the table: four radii times four distances.
+        columns = self._response.shape[1]
+        corner = (size_row - 1) * columns + first
+        steps = np.add.outer(columns * np.arange(4), np.arange(4)).ravel()
+        neighbours = self._rows.take(corner[:, None] + steps, axis=0)
+
+        by_log = by_size[1] / _SIZE_LOG_STEP
+        by_log_twice = by_size[2] / _SIZE_LOG_STEP**2
+        over_size = np.stack([by_size[0], by_size[0], by_log, by_log_twice]).T
+        slope = distance_slope / self._table.step
+        over_distance = np.stack([by_distance, slope, by_distance, by_distance]).T
+        weights = over_size[:, :, None] * over_distance[:, None]
+        by_row = weights.reshape(-1, 16, 4).swapaxes(1, 2).astype(np.float32)
+        return np.asarray(by_row @ neighbours).reshape(len(distance), 4, 3, -1)
+
+    def response_to_forces(
+        self,
+        place: Array,
+        angle: Array,
+        variant: Index,
+        size: Array,
+        force: Array,
+    ) -> Array:
+        """Compute the measured components under Hertz contacts approximately, but fast.
+
+        `response` interpolates the tables cubically, this method linearly. The error is at most a
+        hundredth of the largest value, and a thousandth at a distance of two depths.
+
+        Args:
+            place: Positions (N, 2) of the cubes from the centre of a contact, in m.
+            angle: Rotations (N,) of the cubes about z, in rad.
+            variant: Index (N,) of each cube's variant in the measurement model.
+            size: Radius (N,) of the contact in m.
+            force: Force (N, 3) in N of the contact, along x, y and z.
+
+        Returns:
+            Components (N, 15) in Pa.
+        """
+        circular = self._respond_fast(self._rows, self._order, place, angle, size, force)
+        return self._cubes.measure(_split(circular), variant)[:, :, 0]
+
+    def sensitivity(
+        self,
+        place: Array,
+        angle: Array,
+        size: Array,
+        force: Array,
+    ) -> Array:
+        """Compute how errors of depth, thickness and Poisson's ratio change the components.
+
+        The cubes are modelled as points here, whatever the measurement model (sensitivity.py).
+
+        Args:
+            place: Positions (N, 2) of the cubes from the centre of a contact, in m.
+            angle: Rotations (N,) of the cubes about z, in rad.
+            size: Radius (N,) of the contact in m.
+            force: Force (N, 3) in N of the contact, along x, y and z.
+
+        Returns:
+            Changes (N, S, 15) in Pa for one standard deviation of each of the S quantities.
+        """
+        circular = self._respond_fast(self._sensitivity_rows, ORDERS, place, angle, size, force)
+        return np.asarray(_split(circular) @ self._point_matrix)
+
+    def _respond_fast(
+        self,
+        rows: Single,
+        order: Orders,
+        place: Array,
+        angle: Array,
+        size: Array,
+        force: Array,
+    ) -> Complex:
+        """Return circular components under Hertz contacts, by linear interpolation of tables.
+
+        Args:
+            rows: S tables (radii x distances, S x 3 n) of the radial functions R, Z and T
+                (circular.py).
+            order: Orders m (n,) of the circular components.
+            place: Positions (N, 2) of the cubes from the centre of a contact, in m.
+            angle: Rotations (N,) of the cubes about z, in rad.
+            size: Radius (N,) of the contact in m.
+            force: Force (N, 3) in N of the contact, along x, y and z.
+
+        Returns:
+            Components (N, S, n) in the frames of the cubes; 0 beyond `REACH_DEPTHS`.
+        """
+        distance, direction = to_polar(place)
+        index = np.minimum(distance / self._table.step, self._table.last)
+        below = index.astype(np.intp)
+        size_index = _size_index(size, self._depth)
+        narrower = size_index.astype(np.intp)
+
+        # Bilinear interpolation uses two neighbouring distances of two neighbouring radii. The
+        # table begins one step before the distance 0, hence the 1 in the row number.
+        columns = self._response.shape[1]
+        first = narrower * columns + below + 1
+        neighbours = rows.take(first[:, None] + [0, 1, columns, columns + 1], axis=0)
+        farther = index - below
+        wider = size_index - narrower
+        by_distance = np.stack([1 - farther, farther]) * (index < self._table.last)
+        weights = np.concatenate([(1 - wider) * by_distance, wider * by_distance])
+        weights = weights.T.astype(np.float32)[:, None]
+        parts = (weights @ neighbours).reshape(len(place), -1, 3, len(order))
+
+        towards = np.exp(1j * direction).astype(np.complex64)
+        in_plane = (force[:, 0] + 1j * force[:, 1]).astype(np.complex64) * towards.conj()
+        in_plane = in_plane[:, None, None]
+        along_z = force[:, 2].astype(np.float32)[:, None, None]
+        circular = np.empty((len(place), parts.shape[1], len(order)), np.complex64)
+        circular.real = in_plane.real * parts[:, :, 0] + along_z * parts[:, :, 1]
+        circular.imag = in_plane.imag * parts[:, :, 2]
+        circular *= _fast_phases(direction - angle, order)[:, None]
+        return circular
+
+    def field(self, place: Array, size: float) -> Array:
+        """Compute stress and gradient under a Hertz contact with a force of 1 N.
+
+        Args:
+            place: Positions (N, 2) from the centre of the contact, in m.
+            size: Radius of the contact in m.
+
+        Returns:
+            Quantities `FIELD` (N, 24, 3) at the depth of the cubes, in Pa and Pa/m per N, for a
+            force along x, y and z.
+        """
+        table = self._interpolate_size(self._field, size, place)
+        circular = self._rotate_loads(table, place, np.zeros(len(place)), ORDERS)
+        return np.asarray((circular @ FIELD_FROM_CIRCULAR).swapaxes(1, 2))
+
+    def _rotate_loads(
+        self,
+        table: Array,
+        place: Array,
+        angle: Array,
+        order: Orders,
+    ) -> Array:
+        """Return circular components in rotated frames under unit loads along x, y and z.
+
+        Args:
+            table: Radial functions R, Z and T (distances, 3, n) over the distance from the load
+                (circular.py).
+            place: Positions (N, 2) from the load, in m.
+            angle: Rotations (N,) of the frames about z, in rad.
+            order: Orders m (n,) of the circular components: a rotation of the frame by an angle
+                multiplies a component by exp(-i m angle).
+
+        Returns:
+            Real parts and then imaginary parts (N, 3, 2 n), for loads along x, y and z.
+        """
+        distance, direction = to_polar(place)
+        parts = self._table.interpolate(table, distance)
+        return rotate_loads(parts, direction, direction - angle, order)
+
+    def _interpolate_size(
+        self,
+        discs: Array,
+        size: float,
+        place: Array,
+    ) -> Array:
+        """Interpolate a table of round contacts between the tabulated radii.
+
+        Args:
+            discs: Radial functions R, Z and T (radii, distances, 3, n) (circular.py).
+            size: Radius of the contact in m.
+            place: Positions (N, 2) from the centre of the contact, in m, for which the result will
+                be used.
+
+        Returns:
+            Functions R, Z and T (distances, 3, n) at the tabulated distances up to the farthest of
+            these positions.
+        """
+        farthest = np.hypot(*place.T).max(initial=0.0) / self._table.step
+        n_distances = int(min(farthest, self._table.last)) + 4
+
+        first, weights = cubic_weights(_size_index(size, self._depth))
+        neighbours = discs[int(first) - 1 : int(first) + 3, :n_distances]
+        return np.asarray(np.tensordot(weights, neighbours, axes=1))
+
+
+def _fast_phases(angle: Array, order: Orders) -> Complex:
+    """Return exp(i m angle) (N, n) as powers of exp(i angle), which takes a third of the time.
+
+    Args:
+        angle: Angles (N,) in rad.
+        order: Orders m (n,).
+    """
+    one = np.exp(1j * angle).astype(np.complex64)
+    powers = [np.ones_like(one)]
+    for _ in range(int(order.max())):
+        powers.append(powers[-1] * one)
+    return np.stack(powers, axis=1)[:, order]
+
+
+def _size_index(size: Array | float, depth: float) -> Array:
+    """Return the fractional indices (...) of radii in `DISC_SIZES`, within the table.
+
+    Args:
+        size: Radii (...) in m.
+        depth: Depth of the cubes' centres below the surface, in m.
+    """
+    # The tabulated radii are a geometric series, so their logarithms are equally spaced.
+    index = np.log(size / depth / DISC_SIZES[0]) / _SIZE_LOG_STEP
+    return np.asarray(np.clip(index, 1.0, len(DISC_SIZES) - 2.001))
+
+
+def _split(circular: Complex) -> Array:
+    """Return the real parts and then the imaginary parts (..., 2 n) of components (..., n)."""
+    return np.concatenate([circular.real, circular.imag], axis=-1)

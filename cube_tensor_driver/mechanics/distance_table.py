@@ -1,0 +1,120 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
+"""Interpolation of tables over the distance between a load and a cube, or between two cubes.
+
+A layer is the same everywhere and in all directions. Quantities that depend on the offset of two
+positions are therefore tabulated over their distance only: the direction of the offset multiplies
+circular components (circular.py) by a phase.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..core.arrays import Array
+
+POINTS_PER_DEPTH = 32
+"""Number of tabulated distances between load and cube per length of one depth (of the cubes'
+centres below the surface). The error of the cubic interpolation between them is 1e-4 of the largest
+value."""
+
+REACH_DEPTHS = 20
+"""Largest tabulated distance along the surface from a load to a cube, divided by the depth of the
+cubes' centres below the surface. Responses and covariances at larger distances count as zero."""
+
+_CUBIC_LAGRANGE = (
+    np.array(
+        [
+            [[0, -2, 3, -1], [6, -3, -6, 3], [0, 6, 3, -3], [0, -1, 0, 1]],
+            [[-2, 6, -3, 0], [-3, -12, 9, 0], [6, 6, -9, 0], [-1, 0, 3, 0]],
+            [[6, -6, 0, 0], [-12, 18, 0, 0], [6, -18, 0, 0], [0, 6, 0, 0]],
+        ]
+    )
+    / 6
+)
+"""Coefficients (3, 4 table entries, 4 powers) of the weights of cubic Lagrange interpolation, and
+of their first and second derivative: with the fraction t of the index between the second and the
+third entry, the weight of an entry is the sum of its coefficients times 1, t, t^2, t^3."""
+
+
+class DistanceTable:
+    """Equally spaced distances, and the interpolation of values that are tabulated at them.
+
+    Cubic interpolation uses two table entries on each side. So the table has one distance before 0,
+    and two beyond the largest distance.
+
+    Attributes:
+        step: Difference of two neighbouring distances in m.
+        last: Index of the largest distance, counted from the distance 0.
+        distances: Tabulated distances (distances,) in m, from -`step` on.
+    """
+
+    def __init__(self, depth: float) -> None:
+        """Define the distances.
+
+        Args:
+            depth: Distance from the centres of the cubes to the surface, in m.
+        """
+        self.step = depth / POINTS_PER_DEPTH
+        self.last = REACH_DEPTHS * POINTS_PER_DEPTH
+        self.distances = np.arange(-1.0, self.last + 3) * self.step
+
+    def weights(self, distance: Array, count: int = 1) -> tuple[Array, ...]:
+        """Return the rows and weights of the interpolation of a table over the distance.
+
+        Args:
+            distance: Distances (N,) in m.
+            count: Number of derivatives by the index of the row, the value included.
+
+        Returns:
+            Index (N,) of the first of the four rows from which each value is interpolated, and for
+            each derivative the weights (4, N) of these rows; 0 beyond `REACH_DEPTHS`.
+        """
+        index = distance / self.step
+        # The table begins one step before the distance 0. The row with the number `below` is
+        # therefore one step before the entry below the distance, and so is the first of the four.
+        below, *weights = cubic_weights(np.minimum(index, self.last), count)
+        is_within = index <= self.last
+        return below, *(one * is_within for one in weights)
+
+    def interpolate(self, table: Array, distance: Array) -> Array:
+        """Interpolate a table over the distance between load and cube, or between two cubes.
+
+        Args:
+            table: Values (distances, ...) at the tabulated distances.
+            distance: Distances (N,) in m.
+
+        Returns:
+            Values (N, ...); 0 at distances of more than `REACH_DEPTHS` depths of the cubes.
+        """
+        first, weights = self.weights(distance)
+        shape = (len(distance),) + (1,) * (table.ndim - 1)
+        weights = weights.reshape(4, *shape)
+        neighbours = [weights[j] * table[first + j] for j in range(4)]
+        return np.asarray(sum(neighbours))
+
+
+def cubic_weights(index: Array | float, count: int = 1) -> tuple[Array, ...]:
+    """Return the weights of cubic Lagrange interpolation from four neighbouring table entries.
+
+    Args:
+        index: Fractional index (...), which lies between the second and the third entry.
+        count: Number of derivatives by the index, the value included.
+
+    Returns:
+        Index (...) of the second entry, and for each derivative the weights (4, ...) of all four.
+    """
+    first = np.floor(index).astype(np.intp)
+    t = index - first
+    powers = np.stack([np.ones_like(t), t, t * t, t * t * t])
+    return first, *(_CUBIC_LAGRANGE[:count] @ powers)
+
+
+def to_polar(place: Array) -> tuple[Array, Array]:
+    """Convert positions (N, 2) in the x-y plane to polar coordinates about the origin.
+
+    Returns:
+        Distances (N,) from the origin, and directions (N,) from the x axis on, in rad.
+    """
+    x, y = place.T
+    return np.hypot(x, y), np.arctan2(y, x)

@@ -1,0 +1,185 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
+"""Measurement model of cubes: the values that they measure, from circular components.
+
+The stress around a cube follows from circular components (circular.py), which depend on the load
+and on the offset of load and cube. What the cube measures depends linearly on them, with a matrix
+that also contains its calibration and which of its pads are in use.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..core.arrays import Array, Index
+from ..core.modes import COMPONENTS, STRESS
+from .circular import FIELD_FROM_CIRCULAR, rotation_phases
+from .layer import FIELD, Layer
+from .spectra import Spectra, layer_spectra
+
+_OBSERVED = np.array([FIELD.index(name) for name in COMPONENTS])
+"""Indices (15,) of the `COMPONENTS` that cubes measure (six stresses, nine gradients of normal
+stresses) in `FIELD`, the names of all 24 stresses and gradients."""
+
+_IS_GRADIENT = np.arange(len(COMPONENTS)) >= len(STRESS)
+"""Whether each of the 15 `COMPONENTS` is a gradient in Pa/m; the others are stresses in Pa."""
+
+
+class MeasurementModel(NamedTuple):
+    """Linear model of the values that the cubes of a skin measure under traction on the surface.
+
+    The values follow from n circular components (circular.py), which are the same for all cubes. A
+    variant is a set of cubes with the same calibration and the same pads in use: their values
+    follow from the circular components by the same matrix.
+
+    Attributes:
+        spectra: Spectra of the circular components over the wavenumber.
+        components: Matrix (variants, 2 n, 15) from the real and imaginary parts of the circular
+            components to the measured `COMPONENTS` in the frame of the cube, in Pa and Pa/m.
+        variant: Index (cubes,) of the variant of each cube.
+        pads: Matrix (variants, 2 n, P) from the same parts to the stress of each pad, divided by
+            the standard deviation of the pad's noise; None if cubes are modelled as points.
+    """
+
+    spectra: Spectra
+    components: Array
+    variant: Index
+    pads: Array | None = None
+
+
+def model_points(
+    layer: Layer,
+    depth: float,
+    cubes: int,
+) -> MeasurementModel:
+    """Return the measurement model of points: cubes measure stress and gradient at their centres.
+
+    Args:
+        layer: Elastic layer that contains the cubes.
+        depth: Distance from the centres of the cubes to the surface, in m.
+        cubes: Number of cubes.
+
+    Raises:
+        ElasticError: The layer does not contain this depth.
+    """
+    spectra = layer_spectra(layer, depth)
+    components = FIELD_FROM_CIRCULAR[None, :, _OBSERVED]
+    return MeasurementModel(spectra, components, np.zeros(cubes, np.intp))
+
+
+class CubeMeasurement:
+    """Conversion of circular components to the values that cubes at one depth in a layer measure.
+
+    Measured components are `COMPONENTS` (six stresses, nine gradients) with the gradients
+    multiplied by `scale`, so that all are in Pa.
+
+    Attributes:
+        layer: Elastic layer.
+        depth: Distance from the centres of the cubes to the surface, in m.
+        spectra: Spectra of the n circular components from which the measured values follow.
+        point_spectra: Spectra of the circular components of the stress at the centre of a cube; the
+            same object as `spectra` if cubes are modelled as points.
+        point_matrix: Matrix (28, 15) from the real and imaginary parts of the components of
+            `point_spectra` to stresses and gradients in Pa.
+        matrices: Matrices (variants, 2 n, 15) from the real and imaginary parts of the circular
+            components to the measured components in Pa. A variant is a set of cubes with the same
+            calibration and the same pads in use.
+        layer_inputs: Numbers and arrays on which the circular components depend, as keys for the
+            cache.
+    """
+
+    def __init__(
+        self,
+        layer: Layer,
+        depth: float,
+        scale: float,
+        model: MeasurementModel | None = None,
+    ) -> None:
+        """Prepare the matrices.
+
+        Args:
+            layer: Elastic layer that contains the cubes.
+            depth: Distance from the centres of the cubes to the surface, in m.
+            scale: Length in m by which gradients are multiplied.
+            model: Measurement model of the cubes; None: they measure stress and gradient at points.
+
+        Raises:
+            ElasticError: The layer does not contain this depth.
+        """
+        points = model_points(layer, depth, 1)
+        model = model or points
+        self.layer = layer
+        self.depth = depth
+        self.spectra = model.spectra
+        self.point_spectra = points.spectra
+        self._unit_factors = np.where(_IS_GRADIENT, scale, 1.0)
+        self.point_matrix = points.components[0] * self._unit_factors
+        self.matrices = model.components * self._unit_factors
+        self.layer_inputs = [
+            layer.thickness,
+            layer.poisson,
+            depth,
+            *vars(model.spectra).values(),
+        ]
+
+    def add_variant(self, components: Array) -> int:
+        """Add a variant of the measurement model, unless an equal one exists already.
+
+        Args:
+            components: Matrix (2 n, 15) as in `MeasurementModel`, for cubes of which only some pads
+                are used; gradients are in Pa/m.
+
+        Returns:
+            Index of the variant in `matrices`.
+        """
+        # Cubes in which the same pads are left out share a variant, so there are few to compare.
+        matrix = components * self._unit_factors
+        is_equal = self.matrices == matrix
+        equal = np.flatnonzero(is_equal.all(axis=(1, 2)))
+        if len(equal):
+            return int(equal[0])
+        self.matrices = np.concatenate([self.matrices, matrix[None]])
+        return len(self.matrices) - 1
+
+    def measure(self, circular: Array, variant: Index) -> Array:
+        """Convert the n circular components at N cubes to the components that the cubes measure.
+
+        Args:
+            circular: Real parts and then imaginary parts (N, 3, 2 n), for loads along x, y and z.
+            variant: Index (N,) of each cube's variant in the measurement model.
+
+        Returns:
+            Measured components (N, 15, 3), for the same loads.
+        """
+        matrices = self.matrices
+        # With only one variant, a single matrix product for all cubes is faster than one per cube.
+        matrix = matrices[0] if len(matrices) == 1 else matrices[variant]
+        matrix = matrix.astype(circular.dtype)
+        return np.asarray((circular @ matrix).swapaxes(1, 2))
+
+    def matrices_towards(self, angle: Array, variant: Index) -> tuple[Array, Array]:
+        """Return the matrices from circular components to measured components of N cubes.
+
+        The circular components are in a frame whose x axis points along the line between two cubes,
+        the measured components in the frame of the cube.
+
+        Args:
+            angle: Direction (N,) of the line in the frame of the cube, in rad.
+            variant: Index (N,) of each cube's variant in the measurement model.
+
+        Returns:
+            Two matrices (N, 15, n): for the real parts of the circular components, and for their
+            imaginary parts.
+        """
+        phases = rotation_phases(angle, self.spectra.order)[:, None]
+        real, imaginary = np.split(
+            self.matrices.swapaxes(1, 2),
+            2,
+            axis=2,
+        )
+        # A rotation of the frame multiplies a circular component by a phase. Here, the coefficients
+        # with which the component enters the measured components are multiplied instead.
+        matrices = (real - 1j * imaginary)[variant] * phases
+        return matrices.real, -matrices.imag
