@@ -67,7 +67,9 @@ class ContactResponse:
 
         # For `response_to_forces` and `sensitivity`, the tables are matrices with one row for each
         # pair of a radius and a distance.
-        self._rows = self._response.reshape(-1, 3 * len(self._order)).astype(np.float32)
+        width = 3 * len(self._order)
+        rows = self._response.reshape(-1, width)
+        self._rows = rows.astype(np.float32)
         self._point_matrix = cubes.point_matrix.astype(np.float32)
         changes = [
             self._tabulate_discs(spectra, bessel)
@@ -154,8 +156,11 @@ class ContactResponse:
         force_x, force_y, force_z = force.astype(np.float32).T[..., None]
         radial = cosine * force_x + sine * force_y
         tangential = cosine * force_y - sine * force_x
-        loads = np.empty((len(place), 4, len(self._order)), np.complex64)
-        loads.real = radial[:, None] * parts[:, :, 0] + force_z[:, None] * parts[:, :, 1]
+        n, n_orders = len(place), len(self._order)
+        by_radial = radial[:, None] * parts[:, :, 0]
+        by_normal = force_z[:, None] * parts[:, :, 1]
+        loads = np.empty((n, 4, n_orders), np.complex64)
+        loads.real = by_radial + by_normal
         loads.imag = tangential[:, None] * parts[:, :, 2]
         value, by_r, by_log, by_log_twice = loads.swapaxes(0, 1)
         order = self._order.astype(np.float32)
@@ -171,7 +176,7 @@ class ContactResponse:
         z = z + below * z_slope
         t = 1j * (t + below * t_slope)
 
-        circular: Complex = np.empty((len(place), 8, len(self._order)), np.complex64)
+        circular: Complex = np.empty((n, 8, n_orders), np.complex64)
         circular[:, 0] = cosine * r - sine * t
         circular[:, 1] = sine * r + cosine * t
         circular[:, 2] = z
@@ -180,9 +185,10 @@ class ContactResponse:
         circular[:, 5] = by_log
         circular[:, 6] = by_log_twice
         circular[:, 7] = moment
-        circular *= _fast_phases(direction - angle, self._order)[:, None]
-        measured: Array = self._cubes.measure(_split(circular), variant).swapaxes(1, 2)
-        return measured
+        phases = _fast_phases(direction - angle, self._order)
+        circular *= phases[:, None]
+        measured = self._cubes.measure(_split(circular), variant)
+        return np.asarray(measured.swapaxes(1, 2))
 
     def _interpolate_slopes(self, distance: Array, size: Array) -> Single:
         """Interpolate the radial functions R, Z and T (circular.py), and their derivatives.
@@ -201,17 +207,21 @@ class ContactResponse:
         # Bicubic interpolation uses 16 rows of the table: four radii times four distances.
         columns = self._response.shape[1]
         corner = (size_row - 1) * columns + first
-        steps = np.add.outer(columns * np.arange(4), np.arange(4)).ravel()
-        neighbours = self._rows.take(corner[:, None] + steps, axis=0)
+        four = np.arange(4)
+        steps = np.add.outer(columns * four, four)
+        indices = corner[:, None] + steps.ravel()
+        neighbours = self._rows.take(indices, axis=0)
 
-        by_log = by_size[1] / _SIZE_LOG_STEP
-        by_log_twice = by_size[2] / _SIZE_LOG_STEP**2
-        over_size = np.stack([by_size[0], by_size[0], by_log, by_log_twice]).T
+        value, size_slope, size_curvature = by_size
+        by_log = size_slope / _SIZE_LOG_STEP
+        by_log_twice = size_curvature / _SIZE_LOG_STEP**2
+        over_size = np.stack([value, value, by_log, by_log_twice]).T
         slope = distance_slope / self._table.step
         over_distance = np.stack([by_distance, slope, by_distance, by_distance]).T
         weights = over_size[:, :, None] * over_distance[:, None]
-        by_row = weights.reshape(-1, 16, 4).swapaxes(1, 2).astype(np.float32)
-        return np.asarray(by_row @ neighbours).reshape(len(distance), 4, 3, -1)
+        by_row = weights.reshape(-1, 16, 4).swapaxes(1, 2)
+        functions = by_row.astype(np.float32) @ neighbours
+        return np.asarray(functions).reshape(len(distance), 4, 3, -1)
 
     def response_to_forces(
         self,
@@ -295,22 +305,31 @@ class ContactResponse:
         # table begins one step before the distance 0, hence the 1 in the row number.
         columns = self._response.shape[1]
         first = narrower * columns + below + 1
-        neighbours = rows.take(first[:, None] + [0, 1, columns, columns + 1], axis=0)
+        steps = [0, 1, columns, columns + 1]
+        neighbours = rows.take(first[:, None] + steps, axis=0)
         farther = index - below
         wider = size_index - narrower
-        by_distance = np.stack([1 - farther, farther]) * (index < self._table.last)
+        is_near = index < self._table.last
+        by_distance = np.stack([1 - farther, farther]) * is_near
         weights = np.concatenate([(1 - wider) * by_distance, wider * by_distance])
         weights = weights.T.astype(np.float32)[:, None]
-        parts = (weights @ neighbours).reshape(len(place), -1, 3, len(order))
+        n, n_orders = len(place), len(order)
+        parts = (weights @ neighbours).reshape(n, -1, 3, n_orders)
 
+        # The radial and the tangential force are the real and the imaginary part of the tangential
+        # vector F_x + i F_y, rotated into the direction from the contact to the cube.
+        force_x, force_y, force_z = force.T
         towards = np.exp(1j * direction).astype(np.complex64)
-        in_plane = (force[:, 0] + 1j * force[:, 1]).astype(np.complex64) * towards.conj()
-        in_plane = in_plane[:, None, None]
-        along_z = force[:, 2].astype(np.float32)[:, None, None]
-        circular = np.empty((len(place), parts.shape[1], len(order)), np.complex64)
-        circular.real = in_plane.real * parts[:, :, 0] + along_z * parts[:, :, 1]
+        tangential = (force_x + 1j * force_y).astype(np.complex64)
+        in_plane = (tangential * towards.conj())[:, None, None]
+        along_z = force_z.astype(np.float32)[:, None, None]
+        by_radial = in_plane.real * parts[:, :, 0]
+        by_normal = along_z * parts[:, :, 1]
+        circular = np.empty((n, parts.shape[1], n_orders), np.complex64)
+        circular.real = by_radial + by_normal
         circular.imag = in_plane.imag * parts[:, :, 2]
-        circular *= _fast_phases(direction - angle, order)[:, None]
+        phases = _fast_phases(direction - angle, order)
+        circular *= phases[:, None]
         return circular
 
     def field(self, place: Array, size: float) -> Array:
@@ -325,7 +344,8 @@ class ContactResponse:
             force along x, y and z.
         """
         table = self._interpolate_size(self._field, size, place)
-        circular = self._rotate_loads(table, place, np.zeros(len(place)), ORDERS)
+        no_rotation = np.zeros(len(place))
+        circular = self._rotate_loads(table, place, no_rotation, ORDERS)
         return np.asarray((circular @ FIELD_FROM_CIRCULAR).swapaxes(1, 2))
 
     def _rotate_loads(
@@ -370,11 +390,13 @@ class ContactResponse:
             Functions R, Z and T (distances, 3, n) at the tabulated distances up to the farthest of
             these positions.
         """
-        farthest = np.hypot(*place.T).max(initial=0.0) / self._table.step
+        distance, _ = to_polar(place)
+        farthest = distance.max(initial=0.0) / self._table.step
         n_distances = int(min(farthest, self._table.last)) + 4
 
         first, weights = cubic_weights(_size_index(size, self._depth))
-        neighbours = discs[int(first) - 1 : int(first) + 3, :n_distances]
+        start = int(first) - 1
+        neighbours = discs[start : start + 4, :n_distances]
         return np.asarray(np.tensordot(weights, neighbours, axes=1))
 
 

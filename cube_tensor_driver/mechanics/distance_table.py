@@ -90,8 +90,8 @@ class DistanceTable:
         first, weights = self.weights(distance)
         shape = (len(distance),) + (1,) * (table.ndim - 1)
         weights = weights.reshape(4, *shape)
-        neighbours = [weights[j] * table[first + j] for j in range(4)]
-        return np.asarray(sum(neighbours))
+        terms = [weights[j] * table[first + j] for j in range(4)]
+        return np.asarray(sum(terms))
 
 
 def cubic_weights(index: Array | float, count: int = 1) -> tuple[Array, ...]:

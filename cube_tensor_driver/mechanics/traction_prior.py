@@ -174,7 +174,8 @@ class TractionPrior:
             second,
             strict=True,
         ):
-            total += left @ self._table.interpolate(table, distance) @ right.swapaxes(1, 2)
+            circular = self._table.interpolate(table, distance)
+            total += left @ circular @ right.swapaxes(1, 2)
         return total
 
     def pressure(
@@ -211,8 +212,8 @@ def _prior_spectrum(wavenumber: Array) -> Array:
     Args:
         wavenumber: Wavenumbers multiplied by the depth of the cubes.
     """
-    parts = [
-        2 * np.pi * length**2 * np.exp(-((wavenumber * length) ** 2) / 2)
-        for length in PRIOR_LENGTHS
-    ]
+    parts = []
+    for length in PRIOR_LENGTHS:
+        decay = np.exp(-((wavenumber * length) ** 2) / 2)
+        parts.append(2 * np.pi * length**2 * decay)
     return np.asarray(np.mean(parts, axis=0))

@@ -117,7 +117,7 @@ class HertzFit:
         """
         self.values = values
         self._depth = depth = inverse.depth
-        # The cubic interpolation of `ContactResponse` needs one tabulated radius below and two above.
+        # Cubic interpolation of responses needs one tabulated radius below and two above.
         self._log_range = np.log(DISC_SIZES[[1, -3]] * depth)
         self.found = starts._replace(log_sizes=np.clip(starts.log_sizes, *self._log_range))
         self.misfit = 1.0
