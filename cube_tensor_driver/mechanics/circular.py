@@ -37,7 +37,8 @@ def _define_components() -> tuple[Complex, Orders]:
         Matrix (14, 24) of the components as combinations of `FIELD`, and their orders (14,).
     """
     # `unit` maps the name of each of the 24 quantities `FIELD` to its unit vector (24,).
-    unit = dict(zip(FIELD, np.eye(len(FIELD)), strict=True))
+    rows = np.eye(len(FIELD))
+    unit = dict(zip(FIELD, rows, strict=True))
 
     def combine_stresses(suffix: str) -> list[tuple[int, Complex]]:
         """Return four circular components of the six stresses, or of their derivatives by one axis.
@@ -62,7 +63,8 @@ def _define_components() -> tuple[Complex, Orders]:
     # and d/dx - i d/dy lowers it by one.
     by_x = combine_stresses("_x")
     by_y = combine_stresses("_y")
-    for (order, along_x), (_, along_y) in zip(by_x, by_y, strict=True):
+    pairs = zip(by_x, by_y, strict=True)
+    for (order, along_x), (_, along_y) in pairs:
         components.append((order + 1, along_x + 1j * along_y))
         # If the order is 0, the component is real. Its two combinations are then complex conjugates
         # of each other, and one of them is enough.

@@ -331,12 +331,12 @@ class SlipEstimator:
         moved = change[..., :3]
         turned = change[..., 3:6]
         distance = _lengths(moved)
-        ratio = newest[:, 3:6]
-        size = _lengths(ratio)[:, None]
+        shear_ratio = newest[:, 3:6]
+        ratio = _lengths(shear_ratio)[:, None]
 
         divisor = np.maximum(distance, 1e-12)
         growth = np.einsum("nlk,nlk->nl", moved, turned) / divisor
-        lever = LEVER_M / (1 + 2 * size)
+        lever = LEVER_M / (1 + 2 * ratio)
         tilt = lever * np.maximum(growth, 0)
         leak = LEAK_M * _lengths(change[..., 3:])
         # A change of force within a short lag may be undone within a longer one, but may still have
@@ -348,16 +348,17 @@ class SlipEstimator:
         moves &= distance > MIN_SPEED * duration
         # A lag is twice the one before. The motion over the lag before is therefore the motion in
         # the second half of a lag; if it is small, the contact has stopped.
-        moves[:, 1:] &= distance[:, :-1] > MIN_LATE_SHARE * distance[:, 1:]
+        late = distance[:, :-1]
+        moves[:, 1:] &= late > MIN_LATE_SHARE * distance[:, 1:]
 
-        along = np.einsum("nlk,nk->nl", moved, ratio)
-        is_along = along > MIN_COSINE * distance * size
+        along = np.einsum("nlk,nk->nl", moved, shear_ratio)
+        is_along = along > MIN_COSINE * distance * ratio
         largest = MIN_SHARE_OF_LARGEST * self._contacts["largest_ratio"]
         min_ratio = np.maximum(MIN_RATIO, largest)
         ratio_change = _lengths(turned)
         slips = moves & is_along
-        slips &= size > min_ratio[:, None]
-        slips &= ratio_change < MAX_RATIO_CHANGE * size
+        slips &= ratio > min_ratio[:, None]
+        slips &= ratio_change < MAX_RATIO_CHANGE * ratio
         return moves, slips
 
     def _remember(self, time_s: float, newest: Array) -> None:
@@ -450,10 +451,13 @@ class SlipEstimator:
         forces = loads[near, :3] @ rotation
         centres = (loads[near, 3:] - poses.position[home]) @ rotation
         sizes = np.log(self._contacts["radius"][near])
-        fit = HertzFit(inverse, local, Discs(forces, centres[:, :2], sizes))
+        discs = Discs(forces, centres[:, :2], sizes)
+        fit = HertzFit(inverse, local, discs)
         linearise(inverse, [fit])
 
-        solved = (fit.covariance[:5] @ fit.jacobian.T).reshape(5, len(cubes), -1)
+        # The first five parameters of the fit are force (3) and position (2) of this contact.
+        solved = fit.covariance[:5] @ fit.jacobian.T
+        solved = solved.reshape(5, len(cubes), -1)
         weights = np.einsum("knc,ncd->knd", solved, local.whitening)
 
         by_pad = np.nan_to_num(inverse.by_pad[cubes])
@@ -489,7 +493,8 @@ def _motion_state(loads: Array, normal: Array) -> Array:
     outward = np.einsum("nk,nk->n", force, normal)[:, None]
     pressing = np.maximum(-outward, 1e-3 * MIN_FORCE_N)
     shear = force - outward * normal
-    parts = [loads[:, 3:], shear / pressing, np.log(pressing)]
+    position = loads[:, 3:]
+    parts = [position, shear / pressing, np.log(pressing)]
     return np.concatenate(parts, axis=1)
 
 
@@ -511,5 +516,6 @@ def _add_ratio(
         deviation: Standard deviations s (n,) of the ratios.
     """
     weight = deviation**-2
-    sums = np.stack([1 / deviation, weight, ratio * weight], axis=1)
+    columns = [1 / deviation, weight, ratio * weight]
+    sums = np.stack(columns, axis=1)
     contacts["sums"] += np.where(chosen[:, None], sums, 0.0)

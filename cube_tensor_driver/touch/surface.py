@@ -190,15 +190,17 @@ class Surface:
         # Where neither a cube nor its neighbours have a value, the pressure is unknown (NaN) and
         # counts as zero.
         pressure = np.nan_to_num(self._pressure(values))
-        inside = pressure > max(threshold, RELATIVE_THRESHOLD * float(pressure.max()))
+        relative_threshold = RELATIVE_THRESHOLD * float(pressure.max())
+        inside = pressure > max(threshold, relative_threshold)
         if not inside.any():
             return []
 
         shear = np.nan_to_num(self._shear(values))
         value_pressure = -self._interpolation.values(values, PRESSURE[:1])
+        shear_by_patch = [self._by_patch(component) for component in shear.T]
         loaded = _LoadedSurface(
             pressure=self._by_patch(pressure),
-            shear=np.stack([self._by_patch(component) for component in shear.T]),
+            shear=np.stack(shear_by_patch),
             moment_pressure=self._by_patch(np.nan_to_num(value_pressure)),
             uncertainty=self._by_patch(self.uncertainty(values)),
             sees_shear=bool(np.isfinite(values[:, SHEAR]).any()),
@@ -267,7 +269,8 @@ class Surface:
         weight = loaded.moment_pressure[chosen] * self.area
         normal_force = float(pressure.sum() * self.area)
         # The normal of the contact is the mean of its cubes' normals, weighted with the pressure.
-        normal = _weighted_sum(pressure.sum(axis=1), rotation[:, :, 2])
+        cube_normals = rotation[:, :, 2]
+        normal = _weighted_sum(pressure.sum(axis=1), cube_normals)
         normal /= np.linalg.norm(normal)
 
         shear = self._shear_force(loaded.shear[:, chosen], rotation)
@@ -279,18 +282,21 @@ class Surface:
 
         # Interpolation errors are correlated over one pitch (distance of neighbouring cubes), so
         # the errors of the pitch / spacing points along each axis add up instead of averaging out.
-        deviation = loaded.uncertainty[chosen] * pressure * self.pitch * self.spacing
-        variance = deviation**2
-        lever = ((points - centre) ** 2).sum(axis=2) / 2
-        n_pressed = np.count_nonzero(pressure > 0.5 * pressure.max())
+        pressure_deviation = loaded.uncertainty[chosen] * pressure
+        variance = (pressure_deviation * self.pitch * self.spacing) ** 2
+        squared_lever = ((points - centre) ** 2).sum(axis=2) / 2
+        moment_variance = (variance * squared_lever).sum()
+        is_pressed = pressure > 0.5 * pressure.max()
+        n_pressed = np.count_nonzero(is_pressed)
+        shear_force = float(np.linalg.norm(shear)) if loaded.sees_shear else np.nan
         return Contact(
             position=position,
             normal=normal,
             force=shear - normal * normal_force,
             normal_force=normal_force,
-            shear_force=float(np.linalg.norm(shear)) if loaded.sees_shear else np.nan,
+            shear_force=shear_force,
             area=float(n_pressed * self.area),
-            position_uncertainty=float(np.sqrt((variance * lever).sum()) / normal_force),
+            position_uncertainty=float(np.sqrt(moment_variance) / normal_force),
             force_uncertainty=float(np.sqrt(variance.sum())),
         )
 

@@ -272,7 +272,8 @@ class Touch:
         self._count[cubes] = 0
         # A slow part that is held is not averaged over the next samples. It keeps the noise of two
         # samples: the one before and the one after the restart.
-        self._margin[cubes] += RESTART_MARGIN * self._held[cubes] * self._deviation[cubes]
+        margin = RESTART_MARGIN * self._deviation[cubes]
+        self._margin[cubes] += self._held[cubes] * margin
 
     def _use_pads(self, cubes: Index, left_out: PadMasks) -> None:
         """Start the slow parts of cubes again, because the pads in use have changed."""
@@ -408,7 +409,8 @@ class Touch:
         square = force**2
 
         place = self._place[cube]
-        pitches = np.linalg.norm(place[:, None] - place, axis=2)
+        offset = place[:, None] - place
+        pitches = np.linalg.norm(offset, axis=2)
         # The distance of a load from itself is infinite: only other loads disturb its force.
         np.fill_diagonal(pitches, np.inf)
         # The errors due to other loads decrease with the distance^-3, their squares with ^-6.

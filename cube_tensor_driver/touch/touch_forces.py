@@ -95,9 +95,18 @@ def estimate_forces(
     _, noise_kind = np.unique(noise, axis=0, return_inverse=True)
     noise_kind = noise_kind.reshape(n)
     # Poses that differ by less than a micrometre or a tenth of a milliradian count as the same.
-    keys = [place.reshape(n, -1) / 1e-6, angle / 1e-4, noise_kind[near]]
+    keys = [
+        place.reshape(n, -1) / 1e-6,
+        angle / 1e-4,
+        noise_kind[near],
+    ]
     rounded = np.hstack(keys).round()
-    _, first, kind = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
+    _, first, kind = np.unique(
+        rounded,
+        axis=0,
+        return_index=True,
+        return_inverse=True,
+    )
 
     own = _grid(np.linspace(-MAX_PITCHES, MAX_PITCHES, 9))
     other = _grid(np.arange(-5.0, 6.0))
@@ -157,10 +166,11 @@ def _solve(
     weights = np.zeros((*observed.shape, 3))
     weights[observed] = solution
 
-    error = np.einsum("cf,csl->sfl", solution, own) - np.eye(3)
-    mean_square = (error**2).mean(axis=0)
+    estimate = np.einsum("cf,csl->sfl", solution, own)
+    error = estimate - np.eye(3)
+    rms_error = np.sqrt((error**2).mean(axis=0))
     noise_variance = np.einsum("if,ij,jf->f", solution, noise, solution)
-    return weights.reshape(-1, 3), np.sqrt(noise_variance), np.sqrt(mean_square)
+    return weights.reshape(-1, 3), np.sqrt(noise_variance), rms_error
 
 
 def _mean_square(signal: Array) -> Array:
@@ -170,4 +180,5 @@ def _mean_square(signal: Array) -> Array:
         signal: Components (n, S, 3) for a force of 1 N along x, y and z at each position.
     """
     flat = signal.reshape(len(signal), -1)
-    return np.asarray(flat @ flat.T / signal.shape[1])
+    n_positions = signal.shape[1]
+    return np.asarray(flat @ flat.T / n_positions)

@@ -31,13 +31,16 @@ def unroll(
         frame of its centre cube, with the origin in the centre of this cube.
     """
     to_centre = poses.rotation[centres]
-    offset = poses.position[near] - poses.position[centres][:, None]
+    origin = poses.position[centres]
+    offset = poses.position[near] - origin[:, None]
     local = np.einsum("nji,nkj->nki", to_centre, offset)
 
     # The direction in the x-y plane stays, the length becomes the distance in space.
     distance = np.linalg.norm(local, axis=2)
-    in_plane = np.hypot(local[..., 0], local[..., 1])
-    stretch = distance / np.where(in_plane > 0, in_plane, 1.0)
+    x, y, _ = np.moveaxis(local, -1, 0)
+    in_plane = np.hypot(x, y)
+    in_plane_safe = np.where(in_plane > 0, in_plane, 1.0)
+    stretch = distance / in_plane_safe
     place = local[..., :2] * stretch[..., None]
 
     # A tilted neighbour gets the rotation about z that is closest to its rotation in space.
