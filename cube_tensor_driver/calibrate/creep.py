@@ -64,7 +64,8 @@ FIRST_BEND = 0.15
 """Standard deviation that the first fit assumes for second differences of the creep law's
 amplitudes at successive relaxation times, divided by the mean amplitude.
 
-Creep that grows as a power of time, with an exponent of 0.1 to 0.4, has values of 0.03 to 0.7.
+It keeps the amplitudes smooth. If creep grows as a power of time, with an exponent of 0.1 to 0.4,
+these differences are 0.03 to 0.7 of the mean amplitude.
 """
 
 BEND = 0.05

@@ -39,8 +39,8 @@ BLOCK_NS = 1_000_000_000
 """Duration, in ns, of the blocks whose mean temperatures and pad stresses are fitted."""
 
 MIN_BLOCKS = 120
-"""Smallest number of blocks (of 1 s) with data, in all bags together, with which temperature is
-fitted."""
+"""Smallest number of blocks (of 1 s) with data, in all bags together. With fewer, the dependence of
+the pads on temperature is not fitted: the fit raises an error."""
 
 MIN_RANGE = 3.0
 """Smallest difference between the highest and the lowest measured temperature, in K. With a smaller

@@ -29,7 +29,8 @@ BLOCK_NS = 500_000_000
 
 MIN_SPREAD = 3.0
 """Smallest standard deviation of the specific force, in m/s², along the direction in which it
-varies least. A recording of three poses, in each of which another axis points upwards, has 4.6."""
+varies least. Six poses, in which each axis points upwards and downwards, have 5.7; the smallest
+sufficient number is four (x, y, z upwards, z downwards: 3.5). With three poses it is 0."""
 
 MIN_BLOCKS = 20
 """Smallest number of blocks (of 0.5 s) with data: four times the number of unknowns of a pad, which
@@ -145,7 +146,8 @@ def _fit_cube(
     if spread < MIN_SPREAD:
         raise BagError(
             f"{label}: its specific force varies by {spread:.2g} m/s² along one direction; at "
-            f"least {MIN_SPREAD:g} are needed, so turn the arm until each axis has pointed upwards"
+            f"least {MIN_SPREAD:g} are needed, so turn the arm until each axis has pointed "
+            "up and down"
         )
 
     constant = np.ones(len(time))

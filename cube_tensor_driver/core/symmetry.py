@@ -202,7 +202,10 @@ class Structure:
 
 
 def default_modes(layout: Layout) -> Modes:
-    """Return the modes that a layout can measure: `PLANE` for pads in one plane, else `SPACE`."""
+    """Return the modes (components of stress and gradient) that a layout of pads can measure.
+
+    They are `PLANE` for pads in one plane, `SPACE` otherwise.
+    """
     return PLANE if layout.planar else SPACE
 
 

@@ -51,7 +51,8 @@ MIN_WIDTH = MIN_SQUARE * NUMBER_GRID[1]
 """Smallest width of a picture, in pixels, that has room for the frame number."""
 
 MIN_HEIGHT = 4 * MIN_SQUARE
-"""Smallest height of a picture, in pixels. The frame number takes two squares of it."""
+"""Smallest height of a picture, in pixels, so that the frame number, which is two rows of squares
+(`NUMBER_GRID`), covers at most half of it."""
 
 HANDOVER_S = 1e-3
 """Time, in s, for which `next_picture` sleeps before it takes the samples that have arrived.

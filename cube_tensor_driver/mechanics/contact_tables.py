@@ -160,8 +160,8 @@ class DiscTables(_ContactTables):
 
         distance = np.arange(_LAST_DISTANCE + 2) * self.depth / POINTS_PER_DEPTH
         bessel = tabulate_bessel(spectra.k, distance)
-        # The table has the axes radius, distance, function (R, Z, T) and circular component (14).
-        # T gets the factor i with which the tangential force F_t acts (circular.py).
+        # The table has the axes radius, distance, force (radial, normal, tangential) and component.
+        # The equations in circular.py contain the tangential force multiplied by i.
         factors = np.array([1, 1, 1j])[:, None]
         table = spectra.radial(bessel, disc_spectra) * factors
         return {"table": table.astype(np.complex64)}

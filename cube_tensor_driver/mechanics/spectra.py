@@ -237,13 +237,16 @@ def wavenumber_quadrature(depth: float) -> tuple[Array, Array]:
 
 
 def layer_spectra(layer: Layer, depth: float, waves_of: float | None = None) -> Spectra:
-    """Return the spectra of the circular components of `FIELD` at a point in a layer.
+    """Return the field at a depth below a unit traction wave on the surface, for all wavenumbers.
+
+    The field (`FIELD`) is stress and its gradient, in circular components: combinations that a
+    rotation about the normal multiplies by a phase factor (circular.py).
 
     Args:
         layer: Elastic layer.
         depth: Distance from the point to the surface, in m.
-        waves_of: Depth in m for which the wavenumbers are chosen (`wavenumber_quadrature`); None:
-            `depth`. Only spectra with the same wavenumbers can be subtracted.
+        waves_of: Another depth in m, whose wavenumbers (`wavenumber_quadrature`) are used instead
+            of those of `depth`. Only spectra with the same wavenumbers can be subtracted.
 
     Raises:
         ElasticError: The layer does not contain this depth.

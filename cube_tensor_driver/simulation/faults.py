@@ -53,7 +53,8 @@ FRAME_FAULTS = ("drop", "flip", "insert", "duplicate", "reorder", "truncate")
 """Kinds of faults that alter or lose single frames (messages of a hub) with a sample."""
 
 PAD_FAULTS = ("open", "short", "stuck", "noisy", "report")
-"""Kinds of faults of one pad (sensing element) of a cube."""
+"""Kinds of faults of one pad (sensing element) of a cube: open or shorted, a frequency that does
+not change or is noisy, and a good pad that the hub reports as failed."""
 
 MOMENTARY_FAULTS = (*FRAME_FAULTS, "reset", "wrap", "drift", "step")
 """Kinds of faults without a duration: they end as soon as they have begun. All other kinds last for

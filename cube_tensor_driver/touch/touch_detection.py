@@ -51,7 +51,8 @@ change of the pressure that is to be found in two scans (samples of every cube).
 OVERSHOOT = 1.04
 """Correction of the limit of the CUSUM, in standard deviations of the noise. It is subtracted from
 the limit that holds for a continuous sum, because a sum of samples jumps beyond the limit. With
-`REFERENCE` = 2, the mean time between false alarms then is 1.05 to 1.15 times the wanted one."""
+`REFERENCE` = 2, the mean time between false alarms then is 1.05 to 1.15 times the one that the user
+has chosen (`touch_false_alarms`)."""
 
 SETTLING_ROWS = 10
 """Number of first samples of a cube whose mean is the start of the slowly drifting part of its
@@ -244,8 +245,8 @@ class Touch:
         slow = self._slow[cube]
         is_unknown = np.isnan(slow)
         if is_unknown.any():
-            # Where a slow part starts again, it is the newest value minus the pressure of the load
-            # so far, so that this load is still seen.
+            # An unknown drift starts at the newest value minus the pressure of the detected load.
+            # Otherwise this load would be taken for drift.
             load = np.nan_to_num(self._change[cube])
             slow = np.where(is_unknown, values - load, slow)
         change = values - slow

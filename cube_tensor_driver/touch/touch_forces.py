@@ -31,8 +31,9 @@ LOAD_WIDTH = 5e-3
 and wider contacts are sums of such contacts."""
 
 FORCE_DEVIATION = 0.1
-"""Prior standard deviation s, in N, of each component of the force of the load. If it were smaller,
-the estimate would suppress the noise more, and the error due to the unknown position less."""
+"""Standard deviation s, in N, of the Gaussian prior of each component of the force of the load, a
+typical force of a touch. A smaller one would reduce the error due to noise, and increase the error
+due to the unknown position of the load."""
 
 OTHER_FORCE_DEVIATION = 0.03
 """Prior standard deviation t, in N, of each component of the forces of other loads. If it were

@@ -115,7 +115,7 @@ def test_cubes_that_differ_widen_the_deviation_of_their_mean(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "name", "text"),
     [
-        ({"poses": POSES[:2] * 3}, None, "turn the arm until each axis has pointed upwards"),
+        ({"poses": POSES[:2] * 3}, None, "turn the arm until each axis has pointed up and down"),
         ({"poses": POSES[:1]}, None, "10 blocks of 0.5 s"),
         ({"motion": False}, None, "record it while the parameter imu or gravity"),
         ({"poses": POSES[:1]}, "c9", "no cube 'c9'; there are c0, c1, c2"),

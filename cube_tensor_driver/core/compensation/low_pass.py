@@ -43,8 +43,8 @@ HALVINGS = 10
 which converges quickly only for small arguments."""
 
 SERIES_TERMS = 9
-"""Number of terms of the Taylor series of the exponential function. Its argument is at most
-64 / 2**10, with which the first term that is left out is 1e-17 of the sum."""
+"""Number of terms of the Taylor series of 1 - exp(-x). The largest ratio, 64, gives
+x = 64 / 2**`HALVINGS`, with which the first term that is left out is 4e-18 of the sum."""
 
 
 def relaxed_share(ratio: Array) -> Array:

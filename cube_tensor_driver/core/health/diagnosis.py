@@ -279,7 +279,10 @@ class PadDiagnosis:
         self._mean_before = np.where(has_mean, window.mean, self._mean_before)
 
     def _find_drifting(self, window: Window) -> Mask:
-        """Find the pads of still cubes whose frequency shifts relative to the others (cubes, P).
+        """Return a mask (cubes, P) of the pads that drift.
+
+        The frequency of such a pad moves away from its value at rest, while those of the other
+        pads of the cube do not. Only cubes that are still (constant frequencies) are examined.
 
         Args:
             window: Statistics of the window that has ended.

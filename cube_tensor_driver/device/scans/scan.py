@@ -278,7 +278,7 @@ class ScanBuilder:
         return scans[::-1]
 
     def build_whole(self, scans: WholeScans) -> FrequencyRows:
-        """Convert whole scans (one sample of each link, all cubes of its hub) to rows."""
+        """Convert whole scans to rows. A scan has one sample of each link, with all cubes of it."""
         rows = self._make_rows(len(scans.cubes), self.cubes.n_pads)
         rows.cube[:] = scans.cubes
         rows.status[:] = 0

@@ -57,7 +57,10 @@ class CubeNoise:
         self._revision = -1
 
     def update(self, scaled: Array, cubes: Index) -> None:
-        """Compute the noise of cubes again whose pads in use, known values or stresses changed.
+        """Compute the noise variances of the stress again, for cubes that need it.
+
+        Those are cubes of which other pads are in use, or other components are known (not NaN),
+        than in the scan before, or whose stress has changed much.
 
         Args:
             scaled: Components of stress and gradient (times d0, half the side of a cube), in Pa

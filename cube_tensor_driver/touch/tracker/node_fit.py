@@ -274,7 +274,7 @@ class NodeFit:
         return discs_of(self.estimate_contacts())
 
     def estimate_contacts(self) -> list[ContactEstimate]:
-        """Return the integrals of the traction over each contact of the region."""
+        """Return force, centre, moment and area of each contact of the region, by integration."""
         estimates = []
         for label in range(self.labels.max() + 1):
             own = self.labels == label

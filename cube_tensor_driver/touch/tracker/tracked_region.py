@@ -262,10 +262,10 @@ class TrackedRegion:
         return self.start
 
     def is_response_stale(self, cubes: Index) -> bool:
-        """Return whether the stored response of some cubes to this region must be computed again.
+        """Return whether the stored stress that this region causes in some cubes is out of date.
 
-        It must if it was not computed for all of these cubes, or if the contacts have changed by
-        more than `MAX_STALE_CHANGE` since.
+        It is if it was not computed for all of these cubes, or if the contacts of the region have
+        changed by more than `MAX_STALE_CHANGE` since.
         """
         if not self._responding[cubes].all():
             return True
