@@ -108,7 +108,7 @@ class Layout:
     """
 
     def __init__(self, width: int, height: int) -> None:
-        """Choose the arrangement for a size in pixels."""
+        """Choose the arrangement of the page for the width and height of a browser, in pixels."""
         is_phone = width < height
         self.target = PHONE_TARGET if is_phone else CAMERA_TARGET
         free = width - LEFT_WIDTH - RIGHT_WIDTH

@@ -49,7 +49,7 @@ class ShownSkin:
         calibrations: Sequence[Calibration],
         depth: float,
     ) -> None:
-        """Prepare the points of the field and both views.
+        """Prepare the points of the field, the 3-D view and the top view of the skin.
 
         Args:
             name: Name of the skin.

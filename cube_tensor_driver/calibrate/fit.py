@@ -424,8 +424,8 @@ class _Model:
                 weighted = root[:, None] * jacobian
                 step = least_squares(weighted, root * r)
                 theta = theta + step
-                # The tolerance is relative to the parameters. If they are near 0, the 1 makes it
-                # absolute.
+                # The tolerance of the step is relative to the norm of the parameters. Adding 1 to
+                # the norm keeps the tolerance from becoming 0 for parameters near 0.
                 size = np.linalg.norm(theta)
                 limit = tolerance * (1 + size)
                 if np.linalg.norm(step) <= limit:

@@ -165,8 +165,8 @@ class Modes:
             state: Amplitudes of the modes (N, M), in Pa.
 
         Returns:
-            Stress at the centre of the cube (N, 3, 3), and gradient d(sigma_ij)/dx_k times d0
-            (N, 3, 3, 3), both in Pa.
+            Stress at the centre of the cube (N, 3, 3), and gradient d(sigma_ij)/dx_k times d0 (half
+            the side of the cube) (N, 3, 3, 3), both in Pa.
         """
         amplitudes = np.asarray(state, dtype=float)
         flat = amplitudes.reshape(-1, self.n_modes) @ self.fields.T

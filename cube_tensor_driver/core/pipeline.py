@@ -281,10 +281,11 @@ class Pipeline:
         return shifted
 
     def shift_of_zero(self, before: Array) -> Array:
-        """Return the stress that unloaded pads have by older rest frequencies (cubes, P).
+        """Return the stress of unloaded pads that older rest frequencies would yield (cubes, P).
 
-        It is divided by the stiffness of the pads, and would be 0 if the older rest frequencies
-        were equal to the present ones.
+        The rest frequency of a pad is its frequency without load. The stress is computed for the
+        present rest frequencies as if the older ones were valid, and is divided by the stiffness
+        of the pads (no unit). It is 0 where both rest frequencies are equal.
 
         Args:
             before: The older rest frequencies (cubes, P), in Hz.

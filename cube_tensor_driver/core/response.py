@@ -62,8 +62,8 @@ plane z-x are chosen so that the pads in this plane respond as `ILLUSTRATIVE` st
 """
 
 _LARGEST_SYMMETRY = {"quad": "slab", "planar": "full", "cube": "full"}
-"""Name of the largest symmetry group of each built-in layout, under which its illustrative
-coefficients are given."""
+"""Name of the largest symmetry group of each built-in layout. The illustrative coefficients of the
+layout's response matrix (`ILLUSTRATIVE`, `ILLUSTRATIVE_CUBE`) are those of this symmetry."""
 MAX_LISTED_NAMES = 6
 """Maximum number of names that an error message lists; of further names it states the number."""
 

@@ -33,8 +33,9 @@ the solution of a contact problem, which takes time.
 """
 
 RANGE_TIMES = 100
-"""Number of equally spaced times in one period of the load from which the range of each component
-(maximum minus minimum) is computed."""
+"""Number of equally spaced times in one period of the load from which the range (maximum minus
+minimum) of each of the 15 stress and gradient components is computed. The errors of the measured
+components are divided by this range."""
 
 LOADED_SHARE = 0.2
 """Fraction of the largest force of a measurement above which the skin counts as loaded.

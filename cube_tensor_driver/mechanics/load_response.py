@@ -30,8 +30,9 @@ MAX_WAVENUMBER = 14.0
 The stress that a wave with this wavenumber causes at this depth is 1e-5 of that on the surface."""
 
 POINTS_PER_DEPTH = 32
-"""Number of tabulated distances per length of one depth of the cubes' centres. The error of the
-linear interpolation between them is a thousandth of the largest value."""
+"""Number of tabulated distances between load and cube in an interval as long as the depth of the
+cubes' centres. The error of the linear interpolation between two distances is about a thousandth
+of the largest value of each component."""
 
 _OBSERVED = [FIELD.index(name) for name in COMPONENTS]
 

@@ -127,9 +127,11 @@ class CubeMeasurement:
     def add_variant(self, components: Array) -> int:
         """Add a variant of the measurement model, unless an equal one exists already.
 
+        A variant is a set of cubes with the same calibration and the same pads in use.
+
         Args:
-            components: Matrix (2 n, 15) as in `MeasurementModel`, for cubes of which only some pads
-                are used; gradients are in Pa/m.
+            components: Matrix (2 n, 15) from the real and imaginary parts of the n circular
+                components to the stresses, in Pa, and gradients, in Pa/m, that these cubes measure.
 
         Returns:
             Index of the variant in `matrices`.
@@ -179,7 +181,7 @@ class CubeMeasurement:
             2,
             axis=2,
         )
-        # A rotation of the frame multiplies a circular component by a phase. Here, the coefficients
-        # with which the component enters the measured components are multiplied instead.
+        # A rotation of the frame multiplies each circular component by a phase. Multiplying its
+        # column of the matrices by this phase has the same effect on the measured components.
         matrices = (real - 1j * imaginary)[variant] * phases
         return matrices.real, -matrices.imag

@@ -17,10 +17,10 @@ from ..core.arrays import Array
 class CubicSpline:
     """A twice continuously differentiable curve through K >= 2 points.
 
-    The time runs from 0 to 1, and point i is reached at the time i / (K - 1). Between two points,
-    the curve is the cubic Hermite polynomial with given slopes m (change per interval) at both
-    points p. A continuous second derivative requires m[i-1] + 4 m[i] + m[i+1] = 3 (p[i+1] -
-    p[i-1]).
+    The time runs from 0 to 1, and the point p[i] is reached at the time i / (K - 1). Between two
+    points, the curve is the cubic Hermite polynomial with the slopes m (change per interval) at
+    both. The slopes follow from a continuous second derivative, m[i-1] + 4 m[i] + m[i+1] =
+    3 (p[i+1] - p[i-1]), and are 0 at the ends unless the curve is closed.
 
     Source: C. de Boor, A Practical Guide to Splines (1978), chapter IV.
     """

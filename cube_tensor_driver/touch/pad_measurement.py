@@ -48,8 +48,12 @@ at a point under a point force have orders up to 4; the four-fold symmetry of a 
 4."""
 
 MIN_SINGULAR_VALUE = 1e-3
-"""Threshold of the singular values of the influence functions, divided by the largest one. Circular
-components with smaller singular values are left out."""
+"""Smallest singular value, divided by the largest one, of a circular component that is kept.
+
+The influence function of a pad is its stress under a force of 1 N, as a function of the force's
+position. A singular value decomposition expresses the influence functions of all pads by circular
+components, which a rotation about the normal of the skin multiplies by a phase.
+"""
 
 _N_DISTANCES = 400
 """Number of Gauss points in r, the distance between force and cube. They resolve the oscillations
@@ -223,14 +227,20 @@ def _hankel_transforms(
 def _fourier_series(influence: Influence, r: Array) -> list[Array]:
     """Compute the Fourier series of the influence functions over the direction from force to cube.
 
+    The influence function of a pad is its stress under a force of 1 N, as a function of the force's
+    position. With the distance r and direction phi from the force to the cube, and the components
+    F_r (along this direction), F_t (across it) and F_z (along the normal) of the force, each order
+    m contributes Re(c) + Im(c') to the stress of a pad. Both c and c' have the form::
+
+        exp(i m phi) (R(r) F_r + Z(r) F_z + i T(r) F_t)
+
     Args:
         influence: Influence functions of P pads.
         r: Distances (distances,) between force and cube, in m.
 
     Returns:
-        For each order m, the radial functions R, Z and T (2 P, 3, distances) of two circular
-        components c and c' for each of P pads: those of all c, then those of all c'. The stress of
-        a pad is the sum of Re(c) + Im(c') over the orders.
+        For each order m, the functions R, Z and T (2 P, 3, distances): first those of the component
+        c of each of the P pads, then those of the component c' of each pad.
     """
     angle = 2 * np.pi * np.arange(N_DIRECTIONS) / N_DIRECTIONS
     cosine = np.cos(angle)

@@ -26,17 +26,23 @@ from .posterior import WindowPosteriors, select_pressure
 class _Prediction(NamedTuple):
     """Matrices for the prediction of the D missing values of one cube.
 
+    In the shapes, C is the number of components of a cube, P the number of its pads, `inner` the
+    number of cubes in `near`, and `points` the number of surface points around a cube at which
+    pressures are computed.
+
     Attributes:
         cube: Index of the cube.
-        columns: Columns (D,) of the missing values among the observed components.
-        near: Indices (inner,) of the cubes from whose values the missing ones are predicted.
-        weights: Matrix (D, inner C) from the values of these cubes to the predictions.
+        columns: Indices (D,) of the missing values among the C components of the cube.
+        near: Indices (inner,) of the cube itself and its nearest neighbours, from whose known
+            values the missing ones are predicted.
+        weights: Matrix (D, inner C) by which the values of these cubes are multiplied to give the
+            predictions; it is 0 for missing values.
         by_pad: Change (D, inner P) of the predictions in Pa for one standard deviation of the noise
-            of each of the P pads of these cubes.
+            of each pad of these cubes.
         rows: Indices (n,) of the windows (a cube and its nearest neighbours) that contain the cube.
             The index of a window is that of its centre cube.
-        gain: Entries (n, D, points x 2) of the matrices G of these windows: change of the pressures
-            on the surface and at the cubes' depth per Pa of each missing value.
+        gain: Changes (n, D, points x 2) of two pressures at each point of these windows (on the
+            surface, and below it at the cubes' depth) per Pa of each missing value.
     """
 
     cube: int
@@ -54,8 +60,10 @@ class MissingValuePrediction:
     The errors of the predictions for different cubes are treated as independent.
 
     Attributes:
-        variance: Increase (cubes, points x 2) in Pa^2 of the posterior variances of the pressures
-            on the surface and at the cubes' depth, for the prior scale s = 1 (posterior.py).
+        variance: Increase (cubes, points x 2), in Pa^2, of the posterior variances of two pressures
+            at each surface point around each cube (on the surface, and below it at the cubes'
+            depth) because values are missing. It holds for the prior scale s = 1, and the scale s
+            of the prior standard deviation of the pressure (posterior.py) multiplies it by s^2.
     """
 
     def __init__(

@@ -99,7 +99,8 @@ MIN_LATE_SHARE = 0.25
 the second half of this duration for slip. With less, the contact has stopped."""
 
 MIN_FORCE_N = 0.05
-"""Smallest normal force in N of a contact whose state is estimated."""
+"""Normal force, in N, that a contact must exceed for the state `STICK`. With a smaller force, its
+state is `UNKNOWN` unless slip is detected."""
 
 FOLLOWED_DEVIATION = 0.02
 """Standard deviation of the followed ratio of shear and normal force, divided by the ratio, after
@@ -339,8 +340,8 @@ class SlipEstimator:
         lever = LEVER_M / (1 + 2 * ratio)
         tilt = lever * np.maximum(growth, 0)
         leak = LEAK_M * _lengths(change[..., 3:])
-        # A change of force within a short lag may be undone within a longer one, but may still have
-        # shifted the contact. So the shift of the shorter lags is allowed for the longer ones, too.
+        # A force that changes and returns within a long lag shows no change over it, but may have
+        # left the contact shifted. So each lag is allowed the largest shift of all shorter ones.
         explained = np.maximum.accumulate(tilt + leak, axis=1)
         noise = SIGNIFICANCE * np.sqrt(2) * self._contacts["noise"]
         threshold = np.maximum(noise, MIN_DISTANCE_M)[:, None]

@@ -229,7 +229,7 @@ class Surface:
         return on_points.reshape(len(self._patches), -1)
 
     def _assign_patches(self, inside: Mask) -> Index:
-        """Assign the patch of each cube to a contact.
+        """Assign the patch of each cube (square grid of points around it) to a contact.
 
         Points in contact belong to one contact if they are neighbours or lie on one patch.
 

@@ -260,7 +260,8 @@ def _write_skin(
 
     Args:
         source: The recorded frequencies of the skin.
-        job: Overrides and options of contacts.
+        job: Job with the calibrations and tare that replace those of the recording (overrides), and
+            with the options with which contacts are computed.
         writer: The bag to write into.
     """
     bag, skin = source.bag, source.topic.removesuffix("frequencies")

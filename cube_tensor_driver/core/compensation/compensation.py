@@ -123,7 +123,11 @@ class Compensation:
         self._fill_offsets()
 
     def _fill_offsets(self) -> None:
-        """Write the sum of creep and the effect of temperature into the arrays of the kernel."""
+        """Write creep plus the effect of temperature on each pad into `offsets`.
+
+        The kernel, the loop over rows, subtracts them from the readings of the pads (pad stress
+        divided by stiffness).
+        """
         thermal = self._thermal.offset
         self.offsets.offset[:] = thermal + self.creep.offset
         # The kernel multiplies the gain by the whole reading of a pad, but creep depends only on

@@ -43,8 +43,12 @@ HALVINGS = 10
 which converges quickly only for small arguments."""
 
 SERIES_TERMS = 9
-"""Number of terms of the Taylor series of 1 - exp(-x). The largest ratio, 64, gives
-x = 64 / 2**`HALVINGS`, with which the first term that is left out is 4e-18 of the sum."""
+"""Number of terms of the Taylor series of 1 - exp(-x), where x is the ratio of a time to a time
+constant, divided by 2**`HALVINGS`.
+
+Ratios are limited to 64, so x is at most 1/16. The first term that is left out is then 4e-18 of the
+sum.
+"""
 
 
 def relaxed_share(ratio: Array) -> Array:

@@ -162,19 +162,19 @@ class CreepModel(EffectModel):
 
 @dataclass(frozen=True, eq=False)
 class ThermalModel(EffectModel):
-    """Reading of each pad of a cube in the skin over temperature, without load.
+    """Stress, in Pa, that each pad of a cube in the skin measures without load, over temperature.
 
     It contains the drift of the electronics and the thermal stress that the expansion of the
-    elastomer causes. The readings include the gains (relative sensitivities) of the pads. With u
-    the measured temperature minus `reference` after low-pass filters, by which the elastomer lags
-    behind the thermometer, pad p reads sum_d coefficient_pd u^d, d = 1, 2, ...
+    elastomer causes, both including the gains (relative sensitivities) of the pads. The temperature
+    u of the elastomer, minus `reference`, is the measured one after low-pass filters, because the
+    elastomer lags behind the thermometer. Pad p measures sum_d coefficient_pd u^d, d = 1, 2, ...
 
     Attributes:
         reference: Temperature, in °C, at which the rest frequencies of the calibration hold.
         lag: Time constants (L,), in s, of low-pass filters in series, all different; 0: no lag.
         coefficient: Coefficients of each pad (P, D), in Pa/K^d, the linear term first.
-        deviation: Standard deviations of `coefficient` (P, D), with a sign, because the errors of
-            all pads are fully correlated; None: they are not known.
+        deviation: Standard deviations of `coefficient` (P, D). The errors of all pads in a column
+            are fully correlated; pads with equal signs err in the same direction. None: unknown.
         ramp: Errors of the pads' stresses by K independent causes (P, K), in Pa per K by which the
             filtered temperature lags behind the measured one, each with the size of one standard
             deviation; None: they are not known.

@@ -38,7 +38,8 @@ client that the server has discovered less than 0.1 s before.
 """
 
 MAX_ANSWER_S = 10.0
-"""Maximum time, in seconds, to wait for the response of a service, with repeated requests."""
+"""Maximum time, in seconds, from the first request to a service to its response. Meanwhile, the
+request is repeated every `REPEAT_S`, because DDS may lose it."""
 
 REPEAT_S = 3.0
 """Time, in seconds, after which a request without a response is sent again."""

@@ -41,12 +41,12 @@ MAX_REGIONS = 32
 """Largest number of regions of contact on one skin; those with the largest pressure are kept."""
 
 MAX_WORK_PER_SCAN = 40
-"""Computing work after which no further fit is made or improved in the same scan (set of values of
+"""Computing work after which no further step of a fit is made in the same scan (set of values of
 all cubes).
 
-The unit is a node, one of the small contacts whose sum is the traction of a region: a new fit of 80
-nodes is a work of 80. The limit bounds the time of a scan; the remaining fits are made in the next
-scans.
+The unit is the time that a new fit takes per node (one of the small contacts whose sum is the
+traction of a region), so a new fit with 80 nodes counts 80. The limit bounds the time of a scan;
+the remaining steps are made in the next scans.
 """
 
 MAX_LINEARISED_FITS = 6

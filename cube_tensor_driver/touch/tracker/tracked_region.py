@@ -103,14 +103,15 @@ MAX_STEPS = 10
 """Largest number of Gauss-Newton steps in the first fit of a Hertz contact."""
 
 STEP_WORK = 5
-"""Work of one Gauss-Newton step of a Hertz contact, in the unit of `MAX_WORK_PER_SCAN`: it takes as
-long as a new fit with this number of nodes."""
+"""Work (computing time) of one Gauss-Newton step of a Hertz contact, in the unit of
+`MAX_WORK_PER_SCAN`: the step takes as long as a new fit of the traction on this number of nodes
+(small contacts on a grid)."""
 
 
 Respond = Callable[[Index], tuple[Array, Array]]
-"""Function that takes the indices of n cubes and returns their response to all other regions of
-contact: changes (n, C), in Pa, of their C measured components, and the standard deviations of these
-changes (n, C), in Pa."""
+"""Function that takes the indices of n cubes and returns their response to all regions of contact
+except the one that is being fitted: changes (n, C), in Pa, of their C measured components, and the
+standard deviations of these changes (n, C), in Pa."""
 
 
 class Work(IntEnum):
