@@ -194,8 +194,13 @@ class SimulatedHub:
         """Add the sample that is due at `next_us` to the log of all samples."""
         due = (self.next_us, self.period_us, self.boots)
         run = self.runs[-1] if self.runs else None
-        # A run ends when samples are skipped, the period changes or the hub restarts.
-        if run is None or due != (run.end_us, run.period_us, run.boot):
+        # A run ends when samples are skipped or get other numbers, the period changes, or the hub
+        # restarts.
+        if (
+            run is None
+            or self.sequence != run.last + 1
+            or due != (run.end_us, run.period_us, run.boot)
+        ):
             run = SampleRun(self.sequence, self.sequence, *due)
             self.runs.append(run)
         run.last = self.sequence

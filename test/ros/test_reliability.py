@@ -541,7 +541,7 @@ def test_a_driver_that_cannot_read_any_more_ends_with_an_error(domain):
     code = (
         "from cube_tensor_driver.device.links.reader import Reader\n"
         "from cube_tensor_driver.ros.nodes.driver import main\n"
-        "Reader._check_timers = lambda *_: 1 / 0\n"
+        "Reader._plan_gathering = lambda *_: 1 / 0\n"
         "main()"
     )
     command = [sys.executable, "-c", code, "--ros-args", *ros_arguments({"config": str(SINGLE)})]
