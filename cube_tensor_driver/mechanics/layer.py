@@ -31,11 +31,15 @@ import numpy as np
 from ..core.arrays import Array, Complex
 from ..core.defaults import POISSONS_RATIO
 from ..core.errors import ElasticError
-from ..core.modes import STRESS
+from ..core.modes import COMPONENTS, STRESS
 
 FIELD = STRESS + tuple(f"{name}_{axis}" for name in STRESS for axis in "xyz")
 """Names of the 24 quantities of a stress field at a point: six stresses in Pa, then the derivatives
 of each of them along x, y and z in Pa/m."""
+
+MEASURED = [FIELD.index(name) for name in COMPONENTS]
+"""Indices (15) in `FIELD` of the `COMPONENTS` that cubes measure: six stresses and the nine
+gradients of the normal stresses."""
 
 _WaveStress = dict[str, tuple[Any, Any]]
 """Stress under a wave of traction on the surface, and the derivative of this stress along z. A key

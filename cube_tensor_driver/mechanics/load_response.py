@@ -16,9 +16,8 @@ from __future__ import annotations
 import numpy as np
 
 from ..core.arrays import Array
-from ..core.modes import COMPONENTS
 from .circular import CIRCULAR_FROM_FIELD, FIELD_FROM_CIRCULAR, ORDERS, rotate_loads
-from .layer import FIELD, Layer
+from .layer import FIELD, MEASURED, Layer
 
 PERIOD_DEPTHS = 64
 """Period of the load along x and along y, divided by the depth of the cubes' centres. The load is
@@ -33,8 +32,6 @@ POINTS_PER_DEPTH = 32
 """Number of tabulated distances between load and cube in an interval as long as the depth of the
 cubes' centres. The error of the linear interpolation between two distances is about a thousandth
 of the largest value of each component."""
-
-_OBSERVED = [FIELD.index(name) for name in COMPONENTS]
 
 
 class LoadResponse:
@@ -111,7 +108,7 @@ class LoadResponse:
 
         direction = np.arctan2(y, x)
         circular = rotate_loads(parts, direction, direction - angle, ORDERS)
-        components = circular @ FIELD_FROM_CIRCULAR[:, _OBSERVED]
+        components = circular @ FIELD_FROM_CIRCULAR[:, MEASURED]
         return np.asarray(components.swapaxes(1, 2))
 
 

@@ -16,12 +16,8 @@ import numpy as np
 from ..core.arrays import Array, Index
 from ..core.modes import COMPONENTS, STRESS
 from .circular import FIELD_FROM_CIRCULAR, rotation_phases
-from .layer import FIELD, Layer
+from .layer import MEASURED, Layer
 from .spectra import Spectra, layer_spectra
-
-_OBSERVED = np.array([FIELD.index(name) for name in COMPONENTS])
-"""Indices (15,) of the `COMPONENTS` that cubes measure (six stresses, nine gradients of normal
-stresses) in `FIELD`, the names of all 24 stresses and gradients."""
 
 _IS_GRADIENT = np.arange(len(COMPONENTS)) >= len(STRESS)
 """Whether each of the 15 `COMPONENTS` is a gradient in Pa/m; the others are stresses in Pa."""
@@ -65,7 +61,7 @@ def model_points(
         ElasticError: The layer does not contain this depth.
     """
     spectra = layer_spectra(layer, depth)
-    components = FIELD_FROM_CIRCULAR[None, :, _OBSERVED]
+    components = FIELD_FROM_CIRCULAR[None, :, MEASURED]
     return MeasurementModel(spectra, components, np.zeros(cubes, np.intp))
 
 

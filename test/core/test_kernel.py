@@ -48,8 +48,11 @@ N_TABLES = 11
 """Number of arrays with tables of the skin that a call of the kernel takes."""
 N_HEALTH = 3
 """Number of arrays with the state of health that a call of the kernel takes."""
-N_OFFSETS, N_CUBE_STATE = 12, 4
-"""Number of arrays with what is subtracted, and of those of them that the kernel writes."""
+N_OFFSETS = 12
+"""Number of arrays with the coefficients and the state of compensation, which the kernel subtracts
+from the readings of the pads."""
+N_CUBE_STATE = 4
+"""Number of arrays of compensation that the kernel writes. They are the last of `N_OFFSETS`."""
 N_COLUMNS = 8
 """Number of arrays with columns of frequencies that a call of the kernel takes."""
 

@@ -18,7 +18,12 @@ from cube_tensor_driver.mechanics.sensitivity import (
     THICKNESS_DEVIATION,
 )
 
-DEPTH, HALF_SIDE, RADIUS = 4e-3, 2e-3, 3e-3
+DEPTH = 4e-3
+"""Distance of the centres of the cubes from the surface, in m."""
+HALF_SIDE = 2e-3
+"""Half the side of a cube, in m."""
+RADIUS = 3e-3
+"""Radius of the Hertz contact, in m."""
 FORCE = np.array([0.4, -0.3, -1.5])
 UNITS = np.where(np.arange(15) < 6, 1.0, HALF_SIDE)
 """Factors that convert the components to Pa."""

@@ -66,7 +66,8 @@ RESPONSE = np.array(
         [-0.775, 0, -4.738],
     ]
 )
-"""Stress of the pads of a steel bar, in Pa per m/s²: ./cube fem planar_slab --weight."""
+"""Stress of each pad of a steel bar per specific force along x, y and z, in Pa per m/s², from
+./cube fem planar_slab --weight."""
 TRUE_RESPONSE = np.array(
     [
         [3.447, 0, -3.469],
@@ -79,8 +80,9 @@ TRUE_RESPONSE = np.array(
         [-0.367, 0, -5.146],
     ]
 )
-"""The same of a bar as it was really built, by one coarse mesh: a section of 58 x 11.3 mm of 1100
-kg/m³ with Poisson's ratio 0.475, and a bar of 7750 kg/m³ that lies 0.2 mm too deep."""
+"""Stress of each pad per specific force, like `RESPONSE`, of a bar whose dimensions and materials
+differ from the model of the compensation: a section of 58 x 11.3 mm with 1100 kg/m³ and Poisson's
+ratio 0.475, and a bar of 7750 kg/m³ that lies 0.2 mm deeper. It is computed on one coarse mesh."""
 
 
 @pytest.fixture

@@ -60,9 +60,9 @@ START_ELASTOMER_PRECISION = 1e4
 """Prior precision, in the first Gauss-Newton step, of the errors of depth, thickness and Poisson's
 ratio of the elastomer, in units of their standard deviations.
 
-The precision of later steps is the misfit (chi-squared per known value, at least 1). The first one
-is so much higher because these errors would otherwise take up the large residual of contacts that
-are far from their solution.
+The precision of later steps is the misfit (chi-squared per known value, at least 1). In the first
+step, the contact may be far from its solution, and its residual is large. A low precision would let
+the errors of the elastomer explain this residual, in place of a shift of the contact.
 """
 
 MAX_PRECISION_RATIO = 2.0
