@@ -110,8 +110,10 @@ class ReplayControls:
         self._drawn = 0.0
         self._button.on_click(lambda _: hold())
 
+        # viser runs a coroutine at once and in order. A plain function would run later in a thread,
+        # where a newer event may overtake it.
         @self._slider.on_update
-        def _(event: viser.GuiEvent[Any]) -> None:
+        async def _(event: viser.GuiEvent[Any]) -> None:
             # `_move_slider` triggers this function, too; such an event has no client (browser).
             if event.client is None:
                 return

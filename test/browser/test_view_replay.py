@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
 from types import SimpleNamespace
 
@@ -30,7 +31,7 @@ class Slider:
         self.max = 1.0
 
     def on_update(self, callback) -> None:
-        self.event = lambda: callback(SimpleNamespace(client="browser"))
+        self.event = lambda: asyncio.run(callback(SimpleNamespace(client="browser")))
 
 
 @pytest.fixture
@@ -162,3 +163,28 @@ def test_a_jump_without_an_answer_is_said_and_the_next_one_is_asked_for(ros, cli
     assert client.replay.update()
     assert client.said == ["jump: no answer within 10 s"]
     ros.wait(lambda: asked == [0.0, 1.0])
+
+
+def test_a_jump_that_comes_while_another_is_sent_is_sent_next(ros, client):
+    """`length` is read while the first jump is sent; just then the second one comes."""
+    asked = serve(ros)
+    ros.wait(client.is_running)
+    replay = client.replay
+
+    class Interrupted:
+        paused = True
+        position = END_S
+
+        @property
+        def length(self) -> float:
+            if replay.state is self:
+                replay.state = SimpleNamespace(position=END_S, length=END_S, paused=True)
+                replay.jump_to(2.0)
+            return END_S
+
+    replay.jump_to(0.0)
+    replay.state = Interrupted()
+    assert replay.update()
+    ros.wait(replay.update)
+    ros.wait(lambda: asked == [0.0, 2.0])
+    assert client.said == []
