@@ -32,11 +32,14 @@ static const double MAX_JITTER_RATIO = 1.5;
 static const int64_t MAX_GAP_NS = 5000000000;
 static const float MAX_SPECIFIC_FORCE = 1000;
 
+/* Limits of core/compensation/motion.py. */
+static const int64_t MAX_EXTRAPOLATION_NS = 20000000, MAX_INTERVAL_NS = 200000000;
+
 /* Quantities of each pad: PAD_QUANTITIES in core/kernel/contract.py. */
 enum { LAST, DIFFERENCE, FIRST_SQUARES, SECOND_SQUARES, BOUNDED_SQUARES, SUM, LOWEST, HIGHEST };
 enum { BASE = HIGHEST + 1, BOUND, LOW, HIGH, QUANTITIES };
 
-enum { N, C, P, G, D, T, E, K, Q }; /* index of each letter in CUBE_SCAN_LETTERS */
+enum { N, C, P, G, D, T, E, K, Q, M }; /* index of each letter in CUBE_SCAN_LETTERS */
 enum { ROWS = 32, LANES_OF_BLOCK = ROWS * CUBE_SCAN_MAX_PADS };
 
 /* Rows that are processed together: successive cubes of one scan, whose pads are adjacent in all
@@ -417,29 +420,85 @@ int64_t cube_scan(const cube_scan_call *call, int64_t start, int64_t *request) {
     return is_unknown ? start : process(call, start, request);
 }
 
-#define ARRAY(type, name, kind, shape, use) \
+/* Interpolates the motion of the skin to a time, linearly between the instants `first` and `first` + 1;
+ * NaN if it is unknown then. Times of a damaged recording may be any numbers, so differences wrap. */
+static void interpolate(const cube_forces_call *call, int64_t first, int64_t stamp_ns, float *state) {
+    const int64_t n = call->length[M], *time_ns = call->time_ns + first;
+    const double *before = call->motion + first * 12;
+    double share = NAN;
+    if (n > 1) {
+        const int64_t length_ns = (int64_t)((uint64_t)time_ns[1] - (uint64_t)time_ns[0]);
+        const int64_t elapsed_ns = (int64_t)((uint64_t)stamp_ns - (uint64_t)time_ns[0]);
+        if (length_ns > 0 && length_ns <= MAX_INTERVAL_NS) {
+            const int64_t twice_ns = 2 * length_ns;
+            const int64_t limit_ns = twice_ns > MAX_EXTRAPOLATION_NS ? twice_ns : MAX_EXTRAPOLATION_NS;
+            if (elapsed_ns >= -limit_ns && elapsed_ns <= length_ns + limit_ns)
+                share = (double)elapsed_ns / (double)length_ns;
+        }
+    }
+    for (int k = 0; k < 12; k++)
+        state[k] = n < 2 ? (n == 1 ? (float)before[k] : NAN)
+                         : (float)(before[k] + (before[12 + k] - before[k]) * share);
+}
+
+void cube_forces(const cube_forces_call *call) {
+    const int64_t last = call->length[M] - 2, *time_ns = call->time_ns;
+    float state[4][3]; /* specific force at the origin, and its derivatives along x, y and z */
+    int64_t first = 0;
+    for (int64_t row = 0; row < call->length[N]; row++) {
+        const int64_t cube = call->cube[row], stamp_ns = call->stamp_ns[row];
+        if (row == 0 || stamp_ns != call->stamp_ns[row - 1]) {
+            while (first > 0 && time_ns[first] > stamp_ns)
+                first--;
+            while (first < last && time_ns[first + 1] <= stamp_ns)
+                first++;
+            interpolate(call, first, stamp_ns, state[0]);
+        }
+        const float *position = call->position + cube * 4, *rotation = call->rotation + cube * 9;
+        float *force = call->force + row * 3, in_parent[3] = {0};
+        const bool is_known = cube < call->length[C];
+        for (int k = 0; k < 4 && is_known; k++)
+            for (int axis = 0; axis < 3; axis++)
+                in_parent[axis] += position[k] * state[k][axis];
+        for (int axis = 0; axis < 3; axis++)
+            force[axis] = is_known ? 0 : NAN;
+        for (int k = 0; k < 3 && is_known; k++)
+            for (int axis = 0; axis < 3; axis++)
+                force[axis] += in_parent[k] * rotation[k * 3 + axis];
+    }
+}
+
+#define SCAN(type, name, kind, shape, use) \
     {#name, shape, offsetof(cube_scan_call, name), sizeof(type), kind, CUBE_SCAN_##use},
-const cube_scan_array cube_scan_arrays[CUBE_SCAN_N_ARRAYS] = {CUBE_SCAN_ARRAYS(ARRAY)};
+#define FORCES(type, name, kind, shape, use) \
+    {#name, shape, offsetof(cube_forces_call, name), sizeof(type), kind, CUBE_SCAN_##use},
+const cube_scan_array cube_scan_arrays[CUBE_SCAN_N_ARRAYS] = {CUBE_SCAN_ARRAYS(SCAN)};
+const cube_scan_array cube_forces_arrays[CUBE_FORCES_N_ARRAYS] = {CUBE_FORCES_ARRAYS(FORCES)};
 _Static_assert(sizeof(cube_state) == 8 * 8, "the shape of words");
 
 cube_scan_call cube_scan_begin(void) {
     cube_scan_call call = {0};
-    for (size_t i = 0; i < sizeof call.length / sizeof *call.length; i++)
-        call.length[i] = -1;
+    memset(call.length, -1, sizeof call.length);
     call.length[Q] = QUANTITIES;
     return call;
 }
 
+cube_forces_call cube_forces_begin(void) {
+    cube_forces_call call = {0};
+    memset(call.length, -1, sizeof call.length);
+    return call;
+}
+
 bool cube_scan_set(
-    cube_scan_call *call, size_t number, void *address, const int64_t *shape, size_t n_axes) {
-    const cube_scan_array *array = &cube_scan_arrays[number];
+    const cube_scan_array *array, void *call, int64_t *length, void *address, const int64_t *shape,
+    size_t n_axes) {
     memcpy((char *)call + array->offset, &address, sizeof address);
     for (size_t axis = 0; axis < n_axes; axis++) {
         const char *letter = strchr(CUBE_SCAN_LETTERS, array->shape[axis]);
         int64_t fixed = array->shape[axis] - '0';
-        int64_t *length = letter == NULL ? &fixed : &call->length[letter - CUBE_SCAN_LETTERS];
-        *length = *length < 0 ? shape[axis] : *length;
-        if (*length != shape[axis])
+        int64_t *known = letter == NULL ? &fixed : &length[letter - CUBE_SCAN_LETTERS];
+        *known = *known < 0 ? shape[axis] : *known;
+        if (*known != shape[axis])
             return false;
     }
     return n_axes == strlen(array->shape);

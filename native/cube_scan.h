@@ -50,7 +50,7 @@ typedef struct {
 
 /* Arrays of a call: type, name, kind (of numpy), shape, use. core/kernel/contract.py describes them.
  * Letters of a shape: N rows, C cubes, P pads, G calibrations, D degrees, T tables, E extra tables,
- * K outputs; digits stand for themselves, Q for the 12 quantities. */
+ * K outputs, M instants; digits stand for themselves, Q for the 12 quantities. */
 #define CUBE_SCAN_ARRAYS(X)                           \
     X(const int32_t, calibration, 'i', "C", INPUT)    \
     X(const int32_t, pads, 'i', "G", INPUT)           \
@@ -97,7 +97,7 @@ typedef struct {
 /* Use of an array: INPUT and OPTION are read, STATE is read and written, RESULT is written. OPTION and
  * STATE may be absent. */
 enum cube_scan_use { CUBE_SCAN_INPUT, CUBE_SCAN_OPTION, CUBE_SCAN_STATE, CUBE_SCAN_RESULT };
-#define CUBE_SCAN_LETTERS "NCPGDTEKQ"
+#define CUBE_SCAN_LETTERS "NCPGDTEKQM"
 
 typedef struct {
 #define CUBE_SCAN_FIELD(type, name, kind, shape, use) type *name;
@@ -119,15 +119,40 @@ extern const cube_scan_array cube_scan_arrays[CUBE_SCAN_N_ARRAYS];
 /* Returns a call without arrays. The caller sets the arrays (`cube_scan_set`) and n_residuals. */
 cube_scan_call cube_scan_begin(void);
 
-/* Stores the address and shape of an array. Returns false if its lengths contradict those of other
- * arrays. */
+/* Stores the address of an array in a call, and its shape in the lengths of the call. Returns false if
+ * its lengths contradict those of other arrays. */
 bool cube_scan_set(
-    cube_scan_call *call, size_t number, void *address, const int64_t *shape, size_t n_axes);
+    const cube_scan_array *array, void *call, int64_t *length, void *address, const int64_t *shape,
+    size_t n_axes);
 
 /* Processes rows from `start` on. Returns the first row that is not processed, or -1 if the arrays do
  * not fit together; `*request` states what the caller has to do before it calls again from there.
  * The numbers in `calibration`, `pads` and `numbers` are not checked: the caller must ensure that they
  * are in range. */
 int64_t cube_scan(const cube_scan_call *call, int64_t start, int64_t *request);
+
+/* Arrays of `cube_forces`, which core/compensation/motion.py describes. */
+#define CUBE_FORCES_ARRAYS(X)                    \
+    X(const int64_t, time_ns, 'i', "M", INPUT)   \
+    X(const double, motion, 'f', "M43", INPUT)   \
+    X(const float, position, 'f', "C4", INPUT)   \
+    X(const float, rotation, 'f', "C33", INPUT)  \
+    X(const uint16_t, cube, 'u', "N", INPUT)     \
+    X(const int64_t, stamp_ns, 'i', "N", INPUT)  \
+    X(float, force, 'f', "N3", RESULT)
+
+typedef struct {
+    CUBE_FORCES_ARRAYS(CUBE_SCAN_FIELD)
+    int64_t length[sizeof CUBE_SCAN_LETTERS];
+} cube_forces_call;
+
+#define CUBE_FORCES_N_ARRAYS 7
+extern const cube_scan_array cube_forces_arrays[CUBE_FORCES_N_ARRAYS];
+
+/* Returns a call without arrays. */
+cube_forces_call cube_forces_begin(void);
+
+/* Computes the specific force at the cube of each row, in the frame of the cube; NaN: unknown. */
+void cube_forces(const cube_forces_call *call);
 
 #endif

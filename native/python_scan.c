@@ -26,8 +26,8 @@ enum { READABLE = 0x1 | 0x100 | 0x200, WRITEABLE = 0x400 };
 static PyObject *attribute; /* the text "__array_struct__", whose hash is computed once */
 
 /* Stores one array in the call. false: it does not fit. */
-static bool store(cube_scan_call *call, size_t number, const array_interface *array) {
-    const cube_scan_array *wanted = &cube_scan_arrays[number];
+static bool store(
+    const cube_scan_array *wanted, void *call, int64_t *length, const array_interface *array) {
     const bool is_written = wanted->use == CUBE_SCAN_STATE || wanted->use == CUBE_SCAN_RESULT;
     const int flags = READABLE | (is_written ? WRITEABLE : 0);
     int64_t shape[4];
@@ -36,34 +36,55 @@ static bool store(cube_scan_call *call, size_t number, const array_interface *ar
         return false;
     for (int axis = 0; axis < array->n_axes; axis++)
         shape[axis] = array->shape[axis];
-    return cube_scan_set(call, number, array->data, shape, (size_t)array->n_axes);
+    return cube_scan_set(wanted, call, length, array->data, shape, (size_t)array->n_axes);
 }
 
-static PyObject *run(PyObject *module, PyObject *args) {
-    (void)module;
-    if (PyTuple_Size(args) != CUBE_SCAN_N_ARRAYS + 2)
-        return PyErr_Format(PyExc_TypeError, "run takes %d arguments", CUBE_SCAN_N_ARRAYS + 2);
-    cube_scan_call call = cube_scan_begin();
-    int64_t request, row = PyLong_AsLongLong(PyTuple_GetItem(args, 0));
-    call.n_residuals = PyLong_AsLongLong(PyTuple_GetItem(args, 1));
-    for (size_t i = 0; i < CUBE_SCAN_N_ARRAYS && !PyErr_Occurred(); i++) {
-        PyObject *object = PyTuple_GetItem(args, (Py_ssize_t)i + 2);
-        const enum cube_scan_use use = cube_scan_arrays[i].use;
+/* Stores the arguments from `first` on in the call. The tuple of arguments holds the arrays, so that
+ * their memory outlives the capsules. If one does not fit, an exception is set. */
+static void store_all(
+    PyObject *args, Py_ssize_t first, const cube_scan_array *arrays, size_t n_arrays, void *call,
+    int64_t *length) {
+    if (PyTuple_Size(args) != first + (Py_ssize_t)n_arrays)
+        PyErr_Format(PyExc_TypeError, "it takes %zd arguments", first + (Py_ssize_t)n_arrays);
+    for (size_t i = 0; i < n_arrays && !PyErr_Occurred(); i++) {
+        PyObject *object = PyTuple_GetItem(args, first + (Py_ssize_t)i);
+        const enum cube_scan_use use = arrays[i].use;
         if (object == Py_None && (use == CUBE_SCAN_STATE || use == CUBE_SCAN_OPTION))
             continue;
         PyObject *capsule = PyObject_GetAttr(object, attribute);
         const array_interface *array = capsule == NULL ? NULL : PyCapsule_GetPointer(capsule, NULL);
-        /* The tuple of arguments holds the array, so that its memory outlives the capsule. */
-        if (array != NULL && !store(&call, i, array))
-            PyErr_Format(PyExc_ValueError, "array %s does not fit", cube_scan_arrays[i].name);
+        if (array != NULL && !store(&arrays[i], call, length, array))
+            PyErr_Format(PyExc_ValueError, "array %s does not fit", arrays[i].name);
         Py_XDECREF(capsule);
+    }
+}
+
+static PyObject *run(PyObject *module, PyObject *args) {
+    (void)module;
+    cube_scan_call call = cube_scan_begin();
+    int64_t request, row = 0;
+    store_all(args, 2, cube_scan_arrays, CUBE_SCAN_N_ARRAYS, &call, call.length);
+    if (!PyErr_Occurred()) {
+        row = PyLong_AsLongLong(PyTuple_GetItem(args, 0));
+        call.n_residuals = PyLong_AsLongLong(PyTuple_GetItem(args, 1));
     }
     if (!PyErr_Occurred() && (row = cube_scan(&call, row, &request)) < 0)
         PyErr_SetString(PyExc_ValueError, "the arrays do not fit together");
     return PyErr_Occurred() ? NULL : Py_BuildValue("LL", (long long)row, (long long)request);
 }
 
-static PyMethodDef functions[] = {{"run", run, METH_VARARGS, NULL}, {NULL, NULL, 0, NULL}};
+static PyObject *forces(PyObject *module, PyObject *args) {
+    (void)module;
+    cube_forces_call call = cube_forces_begin();
+    store_all(args, 0, cube_forces_arrays, CUBE_FORCES_N_ARRAYS, &call, call.length);
+    if (PyErr_Occurred())
+        return NULL;
+    cube_forces(&call);
+    return Py_NewRef(Py_None);
+}
+
+static PyMethodDef functions[] = {
+    {"run", run, METH_VARARGS, NULL}, {"forces", forces, METH_VARARGS, NULL}, {NULL, NULL, 0, NULL}};
 
 static struct PyModuleDef module = {
     PyModuleDef_HEAD_INIT, .m_name = "_scan", .m_size = -1, .m_methods = functions};

@@ -37,7 +37,8 @@ int main(void) {
             sizes[i] = (size_t)size;
             memory[i] = malloc(sizes[i] + (size == 0));
             if (memory[i] == NULL || fread(memory[i], 1, sizes[i], stdin) != sizes[i] ||
-                !cube_scan_set(&call, i, memory[i], shape, (size_t)n_axes))
+                !cube_scan_set(
+                    &cube_scan_arrays[i], &call, call.length, memory[i], shape, (size_t)n_axes))
                 return 1;
         }
         row = cube_scan(&call, row, &request);

@@ -8,7 +8,7 @@ stresses. So the motion comes from elsewhere.
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
+import math
 from collections import deque
 from typing import Any, NamedTuple, Protocol
 
@@ -37,6 +37,16 @@ MAX_TRANSFORM_AGE_NS = SECOND
 """Maximum difference, in ns, between the time of a transform and the time of the newest row (sample
 of a cube). With an older transform the direction of gravity counts as unknown. The limit does not
 apply to static transforms."""
+
+CROSS_OF_AXES = np.array(
+    [
+        [0.0, 0, 0, 0, 0, -1, 0, 1, 0],
+        [0, 0, 1, 0, 0, 0, -1, 0, 0],
+        [0, -1, 0, 1, 0, 0, 0, 0, 0],
+    ]
+)
+"""For each axis x, y, z, the 9 numbers of the matrix whose product with any vector r is the cross
+product of the unit vector along the axis and r (3, 9)."""
 
 
 class MissingMotion(CubeError):
@@ -155,24 +165,27 @@ class GravityMotion:
         return Motion(np.array([last_ns]), up[None], no_rotation)
 
 
+Vector = tuple[float, ...]
+"""Components x, y and z of a vector. Computing with three floats is faster than with an array."""
+
+
 class _Sample(NamedTuple):
-    """One sample of an IMU, with its vectors in the parent frame of the skin.
+    """One sample of an IMU, with its vectors in the frame of the IMU.
 
     Attributes:
         time_ns: Time of the sample, in ns since the Unix epoch.
-        angular_velocity: Angular velocity (3,), in rad/s.
-        mean_acceleration: Mean angular acceleration (3,) since the sample before, in rad/s²; 0 if
-            there is none.
-        specific_force: Specific force (acceleration minus gravity) at the origin of the frame (3,),
-            in m/s².
-        gradient: Derivatives of the specific force with respect to position (3, 3), in 1/s².
+        specific_force: Specific force (acceleration minus gravity), in m/s².
+        angular_velocity: Angular velocity, in rad/s.
+        angular_acceleration: Angular acceleration, in rad/s².
+        mean_acceleration: Mean angular acceleration since the sample before, in rad/s²; 0 if there
+            is none.
     """
 
     time_ns: int
-    angular_velocity: Array
-    mean_acceleration: Array
-    specific_force: Array
-    gradient: Array
+    specific_force: Vector
+    angular_velocity: Vector
+    angular_acceleration: Vector = (0.0, 0.0, 0.0)
+    mean_acceleration: Vector = (0.0, 0.0, 0.0)
 
 
 class ImuMotion:
@@ -189,57 +202,40 @@ class ImuMotion:
         self._topic, self._parent_frame = topic, parent_frame
         self._transforms = Transforms(node)
         self._samples: deque[_Sample] = deque(maxlen=MAX_SAMPLES)
+        self._imu_frame = parent_frame
         self._problem = f"no message on {topic}: start the IMU, or set imu to its topic"
         subscription = CheckedSubscription(node, Imu, topic, self.on_imu, NEWEST)
         node.call_at_cleanup(subscription.close)
 
     def on_imu(self, message: Imu) -> None:
-        """Store a message of the IMU as a sample in the parent frame of the skin.
+        """Store a message of the IMU, which `motion` uses.
 
         A message that cannot be used is ignored; the reason is stored as the text of the error that
         `motion` raises.
         """
-        imu_frame = message.header.frame_id
-        try:
-            rotation, position, _ = self._transforms.newest(self._parent_frame, imu_frame)
-        except MissingMotion as error:
-            self._problem = str(error)
-            return
         a, w = message.linear_acceleration, message.angular_velocity
-        force = rotation @ [a.x, a.y, a.z]
-        velocity = rotation @ [w.x, w.y, w.z]
+        velocity = w.x, w.y, w.z
+        sample = _Sample(to_ns(message.header.stamp), (a.x, a.y, a.z), velocity)
         # According to sensor_msgs/Imu, -1 means that the IMU does not measure the acceleration.
         is_unmeasured = message.linear_acceleration_covariance[0] == -1
-        if is_unmeasured or not np.isfinite([force, velocity]).all():
+        if is_unmeasured or not math.isfinite(sum(sample.specific_force) + sum(velocity)):
             self._problem = f"{self._topic} states no acceleration: name an IMU that measures it"
             return
-        time_ns = to_ns(message.header.stamp)
-        before = self._samples[-1] if self._samples else None
-        if before is not None and time_ns <= before.time_ns:
+        before = self._samples[-1] if self._samples else sample
+        interval_ns = sample.time_ns - before.time_ns
+        if interval_ns <= 0:
             # Time went back, because a replay has jumped or a clock was set. Older samples cannot
             # be compared with new ones any more.
             self._samples.clear()
-            before = None
-        mean_acceleration = acceleration = np.zeros(3)
-        if before is not None and time_ns - before.time_ns <= MAX_INTERVAL_NS:
-            interval_s = (time_ns - before.time_ns) / SECOND
-            mean_acceleration = (velocity - before.angular_velocity) / interval_s
+        elif interval_ns <= MAX_INTERVAL_NS:
+            changes = zip(velocity, before.angular_velocity, strict=True)
+            mean = tuple((now - then) * SECOND / interval_ns for now, then in changes)
             # The mean acceleration is that in the middle of the interval. It is extrapolated
             # linearly by half an interval to the time of the sample.
-            acceleration = 1.5 * mean_acceleration - 0.5 * before.mean_acceleration
-        # The acceleration of a rigid body at the position r, relative to its origin, is
-        # alpha x r + omega x (omega x r) = G r, with angular acceleration alpha, angular velocity
-        # omega, and the gradient G.
-        turning = _cross_matrix(velocity)
-        gradient = _cross_matrix(acceleration) + turning @ turning
-        force_at_origin = force - gradient @ position
-        sample = _Sample(
-            time_ns,
-            velocity,
-            mean_acceleration,
-            force_at_origin,
-            gradient,
-        )
+            means = zip(mean, before.mean_acceleration, strict=True)
+            acceleration = tuple(1.5 * now - 0.5 * then for now, then in means)
+            sample = sample._replace(angular_acceleration=acceleration, mean_acceleration=mean)
+        self._imu_frame = message.header.frame_id
         self._samples.append(sample)
 
     def motion(self, first_ns: int, last_ns: int) -> Motion:
@@ -251,12 +247,15 @@ class ImuMotion:
         # The chosen samples enclose the span of time if possible. At least two are chosen, so that
         # the motion can be extrapolated.
         newest = len(samples) - 1
-        first = bisect_right(samples, first_ns, 1, newest, key=_time_ns) - 1
-        last = bisect_left(samples, last_ns, first + 1, newest, key=_time_ns)
-        chosen = samples[first : last + 1]
-        late_ns = last_ns - chosen[-1].time_ns
-        early_ns = chosen[0].time_ns - first_ns
-        interval_ns = chosen[1].time_ns - chosen[0].time_ns
+        first = newest - 1
+        while first > 0 and samples[first].time_ns > first_ns:
+            first -= 1
+        last = first + 1
+        while last < newest and samples[last].time_ns < last_ns:
+            last += 1
+        late_ns = last_ns - samples[last].time_ns
+        early_ns = samples[first].time_ns - first_ns
+        interval_ns = samples[first + 1].time_ns - samples[first].time_ns
         limit_ns = max(MAX_EXTRAPOLATION_NS, 2 * interval_ns)
         if max(late_ns, early_ns) > limit_ns:
             side, off_ns = ("older", late_ns) if late_ns > early_ns else ("newer", early_ns)
@@ -264,23 +263,24 @@ class ImuMotion:
                 f"samples on {self._topic} are {off_ns / 1e9:.3f} s {side} than the rows: the IMU "
                 "has stopped or is late, or its clock differs from that of this computer"
             )
-        return Motion(
-            np.array([sample.time_ns for sample in chosen]),
-            np.array([sample.specific_force for sample in chosen]),
-            np.array([sample.gradient for sample in chosen]),
-        )
+        chosen = samples[first : last + 1]
+        rotation, position, _ = self._transforms.newest(self._parent_frame, self._imu_frame)
+        in_imu = np.array([sample[1:4] for sample in chosen])
+        force, velocity, acceleration = (in_imu @ rotation.T).swapaxes(0, 1)
+        # The acceleration of a rigid body at the position r, relative to its origin, is
+        # alpha x r + omega x (omega x r) = G r, with angular acceleration alpha, angular velocity
+        # omega, and the gradient G.
+        turning = _cross_matrices(velocity)
+        gradient = _cross_matrices(acceleration) + turning @ turning
+        time_ns = np.array([sample.time_ns for sample in chosen])
+        return Motion(time_ns, force - gradient @ position, gradient)
 
 
-def _time_ns(sample: _Sample) -> int:
-    return sample.time_ns
+def _cross_matrices(vectors: Array) -> Array:
+    """Return matrices (K, 3, 3) whose products with any r are the cross products vector x r.
 
-
-def _cross_matrix(vector: Array) -> Array:
-    """Return the matrix (3, 3) whose product with any vector r is the cross product vector x r."""
-    x, y, z = vector
-    rows = [
-        [0, -z, y],
-        [z, 0, -x],
-        [-y, x, 0],
-    ]
-    return np.array(rows)
+    Args:
+        vectors: The vectors (K, 3).
+    """
+    matrices: Array = (vectors @ CROSS_OF_AXES).reshape(-1, 3, 3)
+    return matrices

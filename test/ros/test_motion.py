@@ -116,9 +116,13 @@ class Published:
 
     def __init__(self) -> None:
         self.sent: list = []
+        self.listeners = 1
 
     def publish(self, message) -> None:
         self.sent.append(message)
+
+    def get_subscription_count(self) -> int:
+        return self.listeners
 
 
 @pytest.fixture
@@ -376,6 +380,16 @@ def test_gravity_comes_from_tf_alone(start, monkeypatch):
     assert "transform from world to tool is 1.4 s older" in node._statuses()[0].message
     stress = [stress_codec.decode(one).rows for one in node.sent["stress"]]
     assert [rows.status[0] & (WEIGHT | COMPENSATION) for rows in stress] == [WEIGHT, COMPENSATION]
+
+
+def test_what_nobody_records_is_not_sent_but_compensated(start, monkeypatch):
+    fake_tf(monkeypatch, imu=IMU_FRAME)
+    node = start(imu="/imu")
+    node._compensation.listeners = 0
+    played(node, MovingSkin(), 0.1)
+    assert not node.sent["compensation"]
+    stress = [stress_codec.decode(one).rows for one in node.sent["stress"]]
+    assert all((rows.status & WEIGHT).all() for rows in stress)
 
 
 def test_without_a_parameter_nothing_is_compensated_and_two_are_refused(start):

@@ -83,8 +83,8 @@ class Creep:
             if model is not None:
                 times.update(model.time.tolist())
         self._times = np.array(sorted(times))
-        time = self._times[:, None]
-        self._memories = LowPass(time, n_cubes, n_pads)
+        time = np.repeat(self._times[:, None], n_cubes, axis=1)
+        self._memories = LowPass(time, n_pads)
         self._amplitude = np.zeros_like(self._memories.lag)
         for cube, model in enumerate(self._models):
             if model is not None:
@@ -174,12 +174,11 @@ class Creep:
             duration_s: Duration for each cube (C,), in s.
         """
         share, mean = self._memories.find_shares(duration_s)
+        seconds = duration_s[: share.shape[1]]
         # The low-passed reading changes, per second, by one fraction of its lag behind the reading
         # and by another fraction of the change of the reading.
-        of_lag = share / duration_s
-        of_change = (1 - mean) / duration_s
-        # A cube without any row so far has no earlier reading from which its first one differs.
-        of_change[:, self._time_ns == 0] = 0
+        of_lag = share / seconds
+        of_change = (1 - mean) / seconds
         self.offset[:] = self._total * self._reading
         self.slope[:] = 0
         self.gain[:] = 0
@@ -189,6 +188,8 @@ class Creep:
             lagging *= of_lag[k, :, None]
             self.slope += lagging
             self.gain += amplitude * of_change[k, :, None]
+        # A cube without any row so far has no earlier reading from which its first one differs.
+        self.gain[self._time_ns == 0] = 0
         self.slope -= self.gain * self._reading
 
     def deviation(self, cube: int) -> Array:

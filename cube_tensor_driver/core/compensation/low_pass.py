@@ -72,15 +72,20 @@ class LowPass:
     """K low-pass filters for each of C cubes, each of which filters P signals.
 
     Attributes:
-        time: Time constants (K, C), or (K, 1) if all cubes have the same, in s.
         lag: How far the outputs of the filters lag behind the inputs (K, C, P).
     """
 
-    def __init__(self, time: Array, n_cubes: int, n_signals: int) -> None:
-        self.time = time
-        n_filters = len(time)
-        shape = n_filters, n_cubes, n_signals
-        self.lag = np.zeros(shape)
+    def __init__(self, time: Array, n_signals: int) -> None:
+        """Begin with outputs that equal the inputs.
+
+        Args:
+            time: Time constants (K, C), in s.
+            n_signals: Number P of signals.
+        """
+        self._time = time
+        # Whether a cube has other time constants than the one before.
+        self._is_other = (time[:, 1:] != time[:, :-1]).any(axis=0)
+        self.lag = np.zeros((*time.shape, n_signals))
 
     def advance(self, elapsed_s: Real, change: Real) -> Array:
         """Advance the filters by one interval for each cube.
@@ -101,23 +106,20 @@ class LowPass:
         return share
 
     def find_shares(self, elapsed_s: Real) -> tuple[Array, Array]:
-        """Return m = 1 - exp(-t / time) and m time / t, both (K, C), of intervals t (C,), in s."""
-        if self.time.shape[1] > 1:
-            return self._find_shares(elapsed_s)
+        """Return m = 1 - exp(-t / time) and m time / t for intervals t (C,), in s.
+
+        Both are (K, C), or (K, 1) if they are the same for all cubes.
+        """
         # The cubes of one hub follow each other and have equal intervals, so one computation serves
         # them all.
-        steps = np.diff(elapsed_s, prepend=-1.0)
-        begins = np.flatnonzero(steps)
-        counts = np.diff(begins, append=len(elapsed_s))
-        share, mean = self._find_shares(elapsed_s[begins])
-        share = np.repeat(share, counts, axis=1)
-        mean = np.repeat(mean, counts, axis=1)
-        return share, mean
-
-    def _find_shares(self, elapsed_s: Real) -> tuple[Array, Array]:
-        ratio = elapsed_s / self.time
+        is_other = self._is_other | (elapsed_s[1:] != elapsed_s[:-1])
+        begins = np.flatnonzero(np.append(True, is_other))
+        ratio = elapsed_s[begins] / self._time[:, begins]
         share = relaxed_share(ratio)
         # The quotient share / ratio tends to 1 as the length of the interval tends to 0.
         divisor = np.maximum(ratio, 1e-300)
         mean = np.where(ratio > 0, share / divisor, 1.0)
-        return share, mean
+        if len(begins) == 1:
+            return share, mean
+        counts = np.diff(begins, append=len(elapsed_s))
+        return np.repeat(share, counts, axis=1), np.repeat(mean, counts, axis=1)

@@ -15,7 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array, Single, Times, index_cubes
+from ..arrays import Array, Single, Times, multiply
+from ..kernel import run as kernel
 from ..poses import CubePoses
 from ..rows import FrequencyRows
 
@@ -57,6 +58,7 @@ class ForcesAtCubes:
     """Computes the specific forces at the cubes of one skin, with the same bits on every processor.
 
     The specific force is what an accelerometer at the cube measures: acceleration minus gravity.
+    The methods `_interpolate` and `_find_forces` are the specification of the function in C.
     """
 
     def __init__(self, poses: CubePoses) -> None:
@@ -66,12 +68,10 @@ class ForcesAtCubes:
             poses: Poses in the parent frame of the skin. For the same bits as a recording, they
                 must be those of its SkinInfo message.
         """
-        # The axis of the cubes is the last one, so that numpy handles all rows in its inner loop.
-        self._position = np.ascontiguousarray(poses.position.T, np.float32)
-        # A vector in the parent frame is transformed to the frame of a cube by the transpose of the
-        # rotation of the cube.
-        to_cube = poses.rotation.transpose(2, 1, 0)
-        self._to_cube = np.ascontiguousarray(to_cube, np.float32)
+        # The factor 1 is that of the specific force at the origin.
+        position = np.insert(poses.position, 0, 1, axis=1)
+        self._position = np.ascontiguousarray(position, np.float32)
+        self._rotation = np.ascontiguousarray(poses.rotation, np.float32)
 
     def add_to(self, rows: FrequencyRows, motion: Motion) -> FrequencyRows:
         """Return rows with a column of specific forces.
@@ -80,77 +80,66 @@ class ForcesAtCubes:
             rows: N rows of frequencies (samples of cubes); those of unknown cubes get NaN.
             motion: Motion of the skin, at instants near the times of the rows.
         """
+        # Specific force at the origin, and its derivatives along x, y and z (K, 4, 3).
+        known = np.empty((len(motion.time_ns), 4, 3))
+        known[:, 0] = motion.specific_force
+        known[:, 1:] = motion.gradient.swapaxes(1, 2)
         columns = rows.columns()
-        columns["specific_force"] = self._find_forces(rows, motion)
+        if kernel.native is None or rows.cube.dtype != np.uint16:
+            force = self._find_forces(rows, motion.time_ns, known)
+        else:
+            force = np.empty((len(rows), 3), np.float32)
+            cube = np.ascontiguousarray(rows.cube)
+            stamp_ns = np.ascontiguousarray(rows.stamp_ns, np.int64)
+            poses = self._position, self._rotation
+            kernel.native.forces(motion.time_ns, known, *poses, cube, stamp_ns, force)
+        columns["specific_force"] = force
         return FrequencyRows(**columns)
 
-    def _find_forces(self, rows: FrequencyRows, motion: Motion) -> Single:
-        """Return the specific forces (N, 3) of rows in the frames of their cubes; NaN: unknown."""
-        n_cubes = self._position.shape[1]
-        cube = index_cubes(rows.cube, n_cubes)
-        origin, gradient = _interpolate(motion, rows.stamp_ns)
-        in_parent = _multiply(gradient, self._position[:, cube])
-        in_parent += origin
-        to_cube = self._to_cube[:, :, cube]
-        in_cube = _multiply(to_cube, in_parent)
-        in_cube[:, rows.cube >= n_cubes] = np.nan
-        return np.ascontiguousarray(in_cube.T)
+    def _find_forces(self, rows: FrequencyRows, time_ns: Times, known: Array) -> Single:
+        """Return the specific forces (N, 3) of rows in the frames of their cubes; NaN: unknown.
+
+        Args:
+            rows: N rows of frequencies.
+            time_ns: Instants (K,) at which the motion is known, in ns.
+            known: Specific force at the origin, in m/s², and its derivatives along x, y and z, in
+                1/s², at the instants (K, 4, 3).
+        """
+        n_cubes = len(self._position)
+        cube = rows.cube.clip(0, n_cubes - 1).astype(np.intp)
+        state = _interpolate(time_ns, known, rows.stamp_ns).astype(np.float32)
+        in_parent = multiply(self._position[cube], state)
+        # A vector in the parent frame is transformed to the frame of a cube by the transpose of the
+        # rotation of the cube.
+        in_cube: Single = multiply(in_parent, self._rotation[cube])
+        in_cube[rows.cube != cube] = np.nan
+        return in_cube
 
 
-def _interpolate(motion: Motion, stamp_ns: Times) -> tuple[Single, Single]:
+def _interpolate(time_ns: Times, known: Array, stamp_ns: Times) -> Array:
     """Return the motion of a skin at N times, interpolated linearly between instants.
 
     Args:
-        motion: The motion; if it is known at one instant only, it is the same at all times.
+        time_ns: Instants (K,), in ns; if there is only one, its motion holds at all times.
+        known: Motion at the instants (K, 4, 3).
         stamp_ns: The times (N,), in ns.
 
     Returns:
-        Specific forces at the origin (3, N), in m/s², and their gradients (3, 3, N), in 1/s²; NaN
-        where they are unknown.
+        The motion at these times (N, 4, 3); NaN where it is unknown.
     """
-    flat_gradient = motion.gradient.reshape(-1, 9)
-    columns = np.hstack([motion.specific_force, flat_gradient])
-    known = columns.T.astype(np.float32)
-    n_instants = len(motion.time_ns)
-    if n_instants < 2:
-        shape = 12, len(stamp_ns)
-        constant = known if n_instants else np.nan
-        state = np.full(shape, constant, np.float32)
-        return _split_motion(state)
-    # Index of the interval between two instants that each row lies in, or is nearest to. With two
-    # instants, which is usual, there is one interval only.
-    inner_ns = motion.time_ns[1:-1]
-    first = np.zeros(1, int)
-    if len(inner_ns):
-        first = np.searchsorted(inner_ns, stamp_ns, side="right")
-    length_ns = np.diff(motion.time_ns)[first]
-    elapsed_ns = stamp_ns - motion.time_ns[first]
-    before_ns = -elapsed_ns
-    after_ns = elapsed_ns - length_ns
-    beyond_ns = np.maximum(before_ns, after_ns)
-    max_beyond_ns = np.maximum(MAX_EXTRAPOLATION_NS, 2 * length_ns)
-    is_near = beyond_ns <= max_beyond_ns
+    if len(time_ns) < 2:
+        state = np.full((len(stamp_ns), 4, 3), np.nan)
+        state[:] = known if len(known) else np.nan
+        return state
+    # Number of the instant before the interval that each time lies in, or is nearest to.
+    first = np.searchsorted(time_ns[1:-1], stamp_ns, side="right")
+    length_ns = np.diff(time_ns)[first]
+    elapsed_ns = stamp_ns - time_ns[first]
+    limit_ns = np.maximum(MAX_EXTRAPOLATION_NS, 2 * length_ns)
+    is_near = (elapsed_ns >= -limit_ns) & (elapsed_ns <= length_ns + limit_ns)
     # A damaged recording may state equal instants.
     is_usual = (length_ns > 0) & (length_ns <= MAX_INTERVAL_NS)
-    is_known = is_near & is_usual
-    share = elapsed_ns / np.maximum(length_ns, 1)
-    share[~is_known] = np.nan
-    change = np.diff(known)[:, first]
-    state = change * share.astype(np.float32)
-    state += known[:, first]
-    return _split_motion(state)
-
-
-def _split_motion(state: Single) -> tuple[Single, Single]:
-    """Split N states (12, N) into specific forces (3, N) and their gradients (3, 3, N)."""
-    force = state[:3]
-    gradient = state[3:].reshape(3, 3, -1)
-    return force, gradient
-
-
-def _multiply(matrix: Single, vector: Single) -> Single:
-    """Return products of matrices (3, 3, N) and vectors (3, N), summed in a fixed order."""
-    product: Single = matrix[:, 0] * vector[0]
-    product += matrix[:, 1] * vector[1]
-    product += matrix[:, 2] * vector[2]
-    return product
+    share = elapsed_ns / np.where(is_near & is_usual, length_ns, np.nan)
+    change = np.diff(known, axis=0)[first]
+    interpolated: Array = known[first] + change * share[:, None, None]
+    return interpolated

@@ -71,7 +71,6 @@ class Thermal:
         stiffness = np.where(pipeline.stiffness > 0, pipeline.stiffness, np.inf)
         n = len(self._models)
         times = np.full((n_lags, n), MIN_LAG_S)
-        self._filters = LowPass(times, n, n_signals=1)
         self._reference = np.zeros(n)
         self._weight = np.zeros((n_lags, n))
         self._coefficient = np.zeros((n_degrees, *stiffness.shape))
@@ -86,7 +85,7 @@ class Thermal:
                 continue
             lag = np.maximum(model.lag, MIN_LAG_S)
             filters = slice(len(lag))
-            self._filters.time[filters, number] = lag
+            times[filters, number] = lag
             self._weight[filters, number] = filter_weights(lag)
             self._reference[number] = model.reference
             pads, degrees = model.coefficient.shape
@@ -98,6 +97,7 @@ class Thermal:
                 total = (model.ramp**2).sum()
                 self._ramp[number] = np.sqrt(total / pads)
         self._coefficient /= stiffness
+        self._filters = LowPass(times, n_signals=1)
 
         # Time stamp of each cube's row in the last step, in ns, and the last measured temperature,
         # in °C.

@@ -242,13 +242,15 @@ class Reconstruction(CubeNode):
                 motion, problem = UNKNOWN_MOTION, f"weight is not compensated: {error}"
                 self.get_logger().warning(problem, throttle_duration_sec=LOG_PERIOD_S)
         self._diagnostics.compensation_problem = problem
-        states: Mapping[str, Array] = {}
-        if abs(stamp_ns - self._states_ns) >= STATES_PERIOD_NS:
-            self._states_ns, states = stamp_ns, compensation.states()
-        if motion is None and not states:
-            return rows
-        message = compensation_message(self._skin.parent_frame, stamp_ns, motion, states)
-        self._compensation.publish(message)
+        # Only a recorder needs the message.
+        if self._compensation.get_subscription_count():
+            states: Mapping[str, Array] = {}
+            if abs(stamp_ns - self._states_ns) >= STATES_PERIOD_NS:
+                self._states_ns, states = stamp_ns, compensation.states()
+            if motion is not None or states:
+                frame_id = self._skin.parent_frame
+                message = compensation_message(frame_id, stamp_ns, motion, states)
+                self._compensation.publish(message)
         return rows if motion is None else self._forces.add_to(rows, motion)
 
     def _refuse(self, error: CubeError) -> None:
