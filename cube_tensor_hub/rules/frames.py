@@ -40,7 +40,7 @@ def goes_on_behind_damage(transcript: Transcript) -> RuleResult:
     if answered:
         return failed(f"the hub answered a request {answered[0]}")
     if step.ack(AFTER_DAMAGE) is None:
-        return failed("no answer to a sound request behind noise and damaged requests")
+        return failed("no answer to a valid request behind noise and damaged requests")
     return passed(f"no answer to noise and to a request {', '.join(DAMAGED.values())}")
 
 

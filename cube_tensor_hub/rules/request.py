@@ -41,7 +41,7 @@ def behind_ack(step: CheckStep, request: int) -> list[Sample]:
     return []
 
 
-@rule("R1", "Each sound request gets one ACK, in order, after it was carried out")
+@rule("R1", "Each valid request gets one ACK, in order, after it was carried out")
 def one_ack_each(transcript: Transcript) -> RuleResult:
     """In each step the ACKs must be those of the requests, in order.
 

@@ -95,7 +95,7 @@ def clock_is_read_between(transcript: Transcript) -> RuleResult:
     return passed(f"{len(trips)} answers, shortest round trip {1e3 * shortest:.2f} ms")
 
 
-@rule("T2", "Each sound request 6 gets one TIME with the request's argument, started or not.")
+@rule("T2", "Each valid request 6 gets one TIME with the request's argument, started or not.")
 def one_time_each(transcript: Transcript) -> RuleResult:
     """Check that each request for TIME has one answer, with the number of the request."""
     if not knows_time(transcript):
