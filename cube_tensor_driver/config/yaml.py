@@ -125,7 +125,7 @@ def read_yaml(path: Path) -> Any:
 
 def to_yaml(value: Any) -> str:
     """Return plain values (numbers, texts, lists, mappings) as YAML text; keys keep their order."""
-    text: str = yaml.dump(
+    return yaml.dump(
         value,
         Dumper=_Dumper,
         sort_keys=False,
@@ -133,7 +133,6 @@ def to_yaml(value: Any) -> str:
         width=110,
         allow_unicode=True,
     )
-    return text
 
 
 def write_yaml(path: Path, value: Any, header: str = "") -> None:

@@ -1,6 +1,6 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Checks of the arguments of the public Python functions."""
+"""Checks of the arguments of the public Python functions, and of the numbers in files."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ import reprlib
 from collections.abc import Callable
 from numbers import Real
 
-from .errors import ConfigError
+import numpy as np
+
+from .arrays import Array
+from .errors import ConfigError, CubeError
 
 
 def check_number(
@@ -46,3 +49,35 @@ def check_skin(skin: object, attribute: str) -> None:
         raise ConfigError(
             f"{reprlib.repr(skin)} is no skin; read_skin(path) reads one from its file"
         )
+
+
+def read_numbers(
+    value: object,
+    name: str,
+    error: type[CubeError],
+    shape: tuple[int, ...] | None = None,
+) -> Array:
+    """Return finite numbers as a read-only array.
+
+    Args:
+        value: Number, or nested list of numbers.
+        name: Name of the value, for the error message.
+        error: Class of the error that is raised if the value is not of finite numbers, or has
+            another shape.
+        shape: Shape that the array must have; None allows any shape.
+    """
+    if not isinstance(value, np.ndarray):
+        # numpy would convert texts and truth values to numbers, but in a file they are mistakes.
+        items = np.asarray(value, dtype=object).ravel()
+        if any(isinstance(item, (str, bool)) or item is None for item in items):
+            raise error(f"{name} is {value!r}; it must be numbers (write 2.0e-3 with its point)")
+    try:
+        array = np.array(value, dtype=float)
+    except (TypeError, ValueError):
+        raise error(f"{name} is {value!r}; it must be numbers") from None
+    if shape is not None and array.shape != shape:
+        raise error(f"{name} has shape {array.shape}; it must be {shape}")
+    if not np.isfinite(array).all():
+        raise error(f"{name} holds NaN or Inf; every value must be finite")
+    array.flags.writeable = False
+    return array

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from .arguments import read_numbers
 from .arrays import Array
 from .compensation.models import CreepModel, EffectModel, ThermalModel, WeightModel
 from .defaults import BETA, FOAM_MODULUS, FREQUENCY_NOISE, HALF_SIDE, REST_FREQUENCY
@@ -35,10 +36,10 @@ noise, modulus of the foam, gain, and beta (ratio of parasitic to active capacit
 
 
 EFFECTS: dict[str, type[EffectModel]] = {
-    model.key: model for model in (WeightModel, CreepModel, ThermalModel)
+    model.key: model for model in (TemperatureModel, WeightModel, CreepModel, ThermalModel)
 }
-"""Classes of the models of weight, creep and temperature, by the name of the attribute of a
-calibration that holds the model."""
+"""Classes of the models of effects that are no load, by the name of the attribute of a calibration
+that holds the model."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +110,6 @@ class Calibration:
             raise CalibrationError(f"calibration: {error}") from error
         self._set("neglect", tuple(self.neglect))
         self._read_response(structure)
-        self._check_temperature()
         self._check_effects()
         self._check_uid()
 
@@ -132,7 +132,7 @@ class Calibration:
             CalibrationError: The shape is wrong, or a value is negative or 0.
         """
         n_pads = self.layout.n_pads
-        array = _read_array(getattr(self, name), None, name)
+        array = read_numbers(getattr(self, name), name, CalibrationError)
         if array.shape not in ((), (n_pads,)):
             raise CalibrationError(
                 f"{name} has shape {array.shape}; layout {self.layout.name!r} has {n_pads} pads: "
@@ -169,21 +169,11 @@ class Calibration:
             self._set("coefficients", ordered)
         else:
             shape = (self.layout.n_pads, structure.modes.n_modes)
-            self._set("matrix", _read_array(self.matrix, shape, "matrix"))
+            self._set("matrix", read_numbers(self.matrix, "matrix", CalibrationError, shape))
         if self.covariance is not None:
             square = (structure.n_coefficients, structure.n_coefficients)
-            self._set("covariance", _read_array(self.covariance, square, "covariance"))
-
-    def _check_temperature(self) -> None:
-        """Raise CalibrationError unless the temperature model has coefficients for every pad."""
-        if self.temperature is None:
-            return
-        n_lists = len(self.temperature.coefficients)
-        if n_lists != self.layout.n_pads:
-            raise CalibrationError(
-                f"temperature has {n_lists} lists of coefficients; "
-                f"layout {self.layout.name!r} has {self.layout.n_pads} pads"
-            )
+            covariance = read_numbers(self.covariance, "covariance", CalibrationError, square)
+            self._set("covariance", covariance)
 
     def _check_effects(self) -> None:
         """Raise CalibrationError unless each effect has values for every pad."""
@@ -317,10 +307,9 @@ class Calibration:
                 f"calibration: neglect is {neglect!r}; it must be a list of names of modes"
             )
         values["neglect"] = tuple(neglect)
-        if values.get("temperature") is not None:
-            values["temperature"] = TemperatureModel.from_dict(values["temperature"])
-        for key in EFFECTS.keys() & values.keys():
-            values[key] = EFFECTS[key].from_dict(values[key])
+        for key, model in EFFECTS.items():
+            if values.get(key) is not None:
+                values[key] = model.from_dict(values[key])
         for key in ("symmetry", "created", "source"):
             if not isinstance(values.get(key, ""), str):
                 raise CalibrationError(f"calibration: {key} is {values[key]!r}; it must be text")
@@ -405,7 +394,7 @@ def _to_plain(value: Any, is_per_pad: bool) -> Any:
         return float(value[0])
     if isinstance(value, np.ndarray):
         return value.tolist()
-    if isinstance(value, (TemperatureModel, EffectModel)):
+    if isinstance(value, EffectModel):
         return value.to_dict()
     if isinstance(value, tuple):
         return list(value)
@@ -418,7 +407,7 @@ def _read_number(value: Any, name: str) -> float:
     Raises:
         CalibrationError: The value is no finite number.
     """
-    return float(_read_array(value, (), name))
+    return float(read_numbers(value, name, CalibrationError, ()))
 
 
 def _read_coefficients(value: Any) -> dict[str, float]:
@@ -432,37 +421,3 @@ def _read_coefficients(value: Any) -> dict[str, float]:
             f"coefficients is {value!r}; it must be a table of names and numbers"
         )
     return {name: _read_number(item, f"coefficient {name!r}") for name, item in value.items()}
-
-
-def _read_array(
-    value: Any,
-    shape: tuple[int, ...] | None,
-    name: str,
-) -> Array:
-    """Return numbers as a read-only array.
-
-    Args:
-        value: Number, or nested list of numbers.
-        shape: Shape that the array must have; None allows any shape.
-        name: Name of the value, for the error message.
-
-    Raises:
-        CalibrationError: The value is not of finite numbers, or has another shape.
-    """
-    if not isinstance(value, np.ndarray):
-        # numpy would convert texts and truth values to numbers, but in a file they are mistakes.
-        items = np.asarray(value, dtype=object).ravel()
-        if any(isinstance(item, (str, bool)) or item is None for item in items):
-            raise CalibrationError(
-                f"{name} is {value!r}; it must be numbers (write 2.0e-3 with its point)"
-            )
-    try:
-        array = np.array(value, dtype=float)
-    except (TypeError, ValueError):
-        raise CalibrationError(f"{name} is {value!r}; it must be numbers") from None
-    if shape is not None and array.shape != shape:
-        raise CalibrationError(f"{name} has shape {array.shape}; it must be {shape}")
-    if not np.all(np.isfinite(array)):
-        raise CalibrationError(f"{name} holds NaN or Inf; every value must be finite")
-    array.flags.writeable = False
-    return array

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from .arguments import read_numbers
 from .arrays import Array
 from .errors import LayoutError
 
@@ -63,16 +64,19 @@ class Layout:
     pad_size: float = PAD_SIZE
 
     def __post_init__(self) -> None:
-        positions = _read_vectors(self.positions, "positions")
-        normals = _read_vectors(self.normals, "normals")
-        if len(positions) != len(normals):
-            self._refuse(f"{len(positions)} positions but {len(normals)} normals")
-        if not 1 <= len(positions) <= MAX_PADS:
-            self._refuse(f"{len(positions)} pads; allowed are 1 to {MAX_PADS}")
+        positions = read_numbers(self.positions, "layout: positions (x, y, z)", LayoutError)
+        n_pads = positions.size // 3
+        if positions.shape != (n_pads, 3) or not 1 <= n_pads <= MAX_PADS:
+            self._refuse(
+                f"positions have shape {positions.shape}; they are a list of [x, y, z] for each of "
+                f"1 to {MAX_PADS} pads"
+            )
+        normals = read_numbers(
+            self.normals, "layout: normals (x, y, z)", LayoutError, positions.shape
+        )
         if not 0 < self.pad_size <= 2:
             self._refuse(f"pad_size {self.pad_size}; allowed is above 0, up to 2")
 
-        positions.flags.writeable = normals.flags.writeable = False
         # A frozen dataclass refuses assignments, so the checked values replace the given ones by
         # way of the base class.
         object.__setattr__(self, "positions", positions)
@@ -215,31 +219,6 @@ def find_layout(name: str) -> Layout:
         return LAYOUTS[name]
     except (KeyError, TypeError):
         raise LayoutError(f"unknown layout {name!r}; built in are {', '.join(LAYOUTS)}") from None
-
-
-def _read_vectors(value: Any, name: str) -> Array:
-    """Convert a list of N vectors [x, y, z] to an array (N, 3).
-
-    Args:
-        value: The list.
-        name: Name of the vectors, for the error message.
-
-    Raises:
-        LayoutError: The value is no such list, or a number is not finite.
-    """
-    try:
-        vectors = np.array(value, dtype=float)
-    except (TypeError, ValueError):
-        raise LayoutError(
-            f"layout: {name} must be a list of [x, y, z] numbers; found {value!r}"
-        ) from None
-    is_list_of_three = vectors.ndim == 2 and vectors.shape[1] == 3
-    if not is_list_of_three or not np.all(np.isfinite(vectors)):
-        raise LayoutError(
-            f"layout: {name} must be a list of [x, y, z] finite numbers; "
-            f"found shape {vectors.shape}"
-        )
-    return vectors
 
 
 def _name_axes(vector: Array) -> str:

@@ -94,5 +94,4 @@ def _keys(rows: SampleRows) -> AnyArray:
     Two rows have the same key if they have the same cube and the same sequence number.
     """
     cube = rows.cube.astype(np.int64) << _SEQUENCE_BITS
-    keys: AnyArray = cube | rows.sequence.astype(np.int64)
-    return keys
+    return cube | rows.sequence.astype(np.int64)

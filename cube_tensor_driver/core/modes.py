@@ -62,15 +62,13 @@ def to_matrix(stress: NDArray[Float]) -> NDArray[Float]:
         stress: Components xx, yy, zz, yz, zx, xy (..., 6).
     """
     s = np.asarray(stress)
-    matrix: NDArray[Float] = s[..., _COMPONENT_NUMBERS]
-    return matrix
+    return s[..., _COMPONENT_NUMBERS]
 
 
 def to_voigt(matrix: NDArray[Float]) -> NDArray[Float]:
     """Return the components xx, yy, zz, yz, zx, xy (..., 6) of stress tensors (..., 3, 3)."""
     m = np.asarray(matrix)
-    components: NDArray[Float] = m[..., _ROWS, _COLUMNS]
-    return components
+    return m[..., _ROWS, _COLUMNS]
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,8 +127,7 @@ class Modes:
                 _, place = _parse_terms(entry)[0]
                 row[place] = 1.0
             row /= row.sum()
-        result: Array = rows @ self.fields
-        return result
+        return rows @ self.fields
 
     def state(self, stress: Array, gradient: Array | None = None) -> Array:
         """Compute the states (amplitudes of the modes) of given stress fields.

@@ -23,13 +23,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .arrays import Array, Real
-from .errors import CalibrationError
+from .compensation.models import EffectModel
 
 
 def pad_stress(
@@ -141,12 +141,11 @@ def rest_ratio(coefficients: Array, change: Array) -> Array:
     total = np.zeros((*change.shape, coefficients.shape[-1]))
     for d in reversed(range(coefficients.shape[-2])):
         total = (total + coefficients[..., d, :]) * t
-    ratio: Array = 1 + total
-    return ratio
+    return 1 + total
 
 
 @dataclass(frozen=True, eq=False)
-class TemperatureModel:
+class TemperatureModel(EffectModel):
     """Polynomial of the rest frequency over temperature, relative to the reference temperature.
 
         f0(T) = f0 (1 + sum_d c_d (T - reference)^d),   d = 1, 2, ...
@@ -154,53 +153,16 @@ class TemperatureModel:
     Attributes:
         reference: Temperature in °C at which the rest frequencies of the calibration hold.
         coefficients: Coefficients c_d of each pad (P, D), in 1/K^d, the linear term first.
-
-    Raises:
-        CalibrationError: A value is not a finite number, or the shape is wrong.
     """
 
-    reference: float
-    coefficients: Array
+    key = "temperature"
+    axes: ClassVar[Mapping[str, int]] = {"reference": 0, "coefficients": 2}
 
-    def __post_init__(self) -> None:
-        try:
-            reference = float(self.reference)
-            coefficients = np.array(self.coefficients, dtype=float)
-        except (TypeError, ValueError):
-            raise CalibrationError(
-                f"temperature: reference {self.reference!r} and coefficients "
-                f"{self.coefficients!r} must be numbers"
-            ) from None
-        if coefficients.ndim != 2 or coefficients.shape[1] == 0:
-            raise CalibrationError(
-                f"temperature: coefficients have shape {coefficients.shape}; "
-                "they must be one list per pad, the linear term first"
-            )
-        if not np.isfinite([reference, *coefficients.flat]).all():
-            raise CalibrationError("temperature: reference and coefficients must be finite")
-        coefficients.flags.writeable = False
-        object.__setattr__(self, "reference", reference)
-        object.__setattr__(self, "coefficients", coefficients)
+    reference: Array
+    coefficients: Array
 
     def factor(self, temperature: ArrayLike) -> Array:
         """Compute the ratio (N, P) of the rest frequencies at temperatures T (N,), in °C, to those
         at the reference temperature."""
         change = np.asarray(temperature, dtype=float) - self.reference
         return rest_ratio(self.coefficients.T, change)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the model as a table of numbers and lists, which `from_dict` reads."""
-        return {"reference": self.reference, "coefficients": self.coefficients.tolist()}
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> TemperatureModel:
-        """Construct a model from the plain types that `to_dict` returns.
-
-        Raises:
-            CalibrationError: A key is missing or unknown, or a value is invalid.
-        """
-        if not isinstance(data, Mapping) or set(data) != {"reference", "coefficients"}:
-            raise CalibrationError(
-                f"temperature: found {data!r}; it is a table of reference and coefficients"
-            )
-        return cls(data["reference"], data["coefficients"])

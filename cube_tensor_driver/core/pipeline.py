@@ -15,8 +15,9 @@ This module makes the matrices; the kernel (`kernel/`) goes through the rows.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -32,9 +33,7 @@ from .kernel.contract import (
     NEEDS_WINDOW,
     UNKNOWN_CUBE,
     Columns,
-    HealthState,
     Numbers,
-    Offsets,
     Results,
     Tables,
 )
@@ -50,6 +49,10 @@ from .modes import GRADIENT, STRESS
 from .oscillator import highest_frequency
 from .rows import FrequencyRows, StressRows
 from .status import INVALID, STAMP
+
+if TYPE_CHECKING:
+    from .compensation.compensation import Compensation
+    from .health.health import Health
 
 MAX_CACHED_ESTIMATORS = 1024
 """Maximum number of matrices, from the stresses on the pads of a cube to components of stress, that
@@ -78,26 +81,6 @@ UNKNOWN = np.iinfo(np.uint16).max
 rows) takes numbers of 16 bits. No skin has a cube with this number."""
 
 
-class Watch(Protocol):
-    """The health of the pads, as `Pipeline.process` updates it with each row of frequencies."""
-
-    @property
-    def sums(self) -> HealthState:
-        """Sums and times of the present window of 0.5 s, which the kernel changes."""
-
-    def advance(self) -> None:
-        """End the present window of 0.5 s, because the next scan lies outside, and open another."""
-
-    def find_conditions(self, tables: Tables, columns: Columns, row: int) -> None:
-        """Add the conditions of pads that a row and all later rows of its scan show.
-
-        Args:
-            tables: Tables of the skin.
-            columns: Rows of frequencies.
-            row: Number of the row.
-        """
-
-
 @lru_cache(maxsize=MAX_CACHED_ESTIMATORS)
 def _find_estimator(calibration: Calibration, mask: int) -> Estimator:
     """Return the estimator (map from pad stresses to components) of a calibration.
@@ -108,31 +91,26 @@ def _find_estimator(calibration: Calibration, mask: int) -> Estimator:
     Args:
         calibration: The calibration.
         mask: Bit mask of the pads that are not used.
+
+    Returns:
+        Estimator of stresses, in Pa, and gradients, in Pa/m. Its arrays must not be changed.
     """
     missing = [pad for pad in range(calibration.layout.n_pads) if mask >> pad & 1]
-    return make_estimator(
+    estimator = make_estimator(
         calibration.response,
         calibration.noise,
         calibration.modes,
         missing,
         calibration.neglect,
     )
-
-
-class Effects(Protocol):
-    """Effects on the pads that are no load (weight, creep, temperature), which are subtracted."""
-
-    @property
-    def offsets(self) -> Offsets:
-        """What is subtracted, with the state that the kernel changes."""
-
-    def step(self, columns: Columns, row: int) -> None:
-        """Compute the offsets for a scan, and for the interval of time after it in which they hold.
-
-        Args:
-            columns: Rows of frequencies.
-            row: Number of the first row of the scan.
-        """
+    # So far, the estimator gives gradients times d0 (half the side of the cube), in Pa.
+    is_stress = np.arange(N_COMPONENTS) < len(STRESS)
+    scale = np.where(is_stress, 1, 1 / calibration.half_side)
+    return replace(
+        estimator,
+        matrix=estimator.matrix * scale[:, None],
+        covariance=estimator.covariance * np.outer(scale, scale),
+    )
 
 
 class Pipeline:
@@ -168,11 +146,10 @@ class Pipeline:
             raise CubeError(f"pipeline: dtype {self.dtype}; use float32 or float64")
         if not calibrations:
             raise CalibrationError("pipeline: no calibrations; give one per cube")
-        self.calibrations = tuple(calibrations)
-        self.n_pads = max(c.layout.n_pads for c in self.calibrations)
-
         # Cubes with equal calibrations form a group, which shares its matrices.
-        by_id = {c.id: c for c in reversed(self.calibrations)}
+        by_id = {c.id: c for c in reversed(calibrations)}
+        self.calibrations = tuple(by_id[c.id] for c in calibrations)
+        self.n_pads = max(c.layout.n_pads for c in self.calibrations)
         numbers = {key: number for number, key in enumerate(by_id)}
         self._groups = tuple(by_id.values())
         group = np.array([numbers[c.id] for c in self.calibrations], np.int32)
@@ -184,7 +161,7 @@ class Pipeline:
         modulus = pad_table(moduli, self.n_pads, fill=0)
         self._beta = np.maximum(beta, MIN_BETA)
         self._stiffness = modulus * (1 + self._beta) / self._beta
-        whole = [self._estimator(number, 0) for number in range(len(self._groups))]
+        whole = [_find_estimator(calibration, 0) for calibration in self._groups]
         # Calibrations with no more pads than modes have no residual. Even if this holds for all,
         # the matrices have one column for the residual, which is NaN.
         self._n_residuals = max(estimator.dof for estimator in whole) or 1
@@ -244,18 +221,6 @@ class Pipeline:
         stiffness: Array = self._stiffness[self._tables.calibration]
         return stiffness
 
-    def temperature_factor(self, cube: Index, temperature: Real) -> Array:
-        """Return the ratio of rest frequencies at a temperature to those at the reference (N, P).
-
-        The ratio is 1 if a calibration has no temperature model or the temperature is unknown.
-
-        Args:
-            cube: Numbers of the cubes (N,).
-            temperature: Temperatures (N,), in °C; NaN where they are unknown.
-        """
-        calibration = self._tables.calibration[cube]
-        return temperature_factor(self._tables, calibration, np.asarray(temperature))
-
     def unloaded_factor(self, cube: Index, temperature: Real, offset: Real | None = None) -> Array:
         """Return the ratio of the frequencies without load to the rest frequencies (N, P).
 
@@ -270,12 +235,13 @@ class Pipeline:
             temperature: Temperatures (N,), in °C; NaN where they are unknown.
             offset: Offsets o (N, P), stress / stiffness; None: those of the newest rows.
         """
-        factor = self.temperature_factor(cube, temperature)
+        calibration = self._tables.calibration[cube]
+        factor = temperature_factor(self._tables, calibration, temperature)
         if offset is None and self.newest_offset is not None:
             offset = self.newest_offset[cube].astype(float)
         if offset is None:
             return factor
-        beta = self._beta[self._tables.calibration[cube]]
+        beta = self._beta[calibration]
         numerator = 1 + offset * (1 + beta) / beta
         shifted: Array = factor * numerator / (1 + offset)
         return shifted
@@ -293,18 +259,17 @@ class Pipeline:
         ratio = self._rest / before
         beta = self._beta[self._tables.calibration]
         highest_ratio = (1 + beta) / beta
-        shift: Array = (ratio - 1) / (highest_ratio - ratio)
-        return shift
+        return (ratio - 1) / (highest_ratio - ratio)
 
     def process(
         self,
         rows: FrequencyRows,
         left_out: PadMasks | None = None,
         *,
-        watch: Watch | None = None,
+        watch: Health | None = None,
         known: Mask | None = None,
         out: StressRows | None = None,
-        effects: Effects | None = None,
+        effects: Compensation | None = None,
         offset: Real | None = None,
     ) -> StressRows:
         """Compute the stress of N rows.
@@ -420,11 +385,11 @@ class Pipeline:
         keys = group.astype(np.int64) << 32 | pack_bits(~is_used)
         for key in np.unique(keys).tolist():
             chosen = keys == key
-            n_pads = self._groups[key >> 32].layout.n_pads
-            estimator = self._estimator(key >> 32, key & (1 << n_pads) - 1)
+            calibration = self._groups[key >> 32]
+            n_pads = calibration.layout.n_pads
+            estimator = _find_estimator(calibration, key & 0xFFFFFFFF)
             result[chosen, :n_pads] = estimator.suspects(stress[chosen, :n_pads])
-        is_known = rows.cube < len(self.calibrations)
-        return result & is_known[:, None]
+        return result
 
     def matrix(self, cube: int, left_out: int = 0) -> Array:
         """Return the matrix (15, P) from the stresses on a cube's pads to its components.
@@ -438,8 +403,7 @@ class Pipeline:
             Rows of components that the pads do not determine are NaN, and columns of pads that are
             not used are 0.
         """
-        estimator, scale = self._find_estimator(cube, left_out)
-        return estimator.matrix * scale[:, None]
+        return _find_estimator(self.calibrations[cube], int(left_out)).matrix
 
     def covariance(self, cube: int, left_out: int = 0) -> Array:
         """Return the covariance (15, 15) of a cube's components due to the noise of its pads.
@@ -452,25 +416,7 @@ class Pipeline:
             Covariance of 6 stresses in Pa and 9 gradients in Pa/m; NaN in the rows and columns of
             components that the pads do not determine.
         """
-        estimator, scale = self._find_estimator(cube, left_out)
-        return estimator.covariance * np.outer(scale, scale)
-
-    def _find_estimator(self, cube: int, left_out: int) -> tuple[Estimator, Array]:
-        """Return the estimator of a cube, and factors for the units of its components.
-
-        Args:
-            cube: Number of the cube.
-            left_out: Bit mask of the pads that are not used.
-
-        Returns:
-            Estimator, and the factors (15,) from its components, in Pa, to Pa and Pa/m.
-        """
-        group = int(self._tables.calibration[cube])
-        # Bits of pads that the cube does not have are removed, because they would fill the cache
-        # with equal estimators.
-        n_pads = self._groups[group].layout.n_pads
-        mask = int(left_out) & (1 << n_pads) - 1
-        return self._estimator(group, mask), self._scale(group)
+        return _find_estimator(self.calibrations[cube], int(left_out)).covariance
 
     def _read_columns(self, rows: FrequencyRows, known: Mask | None) -> Columns:
         """Return the columns of rows in the types that the kernel takes.
@@ -538,26 +484,6 @@ class Pipeline:
         stress = np.where(is_used, v * self._stiffness[group], 0)
         return group, is_used, stress
 
-    def _scale(self, group: int) -> Array:
-        """Return the factors (15,) from the components of an estimator to Pa and Pa/m.
-
-        An estimator gives gradients times d0 (half the side of the cube), in Pa.
-
-        Args:
-            group: Number of the calibration.
-        """
-        is_stress = np.arange(N_COMPONENTS) < len(STRESS)
-        return np.where(is_stress, 1, 1 / self._groups[group].half_side)
-
-    def _estimator(self, group: int, mask: int) -> Estimator:
-        """Return the estimator (map from pad stresses to components) of a calibration.
-
-        Args:
-            group: Number of the calibration.
-            mask: Bit mask of the pads that are not used.
-        """
-        return _find_estimator(self._groups[group], mask)
-
     def _allocate_tables(self, group: AnyArray) -> Tables:
         """Return the tables of the skin, with room for `MAX_CACHED_ESTIMATORS` sets of bad pads.
 
@@ -605,7 +531,7 @@ class Pipeline:
             keys[:] = NO_KEY
         number = len(self._groups) + self._n_extra
         group, mask = key >> 32, key & 0xFFFFFFFF
-        self._store_table(number, group, self._estimator(group, mask))
+        self._store_table(number, group, _find_estimator(self._groups[group], mask))
         self._n_extra += 1
         place = int(np.searchsorted(keys, key))
         keys[place + 1 :], numbers[place + 1 :] = keys[place:-1].copy(), numbers[place:-1].copy()
@@ -621,8 +547,7 @@ class Pipeline:
         """
         n_pads = self._groups[group].layout.n_pads
         matrix = np.zeros(self._tables.matrix.shape[1:])
-        scaled = estimator.matrix * self._scale(group)[:, None]
-        matrix[:n_pads, :N_COMPONENTS] = scaled.T
+        matrix[:n_pads, :N_COMPONENTS] = estimator.matrix.T
         # If pads are missing and the rank falls by more than their number, the residual has more
         # degrees of freedom than the table has columns for it. Then only the first are used.
         null = estimator.null[: self._n_residuals]

@@ -209,6 +209,7 @@ def default_modes(layout: Layout) -> Modes:
     return PLANE if layout.planar else SPACE
 
 
+@lru_cache(maxsize=64)
 def find_structure(
     layout: Layout,
     symmetry: str = "full",
@@ -224,16 +225,7 @@ def find_structure(
     Raises:
         SymmetryError: The layout does not have this symmetry.
     """
-    return _derive_structure(layout, symmetry, modes or default_modes(layout))
-
-
-@lru_cache(maxsize=64)
-def _derive_structure(
-    layout: Layout,
-    symmetry: str,
-    modes: Modes,
-) -> Structure:
-    """Derive the structure that `find_structure` returns; the arguments are the same."""
+    modes = modes or default_modes(layout)
     elements = find_layout_group(layout, symmetry)
     pad_images = np.array([map_pads(layout, element) for element in elements])
     mode_images, mode_signs = _read_signed_permutations(

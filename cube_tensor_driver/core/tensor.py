@@ -211,8 +211,7 @@ def face_force(stress: Real, side: Array | float) -> Array:
     """
     zx_yz_zz = [4, 3, 2]
     traction: AnyArray = np.nan_to_num(stress)[..., zx_yz_zz]
-    force: Array = side**2 * traction
-    return force
+    return side**2 * traction
 
 
 def contact_wrench(

@@ -355,8 +355,7 @@ class CubeNode(LifecycleNode):
     def on_deactivate(self, state: State) -> TransitionCallbackReturn:
         self.is_active = False
         self.deactivate()
-        result: TransitionCallbackReturn = super().on_deactivate(state)
-        return result
+        return super().on_deactivate(state)
 
     def on_cleanup(self, state: State) -> TransitionCallbackReturn:
         self.end()

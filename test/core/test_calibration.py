@@ -106,7 +106,7 @@ def test_another_layout_keeps_its_pads():
         ({"neglect": ["aa"]}, "'aa'"),
         ({"uid": -1}, "uid is -1"),
         ({"uid": "0x1"}, "whole number"),
-        ({"temperature": {"reference": 25, "coefficients": [[0.1]]}}, "1 lists"),
+        ({"temperature": {"reference": 25, "coefficients": [[0.1]]}}, "1 pads"),
         ({"modulus": True}, "must be numbers"),
         ({"gain": [[1], [2, 3]]}, "must be numbers"),
     ],

@@ -127,7 +127,7 @@ def test_a_layout_survives_plain_types():
         ({"pad_size": "big"}, "pad_size"),
         ({"colour": "red"}, "colour"),
         ({"positions": [], "normals": []}, "x, y, z"),
-        ({"positions": [[0, 0, 1], [0.5, 0, 1]]}, "2 positions but 1 normals"),
+        ({"positions": [[0, 0, 1], [0.5, 0, 1]]}, r"normals.* shape \(1, 3\); it must be \(2, 3\)"),
     ],
 )
 def test_a_bad_layout_is_refused_with_the_reason(change, words):
@@ -360,8 +360,6 @@ def test_coefficients_that_do_not_fit_are_named():
     structure = find_structure(LAYOUTS["planar"])
     with pytest.raises(CalibrationError, match="missing h, unknown k"):
         response(structure, {n: 1.0 for n in ("a", "b", "c_plus_d", "e", "f", "g", "k")})
-    with pytest.raises(CalibrationError, match="finite; a are not"):
-        response(structure, ILLUSTRATIVE | {"a": float("nan")})
     with pytest.raises(CalibrationError, match="shape"):
         project(structure, np.zeros((8, 8)))
 

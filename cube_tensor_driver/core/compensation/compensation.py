@@ -22,8 +22,9 @@ import numpy as np
 
 from ..arrays import Array, Mask, PadMasks, Real
 from ..errors import LayoutError
+from ..health.health import Health
 from ..kernel.contract import Columns, Offsets
-from ..pipeline import Pipeline, Watch
+from ..pipeline import Pipeline
 from ..rows import FrequencyRows, StressRows
 from ..status import COMPENSATION, WEIGHT
 from .creep import Creep
@@ -77,7 +78,7 @@ class Compensation:
         rows: FrequencyRows,
         left_out: PadMasks | None,
         *,
-        watch: Watch | None,
+        watch: Health | None,
         known: Mask | None,
         out: StressRows,
         offset: Real | None = None,

@@ -218,8 +218,7 @@ class PadDiagnosis:
             self._update_still(window, span, has_enough_rows, state)
             found[self._find_drifting(window)] |= DRIFT
         is_valid = has_enough_rows[:, None] & self._exists
-        valid: StatusBits = found * is_valid
-        return valid
+        return found * is_valid
 
     def _find_noisy(self, window: Window, state: StatusBits) -> Mask:
         """Find the pads whose noise is high (cubes, P), with hysteresis, and set the new `bound`.
@@ -237,8 +236,7 @@ class PadDiagnosis:
         # A moving load raises the computed noise, too, but the frequency is then smooth, not rough.
         # A pad that was noisy before stays noisy even if the load now makes its frequency smooth.
         is_noise = window.rough | was_noisy
-        noisy: Mask = (window.noise > limit) & is_noise
-        return noisy
+        return (window.noise > limit) & is_noise
 
     def _find_stuck(self, span: Real, state: StatusBits) -> Mask:
         """Find the pads that keep a single value while the other pads of the cube move (cubes, P).
@@ -332,8 +330,7 @@ def _squared_bound(noise: Array) -> Array:
         noise: Usual noise (standard deviation of the frequency) of each pad, in Hz.
     """
     limit = MAX_SECOND_DIFFERENCE * noise
-    bound: Array = (limit**2).astype(np.float32)
-    return bound
+    return (limit**2).astype(np.float32)
 
 
 def _lower_median(values: Real) -> Real:

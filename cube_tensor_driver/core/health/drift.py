@@ -167,8 +167,7 @@ class DriftTracker:
         with np.errstate(invalid="ignore"):  # NaN where a cube has no such pad
             is_close = np.abs(measured / self._tracked_rest - 1) < CONTACT_THRESHOLD
         all_close = (is_close | ~usable).all(axis=1)
-        at_rest: Mask = all_close & usable.any(axis=1) & self._health.still
-        return at_rest
+        return all_close & usable.any(axis=1) & self._health.still
 
     def _count_unloaded_windows(self, at_rest: Mask, has_rows: Mask) -> None:
         """Count the windows (of 0.5 s) for which each cube has been unloaded.

@@ -103,8 +103,7 @@ class Health:
     @property
     def mask(self) -> PadMasks:
         """Bit masks of the pads that are not used, because of their conditions (cubes,)."""
-        mask: PadMasks = self.sums.cubes["mask"]
-        return mask
+        return self.sums.cubes["mask"]
 
     @property
     def still(self) -> Mask:
@@ -124,8 +123,7 @@ class Health:
     @property
     def temperature(self) -> Single:
         """Newest temperature of each cube (cubes,), in °C."""
-        temperature: Single = self.sums.cubes["temperature"]
-        return temperature
+        return self.sums.cubes["temperature"]
 
     @property
     def newest_ns(self) -> int:
@@ -135,8 +133,7 @@ class Health:
     @property
     def age_ns(self) -> Times:
         """Time from the newest row of each cube to the newest row of any cube (cubes,), in ns."""
-        age: Times = self.newest_ns - self.sums.cubes["time_ns"]
-        return age
+        return self.newest_ns - self.sums.cubes["time_ns"]
 
     def window(self) -> Window:
         """Return the statistics of the present window, which has not ended."""

@@ -178,8 +178,7 @@ class HealthState(NamedTuple):
     @property
     def cubes(self) -> AnyArray:
         """State of each cube (C,), of type `CUBE_STATE`, as a view."""
-        view: AnyArray = self.words.view(CUBE_STATE)[:, 0]
-        return view
+        return self.words.view(CUBE_STATE)[:, 0]
 
     def pads(self, name: str) -> Single:
         """Return one quantity of all pads (C, P), as a view; `PAD_QUANTITIES` has the names."""

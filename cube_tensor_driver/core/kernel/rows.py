@@ -125,8 +125,7 @@ def temperature_factor(tables: Tables, calibration: Numbers, temperature: Real) 
 def find_existing(tables: Tables, calibration: Numbers) -> Mask:
     """Return whether cubes with these calibrations (N,) have each pad (N, P)."""
     pads = np.arange(tables.rest.shape[1])
-    exists: Mask = pads < tables.pads[calibration][:, None]
-    return exists
+    return pads < tables.pads[calibration][:, None]
 
 
 def mask_bits(tables: Tables, calibration: Numbers, mask: PadMasks) -> Mask:

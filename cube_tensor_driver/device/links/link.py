@@ -239,8 +239,7 @@ class Link:
                 data = self._stream.recv(READ_CHUNK)
             elif self._stream is not None:
                 # Here no byte means that none has arrived; an unplugged port raises an OSError.
-                received: bytes = self._stream.read(self._stream.in_waiting)
-                return received
+                return self._stream.read(self._stream.in_waiting)
             else:
                 return b""
         except BlockingIOError:
