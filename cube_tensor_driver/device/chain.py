@@ -262,46 +262,17 @@ class LiveLinks:
             native: Samples that came before these frames and that the module in C has counted and
                 stamped already; None if there are none.
         """
-        if native is not None and native.links and not self._deliver_whole(native):
-            self._add_native(native)
+        if native is not None:
+            samples = unpack_all(native.raws)
+            for link, sample, stamp_ns in zip(native.links, samples, native.stamps_ns, strict=True):
+                if isinstance(sample, Sample):
+                    self._rows.received += sample.n_cubes
+                    self._scans.add(link, sample, stamp_ns)
         if received:
             self._handle_received(received)
         self._was_clock_set = False
         self._deliver()
         self._rows.check(self._scans.rows_waiting())
-
-    def _add_native(self, native: NativeSamples) -> None:
-        """Add samples that the module in C has counted and stamped to the scans."""
-        samples = unpack_all(native.raws)
-        for link, sample, stamp_ns in zip(native.links, samples, native.stamps_ns, strict=True):
-            if isinstance(sample, Sample):
-                self._rows.received += sample.n_cubes
-                self._scans.add(link, [sample], [stamp_ns])
-
-    def _deliver_whole(self, native: NativeSamples) -> bool:
-        """Call `on_rows` at once if these samples are whole scans of all links that deliver.
-
-        A whole scan holds one sample of every such link with all cubes of its hub.
-
-        Args:
-            native: Samples that the module in C has counted and stamped already.
-
-        Returns:
-            Whether they are whole scans. If not, the caller must add the samples to the scans.
-        """
-        scans = self._scans.order_whole(
-            native,
-            self._scans_per_call,
-            self._max_scans,
-        )
-        sizes = [len(part.cubes) for part in scans]
-        self._rows.received += sum(sizes)
-        if self._is_overloaded():
-            self._count_overload(sum(sizes[:-1]))
-            scans = scans[-1:]
-        for part in scans:
-            self._give_rows(partial(self._scans.build_whole, part))
-        return bool(scans)
 
     def _is_overloaded(self) -> bool:
         """Return whether scans (one sample of every cube) must be dropped, as the host is too slow.
@@ -422,7 +393,8 @@ class LiveLinks:
         numbers = [sample.sequence for sample in samples]
         stamps_ns = clock.update(device_us, read.arrival_ns, numbers, read.is_late)
         status = STAMP if clock.in_doubt else 0
-        self._scans.add(read.link, samples, stamps_ns, status)
+        for sample, stamp_ns in zip(samples, stamps_ns, strict=True):
+            self._scans.add(read.link, sample, stamp_ns, status)
         record.track.is_native_allowed = record.account.has_whole_samples and clock.is_steady
 
     def _deliver(self) -> None:

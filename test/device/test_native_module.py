@@ -114,7 +114,7 @@ def test_rows_have_the_same_bits(pads: tuple[int, ...], monkeypatch: pytest.Monk
         for link, sample in enumerate(samples):
             uids = np.arange(1, sample.n_cubes + 1, dtype="<u8") + 100 * link
             assert builder.cubes.learn(link, Hello(link, 0, sample.n_pads, 1, uids)) == []
-            builder.add(link, [sample], [1_700_000_000_000_000_000 + link])
+            builder.add(link, sample, 1_700_000_000_000_000_000 + link)
         built.append(builder.build())
     for name, c in built[0].columns().items():
         python = getattr(built[1], name)

@@ -54,9 +54,9 @@ def two_links():
 
 def test_rows_carry_the_cubes_of_the_skin():
     scan = two_links()
-    scan.add(0, [sample(10, [[1.0, 2.0], [3.0, 4.0]], celsius=2150)], [1000])
+    scan.add(0, sample(10, [[1.0, 2.0], [3.0, 4.0]], celsius=2150), 1000)
     assert scan.is_complete()  # link 1 has never delivered: nobody waits for it
-    scan.add(1, [sample(20, [[5.0, 6.0], [7.0, 8.0]], fault=2)], [3000])
+    scan.add(1, sample(20, [[5.0, 6.0], [7.0, 8.0]], fault=2), 3000)
     rows = scan.build()
     assert rows.cube.tolist() == [2, 1, 0, 3]
     assert rows.sequence.tolist() == [10, 10, 20, 20]
@@ -70,14 +70,14 @@ def test_rows_carry_the_cubes_of_the_skin():
 def test_a_scan_waits_for_live_links_but_not_twice():
     scan = two_links()
     for link in (0, 1):
-        scan.add(link, [sample(0, [[1.0, 1.0]])], [0])
+        scan.add(link, sample(0, [[1.0, 1.0]]), 0)
     scan.build()
-    scan.add(0, [sample(1, [[1.0, 1.0]])], [1])
+    scan.add(0, sample(1, [[1.0, 1.0]]), 1)
     assert not scan.is_complete()
-    scan.add(0, [sample(2, [[1.0, 1.0]])], [2])
+    scan.add(0, sample(2, [[1.0, 1.0]]), 2)
     assert scan.is_complete()
     scan.build()
-    scan.add(0, [sample(3, [[1.0, 1.0]])], [3])
+    scan.add(0, sample(3, [[1.0, 1.0]]), 3)
     scan.forget(1)
     assert scan.is_complete()
 
@@ -86,7 +86,7 @@ def test_a_link_that_was_late_once_does_not_stay_a_sample_behind():
     scan = two_links()
 
     def give(link, number):
-        scan.add(link, [sample(number, [[1.0, 1.0]] * 2)], [1000 * (number + 1) + link])
+        scan.add(link, sample(number, [[1.0, 1.0]] * 2), 1000 * (number + 1) + link)
 
     def taken():
         rows = scan.build() if scan.is_complete() else None
@@ -136,7 +136,7 @@ def test_links_that_are_late_by_different_times_make_whole_scans():
 
     def give(link, *numbers):
         for number in numbers:
-            scan.add(link, [sample(number, [[1.0, 1.0]] * 2)], [1000 * number + link])
+            scan.add(link, sample(number, [[1.0, 1.0]] * 2), 1000 * number + link)
 
     give(0, 0), give(1, 0)
     taken(scan)
@@ -168,7 +168,7 @@ def test_each_sample_is_built_once_and_in_order(turns, max_scans):
                 continue
             for _ in range(counts[link]):
                 number, stamp_ns = given[link], 1_000_000 * turn + given[link]
-                scan.add(link, [sample(number, [[1.0, 1.0]] * 2)], [stamp_ns])
+                scan.add(link, sample(number, [[1.0, 1.0]] * 2), stamp_ns)
                 given[link] += 1
         while scan.is_complete():
             rows = scan.build(max_scans=max_scans)
@@ -185,7 +185,7 @@ def test_what_a_link_has_not_sent_does_not_keep_batches_small(begins, lost):
         for link in (0, 1):
             if link == 0 or (number >= begins and number not in lost):
                 frame = sample(number, [[1.0, 1.0], [1.0, 1.0]])
-                scan.add(link, [frame], [number * period + 1_000_000 * link])
+                scan.add(link, frame, number * period + 1_000_000 * link)
             while scan.is_complete(5):
                 rows = scan.build(max_scans=6)
                 sizes.append(len(rows))
@@ -198,7 +198,7 @@ def test_a_sample_in_two_frames_goes_on_at_once():
     """Its second part does not wait for the next scan, whichever hub is the earlier one."""
     scan = two_links()
     for link, stamp_ns in ((0, 1010), (0, 1010), (1, 1000)):
-        scan.add(link, [sample(0, [[1.0, 1.0]])], [stamp_ns])
+        scan.add(link, sample(0, [[1.0, 1.0]]), stamp_ns)
     taken = [len(scan.build().cube) for _ in range(2) if scan.is_complete()]
     assert taken == [2, 1] and not scan.is_complete() and scan.rows_waiting() == 0
 
@@ -206,7 +206,7 @@ def test_a_sample_in_two_frames_goes_on_at_once():
 def test_not_measured_is_nan_and_millihertz_survive():
     scan = ScanBuilder(1, [CubeAddress("a", 0, 0, None, 2)])
     scan.cubes.learn(0, hello([1]))
-    scan.add(0, [sample(0, [[0.0, 100_000.001]])], [0])
+    scan.add(0, sample(0, [[0.0, 100_000.001]]), 0)
     frequency = scan.build().frequency
     # 1 mHz is below float32's spacing at 100 kHz (7.8 mHz): the nearest float32 is what must come
     # out
@@ -218,7 +218,7 @@ def test_unknown_cubes_are_counted_and_left_out():
     assert scan.cubes.learn(0, hello([1, 2, 3])) == [
         "the hub's cubes 0 (uid 0x1), 2 (uid 0x3) not in the skin file: add it there",
     ]
-    scan.add(0, [sample(0, [[1.0, 1.0], [2.0, 2.0], [3.0, 3.0], [4.0, 4.0]])], [0])
+    scan.add(0, sample(0, [[1.0, 1.0], [2.0, 2.0], [3.0, 3.0], [4.0, 4.0]]), 0)
     rows = scan.build()
     assert rows.cube.tolist() == [0] and rows.frequency.tolist() == [[2.0, 2.0]]
     assert (scan.counts.unknown_cube, scan.counts.wrong_pads) == (3, 0)
@@ -228,7 +228,7 @@ def test_another_number_of_pads_names_both_and_invents_nothing():
     scan = ScanBuilder(1, [CubeAddress("a", 0, 0, None, 8), CubeAddress("b", 0, 1, None, 2)])
     (problem,) = scan.cubes.learn(0, hello([1, 2]))
     assert "cube a" in problem and "reports 2 pads" in problem and "layout has 8" in problem
-    scan.add(0, [sample(0, [[1.0, 2.0], [3.0, 4.0]])], [0])
+    scan.add(0, sample(0, [[1.0, 2.0], [3.0, 4.0]]), 0)
     rows = scan.build()
     assert rows.cube.tolist() == [1] and scan.counts.wrong_pads == 1
     # narrower than the skin's widest cube: the rest is not measured
@@ -257,7 +257,7 @@ def test_a_repeated_hello_says_nothing_and_a_changed_one_counts():
     assert scan.cubes.learn(0, hello([4, 5])) == [
         "the hub's cube 0 (uid 0x4) not in the skin file: add it there"
     ]
-    scan.add(0, [sample(0, [[1.0, 1.0], [2.0, 2.0]])], [0])
+    scan.add(0, sample(0, [[1.0, 1.0], [2.0, 2.0]]), 0)
     assert scan.build().frequency.tolist() == [[2.0, 2.0]]
 
 
@@ -268,8 +268,8 @@ def test_two_cubes_with_one_uid_give_rows_of_one():
     assert problem == "the hub's cube 1 (uid 0x5) left out: an earlier one has the same uid"
     (problem, *_) = scan.cubes.learn(1, hello([5, 7]))
     assert problem == "cube a (uid 0x5) left out here: another link has a cube of the same uid"
-    scan.add(0, [sample(0, [[1.0, 1.0], [2.0, 2.0], [3.0, 3.0]])], [0])
-    scan.add(1, [sample(0, [[4.0, 4.0], [5.0, 5.0]])], [0])
+    scan.add(0, sample(0, [[1.0, 1.0], [2.0, 2.0], [3.0, 3.0]]), 0)
+    scan.add(1, sample(0, [[4.0, 4.0], [5.0, 5.0]]), 0)
     rows = scan.build()
     assert rows.cube.tolist() == [0, 1] and rows.frequency[:, 0].tolist() == [1.0, 3.0]
     assert scan.counts.unknown_cube == 3 and scan.rows_waiting() == 0
@@ -278,7 +278,7 @@ def test_two_cubes_with_one_uid_give_rows_of_one():
     assert scan.cubes.learn(1, hello([5, 7])) == [
         "the hub's cube 1 (uid 0x7) not in the skin file: add it there"
     ]
-    scan.add(1, [sample(1, [[4.0, 4.0], [5.0, 5.0]])], [0])
+    scan.add(1, sample(1, [[4.0, 4.0], [5.0, 5.0]]), 0)
     assert scan.build().cube.tolist() == [0]
     # the first comes back: now it is the second
     assert "cube a (uid 0x5) left out here" in scan.cubes.learn(0, hello([5, 5, 6]))[0]
@@ -298,9 +298,7 @@ def test_batches_hold_the_first_samples_of_all_links_then_the_second_ones():
     for number in range(3):
         for link in (0, 1):
             assert not scan.is_complete(3)
-            scan.add(
-                link, [sample(number, [[10 * link + number + 1, 1.0]] * 2)], [100 * number + link]
-            )
+            scan.add(link, sample(number, [[10 * link + number + 1, 1.0]] * 2), 100 * number + link)
     assert scan.is_complete(3) and scan.is_complete(2) and not scan.is_complete(4)
     first, second = scan.build(max_scans=2), scan.build()
     assert first.stamp_ns.tolist() == [0, 0, 1, 1, 100, 100, 101, 101]
@@ -417,8 +415,8 @@ def test_pads_that_a_cube_does_not_have_are_nan():
     )
     scan.cubes.learn(0, hello([1], 3))
     scan.cubes.learn(1, hello([2, 3], 2))
-    scan.add(0, [sample(0, [[1.0, 0.0, 3.0]])], [0])
-    scan.add(1, [sample(0, [[4.0, 5.0], [6.0, 7.0]])], [0])
+    scan.add(0, sample(0, [[1.0, 0.0, 3.0]]), 0)
+    scan.add(1, sample(0, [[4.0, 5.0], [6.0, 7.0]]), 0)
     expected = [[1, np.nan, 3], [4, 5, np.nan], [6, 7, np.nan]]
     np.testing.assert_array_equal(scan.build().frequency, expected)
 

@@ -105,8 +105,6 @@ class CubeTable:
         self._addresses = tuple(addresses)
         self._pads = np.array([address.n_pads for address in addresses])
         self._hubs = [_HubCubes() for _ in range(n_links)]
-        # Cached result of the last call of `find_all`, by the indices of the links.
-        self._whole: dict[tuple[int, ...], RowIndex | None] = {}
 
     def learn(self, link: int, hello: Hello) -> list[str] | None:
         """Store which cubes the hub of a link has, from its HELLO frame.
@@ -130,7 +128,6 @@ class CubeTable:
             return None
         hub.hello = hello
         hub.is_present = True
-        self._whole = {}
         cubes, problems = self._match(link, hello)
         if is_same and np.array_equal(cubes, hub.cubes):
             return None
@@ -196,23 +193,6 @@ class CubeTable:
             temperature=sample.temperature[rows],
         )
         return cubes[rows].astype(np.uint16), kept
-
-    def find_all(self, links: Sequence[int]) -> RowIndex | None:
-        """Return the indices in the skin of all cubes of the hubs of some links, link after link.
-
-        If the skin does not have one of these cubes, or has it with another number of pads, the
-        result is None.
-
-        Args:
-            links: Indices of the links, in order.
-        """
-        key = tuple(links)
-        if key not in self._whole:
-            found = [self._hubs[link].complete for link in links]
-            cubes = [hub[0] for hub in found if hub is not None]
-            is_whole = len(cubes) == len(links)
-            self._whole = {key: np.concatenate(cubes) if is_whole else None}
-        return self._whole[key]
 
     def _match(self, link: int, hello: Hello) -> tuple[HubIndex, list[str]]:
         """Find each cube of a hub in the skin.

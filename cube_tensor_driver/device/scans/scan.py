@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 
 from ...core.rows import FrequencyRows
-from ..links.intake import NativeSamples
 from ..wire.native import wire
 from ..wire.protocol import NOT_MEASURED, TEMPERATURE_UNKNOWN, Sample
 from .cube_table import CubeAddress, CubeTable, RowIndex
@@ -54,20 +53,6 @@ def empty_rows(n_rows: int, n_pads: int) -> FrequencyRows:
         pad_fault=np.empty(n_rows, np.uint32),
         status=np.empty(n_rows, np.uint16),
     )
-
-
-class WholeScans(NamedTuple):
-    """Successive scans with one sample of every link that delivers, all cubes of its hub in each.
-
-    Attributes:
-        cubes: Index in the skin of the cube of each row (N,).
-        raws: Bytes of the samples, from type to CRC, scan after scan.
-        stamps_ns: Host time at which each sample was taken, in ns since the Unix epoch.
-    """
-
-    cubes: RowIndex
-    raws: list[bytes]
-    stamps_ns: list[int]
 
 
 class _SampleRows(NamedTuple):
@@ -137,33 +122,31 @@ class ScanBuilder:
     def add(
         self,
         link: int,
-        samples: Sequence[Sample],
-        stamps_ns: Sequence[int],
+        sample: Sample,
+        stamp_ns: int,
         status: int = 0,
     ) -> None:
-        """Add samples of one link to the scans of the same time.
+        """Add a sample of one link to the scan of the same time.
 
         Args:
             link: Index of the link.
-            samples: The samples, in order.
-            stamps_ns: Host time at which each sample was taken, in ns since the Unix epoch.
-            status: Status bits of all rows of the samples (core/status.py).
+            sample: The sample; the samples of a link are added in the order of their numbers.
+            stamp_ns: Host time at which it was taken, in ns since the Unix epoch.
+            status: Status bits of its rows (core/status.py).
         """
         self._live.add(link)
         self._holds_back = False
-        for sample, stamp_ns in zip(samples, stamps_ns, strict=True):
-            cubes, kept = self.cubes.find(link, sample)
-            part = _SampleRows(cubes, kept, stamp_ns, status)
-            # After a loss, the next sample of the link joins the scan of its own time. If it joined
-            # the next scan, the link would stay behind the others for good.
-            scan = self._n_pending[link]
-            if len(self._pending) > 1:
-                scan = max(scan, self._first_scan_at(stamp_ns))
-            if scan == len(self._pending):
-                self._pending.append({})
-                self._pending_ns.append(stamp_ns)
-            self._pending[scan][link] = part
-            self._n_pending[link] = scan + 1
+        cubes, kept = self.cubes.find(link, sample)
+        # After a loss, the next sample of the link joins the scan of its own time. If it joined
+        # the next scan, the link would stay behind the others for good.
+        scan = self._n_pending[link]
+        if len(self._pending) > 1:
+            scan = max(scan, self._first_scan_at(stamp_ns))
+        if scan == len(self._pending):
+            self._pending.append({})
+            self._pending_ns.append(stamp_ns)
+        self._pending[scan][link] = _SampleRows(cubes, kept, stamp_ns, status)
+        self._n_pending[link] = scan + 1
 
     def is_complete(self, n_scans: int = 1) -> bool:
         """Return whether rows (samples of cubes) can be built from the pending scans now.
@@ -210,79 +193,19 @@ class ScanBuilder:
         parts = [part for part in taken if part.stamp_ns <= end_ns]
         self._deferred = [part for part in taken if part.stamp_ns > end_ns]
 
-        cubes = [part.cubes for part in parts]
-        sizes = [len(part.cubes) for part in parts]
-        statuses = [part.status for part in parts]
+        cubes, samples, stamps_ns, statuses = zip(*parts, strict=True)
+        sizes = [len(indices) for indices in cubes]
         rows = self._make_rows(sum(sizes), self.cubes.n_pads)
         np.concatenate(cubes, out=rows.cube)
-        rows.status[:] = 0
-        if any(statuses):
-            rows.status[:] = np.repeat(statuses, sizes)
-        raws = [part.sample.raw for part in parts]
+        rows.status[:] = np.repeat(statuses, sizes) if any(statuses) else 0
+        raws = [sample.raw for sample in samples]
         if wire is not None and all(raws):
-            _place(rows, raws, [part.stamp_ns for part in parts])
+            _place(rows, raws, list(stamps_ns))
             return rows
         start = 0
         for part, size in zip(parts, sizes, strict=True):
             _fill(rows.select(slice(start, start + size)), part)
             start += size
-        return rows
-
-    def order_whole(
-        self,
-        native: NativeSamples,
-        n_scans: int,
-        max_scans: int,
-    ) -> list[WholeScans]:
-        """Arrange samples as whole scans, if every link that delivers has given as many of them.
-
-        A whole scan has one sample of every such link, with all cubes of its hub. Whole scans need
-        not be added and built one by one. If other samples wait, or if the samples of a link are
-        missing, the list is empty.
-
-        Args:
-            native: The samples, each with all cubes of its hub.
-            n_scans: Number of scans to wait for.
-            max_scans: Largest number of scans in one item of the list.
-        """
-        live = sorted(self._live)
-        width = len(live)
-        count = len(native.links) // max(1, width)
-        if self._pending or self._deferred or count < n_scans:
-            return []
-        raws, stamps_ns = native.raws, native.stamps_ns
-        if native.links != live:
-            by_link = sorted(range(len(raws)), key=native.links.__getitem__)
-            links = [native.links[i] for i in by_link]
-            needed = [link for link in live for _ in range(count)]
-            if links != needed:
-                return []
-            # Samples k, k + count, k + 2 count … of the sorted ones form scan k.
-            order = [i for k in range(count) for i in by_link[k::count]]
-            raws = [raws[i] for i in order]
-            stamps_ns = [stamps_ns[i] for i in order]
-        cubes = self.cubes.find_all(live)
-        if cubes is None or max(stamps_ns) - min(stamps_ns) > MAX_SPAN_NS:
-            return []
-        newest_ns = stamps_ns[-width:]
-        for link, stamp_ns in zip(live, newest_ns, strict=True):
-            self._built_ns[link] = stamp_ns
-        scans = []
-        # The scans are divided from the newest one backwards, so that the last item is full: a host
-        # that is too slow drops all other items.
-        for end in range(count, 0, -max_scans):
-            begin = max(0, end - max_scans)
-            part = slice(begin * width, end * width)
-            cubes_of_rows = np.tile(cubes, end - begin)
-            scans.append(WholeScans(cubes_of_rows, raws[part], stamps_ns[part]))
-        return scans[::-1]
-
-    def build_whole(self, scans: WholeScans) -> FrequencyRows:
-        """Convert whole scans to rows. A scan has one sample of each link, with all cubes of it."""
-        rows = self._make_rows(len(scans.cubes), self.cubes.n_pads)
-        rows.cube[:] = scans.cubes
-        rows.status[:] = 0
-        _place(rows, scans.raws, scans.stamps_ns)
         return rows
 
     def drop_oldest(self, n_kept: int) -> int:
@@ -308,11 +231,12 @@ class ScanBuilder:
         Args:
             max_scans: Largest number of scans to remove; None for all that can be built.
         """
-        if len(self._pending) - self._n_reached() > 1:
+        n_reached = self._n_reached()
+        if len(self._pending) - n_reached > 1:
             self._align_by_order()
             self._holds_back = True
+            n_reached = self._n_reached()
         n_scans = len(self._pending)
-        n_reached = self._n_reached()
         # Only scans to which no sample can be added any more are taken. If a link has no sample in
         # any pending scan, or another one is too far ahead, all scans are taken.
         if n_reached and n_scans - n_reached <= MAX_SCANS_AHEAD:
@@ -321,13 +245,8 @@ class ScanBuilder:
             n_scans = max_scans
             self._holds_back = False
 
-        parts: list[_SampleRows] = []
-        for scan in self._remove_scans(n_scans):
-            for link in sorted(scan):
-                part = scan[link]
-                if len(part.cubes):
-                    parts.append(part)
-        return parts
+        scans = self._remove_scans(n_scans)
+        return [scan[link] for scan in scans for link in sorted(scan) if len(scan[link].cubes)]
 
     def _remove_scans(self, n_scans: int) -> list[dict[int, _SampleRows]]:
         """Remove the oldest pending scans (one sample of each link), and return them.
