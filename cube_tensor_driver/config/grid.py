@@ -47,29 +47,13 @@ def grid(
         port: Port of each link, where {} stands for the number of the link.
 
     Raises:
-        ConfigError: A number is not greater than 0, there are more links than cubes or more cubes
-            than `MAX_CUBES`, or several links would have the same port.
+        ConfigError: There are more links than cubes, or more cubes than `MAX_CUBES`.
     """
     n_cubes = nx * ny
-    _check_numbers(
-        nx=nx,
-        ny=ny,
-        pitch=pitch,
-        links=links,
-        rate=rate,
-    )
-    if links > n_cubes:
-        raise ConfigError(f"grid: {links} links for {n_cubes} cubes; use at most one link per cube")
-    if n_cubes > MAX_CUBES:
+    if nx < 1 or not 1 <= links <= n_cubes <= MAX_CUBES:
         raise ConfigError(
-            f"grid: {nx} x {ny} are {n_cubes} cubes, a skin has at most {MAX_CUBES}: "
-            "make several skins"
-        )
-    # Two links that read the same port would each receive only a part of its bytes.
-    if links > 1 and LINK_NUMBER not in port:
-        raise ConfigError(
-            f"grid: the port {port!r} is that of all {links} links; write {LINK_NUMBER} where the "
-            "number of the link belongs"
+            f"grid: {links} links for {nx} x {ny} cubes; allowed: 1 to {MAX_CUBES} cubes, and at "
+            "least one cube per link"
         )
 
     # Names have leading zeros (c00, c01, ...), so that sorting them by text gives the same order as
@@ -101,8 +85,3 @@ def grid(
         "cubes": cubes,
     }
 
-
-def _check_numbers(**numbers: float) -> None:
-    for name, value in numbers.items():
-        if value <= 0:
-            raise ConfigError(f"grid: {name} is {value}, must be greater than 0")

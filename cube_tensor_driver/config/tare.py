@@ -100,32 +100,14 @@ def read_tare(folder: Path, uid: int, calibration: Calibration) -> StoredTare | 
     if not path.exists():
         return None
     data = read_yaml(path)
-    for _, mistake in _tare_schema(calibration.layout.n_pads).mistakes(data):
+    for _, mistake in _tare_schema(uid, calibration).mistakes(data):
         raise ConfigError(f"{path}: {mistake}; tare again")
-
-    # The uid in the content differs from the uid in the file name if somebody has renamed the file
-    # or copied it for another cube.
-    if int(data["uid"], 16) != uid:
-        raise ConfigError(
-            f"{path}: uid is {data['uid']!r}, the file's name says {uid:#x}; tare again"
-        )
-    # Rest frequencies are stored corrected to the reference temperature with the coefficients of
-    # the calibration, so they are not valid under another one.
-    if data["calibration_id"] != calibration.id:
-        raise ConfigError(
-            f"{path}: measured under calibration {data['calibration_id']!r}, "
-            f"the cube now has {calibration.id!r}; tare again"
-        )
-    rest_frequency = np.array(data["rest_frequency"], float)
-    change = np.abs(rest_frequency / calibration.rest_frequency - 1)
-    pad = int(change.argmax())
-    if change[pad] > MAX_REST_CHANGE:
-        raise ConfigError(
-            f"{path}: pad {pad} has {rest_frequency[pad]:g} Hz, which is more than "
-            f"{MAX_REST_CHANGE:.0%} from the {calibration.rest_frequency[pad]:g} Hz of the "
-            "calibration; tare again"
-        )
-    return StoredTare(rest_frequency, _parse_time(path, data["created"]))
+    try:
+        # Times with and without a zone cannot be compared, so one without is taken as local time.
+        created = datetime.fromisoformat(data["created"]).astimezone()
+    except (ValueError, OverflowError) as error:
+        raise ConfigError(f"{path}: created: {error}; tare again") from None
+    return StoredTare(np.array(data["rest_frequency"], float), created)
 
 
 def remove_tare(folder: Path, uid: int) -> None:
@@ -146,46 +128,41 @@ def remove_tare(folder: Path, uid: int) -> None:
         raise ConfigError(f"{path}: {error.strerror}; remove it by hand") from None
 
 
-def _tare_schema(n_pads: int) -> Schema:
-    frequencies: JsonSchema = {
-        "type": "array",
-        "items": {
+def _tare_schema(uid: int, calibration: Calibration) -> Schema:
+    """Return the schema of the tare file of a cube.
+
+    The uid in the content differs from that of the cube if somebody has renamed the file, or copied
+    it for another cube. Rest frequencies are stored corrected to the reference temperature with the
+    coefficients of the calibration, so they are not valid under another one.
+
+    Args:
+        uid: Unique number of the cube.
+        calibration: Calibration of the cube.
+    """
+    frequencies: list[JsonSchema] = [
+        {
             "type": "number",
-            "exclusiveMinimum": 0,
-            "description": "a number above 0",
-        },
-        "minItems": n_pads,
-        "maxItems": n_pads,
-        "description": f"{n_pads} numbers above 0",
-    }
+            "minimum": (1 - MAX_REST_CHANGE) * calibrated,
+            "maximum": (1 + MAX_REST_CHANGE) * calibrated,
+            "description": f"within {MAX_REST_CHANGE:.0%} of the calibration's {calibrated:g} Hz",
+        }
+        for calibrated in calibration.rest_frequency.tolist()
+    ]
+    n_pads = len(frequencies)
     properties: JsonSchema = {
         "schema": {"const": SCHEMA_VERSION, "description": f"{SCHEMA_VERSION} in this version"},
-        "uid": {
-            "type": "string",
-            "pattern": r"^0x[0-9a-f]{1,16}\Z",
-            "description": "a uid in hexadecimal as in 0x1f",
+        "uid": {"const": f"{uid:#x}", "description": f"{uid:#x}, as in the name of the file"},
+        "calibration_id": {
+            "const": calibration.id,
+            "description": f"{calibration.id}, the id of the cube's calibration",
         },
-        "calibration_id": TEXT,
-        # The schema allows any value, because YAML reads a time as a datetime or as a text. Both
-        # are checked by `_parse_time`.
-        "created": {},
-        "rest_frequency": frequencies,
+        "created": TEXT,
+        "rest_frequency": {
+            "type": "array",
+            "items": frequencies,
+            "minItems": n_pads,
+            "maxItems": n_pads,
+            "description": f"{n_pads} numbers",
+        },
     }
     return Schema(mapping(properties, properties))
-
-
-def _parse_time(path: Path, value: Any) -> datetime:
-    """Return the value of the key `created` of a tare file as a datetime.
-
-    Raises:
-        ConfigError: The value is no date and time, or has no time zone.
-    """
-    try:
-        time = datetime.fromisoformat(value) if isinstance(value, str) else value
-    except ValueError:
-        time = None
-    if isinstance(time, datetime) and time.tzinfo is not None:
-        return time
-    raise ConfigError(
-        f"{path}: created is {value!r}, it must be a date and time with its zone; tare again"
-    )

@@ -60,9 +60,9 @@ def test_a_large_grid_is_written_checked_and_drawn_as_frames(tmp_path):
     ("arguments", "code", "words"),
     [
         (["--nx", 0, "--ny", 1], 2, "--nx: '0' is not a whole number of at least 1"),
-        (["--nx", 2, "--ny", 1, "--links", 3], 1, "3 links for 2 cubes"),
-        (["--nx", 1000, "--ny", 1000], 1, "1000000 cubes, a skin has at most 65536"),
-        (["--nx", 2, "--ny", 1, "--links", 2, "--port", "/dev/x"], 1, "is that of all 2 links"),
+        (["--nx", 2, "--ny", 1, "--links", 3], 1, "3 links for 2 x 1 cubes"),
+        (["--nx", 1000, "--ny", 1000], 1, "1 to 65536 cubes"),
+        (["--nx", 2, "--ny", 1, "--links", 2, "--port", "/dev/x"], 1, "appears twice"),
         (["--nx", 1, "--ny", 1, "--layout", "banana"], 1, "'banana'"),
         (["--nx", 1, "--ny", 1, "--name", "a skin"], 1, "name: found 'a skin', allowed: a name"),
         (["--nx", 1, "--ny", 1, "--rate", 1e9], 2, "is not a rate from 0.1 to 10000"),

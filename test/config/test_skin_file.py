@@ -197,9 +197,9 @@ def test_names_and_calibrations_are_in_the_order_of_the_cubes(tmp_path):
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
-        ({"nx": 0}, "grid: nx is 0, must be greater than 0"),
-        ({"pitch": -0.01}, "grid: pitch is -0.01"),
-        ({"links": 7}, "grid: 7 links for 6 cubes; use at most one link per cube"),
+        ({"nx": 0}, "grid: 1 links for 0 x 2 cubes"),
+        ({"nx": 1 << 15, "ny": 3}, "1 to 65536 cubes"),
+        ({"links": 7}, "grid: 7 links for 3 x 2 cubes"),
     ],
 )
 def test_grids_that_cannot_be(wrong, words):
