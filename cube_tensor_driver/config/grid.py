@@ -84,4 +84,3 @@ def grid(
         "links": [{"name": f"hub{link}", "port": port} for link, port in enumerate(ports)],
         "cubes": cubes,
     }
-

@@ -126,6 +126,9 @@ class LiveLinks:
             simulated time.
         log: Logger for events of the links; None stands for Python's logging.
         on_end: Called in the reader's thread when it ends, after `close` or because of an error.
+
+    Raises:
+        LinkError: With the kind `bad_port`: a port is neither a device path nor a TCP address.
     """
 
     def __init__(
@@ -166,17 +169,20 @@ class LiveLinks:
         self._overloaded_until = 0.0
         # Number of samples lost until the last callback; None while this process reads in time.
         self._missing_before: int | None = None
-        self._reader: Reader | None = None
+        self._reader = self._make_reader()
 
     def start(self) -> None:
         """Start the thread that opens the links and starts the hubs.
 
         It may be called again after `close`.
-
-        Raises:
-            LinkError: With the kind `bad_port`: a port is neither a device path nor a TCP address.
         """
-        self._reader = Reader(
+        # A port may hang in the kernel and keep the thread of the reader before, so each start has
+        # a reader of its own.
+        self._reader = self._make_reader()
+        self._reader.start()
+
+    def _make_reader(self) -> Reader:
+        return Reader(
             self._configs,
             on_frames=self.receive,
             on_state=self._on_state,
@@ -185,15 +191,13 @@ class LiveLinks:
             on_end=self._on_end,
             tracks=[record.track for record in self._records],
         )
-        self._reader.start()
 
     def close(self) -> None:
         """Send STOP to the hubs, close the links and end the reader's thread.
 
         A second call does nothing.
         """
-        if self._reader is not None:
-            self._reader.close()
+        self._reader.close()
 
     def set_rate(self, rate: float | None) -> None:
         """Request another sample rate, in Hz, from all hubs.
@@ -202,22 +206,20 @@ class LiveLinks:
         """
         self._rate = rate
         period_us = _period_us(rate)
-        if self._reader is None or period_us is None:
-            return
-        for link in range(len(self._configs)):
-            self._reader.set_period(link, period_us)
+        if period_us is not None:
+            for link in range(len(self._configs)):
+                self._reader.set_period(link, period_us)
 
     @property
     def failure(self) -> Exception | None:
         """Error that ended the reader's thread; None while it runs or if it ended by `close`."""
-        return None if self._reader is None else self._reader.failure
+        return self._reader.failure
 
     @property
     def callback_errors(self) -> int:
         """Number of exceptions raised in the reader's thread while frames were handled or rows
         delivered."""
-        in_reader = 0 if self._reader is None else self._reader.callback_errors
-        return self._errors + in_reader
+        return self._errors + self._reader.callback_errors
 
     @property
     def cube_uids(self) -> dict[int, int]:
@@ -235,12 +237,7 @@ class LiveLinks:
         return replace(self._rows)
 
     def report(self) -> list[LinkReport]:
-        """Return the state of each link, and its problems since the last call of this method.
-
-        Before `start`, the list is empty.
-        """
-        if self._reader is None:
-            return []
+        """Return the state of each link, and its problems since the last call of this method."""
         links = zip(self._reader.links, self._records, strict=True)
         lag_s = self._reader.take_lag_s()
         with self._lock:
@@ -284,7 +281,7 @@ class LiveLinks:
         cost more time than complete ones.
         """
         now = time.monotonic()
-        if self._reader is not None and self._reader.behind_s > OVERLOAD_S:
+        if self._reader.behind_s > OVERLOAD_S:
             n_missing = sum(record.account.missing for record in self._records)
             if self._missing_before is not None and n_missing > self._missing_before:
                 self._overloaded_until = now + OVERLOAD_S
@@ -341,8 +338,7 @@ class LiveLinks:
             for record in self._records:
                 record.clock.shift(step_ns)
                 record.clock.problems.add(text)
-        if self._reader is not None:
-            self._reader.forget_questions()
+        self._reader.forget_questions()
         return now_ns
 
     def _handle_frames(self, read: LinkFrames) -> None:
@@ -488,7 +484,6 @@ def _report(link: Link, record: _LinkRecord, lag_s: float) -> LinkReport:
     notes = [] if link.error is None else [str(link.error)]
     notes += _loss_notes(record.reported, counters, lag_s)
     notes += record.problems
-    notes += record.account.contradictions()
     record.reported = counters
     if link.period_problem:
         notes.append(link.period_problem)

@@ -333,7 +333,9 @@ def test_a_file_is_held_to_the_limit_of_the_service(tmp_path, hertz):
     assert read_tare(tmp_path, 7, CALIBRATION) is not None
     rest[3] = hertz
     write_tare(tmp_path, 7, CALIBRATION, rest, NOW)
-    with pytest.raises(ConfigError, match=r"0007\.yaml: rest_frequency\[3\]: found .*20%.*tare again"):
+    with pytest.raises(
+        ConfigError, match=r"0007\.yaml: rest_frequency\[3\]: found .*20%.*tare again"
+    ):
         read_tare(tmp_path, 7, CALIBRATION)
 
 

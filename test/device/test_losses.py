@@ -204,7 +204,6 @@ def test_frames_of_cubes_that_the_hub_does_not_have_are_not_remembered() -> None
     assert len(account._trackers) == 8
     counters = account.counters()
     assert (counters["delivered"], counters["lost_on_the_way"]) == (20_000, 0)
-    assert account.contradictions() == []
 
 
 def test_a_host_that_falls_behind_does_not_blame_the_hubs_clock() -> None:

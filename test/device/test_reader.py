@@ -805,12 +805,6 @@ def test_a_reader_that_is_behind_knows_for_how_long(start: Start, hub: PtyHub) -
     assert watch.reader.take_lag_s() >= 0.1
 
 
-def test_starts_once(start: Start, hub: PtyHub) -> None:
-    watch = start(LinkConfig("a", hub.port))
-    with pytest.raises(LinkError, match="make a new Reader"):
-        watch.reader.start()
-
-
 def test_one_thread_and_nothing_left_behind(hub: PtyHub) -> None:
     threads, files = threading.active_count(), open_files()
     for _ in range(30):

@@ -81,7 +81,7 @@ def test_harmed_frames_are_delivered_or_missing_never_wrong(kind):
     arrivals = [account.classify(sample) for sample in samples]
     account.add_stats(Stats(10_000, link.hub.sequence, 0))
     counters = account.counters()
-    assert not account.contradictions()
+    assert counters["delivered"] + counters["duplicate"] == len(samples)
     assert counters["taken"] == 100 == counters["delivered"] + counters["lost_on_the_way"]
     for sample in samples:
         np.testing.assert_array_equal(sample.frequency, VALUES)
@@ -111,8 +111,6 @@ def test_stats_complete_the_account_and_tell_drops_from_loss():
     assert (account.counters()["dropped_in_hub"], account.counters()["lost_on_the_way"]) == (3, 1)
     assert account.classify(samples[7]) is Arrival.LATE
     assert account.counters()["lost_on_the_way"] + account.counters()["dropped_in_hub"] == 3
-    account._received += 1
-    assert "lost count" in account.contradictions()[0]
 
 
 def test_faults_of_pads_and_hub_change_what_the_hub_says():

@@ -277,7 +277,6 @@ class SampleAccount:
     def __init__(self, track: LinkTrack | None = None) -> None:
         self._track = LinkTrack() if track is None else track
         self._track.n_cubes = _MAX_CUBES  # until HELLO states the number
-        self._received = 0
         self.stats_frame: Stats | None = None
         # Trackers by the first cube of the frame: a sample of many cubes comes in several frames.
         self._trackers: dict[int, SequenceTracker] = {}
@@ -288,7 +287,6 @@ class SampleAccount:
 
     def classify(self, frame: Sample) -> Arrival:
         """Classify one SAMPLE frame by its number (new, late, duplicate …), and count it."""
-        self._received += 1
         tracker = self._trackers.get(frame.first_cube)
         if tracker is None or tracker.n_cubes != frame.n_cubes:
             if frame.first_cube >= self._track.n_cubes:
@@ -412,17 +410,3 @@ class SampleAccount:
         for tracker in self._trackers.values():
             total.add(tracker.counters)
         return total
-
-    def contradictions(self) -> list[str]:
-        """Return one text if received differs from delivered + duplicate; otherwise none.
-
-        The text shows a defect of the driver. Samples that the module in C has counted are left
-        out, because it may count more meanwhile.
-        """
-        total = self._total()
-        if self._received == total.delivered + total.duplicate:
-            return []
-        return [
-            f"{self._received} samples received in Python, {total.delivered} delivered and "
-            f"{total.duplicate} duplicate: the driver lost count, please report it",
-        ]

@@ -55,13 +55,11 @@ class Driver(CubeNode):
         super().__init__("driver", DRIVER)
         self._on_rows = on_rows
         self._node_clock = NodeClock(self)
-        # The links to the hubs; None while the node is not configured.
-        self._links: LiveLinks | None = None
         self._diagnostics = Diagnostics(self, self._statuses, self._count_errors)
 
     @property
     def failure(self) -> Exception | None:
-        return None if self._links is None else self._links.failure
+        return self._links.failure if self.is_configured else None
 
     def configure(self) -> None:
         skin = self._skin = self.read_skin()
@@ -87,19 +85,16 @@ class Driver(CubeNode):
             is_host_clock=lambda: not self._node_clock.is_simulated,
             log=self.get_logger(),
         )
-        self.call_at_cleanup(self._forget_links)
         self._link_diagnostics = LinkDiagnostics(skin.name)
         self._published_uids: dict[int, int] = {}
         self._publish_info()
 
     def activate(self) -> None:
-        if self._links is not None:
-            self._node_clock.update()
-            self._links.start()
+        self._node_clock.update()
+        self._links.start()
 
     def deactivate(self) -> None:
-        if self._links is not None:
-            self._links.close()
+        self._links.close()
 
     def on_parameter_change(self, name: str) -> None:
         """Ask the hubs for the new sampling rate.
@@ -107,11 +102,7 @@ class Driver(CubeNode):
         The depth of the topics' queues, which follows from the sampling rate, is not changed: that
         would need new publishers.
         """
-        if self._links is not None:
-            self._links.set_rate(self._rate())
-
-    def _forget_links(self) -> None:
-        self._links = None
+        self._links.set_rate(self._rate())
 
     def _rate(self) -> float | None:
         """Return the sampling rate, in Hz, that hubs are asked for; None: each hub chooses one."""
@@ -126,7 +117,7 @@ class Driver(CubeNode):
         """Return the number of exceptions in callbacks in both threads: main thread and reader."""
         # `callback_errors` counts exceptions in the main thread only. The links count those in the
         # thread that reads them.
-        in_reader = 0 if self._links is None else self._links.callback_errors
+        in_reader = self._links.callback_errors if self.is_configured else 0
         return self.callback_errors.count + in_reader
 
     def _publish_info(self) -> None:
@@ -145,7 +136,7 @@ class Driver(CubeNode):
     def _statuses(self) -> list[DiagnosticStatus]:
         """Return the diagnostics: a status about all rows (samples), and while the node is active
         one for each link (connection to a hub)."""
-        if self._links is None:
+        if not self.is_configured:
             return []
         self._node_clock.update()
         # Hubs report the uids (unique numbers) of cubes some time after the start. The
