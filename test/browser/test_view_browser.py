@@ -229,6 +229,7 @@ def test_the_page_shows_a_load_a_cube_and_a_tare(ros, tmp_path, page):
         children.check()
 
 
+@pytest.mark.alone
 def test_a_replay_is_controlled_from_the_page(ros, tmp_path, page):
     """A bag of 30 s whose cubes swing with a period of 2 s.
 
