@@ -174,7 +174,7 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
             contacts
             and contacts[-1].position
             and pictures
-            and "20 kPa" in pictures[-1].markers[-1].text
+            and "20.0 kPa" in pictures[-1].markers[-1].text
             and any(one.ns == "contact 0" and one.color.a == 1 for one in pictures[-1].markers)
         )
 
@@ -220,7 +220,7 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
     assert not np.ptp(np.delete(traction, pressed, 0), axis=2).any()
     faults = np.array([[p.x, p.y, p.z] for p in markers["faults"].points]).reshape(n, 4, 3)
     assert np.flatnonzero(np.ptp(faults, axis=1).any(axis=1)).tolist() == [silent]
-    assert "15 ok" in markers["legend"].text and "1 stale" in markers["legend"].text
+    assert markers["legend"].text == "pressure -szz: 0 to 20.0 kPa; 15 ok, 1 stale"
     numbers = [float(markers[f"legend number {k}"].text) for k in range(3)]
     assert numbers == [0, 10, 20]
     # Arrows are to the scale of the legend's.
@@ -229,9 +229,7 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
     assert np.linalg.norm(shaft) / np.linalg.norm(sample[1] - sample[0]) == pytest.approx(
         np.hypot(20, 4) / 20
     )
-    # RViz 2 makes blanks over a metre wide where scale.x does not say, and first looks for the text
-    # without it
-    assert not markers["legend"].text[0].isspace() and not markers["legend"].text[-1].isspace()
+    # RViz 2 makes blanks over a metre wide where scale.x does not say
     assert 0.4 < markers["legend"].scale.x / markers["legend"].scale.z < 0.8
     # RViz sets a second line 1 cm lower and knows no letter that takes two bytes
     assert "\n" not in markers["legend"].text and markers["legend"].text.isascii()
@@ -271,6 +269,49 @@ def test_the_text_of_a_contact_is_pale_until_it_is_fitted():
     assert opacities == [[1.0, 0.5], [1.0, 1.0]]
 
 
+def test_the_title_has_no_padding_and_leaves_the_rest_of_the_picture_as_it_was():
+    pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
+    from rclpy.serialization import deserialize_message
+    from visualization_msgs.msg import MarkerArray
+
+    from cube_tensor_driver.ros.markers.canvas import Canvas
+
+    canvas = Canvas("skin", places(12), crosses=True, signed=False)
+    values, health = np.zeros((12, 15)), np.full(12, FINE)
+    values[3, 2:5] = -2e3, 500, 0
+    health[7] = FAULTY
+    colours = np.random.default_rng(1).random((12, 3))
+    canvas.draw_cubes(colours)
+    canvas.draw_arrows(values, scene.Ranges().follow(values, np.zeros(12), 2e3))
+    canvas.draw_faults(health)
+
+    def drawn():
+        markers = deserialize_message(bytes(canvas.data), MarkerArray).markers
+        title = markers.pop()
+        assert title.ns == "legend"
+        return title.text, [one for one in markers if not one.ns.startswith("legend number")]
+
+    _, before = drawn()
+    titles = []
+    for name, top in (("pressure", 2e3), ("pressure", 950.0), ("gradient", 3e6), ("residual", 3.0)):
+        canvas.legend.draw(scene.QUANTITIES[name], top, health)
+        titles.append(drawn()[0])
+    canvas.legend.draw(scene.QUANTITIES["pressure"], 5e5, np.full(12, STALE))
+    title, after = drawn()
+    assert [*titles, title] == [
+        "pressure -szz: 0 to 2.00 kPa; 11 ok, 1 no tensor",
+        "pressure -szz: 0 to 0.95 kPa; 11 ok, 1 no tensor",
+        "gradient |dszz/dx, dszz/dy|: 0 to 3.00 kPa/mm; 11 ok, 1 no tensor",
+        "residual: 0 to 3.00 sigma; 11 ok, 1 no tensor",
+        "pressure -szz: 0 to 500. kPa; 0 ok, 12 stale",
+    ]
+    bars = [next(one for one in made if one.ns == "legend bar") for made in (before, after)]
+    bars[0].colors = bars[1].colors
+    assert before == after
+    cubes = next(one for one in after if one.ns == "cubes 0")
+    np.testing.assert_allclose([[c.r, c.g, c.b] for c in cubes.colors], colours, 1e-6)
+
+
 @pytest.mark.parametrize("name", ["a", "ab", "abc", "abcd", "a name of many letters"])
 def test_arrays_of_serialised_markers_are_where_other_nodes_read_them(name):
     """Lengths of texts decide about the alignment of all that follows."""
@@ -300,6 +341,15 @@ def test_arrays_of_serialised_markers_are_where_other_nodes_read_them(name):
     assert [[p.x, p.y, p.z] for p in read["last"].points] == last.tolist()
     np.testing.assert_allclose([[c.r, c.g, c.b, c.a] for c in read[name].colors], colours, 1e-6)
     assert read[f"{name}'s legend"].text == "7 bytes" and "nobody" not in made
+
+    # All else is moved when a text gets another length, and keeps its values.
+    read[f"{name}'s legend"].text = "more than 7 bytes"
+    made.write_text(f"{name}'s legend", "more than 7 bytes")
+    moved = deserialize_message(bytes(made.data), MarkerArray).markers
+    assert moved == list(read.values())
+    made["last"].points[:] = last = random.random((2, 3))
+    moved = deserialize_message(bytes(made.data), MarkerArray).markers
+    assert [[p.x, p.y, p.z] for p in moved[-1].points] == last.tolist()
 
 
 def test_the_head_of_an_arrow_is_at_its_tip_and_flat_to_the_viewer():

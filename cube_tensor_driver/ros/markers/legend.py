@@ -80,14 +80,6 @@ SCALES = (
 )
 """The two kinds of arrows in the picture, in the order of the legend from top to bottom."""
 
-TITLE_BYTES = 128
-"""Length of the text of the legend's title, in bytes. The title is centred in it with spaces.
-
-It is a single line, because RViz draws a second line 1 cm lower, whatever the size of the text. A
-dot stands at both ends: RViz 2 first computes spaces as wider than a metre, so that it would take a
-text that begins with spaces for invisible and never draw it.
-"""
-
 PLAIN_LETTERS = str.maketrans("−σ∂", "-sd")
 """Translation of letters that are not ASCII. RViz 2 draws a text byte by byte, and such a letter,
 which has several bytes in UTF-8, would leave gaps."""
@@ -212,10 +204,7 @@ class Legend:
             text = sign + four_characters(abs(value))
             self._markers.write_text(f"legend number {number}", text)
 
-        title = _title(quantity, top, health)
-        n_dots = 2
-        width = TITLE_BYTES - n_dots
-        self._markers.write_text("legend", f".{title[:width].center(width)}.")
+        self._markers.write_text("legend", _title(quantity, top, health))
 
     def draw_scale(self, traction_pa: float, gradient_pa_per_m: float) -> None:
         """Write the values of the longest arrows.
@@ -273,7 +262,7 @@ def legend_markers(
         markers += [arrow, text]
 
     centre = place.point(0.5, TITLE_LINE)
-    return [*markers, make_text(frame_id, "legend", height, "." * TITLE_BYTES, centre)]
+    return [*markers, make_text(frame_id, "legend", height, "title", centre)]
 
 
 def four_characters(value: float) -> str:
@@ -291,13 +280,16 @@ def four_characters(value: float) -> str:
 def _title(quantity: scene.Quantity, top: float, health: Index) -> str:
     """Return the title: quantity and range of the colours, and number of cubes in each health.
 
+    It is a single line, because RViz draws a second line 1 cm lower, whatever the size of the text.
+    Its length changes only with the numbers of cubes.
+
     Args:
         quantity: The quantity that colours show.
         top: Value at the upper end of the colour scale, in SI units.
         health: Health of each cube, (cubes,).
     """
-    high = top / quantity.size
-    low = -high if quantity.signed else 0
+    high = four_characters(top / quantity.size)
+    low = f"-{high}" if quantity.signed else "0"
     label = quantity.label.translate(PLAIN_LETTERS)
     unit = quantity.unit.replace("σ", "sigma")
     states = []
@@ -305,7 +297,7 @@ def _title(quantity: scene.Quantity, top: float, health: Index) -> str:
         count = np.count_nonzero(health == state)
         if count or state == FINE:
             states.append(f"{count} {word}")
-    return f"{label}: {low:.3g} to {high:.3g} {unit}; {', '.join(states)}"
+    return f"{label}: {low} to {high} {unit}; {', '.join(states)}"
 
 
 def _scale_text(scale: ArrowScale, value: float) -> str:

@@ -82,7 +82,7 @@ def make_text(
         frame_id: Frame id of the frame in which the position of the text is given.
         name: Name of the marker, which becomes its namespace.
         height: Height of the letters, in m.
-        text: The text. Texts that replace it must have the same length.
+        text: The text.
         position: Position of the centre of the text, (3,), in m; None: the origin of the frame.
     """
     marker = make_marker(frame_id, name, Marker.TEXT_VIEW_FACING)
@@ -133,20 +133,61 @@ class SerialisedMarkers:
         data: The serialised message.
     """
 
+    data: bytearray
+
     def __init__(self, markers: Sequence[Marker]) -> None:
         """Serialise markers.
 
         Args:
-            markers: The markers. Their numbers of points and colours and the lengths of their texts
-                cannot change afterwards; texts have at least four letters.
+            markers: The markers. Their numbers of points and colours cannot change afterwards; a
+                text that is not empty has at least four letters.
         """
-        self.data = bytearray(serialize_message(MarkerArray(markers=list(markers))))
+        self._markers = {marker.ns: marker for marker in markers}
+        self._arrays: dict[str, MarkerArrays] = {}
+        self._serialise()
+
+    def __getitem__(self, namespace: str) -> MarkerArrays:
+        return self._arrays[namespace]
+
+    def __contains__(self, namespace: str) -> bool:
+        return namespace in self._arrays
+
+    def write_text(self, namespace: str, text: str) -> None:
+        """Replace the text of a marker.
+
+        A text of another length takes as long as a new message, and replaces all arrays.
+
+        Args:
+            namespace: Namespace of the marker.
+            text: The new text in ASCII, at least four letters.
+        """
+        codes = np.frombuffer(text.encode(), np.uint8)
+        if len(codes) != len(self._arrays[namespace].text):
+            self._markers[namespace].text = text
+            self._rebuild()
+        self._arrays[namespace].text[:] = codes
+
+    def _rebuild(self) -> None:
+        """Serialise the markers again after one text has changed its length, with the present
+        values of all other arrays."""
+        previous = self._arrays
+        self._serialise()
+        for namespace, arrays in previous.items():
+            old: Sequence[AnyArray] = arrays
+            new: Sequence[AnyArray] = self._arrays[namespace]
+            for field, value in zip(new, old, strict=True):
+                if field.shape == value.shape:
+                    field[:] = value
+
+    def _serialise(self) -> None:
+        markers = list(self._markers.values())
+        self.data = bytearray(serialize_message(MarkerArray(markers=markers)))
         # The byte offset of a field depends only on the lengths of the lists and texts before it.
         # So it is found in the bytes of a copy in which the values of the fields are unique.
-        copies = copy.deepcopy(list(markers))
+        copies = copy.deepcopy(markers)
         marks = [_mark(marker, number) for number, marker in enumerate(copies)]
         marked = serialize_message(MarkerArray(markers=copies))
-        self._arrays: dict[str, MarkerArrays] = {}
+        self._arrays = {}
         for marker, begins in zip(markers, marks, strict=True):
             points, colours, text, position, colour = map(marked.index, begins)
             n_points, n_colours = len(marker.points), len(marker.colors)
@@ -158,22 +199,6 @@ class SerialisedMarkers:
                 position=self._view("<f8", position, (3,)),
                 colour=self._view("<f4", colour, (4,)),
             )
-
-    def __getitem__(self, namespace: str) -> MarkerArrays:
-        return self._arrays[namespace]
-
-    def __contains__(self, namespace: str) -> bool:
-        return namespace in self._arrays
-
-    def write_text(self, namespace: str, text: str) -> None:
-        """Replace the text of a marker.
-
-        Args:
-            namespace: Namespace of the marker.
-            text: The new text in ASCII, which must be as long as the previous one.
-        """
-        codes = np.frombuffer(text.encode(), np.uint8)
-        self._arrays[namespace].text[:] = codes
 
     def _view(self, dtype: str, start: int, shape: tuple[int, ...]) -> AnyArray:
         view: AnyArray = np.ndarray(shape, dtype, self.data, start)
