@@ -161,7 +161,8 @@ class ReplayClient:
         if state is None:
             return
         request = SteerReplay.Request(position=np.nan, paused=not state.paused)
-        self._services.ask("replay", self._client, request)
+        # The page shows whether the replay is paused, so an action that succeeds needs no note.
+        self._services.ask("replay", self._client, request, notes_success=False)
 
     def jump_to(self, position: float) -> None:
         """Store a position, in s after the start of the bag, to which a later `update` jumps.

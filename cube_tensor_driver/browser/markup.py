@@ -67,6 +67,7 @@ VALUE_STYLE = "text-align:right;font-family:monospace"
 
 STYLE = (
     "<style>"
+    ".tabler-icon-cloud-check {display: none}"
     ".mantine-Notification-root {font-size: 0.8em; padding: 0.3em 0.6em 0.3em 1.6em}"
     "@media (max-width: 36em) {"
     ".mantine-Notification-description {display: none}"
@@ -75,7 +76,8 @@ STYLE = (
 )
 """Style sheet of the page.
 
-It makes notes small, so that they cover little of the skin. On a screen of at most 36em a note
+It hides the green tick of viser's connection, which users would take for the state of the skin. It
+makes notes small, so that they cover little of the skin. On a screen of at most 36em a note
 shows only its title. viser's panel is 20em wide there and covers the skin; the style makes it as
 wide as the screen and limits its height to 45 % of the screen, so that the skin stays visible.
 """
@@ -287,7 +289,7 @@ def explanation(
         f"<div><b>▦</b> field: {field.source}{_typical(field.sigma)}</div>",
         "<div><b>⌜⌟</b> the chosen cube; click another one to choose it</div>",
         "<div><b style='color:#c828a0'>◯</b> contacts; the first line has the strongest</div>",
-        "<div>principal stresses: <b style='color:#d22828'>red</b> pulls, "
+        "<div><b>┼</b> principal stresses: <b style='color:#d22828'>red</b> pulls, "
         "<b style='color:#2850dc'>blue</b> pushes</div>",
         "<div><b>✕</b> over a cube: see <i>health</i>. Axes: x red, y green, z blue</div>",
     ]

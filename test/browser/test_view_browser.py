@@ -156,6 +156,7 @@ def test_the_page_shows_a_load_a_cube_and_a_tare(ros, tmp_path, page):
         )
         children.wait_for_line("view", waiting, 10)
         see(ros, page, lambda text: waiting in text)
+        assert not page.find_element("class name", "tabler-icon-cloud-check").is_displayed()
         children.start(
             Process(
                 "reconstruction",
