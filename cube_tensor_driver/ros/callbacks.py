@@ -28,6 +28,30 @@ LOG_PERIOD_S = 5.0
 """Minimum time, in seconds, between two log messages about errors that occur repeatedly."""
 
 
+def guard(
+    callback: Callback,
+    on_error: Callback,
+    errors: type[Exception] = Exception,
+) -> Callback:
+    """Wrap a callback so that no exception of a class leaves it.
+
+    Args:
+        callback: Callback of a subscription, a timer or a service.
+        on_error: Called with an exception of the callback, and with its arguments; its result is
+            returned in place of that of the callback.
+        errors: Class of the exceptions; others are not caught.
+    """
+
+    @wraps(callback)
+    def call(*arguments: Any) -> Any:
+        try:
+            return callback(*arguments)
+        except errors as error:
+            return on_error(error, *arguments)
+
+    return call
+
+
 class CallbackErrors:
     """Catches, logs and counts the exceptions of a node's callbacks.
 
@@ -40,21 +64,8 @@ class CallbackErrors:
         self._node = node
 
     def catch(self, callback: Callback) -> Callback:
-        """Wrap the callback of a subscription or a timer so that its exceptions are caught.
-
-        Returns:
-            A function that calls the callback; exceptions are logged and counted.
-        """
-
-        @wraps(callback)
-        def call(*arguments: Any) -> Any:
-            try:
-                return callback(*arguments)
-            except Exception as error:  # noqa: BLE001  (see the head of this file)
-                self._note(error)
-                return None
-
-        return call
+        """Wrap the callback of a subscription or a timer so that its exceptions are caught."""
+        return guard(callback, self._note)
 
     def catch_in_service(self, callback: Callback) -> Callback:
         """Wrap the callback of a service so that its exceptions are logged, counted and reported.
@@ -63,17 +74,13 @@ class CallbackErrors:
         the exception into it, and the fields that the callback has not set keep their defaults.
         """
 
-        @wraps(callback)
-        def call(request: Any, response: Any) -> Any:
-            try:
-                return callback(request, response)
-            except Exception as error:  # noqa: BLE001  (see the head of this file)
-                self._note(error)
-                return explain_failure(request, response, repr(error))
+        def explain(error: Exception, request: Any, response: Any) -> Any:
+            self._note(error)
+            return explain_failure(request, response, repr(error))
 
-        return call
+        return guard(callback, explain)
 
-    def _note(self, error: Exception) -> None:
+    def _note(self, error: Exception, *_: Any) -> None:
         self.count += 1
         self._node.get_logger().error(
             f"a callback failed, the node goes on ({self.count} so far): {error!r}",
@@ -107,22 +114,3 @@ def shorten(text: str) -> str:
     if len(text) <= MAX_CHARACTERS:
         return text
     return f"{text[:MAX_CHARACTERS]}… ({len(text)} characters)"
-
-
-def refuse_on_error(callback: Callback, errors: type[Exception]) -> Callback:
-    """Wrap the callback of a service so that certain exceptions give a response with success=false.
-
-    Args:
-        callback: The callback of the service.
-        errors: Type of these exceptions; others are not caught.
-    """
-
-    @wraps(callback)
-    def call(request: Any, response: Any) -> Any:
-        try:
-            return callback(request, response)
-        except errors:
-            response.success = False
-            return response
-
-    return call

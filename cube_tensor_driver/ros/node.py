@@ -27,23 +27,18 @@ from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.lifecycle import (
     LifecycleNode,
-    LifecyclePublisher,
     State,
     TransitionCallbackReturn,
 )
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RclpyParameter
-from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
-from rclpy.service import Service
-from rclpy.subscription import Subscription
-from rclpy.timer import Timer
 
 from ..config.parameters import Parameter
 from ..config.skin import Skin, read_skin
 from ..core.errors import ConfigError, CubeError
 from ..processes.stop_signals import stop_event
-from .callbacks import Callback, CallbackErrors, refuse_on_error, shorten
+from .callbacks import Callback, CallbackErrors, guard, shorten
 from .compat import after_parameters_are_set, make_executor
 from .qos import SERVICES, batch_profile, scans_per_message
 from .session import spin_until, start_ros
@@ -72,7 +67,7 @@ Processing a scan (one sample of every cube) leaves no cyclic garbage. With the 
 700 new objects the collector would run at every scan or every second scan without finding garbage.
 """
 
-Entity = TypeVar("Entity", Publisher, Subscription, Timer, Service)
+Entity = TypeVar("Entity")
 """Type of an rclpy object that a node makes and destroys."""
 
 
@@ -156,18 +151,15 @@ class CubeNode(LifecycleNode):
         Returns:
             The same object.
         """
-        destroyers: tuple[tuple[type, Callable[[Any], object]], ...] = (
-            # A LifecyclePublisher is also a Publisher, so its type must be tested first.
-            (LifecyclePublisher, self.destroy_lifecycle_publisher),
-            (Publisher, self.destroy_publisher),
-            (Subscription, self.destroy_subscription),
-            (Timer, self.destroy_timer),
-            (Service, self.destroy_service),
+        # Each of these methods of rclpy destroys only objects of its own type.
+        destroyers: tuple[Callback, ...] = (
+            self.destroy_lifecycle_publisher,
+            self.destroy_subscription,
+            self.destroy_timer,
+            self.destroy_service,
         )
-        for kind, destroy in destroyers:
-            if isinstance(entity, kind):
-                self._resources.callback(destroy, entity)
-                break
+        for destroy in destroyers:
+            self._resources.callback(destroy, entity)
         return entity
 
     def call_at_cleanup(self, function: Callable[[], object]) -> None:
@@ -256,7 +248,9 @@ class CubeNode(LifecycleNode):
         """
         for service in self.services:
             if service.srv_type is ChangeState:
-                service.callback = refuse_on_error(service.callback, RuntimeError)
+                # rclpy raises RuntimeError for a transition that is impossible now. The response
+                # then keeps its default, success=false.
+                service.callback = guard(service.callback, _give_response, RuntimeError)
             service.callback = self.callback_errors.catch_in_service(service.callback)
 
     # The following methods declare, check and apply parameters.
@@ -497,3 +491,7 @@ def _start(node: CubeNode) -> bool:
         transition() == TransitionCallbackReturn.SUCCESS
         for transition in (node.trigger_configure, node.trigger_activate)
     )
+
+
+def _give_response(error: Exception, request: Any, response: Any) -> Any:
+    return response

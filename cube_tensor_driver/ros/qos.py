@@ -13,8 +13,6 @@ from collections.abc import Sequence
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from ..core.errors import ConfigError
-
 MAX_PAUSE_S = 2.0
 """Longest pause, in seconds, that a subscriber of a batch topic may make without losing a message.
 A batch topic is one whose messages hold all cubes, such as `stress`.
@@ -62,11 +60,6 @@ Its queue is longer than the default of ROS, 10 requests, beyond which DDS silen
 one. The parameter services of rclpy have a depth of 1000, too.
 """
 
-_RELIABILITIES = {
-    "reliable": ReliabilityPolicy.RELIABLE,
-    "best_effort": ReliabilityPolicy.BEST_EFFORT,
-}
-
 
 def batch_profile(
     rate_hz: float | None, reliability: str = "reliable", rows: int = 1
@@ -77,19 +70,14 @@ def batch_profile(
         rate_hz: Rate of the messages, in Hz; None: not known, `DEFAULT_RATE_HZ` is assumed.
         reliability: reliable or best_effort.
         rows: Number of rows in each message. A row is one sample of one cube.
-
-    Raises:
-        ConfigError: The reliability is another text.
     """
-    if reliability not in _RELIABILITIES:
-        allowed = ", ".join(_RELIABILITIES)
-        raise ConfigError(f"parameter qos_reliability is {reliability!r}, allowed: {allowed}")
     wanted_depth = (rate_hz or DEFAULT_RATE_HZ) * MAX_PAUSE_S
     # The messages of a large skin are so large that a queue of the wanted depth would take too much
     # memory.
     affordable_depth = MAX_QUEUE_BYTES / (rows * ROW_BYTES)
     depth = max(MIN_BATCH_DEPTH, math.ceil(min(wanted_depth, affordable_depth)))
-    return QoSProfile(depth=depth, reliability=_RELIABILITIES[reliability])
+    policy = ReliabilityPolicy.get_from_short_key(reliability)
+    return QoSProfile(depth=depth, reliability=policy)
 
 
 def scans_per_message(publish_period_s: float, rate_hz: float | None) -> int:

@@ -406,9 +406,9 @@ def test_the_tensor_of_a_cube_states_what_is_not_known_of_its_weight(start, monk
     fake_tf(monkeypatch, imu=IMU_FRAME)
     node = start(imu="/imu")
     node.on_rows(scan_at(0.1))
-    unknown = node._publisher._cubes._covariance(0, 0)
+    unknown = node._reconstructor.covariance(0)
     played(node, MovingSkin(), 0.1)
-    known = node._publisher._cubes._covariance(0, 0)
+    known = node._reconstructor.covariance(0)
     np.testing.assert_array_equal(known, node._reconstructor.pipeline.covariance(0))
     # zz: 1 g along x and z, which RESPONSE turns into about 115 Pa
     assert 80**2 < unknown[2, 2] - known[2, 2] < 150**2

@@ -102,28 +102,7 @@ def make_status(
         text: Message of the status.
         values: Key -> value, shown as text.
     """
-    pairs = [_make_pair(name, key, str(value)) for key, value in values.items()]
+    pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
     return DiagnosticStatus(
         name=name, hardware_id=hardware_id, level=level, message=text, values=pairs
     )
-
-
-_newest_pairs: dict[tuple[str, str], KeyValue] = {}
-"""(name of a status, key) -> the pair of key and value that was published last."""
-
-
-def _make_pair(name: str, key: str, value: str) -> KeyValue:
-    """Return a pair of key and value for the status with this name.
-
-    The previous pair is returned if the value has not changed, because rclpy takes 2 µs to make a
-    new one.
-
-    Args:
-        name: Name of the diagnostic status.
-        key: Key within this status.
-        value: Value as text.
-    """
-    pair = _newest_pairs.get((name, key))
-    if pair is None or pair.value != value:
-        pair = _newest_pairs[name, key] = KeyValue(key=key, value=value)
-    return pair

@@ -18,7 +18,6 @@ from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Header
 
 from ...config.skin import Skin
-from ...core.arrays import Array
 from ...core.forces import Forces
 from ...core.reconstructor import Reconstructor
 from ...core.rows import FrequencyRows, StressRows
@@ -40,10 +39,6 @@ MAX_ANNOUNCED_CUBES = 64
 On a larger skin such a publisher is made only when somebody subscribes to its topic, because DDS
 sends the description of every publisher to every process in the domain.
 """
-
-MAX_COVARIANCES = 4096
-"""Maximum number of cached covariance matrices of the stress of single cubes. There is one for each
-combination of a cube and a set of faulty pads, which are left out of its computation."""
 
 CUBE_TOPIC_DEPTH = 10
 """Depth of the queues of the topics of single cubes (`cubes/<name>/stress` and
@@ -206,7 +201,6 @@ class CubeTopics:
         self._node, self._skin, self._reconstructor = node, skin, reconstructor
         own_sides = [2 * cube.calibration.half_side for cube in skin.cubes]
         self._sides = np.array([side or own_side for own_side in own_sides])
-        self._covariances: dict[tuple[int, int], Array] = {}
         self._tensors = _CubePublishers(node, skin, "stress", StressTensorStamped)
         self._wrenches = _CubePublishers(node, skin, "wrench", WrenchStamped)
 
@@ -236,7 +230,7 @@ class CubeTopics:
         for row in np.flatnonzero(is_chosen).tolist():
             cube = int(rows.cube[row])
             left_out = int(rows.left_out[row])
-            covariance = self._covariance(cube, left_out)
+            covariance = self._reconstructor.covariance(cube, left_out)
             header = self._header(rows, row, cube)
             message = tensor_message(header, rows, row, covariance)
             self._tensors.publish(cube, message)
@@ -267,21 +261,6 @@ class CubeTopics:
         stamp = to_time(int(rows.stamp_ns[row]))
         frame_id = self._skin.frame(self._skin.cubes[cube])
         return Header(stamp=stamp, frame_id=frame_id)
-
-    def _covariance(self, cube: int, left_out: int) -> Array:
-        key = cube, left_out
-        if key not in self._covariances:
-            # Every set of left-out pads is a new key, so without a limit the cache of a large skin
-            # with pads that fail intermittently would grow for ever.
-            if len(self._covariances) >= MAX_COVARIANCES:
-                self._covariances.clear()
-            pipeline = self._reconstructor.pipeline
-            self._covariances[key] = pipeline.covariance(cube, left_out)
-        # The uncertainty of the compensation of weight, creep and temperature changes from row to
-        # row, so its covariance is not cached but added here.
-        compensation = self._reconstructor.compensation.covariance(cube, left_out)
-        noise = self._covariances[key]
-        return noise if compensation is None else noise + compensation
 
 
 class _CubePublishers:

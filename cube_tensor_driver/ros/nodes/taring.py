@@ -148,69 +148,46 @@ class Taring:
             if known == uid:
                 continue
             self.uids[number] = uid
+            cube = self._skin.cubes[number]
             if known is not None:
                 # The cube was exchanged, so that its tare is not valid.
-                self._forget_tare(number, rest)
-            if number in self.created:
-                # The cube was tared, or its tare cleared, since the node was started. That is newer
-                # than the tare file, which an earlier run of the node wrote.
-                self._store_late(number, rest)
-            else:
-                self._restore_tare(number, uid, rest)
+                n_pads = cube.calibration.layout.n_pads
+                rest[number, :n_pads] = cube.calibration.rest_frequency
+                self.created.pop(number, None)
+            try:
+                if number in self.created:
+                    # The cube was tared, or its tare cleared, since the node was started. That is
+                    # newer than the tare file, which an earlier run of the node wrote.
+                    self._store(number, rest)
+                else:
+                    self._restore_tare(number, uid, rest)
+            except ConfigError as error:
+                log = self._node.get_logger()
+                log.warning(f"cube {cube.name}: tare not restored or kept: {error}")
         return None if np.array_equal(before, rest, equal_nan=True) else rest
 
     def _restore_tare(self, number: int, uid: int, rest: Array) -> None:
         """Read the tare file of a cube, if it exists, and write its content into `rest`.
-
-        A file that cannot be used gives a warning in the log.
 
         Args:
             number: Index of the cube in the skin.
             uid: Unique number of the cube, which is part of the name of the file.
             rest: Rest frequencies (without load) of all cubes, (cubes, pads), in Hz, which are
                 changed.
+
+        Raises:
+            ConfigError: The file cannot be used.
         """
         if self._folder is None:
             return
         cube = self._skin.cubes[number]
-        log = self._node.get_logger()
-        try:
-            stored = read_tare(self._folder, uid, cube.calibration)
-        except ConfigError as error:
-            log.warning(f"cube {cube.name}: tare not restored: {error}")
-            return
+        stored = read_tare(self._folder, uid, cube.calibration)
         if stored is not None:
             n_pads = cube.calibration.layout.n_pads
             rest[number, :n_pads] = stored.rest_frequency
             self.created[number] = stored.created
+            log = self._node.get_logger()
             log.info(f"cube {cube.name}: tare of {stored.created} restored")
-
-    def _forget_tare(self, number: int, rest: Array) -> None:
-        """Replace the tare of a cube that was exchanged by the rest frequencies of its calibration.
-
-        Args:
-            number: Index of the cube in the skin.
-            rest: Rest frequencies (without load) of all cubes, (cubes, pads), in Hz, which are
-                changed.
-        """
-        calibration = self._skin.cubes[number].calibration
-        rest[number, : calibration.layout.n_pads] = calibration.rest_frequency
-        self.created.pop(number, None)
-
-    def _store_late(self, number: int, rest: Array) -> None:
-        """Store a tare that was measured or cleared before the uid of the cube was known.
-
-        If the file cannot be written or removed, a warning is logged.
-
-        Args:
-            number: Index of the cube in the skin.
-            rest: Rest frequencies (without load) of all cubes, (cubes, pads), in Hz.
-        """
-        try:
-            self._store(number, rest)
-        except ConfigError as error:
-            name = self._skin.names[number]
-            self._node.get_logger().warning(f"cube {name}: tare not kept: {error}")
 
     def _store(self, number: int, rest: Array) -> None:
         """Write the tare file of a cube, or remove it if the tare was cleared.
