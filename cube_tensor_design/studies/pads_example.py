@@ -100,7 +100,7 @@ def sweep(points: int = 129) -> Sweep:
     pads = true_state(calibration, passing[:, :6], gradient) @ calibration.response.T
 
     estimator = make_estimator(calibration.response, calibration.noise, calibration.modes)
-    left, right = (calibration.layout.index(name) for name in PAIR)
+    left, right = (calibration.layout.pads.index(name) for name in PAIR)
     # The difference of the two pads counts as shear, with the gain of uniform shear.
     to_shear = calibration.response[:, calibration.modes.names.index("zx")]
     pair_gain = to_shear[left] - to_shear[right]

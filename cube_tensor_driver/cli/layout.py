@@ -100,7 +100,7 @@ def show_layout(layout: Layout, symmetry: str, result: dict[str, Any], source: s
     say(f"layout {layout.name}: {layout.n_pads} pads   {pads}")
     counts = [
         f"{name} {'not possible' if count is None else count}"
-        for name, count in coefficient_counts(layout).items()
+        for name, count in coefficient_counts(layout)
     ]
     say(f"coefficients by symmetry: {', '.join(counts)}")
     say(f"symmetry {symmetry}; {source}")

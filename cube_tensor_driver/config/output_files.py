@@ -13,7 +13,6 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
 from uuid import uuid4
 
 from ..core.errors import ConfigError
@@ -113,7 +112,7 @@ def check_yaml(option: str, path: Path | None) -> None:
         raise ConfigError(f"{option} {path}: a YAML file ends in {suffixes}; name one")
 
 
-def to_json(value: Any, indent: int | None = None) -> str:
+def to_json(value: object, indent: int | None = None) -> str:
     """Return plain values as JSON text. NaN and infinity, which JSON lacks, become null.
 
     Args:
@@ -123,7 +122,7 @@ def to_json(value: Any, indent: int | None = None) -> str:
     return json.dumps(_without_nan(value), indent=indent, allow_nan=False)
 
 
-def _without_nan(value: Any) -> Any:
+def _without_nan(value: object) -> object:
     if hasattr(value, "tolist"):
         value = value.tolist()
     if isinstance(value, float):
@@ -135,7 +134,7 @@ def _without_nan(value: Any) -> Any:
     return value
 
 
-def write_json(path: Path, value: Any) -> None:
+def write_json(path: Path, value: object) -> None:
     """Write plain values as a JSON file, completely or not at all.
 
     Raises:

@@ -124,7 +124,7 @@ class Schema:
         number = base.TYPE_CHECKER.redefine("number", _is_finite_number)
         self._validator = jsonschema.validators.extend(base, type_checker=number)(schema)
 
-    def mistakes(self, data: Any) -> list[tuple[KeyPath, str]]:
+    def mistakes(self, data: object) -> list[tuple[KeyPath, str]]:
         """Return all mistakes in plain values (mappings, lists, numbers, texts), sorted by key.
 
         Args:
@@ -142,16 +142,17 @@ class Schema:
         return sorted(found, key=_sort_key)
 
 
-def _is_finite_number(_: Any, value: Any) -> bool:
+def _is_finite_number(_: object, value: object) -> bool:
     """Return whether a value is a number in the range of a float.
 
     The result is false for NaN and infinity, which YAML writes as .nan and .inf. The library
     jsonschema passes its checker of types as the first argument, which is not used.
     """
-    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
     # The comparison is false for NaN. math.isfinite would raise OverflowError for an integer above
     # the range of a float.
-    return is_number and abs(value) <= sys.float_info.max
+    return abs(value) <= sys.float_info.max
 
 
 def _sort_key(mistake: tuple[KeyPath, str]) -> list[tuple[bool, str | int]]:

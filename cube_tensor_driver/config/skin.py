@@ -258,7 +258,7 @@ def check_skin(path: Path) -> tuple[Skin | None, list[str]]:
     return check_skin_data(read_yaml(path), path.parent)
 
 
-def check_skin_data(data: Any, folder: Path) -> tuple[Skin | None, list[str]]:
+def check_skin_data(data: object, folder: Path) -> tuple[Skin | None, list[str]]:
     """Check the content of a skin file.
 
     Args:

@@ -10,12 +10,11 @@ from __future__ import annotations
 
 from datetime import datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..core.arrays import Array
+from ..core.arrays import Array, Real
 from ..core.calibration import Calibration
 from ..core.errors import ConfigError
 from ..core.health.tare import MAX_REST_CHANGE
@@ -51,7 +50,7 @@ def write_tare(
     folder: Path,
     uid: int,
     calibration: Calibration,
-    rest_frequency: NDArray[np.floating[Any]],
+    rest_frequency: Real,
     created: datetime,
 ) -> None:
     """Write the tare file (frequencies without load) of a cube, completely or not at all.

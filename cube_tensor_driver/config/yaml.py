@@ -123,7 +123,7 @@ def read_yaml(path: Path) -> Any:
     return parse_yaml(data, str(path))
 
 
-def to_yaml(value: Any) -> str:
+def to_yaml(value: object) -> str:
     """Return plain values (numbers, texts, lists, mappings) as YAML text; keys keep their order."""
     return yaml.dump(
         value,
@@ -135,7 +135,7 @@ def to_yaml(value: Any) -> str:
     )
 
 
-def write_yaml(path: Path, value: Any, header: str = "") -> None:
+def write_yaml(path: Path, value: object, header: str = "") -> None:
     """Write plain values as a YAML file, completely or not at all.
 
     Args:

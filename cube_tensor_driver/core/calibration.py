@@ -22,7 +22,7 @@ from .layout import LAYOUTS, Layout, find_layout
 from .modes import Modes
 from .oscillator import TemperatureModel
 from .response import illustrative_coefficients, response
-from .symmetry import Structure, default_modes, find_structure
+from .symmetry import Structure, default_modes, find_structure, largest_symmetry
 
 SCHEMA = 1
 """Version of the format of calibration files, which each file states under the key "schema"."""
@@ -118,7 +118,7 @@ class Calibration:
         source = self.source or "unknown source"
         return f"Calibration({self.id}, layout {self.layout.name!r}, {owner}, {source})"
 
-    def _set(self, name: str, value: Any) -> None:
+    def _set(self, name: str, value: object) -> None:
         """Replace the attribute with this name by its checked value.
 
         A frozen dataclass refuses an ordinary assignment.
@@ -341,9 +341,7 @@ def illustrative(
         uid: Unique id of the cube; None means any cube.
     """
     layout = find_layout(layout_name)
-    # The pads of the layout quad lie only on the faces +z and -z, so they do not have the symmetry
-    # that exchanges z with x or y.
-    symmetry = "slab" if layout_name == "quad" else "full"
+    symmetry = largest_symmetry(layout)
     structure = find_structure(layout, symmetry)
     return Calibration(
         layout=layout,
@@ -401,7 +399,7 @@ def _to_plain(value: Any, is_per_pad: bool) -> Any:
     return dict(value) if isinstance(value, Mapping) else value
 
 
-def _read_number(value: Any, name: str) -> float:
+def _read_number(value: object, name: str) -> float:
     """Return a value of a file as a float; `name` stands for it in the error message.
 
     Raises:
@@ -410,7 +408,7 @@ def _read_number(value: Any, name: str) -> float:
     return float(read_numbers(value, name, CalibrationError, ()))
 
 
-def _read_coefficients(value: Any) -> dict[str, float]:
+def _read_coefficients(value: object) -> dict[str, float]:
     """Return coefficients by name, as a file holds them, as numbers.
 
     Raises:

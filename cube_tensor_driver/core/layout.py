@@ -9,7 +9,7 @@ cube. Lengths are in units of the half side d0 of the cube.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
 
@@ -74,14 +74,15 @@ class Layout:
         normals = read_numbers(
             self.normals, "layout: normals (x, y, z)", LayoutError, positions.shape
         )
-        if not 0 < self.pad_size <= 2:
-            self._refuse(f"pad_size {self.pad_size}; allowed is above 0, up to 2")
+        pad_size = float(read_numbers(self.pad_size, "layout: pad_size", LayoutError, ()))
+        if not 0 < pad_size <= 2:
+            self._refuse(f"pad_size {pad_size}; allowed is above 0, up to 2")
 
         # A frozen dataclass refuses assignments, so the checked values replace the given ones by
         # way of the base class.
         object.__setattr__(self, "positions", positions)
         object.__setattr__(self, "normals", normals)
-        object.__setattr__(self, "pad_size", float(self.pad_size))
+        object.__setattr__(self, "pad_size", pad_size)
         for number in range(len(positions)):
             self._check_pad(number)
 
@@ -144,19 +145,6 @@ class Layout:
         is_tilted = np.any(self.normals[:, 1])
         return not (is_off_plane or is_tilted)
 
-    def index(self, pad: str) -> int:
-        """Return the number (from 0) of the pad with a name.
-
-        Raises:
-            LayoutError: The layout has no pad with this name.
-        """
-        try:
-            return self.pads.index(pad)
-        except ValueError:
-            raise LayoutError(
-                f"layout {self.name!r} has no pad {pad!r}; its pads are {', '.join(self.pads)}"
-            ) from None
-
     def same_as(self, other: Layout) -> bool:
         """Return whether both layouts have the same pads in the same order."""
         return (
@@ -185,28 +173,11 @@ class Layout:
         Raises:
             LayoutError: A key is missing or unknown, or a value is invalid.
         """
-        if not isinstance(data, Mapping):
-            raise LayoutError(f"a layout is a table with name, positions, normals; found {data!r}")
+        allowed = [item.name for item in fields(cls)]
         required = {"name", "positions", "normals"}
-        unknown = set(data) - required - {"pad_size"}
-        missing = required - set(data)
-        if unknown or missing:
-            raise LayoutError(
-                f"layout: unknown keys {sorted(unknown)}, missing keys {sorted(missing)}; "
-                "allowed are name, positions, normals, pad_size"
-            )
-        size = data.get("pad_size", PAD_SIZE)
-        # True and False are integers in Python, but never a size.
-        if isinstance(size, bool) or not isinstance(size, (int, float)):
-            raise LayoutError(
-                f"layout: pad_size is {size!r}; it must be a number in units of the half side"
-            )
-        return cls(
-            name=str(data["name"]),
-            positions=data["positions"],
-            normals=data["normals"],
-            pad_size=size,
-        )
+        if not isinstance(data, Mapping) or not required <= set(data) <= set(allowed):
+            raise LayoutError(f"layout: found {data!r}; it is a table of {', '.join(allowed)}")
+        return cls(**data)
 
 
 def find_layout(name: str) -> Layout:

@@ -12,12 +12,12 @@ same bits.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from .arguments import check_skin
-from .arrays import Array, Mask, PadMasks, StatusBits
+from .arrays import Array, Index, Mask, PadMasks, StatusBits
 from .calibration import Calibration
 from .compensation.compensation import Compensation
 from .errors import TareError
@@ -41,7 +41,7 @@ class RecordedHealth(NamedTuple):
     left_out: PadMasks
     status: StatusBits
 
-    def select(self, chosen: Any) -> RecordedHealth:
+    def select(self, chosen: Mask | Index | slice) -> RecordedHealth:
         """Return the recorded health of some of the rows.
 
         Args:

@@ -16,7 +16,8 @@ import numpy as np
 
 from .arrays import Array
 from .errors import CalibrationError, LayoutError
-from .symmetry import Structure, find_structure
+from .layout import LAYOUTS
+from .symmetry import Structure, find_structure, largest_symmetry
 
 ILLUSTRATIVE = {
     "a": 1.4,
@@ -61,9 +62,6 @@ plane z-x are chosen so that the pads in this plane respond as `ILLUSTRATIVE` st
 (yy, yy_x, yy_z and the two shear gradients) are chosen freely.
 """
 
-_LARGEST_SYMMETRY = {"quad": "slab", "planar": "full", "cube": "full"}
-"""Name of the largest symmetry group of each built-in layout. The illustrative coefficients of the
-layout's response matrix (`ILLUSTRATIVE`, `ILLUSTRATIVE_CUBE`) are those of this symmetry."""
 MAX_LISTED_NAMES = 6
 """Maximum number of names that an error message lists; of further names it states the number."""
 
@@ -81,7 +79,7 @@ def illustrative_coefficients(structure: Structure) -> dict[str, float]:
         LayoutError: The layout is none of quad, planar and cube.
     """
     layout = structure.layout
-    if layout.name not in _LARGEST_SYMMETRY:
+    if layout.name not in LAYOUTS:
         raise LayoutError(
             f"no illustrative response for layout {layout.name!r}; there is one for "
             "quad, planar and cube: fit a calibration for yours"
@@ -92,7 +90,7 @@ def illustrative_coefficients(structure: Structure) -> dict[str, float]:
 
     # A smaller symmetry has more coefficients. They are computed from the response matrix of the
     # largest symmetry, whose coefficients are known.
-    symmetric = find_structure(layout, _LARGEST_SYMMETRY[layout.name])
+    symmetric = find_structure(layout, largest_symmetry(layout))
     matrix = response(symmetric, illustrative_coefficients(symmetric))
     coefficients, _ = project(structure, matrix)
     return coefficients

@@ -14,9 +14,9 @@ from dataclasses import dataclass, fields
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from .arrays import AnyArray, PadMasks, Real, Single, StatusBits, Times
+from .arrays import AnyArray, Index, Mask, PadMasks, Real, Single, StatusBits, Times
 
 COLUMN_TYPES: dict[str, type] = {
     "sequence": np.uint32,
@@ -49,7 +49,7 @@ class _Rows:
         duration_s = float(np.ptp(self.stamp_ns)) * 1e-9
         return f"{name}({len(self)} rows of {cubes} cubes over {duration_s:.3g} s)"
 
-    def select(self: _Kind, chosen: Any) -> _Kind:
+    def select(self: _Kind, chosen: Mask | Index | slice) -> _Kind:
         """Return some of the rows.
 
         Args:
@@ -97,15 +97,15 @@ class FrequencyRows(_Rows):
     @classmethod
     def of(
         cls,
-        cube: Any,
-        frequency: Any,
+        cube: ArrayLike,
+        frequency: ArrayLike,
         *,
-        stamp_ns: Any = 0,
-        sequence: Any = 0,
-        temperature: Any = np.nan,
-        pad_fault: Any = 0,
-        status: Any = 0,
-        specific_force: Any = None,
+        stamp_ns: ArrayLike = 0,
+        sequence: ArrayLike = 0,
+        temperature: ArrayLike = np.nan,
+        pad_fault: ArrayLike = 0,
+        status: ArrayLike = 0,
+        specific_force: ArrayLike | None = None,
     ) -> FrequencyRows:
         """Construct N rows from numbers, lists or arrays.
 
@@ -162,16 +162,16 @@ class StressRows(_Rows):
     @classmethod
     def of(
         cls,
-        cube: Any,
-        stress: Any,
-        gradient: Any,
+        cube: ArrayLike,
+        stress: ArrayLike,
+        gradient: ArrayLike,
         *,
-        residual: Any = np.nan,
-        status: Any = 0,
-        observed: Any = 0,
-        stamp_ns: Any = 0,
-        sequence: Any = 0,
-        left_out: Any = 0,
+        residual: ArrayLike = np.nan,
+        status: ArrayLike = 0,
+        observed: ArrayLike = 0,
+        stamp_ns: ArrayLike = 0,
+        sequence: ArrayLike = 0,
+        left_out: ArrayLike = 0,
     ) -> StressRows:
         """Construct N rows from numbers, lists or arrays.
 
@@ -206,7 +206,7 @@ def concatenate(parts: Sequence[_Kind]) -> _Kind:
     )
 
 
-def _fill_columns(cube: Any, **columns: Any) -> dict[str, AnyArray]:
+def _fill_columns(cube: ArrayLike, **columns: Any) -> dict[str, AnyArray]:
     """Return the columns (N,) of N rows by name, with the types of `COLUMN_TYPES`.
 
     Args:

@@ -13,7 +13,7 @@ Source: Kiyota & Shinoda, the symmetry argument for eq. 1, applied to any layout
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -290,20 +290,18 @@ def _read_signed_permutations(matrices: Array) -> tuple[Index, Index]:
     return magnitude.argmax(axis=1), signs
 
 
-def coefficient_counts(layout: Layout) -> dict[str, int | None]:
+def coefficient_counts(layout: Layout) -> Iterator[tuple[str, int | None]]:
     """Count the coefficients of a layout's response under each symmetry group.
 
-    Returns:
-        Number of coefficients by the name of the group, the largest group first. The number is None
-        if the layout does not have the symmetry.
+    Yields:
+        Name of a group, the largest group first, and the number of coefficients; None if the layout
+        does not have the symmetry.
     """
-    counts: dict[str, int | None] = {}
     for name in GENERATORS:
         try:
-            counts[name] = find_structure(layout, name).n_coefficients
+            yield name, find_structure(layout, name).n_coefficients
         except SymmetryError:
-            counts[name] = None
-    return counts
+            yield name, None
 
 
 def largest_symmetry(layout: Layout) -> str:
@@ -311,5 +309,4 @@ def largest_symmetry(layout: Layout) -> str:
 
     Groups under which all responses of the layout would be zero are skipped.
     """
-    counts = coefficient_counts(layout)
-    return next(name for name, count in counts.items() if count)
+    return next(name for name, count in coefficient_counts(layout) if count)

@@ -149,7 +149,7 @@ def message_class(topic: str, type_name: str) -> Any:
         ) from None
 
 
-def make_message(type_name: str, **fields: Any) -> Any:
+def make_message(type_name: str, **fields: object) -> Any:
     """Return an rclpy message.
 
     Args:

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -156,7 +155,7 @@ class SkinSubscriberNode(CubeNode):
             skin: The state of the skin, as received on its topics.
         """
 
-    def compute_message(self, skin: FollowedSkin, health: Index) -> Any:
+    def compute_message(self, skin: FollowedSkin, health: Index) -> object:
         """Return the message to publish now, or its serialised bytes; subclasses override it.
 
         It is called `rate` times per second. If it returns None, nothing is published.
@@ -167,7 +166,7 @@ class SkinSubscriberNode(CubeNode):
                 `LatestStress.health` returns it.
         """
 
-    def follow_stress(self, skin: FollowedSkin, health: Index) -> Any:
+    def follow_stress(self, skin: FollowedSkin, health: Index) -> object:
         """Return a message to publish at once, without waiting for the next regular one, or None.
 
         If a subclass overrides this method, it is called at each `stress` message.
@@ -194,7 +193,7 @@ class SkinSubscriberNode(CubeNode):
             self.create_lifecycle_publisher(self._message_type, topic, self._depth)
         )
 
-        def publish(compute: Callable[[FollowedSkin, Index], Any]) -> None:
+        def publish(compute: Callable[[FollowedSkin, Index], object]) -> None:
             skin = subscriber.skin
             if skin is None or not self.is_active or not self.has_listeners(publisher):
                 return

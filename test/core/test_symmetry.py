@@ -137,12 +137,10 @@ def test_a_bad_layout_is_refused_with_the_reason(change, words):
         Layout.from_dict(good | change)
 
 
-def test_an_unknown_layout_or_pad_is_named():
+def test_an_unknown_layout_is_named():
     with pytest.raises(LayoutError, match=r"'ring'.*quad, planar, cube"):
         find_layout("ring")
-    with pytest.raises(LayoutError, match=r"'top'.*[+]z-x"):
-        LAYOUTS["quad"].index("top")
-    assert LAYOUTS["planar"].index("-x+z") == 7
+    assert LAYOUTS["planar"].pads.index("-x+z") == 7
 
 
 @pytest.mark.parametrize("modes, count", [(PLANE, 7), (PAPER, 8), (SPACE, 21)])

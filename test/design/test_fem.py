@@ -106,7 +106,7 @@ def test_a_cube_off_the_middle_feels_the_field_at_its_place_and_the_free_surface
     up, down = (compute_response(Body(z=z), layout, meshes=1).matrix for z in (2e-3, -2e-3))
     middle = compute_response(Body(), layout, meshes=1).matrix
     # Turned over, pads and modes change places.
-    below = [layout.index(name.translate(str.maketrans("+-", "-+"))) for name in layout.pads]
+    below = [layout.pads.index(name.translate(str.maketrans("+-", "-+"))) for name in layout.pads]
     turned = [1.0 if name in ("zz", "zx", "xx") else -1.0 for name in PLANE.names]
     assert np.abs(up - down[below] * turned).max() < 1e-6
     assert np.linalg.norm(up - middle) == pytest.approx(0.148 * np.linalg.norm(middle), rel=0.02)

@@ -24,6 +24,7 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.arrays import AnyArray
 from ...core.errors import ProtocolError
 from . import cobs
 
@@ -407,10 +408,10 @@ def encode(frame: Frame, version: int = VERSION) -> bytes:
 
 def _check_array(
     name: str,
-    value: Any,
+    value: object,
     dtype: np.dtype[Any],
     shape: tuple[int, ...],
-) -> NDArray[Any]:
+) -> AnyArray:
     """Return `value` if it is an array of this dtype and shape; otherwise raise ProtocolError.
 
     Args:

@@ -155,7 +155,7 @@ class _Listener:
     """
 
     def __init__(self, node: Node, topic: str) -> None:
-        self.waiting: deque[Any] = deque(maxlen=QUEUE_DEPTH)
+        self.waiting: deque[object] = deque(maxlen=QUEUE_DEPTH)
         self._node, self._topic = node, topic
         self._names: list[str] | None = None
         self._needs_names = False
@@ -237,7 +237,7 @@ class _Listener:
             raw=raw,
         )
 
-    def _on_message(self, message: Any) -> None:
+    def _on_message(self, message: object) -> None:
         self.waiting.append(message)
 
     def _on_info(self, info: SkinInfo) -> None:

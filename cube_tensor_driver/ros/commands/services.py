@@ -229,7 +229,7 @@ class _NodeParameters:
         if not result.successful:
             raise ConfigError(f"{refusal}: {result.reason}")
 
-    def _call(self, service_type: type, service: str, request: Any) -> Any:
+    def _call(self, service_type: type, service: str, request: object) -> Any:
         return call_service(self._session, service_type, f"{self._name}/{service}", request)
 
 
@@ -276,7 +276,7 @@ def find_services(session: Session, kind: str, wanted: str = "") -> list[str]:
     return find()
 
 
-def call_service(session: Session, service_type: type, name: str, request: Any) -> Any:
+def call_service(session: Session, service_type: type, name: str, request: object) -> Any:
     """Call a service and return its response.
 
     The request is sent again every `REPEAT_S`, so it must be one that may be executed twice.

@@ -8,9 +8,9 @@ import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import fields
 from functools import partial
-from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.publisher import Publisher
 from sensor_msgs.msg import PointCloud2
 
 from ...config.parameters import CONTACTS
@@ -54,7 +54,7 @@ class Contacts(SkinSubscriberNode):
         self._traction = self.own(self.create_lifecycle_publisher(PointCloud2, "traction", 2))
         super().configure()
 
-    def has_listeners(self, publisher: Any) -> bool:
+    def has_listeners(self, publisher: Publisher) -> bool:
         return self._has_traction_listeners() or super().has_listeners(publisher)
 
     def prepare(self, skin: FollowedSkin) -> None:
