@@ -290,14 +290,15 @@ def check_skin_data(data: object, folder: Path) -> tuple[Skin | None, list[str]]
     # links that cubes name are checked only if all links could be read.
     link_names = [link.name for link in links]
     all_links_known = len(set(link_names)) == len(data["links"])
-    reader = _CubeReader(folder, link_names if all_links_known else None)
     # Malformed entries are skipped instead of ending the check, so that the user sees the mistakes
     # of all entries at once.
-    for number, item in enumerate(data["cubes"]):
-        if ("cubes", number) not in malformed:
-            reader.read(number, item)
-    cubes = tuple(reader.cubes)
-    mistakes += reader.mistakes
+    items = {
+        number: item
+        for number, item in enumerate(data["cubes"])
+        if ("cubes", number) not in malformed
+    }
+    cubes, cube_mistakes = _read_cubes(items, folder, link_names if all_links_known else None)
+    mistakes += cube_mistakes
     mistakes += _find_cube_mistakes(cubes)
     mistakes += _find_pad_mistakes(links, cubes)
 
@@ -321,108 +322,89 @@ def check_skin_data(data: object, folder: Path) -> tuple[Skin | None, list[str]]
     return skin, []
 
 
-class _CubeReader:
-    """Makes cubes from the entries of a skin file, and reads each calibration file only once.
+def _read_cubes(
+    items: dict[int, dict[str, Any]],
+    folder: Path,
+    links: list[str] | None,
+) -> tuple[tuple[SkinCube, ...], list[str]]:
+    """Make cubes from their entries in a skin file, and read each calibration file only once.
 
-    Attributes:
-        cubes: The cubes that were read so far.
-        mistakes: The mistakes that were found so far, one line each.
+    Args:
+        items: Index of a cube in the skin file -> its entry, the keys and values of the cube.
+        folder: The folder of the skin file, in which calibration files are searched.
+        links: Names of all links of the file; None: the entry of a link is malformed, so names of
+            links cannot be checked.
+
+    Returns:
+        The cubes whose calibration could be read, and the mistakes, one line each.
     """
-
-    def __init__(self, folder: Path, links: list[str] | None) -> None:
-        """Make a reader.
-
-        Args:
-            folder: The folder of the skin file, in which calibration files are searched.
-            links: Names of all links of the file; None: the entry of a link is malformed, so names
-                of links cannot be checked.
-        """
-        self.cubes: list[SkinCube] = []
-        self.mistakes: list[str] = []
-        self._folder = folder
-        self._links = links
-        self._calibrations: dict[str, Calibration | None] = {}
-
-    def read(self, number: int, item: dict[str, Any]) -> None:
-        """Read the entry of one cube; add the cube to `cubes`, and its mistakes to `mistakes`.
-
-        Args:
-            number: Index of the cube in the skin file.
-            item: The entry: keys and values of the cube.
-        """
-        calibration = self._read_calibration(number, item["calibration"])
+    cubes: list[SkinCube] = []
+    mistakes: list[str] = []
+    # A calibration that cannot be read is None. It is reported once, for its first cube.
+    calibrations: dict[str, Calibration | None] = {}
+    for number, item in items.items():
+        name = item["calibration"]
+        if name not in calibrations:
+            calibrations[name] = None
+            try:
+                calibrations[name] = read_calibration(find_calibration(name, folder))
+            except CubeError as error:
+                mistakes.append(f"cubes[{number}].calibration: {error}")
+        calibration = calibrations[name]
         if calibration is None:
-            return
-        uid = _parse_uid(item, "uid")
-        for line in self._find_contradictions(item, uid, calibration):
-            self.mistakes.append(f"cubes[{number}]{line}")
+            continue
         cube = SkinCube(
             name=item["name"],
             link=item.get("link"),
             index=item.get("index"),
-            uid=uid,
+            uid=_parse_uid(item, "uid"),
             xyz=_to_triple(item["pose"]["xyz"]),
             rpy=_to_triple(item["pose"]["rpy"]),
             calibration=calibration,
         )
-        self.cubes.append(cube)
+        cubes.append(cube)
+        for line in _find_contradictions(cube, item, links):
+            mistakes.append(f"cubes[{number}]{line}")
+    return tuple(cubes), mistakes
 
-    def _read_calibration(self, number: int, name: str) -> Calibration | None:
-        """Return the calibration that a cube names, or None if it cannot be read.
 
-        If several cubes name a calibration that cannot be read, the error is added to `mistakes`
-        only once, for the first of these cubes.
+def _find_contradictions(
+    cube: SkinCube, item: dict[str, Any], links: list[str] | None
+) -> Iterator[str]:
+    """Yield a mistake for each key of a cube that contradicts another key or the calibration.
 
-        Args:
-            number: Index of the cube in the skin file.
-            name: Name or path of the calibration, as the skin file states it.
-        """
-        if name not in self._calibrations:
-            try:
-                path = find_calibration(name, self._folder)
-                self._calibrations[name] = read_calibration(path)
-            except CubeError as error:
-                self._calibrations[name] = None
-                self.mistakes.append(f"cubes[{number}].calibration: {error}")
-        return self._calibrations[name]
-
-    def _find_contradictions(
-        self, item: dict[str, Any], uid: int | None, calibration: Calibration
-    ) -> Iterator[str]:
-        """Yield a mistake for each key of a cube that contradicts another key or the calibration.
-
-        Args:
-            item: The entry of the cube in the skin file.
-            uid: Uid of the cube; None: the entry has none.
-            calibration: Calibration that the entry names.
-        """
-        link, index = item.get("link"), item.get("index")
-        # An entry may leave out the link; then the cube is searched by its uid on all links.
-        if link is not None and self._links is not None and link not in self._links:
-            allowed = ", ".join(sorted(self._links))
-            yield f".link: found {link!r}, allowed: one of the links {allowed}"
-        if uid is None and (link is None or index is None):
-            yield (
-                ": found neither uid nor both link and index, which say where the cube is; "
-                "add one of them"
-            )
-        # If the cube at this index is replaced by another one, the uid and the index in the file
-        # identify different cubes.
-        if uid is not None and index is not None:
-            yield ": found both uid and index; keep one, they might contradict each other"
-        if item["layout"] != calibration.layout.name:
-            yield (
-                f".layout: found {item['layout']!r}, but the calibration {item['calibration']!r} "
-                f"is for the layout {calibration.layout.name!r}"
-            )
-        # A calibration with a uid was measured on that cube. A computed one has none and is valid
-        # for all cubes of its layout.
-        if calibration.uid is not None and uid != calibration.uid:
-            found = "not given" if uid is None else hex(uid)
-            yield (
-                f".calibration: {item['calibration']!r} was made for the cube with uid "
-                f"{calibration.uid:#x}, this cube's uid is {found}"
-            )
+    Args:
+        cube: The cube.
+        item: The entry of the cube in the skin file.
+        links: Names of all links of the file; None: they are not known.
+    """
+    # An entry may leave out the link; then the cube is searched by its uid on all links.
+    if cube.link is not None and links is not None and cube.link not in links:
+        allowed = ", ".join(sorted(links))
+        yield f".link: found {cube.link!r}, allowed: one of the links {allowed}"
+    if cube.uid is None and (cube.link is None or cube.index is None):
+        yield (
+            ": found neither uid nor both link and index, which say where the cube is; "
+            "add one of them"
+        )
+    # If the cube at this index is replaced by another one, the uid and the index in the file
+    # identify different cubes.
+    if cube.uid is not None and cube.index is not None:
+        yield ": found both uid and index; keep one, they might contradict each other"
+    calibration = cube.calibration
+    if item["layout"] != calibration.layout.name:
+        yield (
+            f".layout: found {item['layout']!r}, but the calibration {item['calibration']!r} "
+            f"is for the layout {calibration.layout.name!r}"
+        )
+    # A calibration with a uid was measured on that cube. A computed one has none and is valid
+    # for all cubes of its layout.
+    if calibration.uid not in (None, cube.uid):
+        found = "not given" if cube.uid is None else hex(cube.uid)
+        yield (
+            f".calibration: {item['calibration']!r} was made for the cube with uid "
+            f"{calibration.uid:#x}, this cube's uid is {found}"
+        )
 
 
 def _find_link_mistakes(links: tuple[SkinLink, ...]) -> Iterator[str]:
