@@ -17,28 +17,10 @@ def no_events_executor() -> None:
     sys.modules["rclpy.experimental.events_executor"] = None
 
 
-def no_matched_event() -> None:
-    import rclpy.event_handler as events
-
-    full = events.PublisherEventCallbacks.__init__
-
-    def __init__(self, *, deadline=None, liveliness=None):
-        full(self, deadline=deadline, liveliness=liveliness)
-
-    events.PublisherEventCallbacks.__init__ = __init__
-
-
-def no_callback_after_parameters_are_set() -> None:
-    from rclpy.node import Node
-
-    del Node.add_post_set_parameters_callback
-
-
 def no_event_handler() -> None:
     """Its names are in another module in Humble."""
     events = importlib.import_module("rclpy.event_handler")
     older = types.ModuleType("rclpy.qos_event")
-    older.PublisherEventCallbacks = events.PublisherEventCallbacks
     older.SubscriptionEventCallbacks = events.SubscriptionEventCallbacks
     sys.modules["rclpy.qos_event"] = older
     sys.modules["rclpy.event_handler"] = None
@@ -55,8 +37,6 @@ FEATURES = {
     remove.__name__: remove
     for remove in (
         no_events_executor,
-        no_matched_event,
-        no_callback_after_parameters_are_set,
         no_event_handler,
         no_message_numbers,
     )

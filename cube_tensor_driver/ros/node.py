@@ -39,7 +39,7 @@ from ..config.skin import Skin, read_skin
 from ..core.errors import ConfigError, CubeError
 from ..processes.stop_signals import stop_event
 from .callbacks import Callback, CallbackErrors, guard, shorten
-from .compat import after_parameters_are_set, make_executor
+from .compat import make_executor
 from .qos import SERVICES, batch_profile, scans_per_message
 from .session import spin_until, start_ros
 
@@ -101,7 +101,6 @@ class CubeNode(LifecycleNode):
         self.is_misconfigured = False
         self._resources = contextlib.ExitStack()
         self._protect_lifecycle_services()
-        after_parameters_are_set(self, self._apply_parameters)
         self.add_on_set_parameters_callback(self._check_parameters)
         for parameter in parameters:
             self._declare(parameter)
@@ -280,7 +279,13 @@ class CubeNode(LifecycleNode):
         self, parameter_list: list[RclpyParameter]
     ) -> SetParametersResult:
         converted = [self._as_declared(parameter) for parameter in parameter_list]
-        return super().set_parameters_atomically(converted)
+        result = super().set_parameters_atomically(converted)
+        if result.successful and self.is_configured:
+            for parameter in parameter_list:
+                known = self._parameters_by_name.get(parameter.name)
+                if known is not None and known.live:
+                    self.on_parameter_change(parameter.name)
+        return result
 
     def _as_declared(self, parameter: RclpyParameter) -> RclpyParameter:
         """Return a parameter, converted from int to float if its declared type is double.
@@ -322,12 +327,6 @@ class CubeNode(LifecycleNode):
                 "clean it up first (lifecycle)"
             )
         return refusal
-
-    def _apply_parameters(self, parameters: list[RclpyParameter]) -> None:
-        for parameter in parameters:
-            known = self._parameters_by_name.get(parameter.name)
-            if self.is_configured and known is not None and known.live:
-                self.on_parameter_change(parameter.name)
 
     # rclpy calls the following methods at the transitions of the lifecycle.
 

@@ -17,7 +17,6 @@ from ...device.chain import LiveLinks
 from ...device.live import cube_addresses, link_configs
 from ...messages.codec import MessageBuffer, frequency_codec
 from ...msg import SkinFrequencies, SkinInfo
-from ..compat import on_matched
 from ..diagnostics.links import LinkDiagnostics
 from ..diagnostics.updater import Diagnostics
 from ..messages import info_message
@@ -28,12 +27,6 @@ from ..node import (
     run,
 )
 from ..qos import LATCHED, scans_per_message
-
-COUNT_PERIOD_S = 0.2
-"""Time, in seconds, between two counts of the subscribers of `frequencies`.
-
-They are counted only if rclpy (as in ROS 2 Humble) does not report changes of their number itself.
-"""
 
 
 class Driver(CubeNode):
@@ -169,23 +162,14 @@ class FrequenciesPublisher:
             always: Whether messages are published even while the topic has no subscribers.
         """
         self._always = always
-        self._has_subscribers = False
         self._frame_id = frame_id.encode() + b"\0"
         self._buffer = lru_cache(maxsize=MAX_BUFFERS)(self._make_buffer)
         # The message into which the caller of `make_rows` writes rows now; None before its first
         # call.
         self._next: MessageBuffer[FrequencyRows] | None = None
-
-        # rclpy reports each change of the number of subscribers. That takes less CPU time than
-        # asking for the number at each message.
-        events = on_matched(self._note_subscribers)
         self._publisher = node.own(
-            node.create_lifecycle_publisher(
-                SkinFrequencies, "frequencies", profile, event_callbacks=events
-            )
+            node.create_lifecycle_publisher(SkinFrequencies, "frequencies", profile)
         )
-        if events is None:
-            node.own(node.create_timer(COUNT_PERIOD_S, self._count_subscribers))
 
     def make_rows(self, n_rows: int, n_pads: int) -> FrequencyRows:
         """Return rows for the caller to fill; their arrays are views of the next message's bytes.
@@ -202,17 +186,13 @@ class FrequenciesPublisher:
 
     def publish(self) -> None:
         """Publish the message whose rows `make_rows` returned last and the caller has filled."""
-        if self._next is not None and (self._always or self._has_subscribers):
+        if self._next is None:
+            return
+        if self._always or self._publisher.get_subscription_count():
             self._publisher.publish(self._next.data())
 
     def _make_buffer(self, n_rows: int, n_pads: int) -> MessageBuffer[FrequencyRows]:
         return frequency_codec.buffer(self._frame_id, n_rows, n_pads)
-
-    def _note_subscribers(self, count: int) -> None:
-        self._has_subscribers = count > 0
-
-    def _count_subscribers(self) -> None:
-        self._note_subscribers(self._publisher.get_subscription_count())
 
 
 def main() -> None:
