@@ -88,23 +88,6 @@ class _Means(NamedTuple):
     noise: Array
 
 
-class _Check(NamedTuple):
-    """A quantity of each pad that must not exceed a limit for a tare to be accepted.
-
-    Attributes:
-        values: The quantity (cubes, P).
-        limit: Limit of the quantity.
-        problem, unit, fix: Texts for the error message: what is wrong with the pad, the unit of the
-            quantity, and what to do.
-    """
-
-    values: Array
-    limit: float
-    problem: str
-    unit: str
-    fix: str
-
-
 def measure_rest(
     pipeline: Pipeline,
     health: Health,
@@ -143,9 +126,7 @@ def measure_rest(
         means = _average(windows, chosen)
         factor = pipeline.unloaded_factor(chosen, health.temperature[chosen])
         rest = means.frequency / factor
-        checks = _list_checks(pipeline, health, chosen, rest, means)
-    for check in checks:
-        _apply_check(check, used, chosen, pipeline, names)
+        _check_pads(pipeline, health, chosen, used, rest, means, names)
     result[chosen] = np.where(used, rest, result[chosen])
     return result
 
@@ -262,82 +243,68 @@ def _average(windows: Sequence[Window], chosen: Index) -> _Means:
     )
 
 
-def _list_checks(
+def _check_pads(
     pipeline: Pipeline,
     health: Health,
     chosen: Index,
+    used: Mask,
     rest: Array,
     means: _Means,
-) -> list[_Check]:
-    """Return the checks that a tare must pass.
+    names: Sequence[str],
+) -> None:
+    """Raise TareError if a quantity of a pad exceeds its limit; the error names the worst pad.
 
     Args:
-        pipeline: Pipeline with the calibrations.
+        pipeline: Pipeline with the calibrations, which name the pads.
         health: Health of the pads, with their noise.
         chosen: Numbers of the cubes to tare.
+        used: Whether a pad of these cubes is checked (cubes, P).
         rest: New rest frequencies (frequencies without load) of these cubes, in Hz.
         means: Statistics of the frequencies of these cubes.
+        names: Names of all cubes.
     """
     calibrations = [pipeline.calibrations[cube] for cube in chosen.tolist()]
     frequencies = [calibration.rest_frequency for calibration in calibrations]
     calibrated = pad_table(frequencies, pipeline.n_pads, np.nan)
     noise = health.noise[chosen]
     jumped = means.span > JUMP_SPAN_RATIO * means.noise
-    return [
-        _Check(
-            values=np.where(jumped, 0, means.noise / noise),
-            limit=MAX_NOISE_RATIO,
-            problem="is noisy",
-            unit="times its noise",
-            fix="look for loose leads and interference",
+    noise_ratio = np.where(jumped, 0, means.noise / noise)
+    change_percent = 100 * np.abs(rest - calibrated) / calibrated
+    for values, limit, problem, unit, fix in (
+        (
+            noise_ratio,
+            MAX_NOISE_RATIO,
+            "is noisy",
+            "times its noise",
+            "look for loose leads and interference",
         ),
-        _Check(
-            values=means.span / noise,
-            limit=MAX_SPAN_RATIO,
-            problem="moves",
-            unit="times its noise peak to peak",
-            fix="let it come to rest",
+        (
+            means.span / noise,
+            MAX_SPAN_RATIO,
+            "moves",
+            "times its noise peak to peak",
+            "let it come to rest",
         ),
-        _Check(
-            values=100 * np.abs(rest - calibrated) / calibrated,
-            limit=100 * MAX_REST_CHANGE,
-            problem="is far from its calibration",
-            unit="%",
-            fix="take the load off, or calibrate the cube again",
+        (
+            change_percent,
+            100 * MAX_REST_CHANGE,
+            "is far from its calibration",
+            "%",
+            "take the load off, or calibrate the cube again",
         ),
-    ]
-
-
-def _apply_check(
-    check: _Check,
-    used: Mask,
-    chosen: Index,
-    pipeline: Pipeline,
-    names: Sequence[str],
-) -> None:
-    """Raise TareError if a quantity of a pad exceeds its limit; the error names the worst pad.
-
-    Args:
-        check: The quantity and its limit.
-        used: Whether a pad is checked (cubes, P).
-        chosen: Numbers of the cubes to tare.
-        pipeline: Pipeline with the calibrations, which name the pads.
-        names: Names of all cubes.
-    """
-    # A comparison with NaN is False. So "not <=" is used instead of ">", with which NaN counts as
-    # above the limit.
-    exceeds = used & ~(check.values <= check.limit)
-    if not exceeds.any():
-        return
-    values = np.nan_to_num(check.values, nan=np.inf)
-    excess = np.where(exceeds, values, -1)
-    row, pad = np.unravel_index(np.argmax(excess), excess.shape)
-    cube = int(chosen[row])
-    pad_name = pipeline.calibrations[cube].layout.pads[pad]
-    value = check.values[row, pad]
-    # The format .3g would show large numbers with an exponent, such as 1.23e+03.
-    shown = f"{value:.0f}" if value > 100 else f"{value:.3g}"
-    raise TareError(
-        f"cube {names[cube]}: pad {pad_name} {check.problem}: {shown} {check.unit}, "
-        f"the limit is {check.limit:g}; {check.fix}"
-    )
+    ):
+        # A comparison with NaN is False. So "not <=" is used instead of ">", with which NaN counts
+        # as above the limit.
+        exceeds = used & ~(values <= limit)
+        if not exceeds.any():
+            continue
+        excess = np.where(exceeds, np.nan_to_num(values, nan=np.inf), -1)
+        row, pad = np.unravel_index(np.argmax(excess), excess.shape)
+        pad_name = calibrations[row].layout.pads[pad]
+        value = values[row, pad]
+        # The format .3g would show large numbers with an exponent, such as 1.23e+03.
+        shown = f"{value:.0f}" if value > 100 else f"{value:.3g}"
+        raise TareError(
+            f"cube {names[chosen[row]]}: pad {pad_name} {problem}: {shown} {unit}, "
+            f"the limit is {limit:g}; {fix}"
+        )

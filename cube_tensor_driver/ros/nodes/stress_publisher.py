@@ -141,7 +141,7 @@ class ForceCloud:
         side: float | None,
     ) -> None:
         self._forces = Forces(skin, side)
-        self._n_cubes = len(skin.cubes)
+        n_cubes = len(skin.cubes)
         self._publisher = node.own(node.create_lifecycle_publisher(PointCloud2, "forces", profile))
         # The message is made once, and later only its data and stamp are replaced. The description
         # of its fields consists of many Python objects that never change.
@@ -149,9 +149,9 @@ class ForceCloud:
         step = item * len(FORCE_FIELDS)
         self._message = PointCloud2(
             height=1,
-            width=self._n_cubes,
+            width=n_cubes,
             point_step=step,
-            row_step=step * self._n_cubes,
+            row_step=step * n_cubes,
         )
         self._message.header.frame_id = skin.parent_frame
         self._message.fields = [
@@ -173,10 +173,7 @@ class ForceCloud:
         """
         if not self._publisher.get_subscription_count():
             return
-        # If the driver of another skin publishes in the same namespace by mistake, rows may have
-        # indices of cubes that this skin does not have.
-        known = rows.select(rows.cube < self._n_cubes)
-        force = self._forces.of_skin(known)
+        force = self._forces.of_skin(rows)
         points = np.hstack([self._forces.position, force])
         point_bytes = points.astype("<f4").view(np.uint8)
         self._message.data = pack_array("B", point_bytes)
