@@ -20,8 +20,10 @@ from ..core.calibration import Calibration
 from ..core.errors import ConfigError
 from ..core.modes import COMPONENTS, STRESS, to_matrix
 from ..core.oscillator import pad_frequency, stress_slope
+from ..core.poses import CubePoses
 from ..device.wire.protocol import NOT_MEASURED
 from .imperfections import Imperfections, PadBehaviour, make_thermal_pads
+from .motion import HeavyPads, read_weight
 from .sample_log import ABSENT
 
 Millihertz = NDArray[np.uint32]
@@ -33,6 +35,7 @@ class SimulatedCubes:
 
     Attributes:
         n_pads: Number of pads of each cube.
+        heavy: Motion and weight of the cubes; None: they weigh nothing.
     """
 
     def __init__(
@@ -43,6 +46,7 @@ class SimulatedCubes:
         drift: float = 0.0,
         imperfections: Imperfections | None = None,
         seed: int = 0,
+        poses: CubePoses | None = None,
     ) -> None:
         """Create the cubes.
 
@@ -54,6 +58,7 @@ class SimulatedCubes:
             imperfections: Deviations of the pads from their calibrations; None: no deviations.
             seed: Seed of the random noise. Together with the seed of the imperfections, it also
                 determines the deviation of each pad.
+            poses: Poses of the cubes in the parent frame of the skin; None: they weigh nothing.
         """
         self.n_pads = calibrations[0].layout.n_pads
         self._drift = drift
@@ -71,6 +76,10 @@ class SimulatedCubes:
         if imperfections is not None:
             self._behaviour = PadBehaviour(imperfections, shape, seed)
         self._thermal = make_thermal_pads(imperfections, shape, seed)
+        self.heavy: HeavyPads | None = None
+        if imperfections is not None and imperfections.poses and poses is not None:
+            response = read_weight(imperfections.weight, self.n_pads)
+            self.heavy = HeavyPads(response, poses, imperfections.poses)
 
     def temperature(self, seconds: float) -> float:
         """Return the temperature, in °C, that the hub measures at a simulated time in s.
@@ -105,6 +114,8 @@ class SimulatedCubes:
         if self._thermal is not None:
             thermal_stress, warm = self._thermal.at(seconds)
             pad_stress += thermal_stress
+        if self.heavy is not None:
+            pad_stress += self.heavy.stress(seconds)
         # Imperfections change the stress that determines a pad's frequency.
         if self._behaviour is not None:
             pad_stress = self._behaviour.reported(pad_stress, seconds)
@@ -200,6 +211,7 @@ def hub_cubes(
         ConfigError: Cubes of one hub have different numbers of pads.
     """
     hubs = []
+    poses = skin.poses
     for number, link in enumerate(skin.links):
         members = hub_members(skin, link.name)
         present = members[members != ABSENT]
@@ -219,6 +231,7 @@ def hub_cubes(
             drift=drift,
             imperfections=imperfections,
             seed=number,
+            poses=CubePoses(*(column[present] for column in poses)),
         )
         hubs.append(HubCubes(link, members, cubes))
     return hubs

@@ -1,7 +1,7 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
 """Deviations of real pads from their calibrations: spread of gains, creep with hysteresis, failure,
-and the effects of temperature (`temperature.py`).
+and the effects of temperature (`temperature.py`) and of weight (`motion.py`).
 
 The foam of the pads creeps: under a constant stress, its strain keeps growing, and so does the
 stress that a pad reports. In linear viscoelasticity, the compliance J (strain per stress) is a
@@ -97,13 +97,19 @@ _SCHEMA = Schema(
             "pad_drift": real("a relative change per K"),
             "pad_drift_spread": real("a number from 0 up", minimum=0),
             "layer_spread": real("a number from 0 to 0.3", minimum=0, maximum=0.3),
+            "poses": {
+                "type": "array",
+                "items": list_of(real("a number"), "numbers", 2) | {"minItems": 7, "maxItems": 7},
+                "description": "[[seconds, x, y, z, roll, pitch, yaw], ...]",
+            },
+            "weight": TEXT,
             "seed": integer(0, MAX_SEED, "a whole number from 0 up"),
         },
     )
 )
 
-_PAIRS = {"creep", "temperature", "air"}
-"""Names of the fields of `Imperfections` that hold pairs of numbers."""
+_TABLES = {"creep", "temperature", "air", "poses"}
+"""Names of the fields of `Imperfections` that hold rows of numbers."""
 
 
 @dataclass(frozen=True)
@@ -132,6 +138,11 @@ class Imperfections:
             K, because of its electronics.
         pad_drift_spread: Standard deviation of a pad's `pad_drift` divided by the mean.
         layer_spread: Standard deviation of the layer's height at a cube divided by the mean.
+        poses: Times in s, positions in m, and roll, pitch, yaw in rad of the parent frame of the
+            skin in the world, whose z axis points up; half cosines in between. Empty: cubes and
+            elastomer weigh nothing.
+        weight: File of `./cube fem --weight -o` with the stress of the pads by specific force, or
+            the name of a shipped one.
         seed: Seed of the random numbers that determine the deviation of each pad.
 
     Raises:
@@ -151,17 +162,19 @@ class Imperfections:
     pad_drift: float = 1e-4
     pad_drift_spread: float = 0.0
     layer_spread: float = 0.0
+    poses: tuple[tuple[float, ...], ...] = ()
+    weight: str = "cube_11mm"
     seed: int = 0
 
     def __post_init__(self) -> None:
-        # The pairs are tuples here, but lists in a file, which the schema describes.
+        # The rows are tuples here, but lists in a file, which the schema describes.
         values = asdict(self)
-        for name in _PAIRS:
-            values[name] = [list(pair) for pair in getattr(self, name)]
+        for name in _TABLES:
+            values[name] = [list(row) for row in getattr(self, name)]
         for _, mistake in _SCHEMA.mistakes(values):
             raise ConfigError(mistake)
-        for name in ("temperature", "air"):
-            times = [time for time, _ in getattr(self, name)]
+        for name in ("temperature", "air", "poses"):
+            times = [time for time, *_ in getattr(self, name)]
             if times != sorted(set(times)):
                 raise ConfigError(f"{name}: found the times {times} s, allowed: rising times")
         # With more growth, a pad would report a negative stress at the begin of a load, because the
@@ -186,8 +199,8 @@ def read_imperfections(path: Path) -> Imperfections:
     for _, mistake in _SCHEMA.mistakes(data):
         raise ConfigError(f"{path}: {mistake}")
     # Lists become tuples, because an instance of `Imperfections` is immutable.
-    for name in _PAIRS & data.keys():
-        data[name] = tuple((first, second) for first, second in data[name])
+    for name in _TABLES & data.keys():
+        data[name] = tuple(map(tuple, data[name]))
     return Imperfections(**data)
 
 

@@ -91,7 +91,8 @@ class SimulatedSource:
     delivers them. All rows of scan k have the sequence number k and the stamp k × period, in ns
     since the start of the load script. Frequencies are rounded as those of a real hub: whole mHz,
     in Hz as float32. They are NaN for pads that a cube does not have or whose oscillator stopped.
-    The temperature is unknown (NaN) unless the imperfections state it.
+    The temperature is unknown (NaN) unless the imperfections state it, and the rows have specific
+    forces if the imperfections state poses.
 
     Attributes:
         skin: Skin to simulate.
@@ -175,6 +176,7 @@ class SkinPads:
         cubes = [hub.skin_cubes for hub in self._hubs]
         self._cube = np.concatenate(cubes).astype(np.uint16)
         self._n_pads = max(hub.cubes.n_pads for hub in self._hubs)
+        self._is_moving = any(hub.cubes.heavy for hub in self._hubs)
 
     def rows(
         self,
@@ -195,11 +197,14 @@ class SkinPads:
         seconds = 1e-6 * time_us
         millihertz = np.full((count, self._n_pads), NOT_MEASURED, np.uint32)
         temperature = np.empty(count, np.float32)
+        force = np.empty((count, 3), np.float32)
         for hub in self._hubs:
             cubes = hub.skin_cubes
             own = hub.cubes.frequency(stress[cubes], gradient[cubes], seconds)
             millihertz[cubes, : hub.cubes.n_pads] = own
             temperature[cubes] = hub.cubes.temperature(seconds)
+            if hub.cubes.heavy is not None:
+                force[cubes] = hub.cubes.heavy.specific_force(seconds)
         # The rows are sorted link by link, as the driver delivers them.
         millihertz, temperature = millihertz[self._cube], temperature[self._cube]
 
@@ -214,4 +219,5 @@ class SkinPads:
             temperature=temperature,
             pad_fault=np.zeros(count, np.uint32),
             status=np.zeros(count, np.uint16),
+            specific_force=force[self._cube] if self._is_moving else None,
         )

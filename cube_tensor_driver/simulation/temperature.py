@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.polynomial.legendre import legvander
 
-from ..config.package_data import package_data
+from ..config.package_data import find_shipped
 from ..config.yaml import read_yaml
 from ..core.arrays import Array
 from ..core.errors import ConfigError
@@ -68,8 +68,8 @@ def read_thermal_stress(name: str, n_pads: int) -> ThermalLayer:
     Raises:
         ConfigError: There is no such file, or it has another number of pads.
     """
-    shipped = package_data() / "config" / "thermal" / f"{name}.yaml"
-    data = read_yaml(shipped if shipped.is_file() else Path(name))
+    advice = "a file of ./cube fem --temperature"
+    data = read_yaml(find_shipped("thermal/*.yaml", name, Path(), advice))
     try:
         pads = np.array(data["pads"], float)
         layer = ThermalLayer(

@@ -9,6 +9,8 @@ import numpy as np
 from . import rows
 from .contract import Columns, HealthState, Offsets, Results, Tables
 
+__all__ = ["native", "run"]
+
 try:
     from ... import _scan as native
 except ImportError:

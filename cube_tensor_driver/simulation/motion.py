@@ -1,0 +1,99 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
+"""A simulated skin that moves: specific force at its cubes, and the stress of their pads by it.
+
+The parent frame of the skin has the position p(t) and rotation R(t) in the world, whose z axis
+points up. An accelerometer in a cube with the position r and rotation C in the parent frame
+measures the specific force, acceleration minus gravity::
+
+    s = (R C)^T (d²(p + R r)/dt² + g z)
+
+The stress of the pads is linear in s. Finite elements (`./cube fem --weight`) have computed it from
+the densities of cube and elastomer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..config.calibration import read_calibration
+from ..config.package_data import find_shipped
+from ..core.arrays import Array
+from ..core.compensation.weight import STANDARD_GRAVITY
+from ..core.errors import ConfigError
+from ..core.poses import CubePoses
+from ..core.tensor import rotation_from_rpy
+
+STEP_S = 1e-3
+"""Step, in s, of the second differences that yield accelerations. At 5 Hz, their error is below
+1e-4 of the acceleration."""
+
+
+def read_weight(name: str, n_pads: int) -> Array:
+    """Return the stress of the pads per specific force (P, 3), in Pa per m/s².
+
+    Args:
+        name: File of `./cube fem --weight -o`, or the name of a shipped one.
+        n_pads: Number of pads P that the cubes have.
+
+    Raises:
+        ConfigError: There is no such file, it states no weight, or is for another number of pads.
+    """
+    path = find_shipped("weight/*.yaml", name, Path(), "a file of ./cube fem --weight")
+    model = read_calibration(path).weight
+    if model is None or model.n_pads != n_pads:
+        raise ConfigError(
+            f"{path}: no weight of cubes with {n_pads} pads; compute it with ./cube fem --weight "
+            "for their layout"
+        )
+    return model.response
+
+
+class HeavyPads:
+    """Specific force at some cubes of a moving skin, and the stress of their pads by it."""
+
+    def __init__(
+        self,
+        response: Array,
+        poses: CubePoses,
+        knots: Sequence[Sequence[float]],
+    ) -> None:
+        """Prepare the motion.
+
+        Args:
+            response: Stress of the pads per specific force (P, 3), in Pa per m/s².
+            poses: Poses of the cubes in the parent frame of the skin.
+            knots: Poses of the parent frame over time, as `Imperfections.poses` defines them.
+        """
+        self._response = response
+        self._cubes = poses
+        self._times, *self._columns = np.array(knots).T
+        self._numbers = np.arange(len(knots))
+
+    def _pose(self, seconds: float) -> tuple[Array, Array]:
+        """Return position (3,), in m, and rotation (3, 3) of the parent frame at a time in s."""
+        number = np.interp(seconds, self._times, self._numbers)
+        begin = np.floor(number)
+        eased = begin + 0.5 * (1 - np.cos(np.pi * (number - begin)))
+        values = [np.interp(eased, self._numbers, column) for column in self._columns]
+        return np.array(values[:3]), rotation_from_rpy(*values[3:])
+
+    def specific_force(self, seconds: float) -> Array:
+        """Return the specific force at each cube in its own frame (cubes, 3), in m/s²."""
+        times = seconds - STEP_S, seconds, seconds + STEP_S
+        poses = [self._pose(time) for time in times]
+        before, now, after = (p + self._cubes.position @ rotation.T for p, rotation in poses)
+        in_world = (after - 2 * now + before) / STEP_S**2
+        in_world[:, 2] += STANDARD_GRAVITY
+        _, rotation = poses[1]
+        to_world = rotation @ self._cubes.rotation
+        force: Array = (in_world[:, None] @ to_world)[:, 0]
+        return force
+
+    def stress(self, seconds: float) -> Array:
+        """Return the stress of the pads by weight and inertia (cubes, P), in Pa."""
+        stress: Array = self.specific_force(seconds) @ self._response.T
+        return stress
