@@ -5,72 +5,51 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cube_tensor_design.studies.pads_study import FORMS, study_pads
+from cube_tensor_design.studies.pads_study import study_pads
 from cube_tensor_design.studies.traction_study import (
     MAIN,
     PITCHES,
     WRONG,
     Errors,
-    Setting,
     traction_study,
 )
-from cube_tensor_driver.config.output_files import atomic_write
+from cube_tensor_driver.config.output_files import atomic_write, to_json
 from cube_tensor_driver.mechanics.influence import Influence
 
 from ..bench.contacts import SCANS, Outcomes, summarise
 
-Table = dict[str, Any]
-"""A table: what it is about, its columns, its rows."""
-
 WIDTHS = [2e-3, 5e-3, 10e-3, 20e-3]
-"""Widths of the simulated contacts, in m; each table has one line for each width."""
+"""Widths of the simulated contacts, in m; each table has one row for each width."""
 WRONG_WIDTHS = [5e-3, 15e-3]
 """Widths, in m, of the contacts for the table about assumptions (such as depth) that are wrong."""
 BALL_LOADS = 100
-"""Number of random loads by a ball from which one line of a table is computed."""
+"""Number of random loads by a ball from which one row of a table is computed."""
 PAD_LOADS = 40
-"""Number of random loads from which one line of the table is computed that compares cubes modelled
+"""Number of random loads from which one row of the table is computed that compares cubes modelled
 as points and as pads."""
 FEW_LOADS = 6
-"""Number of random loads from which one line of the other tables is computed."""
+"""Number of random loads from which one row of the other tables is computed."""
 SEED = 7031
 """Seed of the random loads. No setting of the methods was chosen by results with this seed."""
 
-METHOD_COLUMNS = [
-    "contact width, mm",
-    "pressure field, relative rms error: interpolation, inverse, inverse with contacts",
-    "normal force, relative rms error in %: interpolation, inverse",
-    "position, 95th percentile of the error in mm: interpolation, inverse",
-    "force, rms error / predicted deviation: interpolation, inverse",
-    "position, rms error / predicted deviation: interpolation, inverse",
-    "pressure field of the inverse with contacts, rms error / predicted deviation: at the depth of "
-    "the cubes, on the surface",
-]
-"""Columns of the tables that compare methods: interpolation, inverse, inverse with contacts.
-
-Each row of a table is one width of the contact.
-"""
-FORM_COLUMNS = [
-    "contact width, mm",
-    "pressure field, relative rms error: points, pads",
-    "normal force, relative rms error in %: points, pads",
-    "position, 95th percentile of the error in mm: points, pads",
-    "force, rms error / predicted deviation: points, pads",
-    "position, rms error / predicted deviation: points, pads",
-]
-"""Columns of the tables that compare two models of a cube: stress at a point, or the real pads.
-
-Each row of a table is one width of the contact.
-"""
-FORM_DIGITS = (3, 1, 2, 2, 2)
-"""Number of decimals of each quantity in `FORM_COLUMNS` after the width."""
+QUANTITIES = {
+    "field": "rms error of the pressure over its rms: interpolation, inverse, inverse with "
+    "contacts",
+    "force": "rms error of the normal force over the force: interpolation, inverse with contacts",
+    "position": "95th percentile of the position's error in m: interpolation, inverse with "
+    "contacts; 0.04 for a contact that was not found",
+    "ratio": "rms error over predicted deviation of force and position: of interpolation, of the "
+    "inverse with contacts",
+    "field_ratio": "rms error over predicted deviation of the pressure of the inverse with "
+    "contacts: at the depth of the cubes, on the surface",
+}
+"""Quantities of each row: name, which is that of the attribute of `Errors`, and meaning."""
 
 
 def write_contact_tables(path: Path, true_pads: Influence, shapes: Outcomes) -> None:
@@ -83,94 +62,48 @@ def write_contact_tables(path: Path, true_pads: Influence, shapes: Outcomes) -> 
     """
     tables = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     tables |= contact_tables(true_pads)
-    tables["shapes"] = shape_table(shapes)
-    text = json.dumps(tables, indent=1, ensure_ascii=False)
-    # Each row of a table is written on one line: line breaks within a row, which are followed by
-    # more than three blanks, become single blanks.
-    text = re.sub(r"\n(?: {4,}| {3}(?=\]))", " ", text)
+    tables["shapes"] = {
+        "loads in each row": max(map(len, shapes.values())),
+        "scans of each load": SCANS,
+        "rows": {
+            name: {key: _round(value) for key, value in figures.items()}
+            for name, figures in summarise(shapes).items()
+        },
+    }
     with atomic_write(path) as partial:
-        partial.write_text(text + "\n", encoding="utf-8")
+        partial.write_text(to_json(tables) + "\n", encoding="utf-8")
 
 
-def contact_tables(true_pads: Influence) -> dict[str, Table]:
-    """Run the studies and return their tables by name."""
+def contact_tables(true_pads: Influence) -> dict[str, Any]:
+    """Run the studies and return their tables by name: 3 N press and 0.9 N rub."""
     balls = traction_study((*MAIN, *PITCHES), WIDTHS, BALL_LOADS, SEED)
+    by_pitch = {
+        f"{setting.cubes}, pitch {1e3 * setting.pitch:g} mm": errors
+        for setting, errors in balls.items()
+    }
     wrong = traction_study(list(WRONG.values()), WRONG_WIDTHS, FEW_LOADS, SEED)
+    by_assumption = {name: wrong[setting] for name, setting in WRONG.items()}
     forms = study_pads(true_pads, WIDTHS, PAD_LOADS, SEED)
+    by_form = {f"{setting.cubes} as {form}": errors for (setting, form), errors in forms.items()}
     return {
-        "balls, pitch 8 mm, depth 5 mm": {
-            "about": f"3 N normal, 0.9 N tangential, {BALL_LOADS} loads for each line. A contact "
-            "that was not found counts as 40 mm.",
-            "columns": ["cubes", *METHOD_COLUMNS],
-            "rows": _method_rows({setting.cubes: balls[setting] for setting in MAIN}),
-        },
-        "balls, pitches 12 and 24 mm, depth 4 mm": {
-            "about": f"As above, {BALL_LOADS} loads for each line.",
-            "columns": ["cubes and pitch", *METHOD_COLUMNS],
-            "rows": _method_rows(
-                {f"{one.cubes}, {1e3 * one.pitch:g} mm": balls[one] for one in PITCHES}
-            ),
-        },
-        "wrong assumptions": {
-            "about": f"24-pad cubes, pitch 8 mm, depth 5 mm, {FEW_LOADS} loads for each line.",
-            "columns": ["assumption", *METHOD_COLUMNS],
-            "rows": _method_rows({name: wrong[setting] for name, setting in WRONG.items()}),
-        },
-        "cubes as points and as pads": {
-            "about": f"Layer of 11 mm, cubes in its middle, pitch 8 mm, {PAD_LOADS} loads for each "
-            "line, inverse with contacts.",
-            "columns": ["cubes", *FORM_COLUMNS],
-            "rows": _form_rows(forms),
-        },
+        "quantities": QUANTITIES,
+        "balls": _table(by_pitch, BALL_LOADS),
+        "wrong assumptions": _table(by_assumption, FEW_LOADS),
+        "cubes as points and as pads in a layer of 11 mm": _table(by_form, PAD_LOADS),
     }
 
 
-def shape_table(outcomes: Outcomes) -> Table:
-    """Return the table of the errors of each shape on each skin."""
-    summary = summarise(outcomes)
-    loads = max(map(len, outcomes.values()))
-    rows = []
-    for name, figures in summary.items():
-        rows.append([name, *(float(f"{value:.2g}") for value in figures.values())])
-    return {
-        "about": f"3 N normal, 0.9 N tangential, {loads} loads for each line, after {SCANS} scans. "
-        "Contacts of one load count together. CPU times are those of one machine.",
-        "columns": ["load, cubes and pitch", *next(iter(summary.values()))],
-        "rows": rows,
-    }
-
-
-def _method_rows(results: Mapping[str, Sequence[Errors]]) -> list[list[Any]]:
-    rows = []
+def _table(results: Mapping[str, Sequence[Errors]], loads: int) -> dict[str, Any]:
+    """Return the table of the errors of each skin and width, from a number of loads for each."""
+    rows = {}
     for name, all_widths in results.items():
-        for one in all_widths:
-            ratios = [[round(before, 1), round(now, 2)] for before, now in one.ratio.T.tolist()]
-            rows.append(
-                [
-                    name,
-                    round(1e3 * one.width),
-                    one.field.round(3).tolist(),
-                    (100 * one.force).round(1).tolist(),
-                    (1e3 * one.position).round(2).tolist(),
-                    *ratios,
-                    one.field_ratio.round(2).tolist(),
-                ]
-            )
-    return rows
+        for errors in all_widths:
+            row = {quantity: _round(getattr(errors, quantity)) for quantity in QUANTITIES}
+            rows[f"{name}, contact width {1e3 * errors.width:g} mm"] = row
+    return {"loads in each row": loads, "rows": rows}
 
 
-def _form_rows(
-    results: Mapping[tuple[Setting, str], Sequence[Errors]],
-) -> list[list[Any]]:
-    rows = []
-    for setting in dict.fromkeys(setting for setting, _ in results):
-        for both in zip(*(results[setting, form] for form in FORMS), strict=True):
-            forms = [
-                [one.field[2], 100 * one.force[1], 1e3 * one.position[1], *one.ratio[1]]
-                for one in both
-            ]
-            # Each quantity is a column, with one number for each form.
-            columns = zip(np.transpose(forms), FORM_DIGITS, strict=True)
-            rounded = [column.round(digits).tolist() for column, digits in columns]
-            rows.append([setting.cubes, round(1e3 * both[0].width), *rounded])
-    return rows
+def _round(values: Any) -> Any:
+    """Return a number, or an array as nested lists, with three significant digits."""
+    rounded = [float(f"{value:.3g}") for value in np.ravel(values)]
+    return np.reshape(rounded, np.shape(values)).tolist()
