@@ -50,7 +50,7 @@ HOMES = {
     "yaml": {"config"},
     "jsonschema": {"config"},
     "rich": {"cli", "views", "cube_tensor_design", "cube_tensor_hub", "workshop"},
-    "psutil": {"demo", "workshop"},
+    "psutil": {"demo", "cube_tensor_design", "workshop"},
     "matplotlib": {"views", "cube_tensor_design", "workshop"},
     "scipy": {"mechanics", "touch", "views", "browser", "cube_tensor_design"},
     "rosbags": {"bags", "lerobot"},

@@ -5,8 +5,8 @@
 from __future__ import annotations
 
 import resource
-from pathlib import Path
 
+import psutil
 import skfem
 
 from cube_tensor_driver.core.errors import ElasticError
@@ -31,7 +31,7 @@ def check_memory(grid: skfem.Mesh, bytes_per_corner: float | None = None) -> Non
     per_corner = bytes_per_corner or BYTES_PER_CORNER[int(grid.dim())]
     needed = FIXED_BYTES + grid.nvertices * per_corner
     available = available_memory()
-    if available is not None and needed > available:
+    if needed > available:
         raise ElasticError(
             f"this needs about {needed / 1e9:.2g} GB of memory and "
             f"{max(available, 0.0) / 1e9:.2g} GB are available; ask for fewer meshes or wider "
@@ -39,22 +39,12 @@ def check_memory(grid: skfem.Mesh, bytes_per_corner: float | None = None) -> Non
         )
 
 
-def available_memory() -> float | None:
-    """Return the bytes that this process may still take, limited by the machine and by ulimit.
-
-    Returns:
-        None where the number is unknown, on systems other than Linux; then no mesh is refused.
-    """
-    try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        # The kernel's estimate of what can be taken without swapping, in kB.
-        (line,) = (line for line in lines if line.startswith("MemAvailable"))
-        free = 1024.0 * float(line.split()[1])
-        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-        if limit == resource.RLIM_INFINITY:
-            return free
-        # The limit counts what this process has taken already.
-        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-        return min(free, float(limit - resource.getpagesize() * pages))
-    except (OSError, ValueError):
-        return None
+def available_memory() -> float:
+    """Return the bytes that this process may still take, limited by the machine and by ulimit."""
+    free = float(psutil.virtual_memory().available)
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if limit == resource.RLIM_INFINITY:
+        return free
+    # The limit counts what this process has taken already.
+    taken = psutil.Process().memory_info().vms
+    return min(free, float(limit - taken))

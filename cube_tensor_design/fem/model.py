@@ -43,6 +43,13 @@ DEFAULT_LAYOUT = "planar"
 """Name of the layout (places of the pads) of a model file that names none."""
 
 _NUMBER = real("a number in SI units")
+_POSITIVE = real("a positive number in SI units", exclusiveMinimum=0)
+# The elements do not lock close to 0.5, but at 0.5 pressure is no longer a function of strain.
+_POISSON = real(
+    "a number in [0, 0.5), for rubber 0.48 to 0.4999",
+    minimum=0,
+    exclusiveMaximum=0.5,
+)
 _MODES = list_of(TEXT, "names of modes") | {
     "minItems": 0,
     "description": "a list of modes",
@@ -53,11 +60,10 @@ _SYMMETRY = {
     "description": "full, slab, mirrors or none",
 }
 _PLANE = {"enum": ["strain", "stress"], "description": "strain or stress"}
-_MATERIAL = ("young", "poisson", "expansion", "density")
-# `Body` checks the ranges.
-_BODY = dict.fromkeys(("width", "depth", "height", *_MATERIAL), _NUMBER)
-_CUBE = {**dict.fromkeys(("side", "x", "z", *_MATERIAL), _NUMBER), "rigid": _RIGID}
-_PADS = dict.fromkeys(("width", "centre"), _NUMBER)
+_MATERIAL = {"young": _POSITIVE, "poisson": _POISSON, "expansion": _NUMBER, "density": _POSITIVE}
+_BODY = {"width": _POSITIVE, "depth": _POSITIVE, "height": _POSITIVE, **_MATERIAL}
+_CUBE = {"side": _POSITIVE, "x": _NUMBER, "z": _NUMBER, **_MATERIAL, "rigid": _RIGID}
+_PADS = {"width": _NUMBER, "centre": _NUMBER}
 _SCHEMA = Schema(
     mapping(
         (),

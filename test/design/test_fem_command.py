@@ -280,9 +280,9 @@ def refused(capsys, arguments, words):
 @pytest.mark.parametrize(
     ("model", "words"),
     [
-        ("body: {poisson: 0.5}", ["body.poisson is 0.5", "[0, 0.5)"]),
-        ("cube: {poisson: 0.5}", ["cube.poisson is 0.5", "[0, 0.5)"]),
-        ("cube: {side: -1.0}", ["cube.side is -1", "positive number"]),
+        ("body: {poisson: 0.5}", ["body.poisson: found 0.5", "[0, 0.5)"]),
+        ("cube: {poisson: 0.5}", ["cube.poisson: found 0.5", "[0, 0.5)"]),
+        ("cube: {side: -1.0}", ["cube.side: found -1", "positive number"]),
         ("cube: {z: 0.004}", ["4 mm off the body's centre along z", "3.3 mm off at most"]),
         ("cube: {side: 0.011}", ["side is 11 mm", "height is 11 mm"]),
         (
