@@ -12,7 +12,6 @@ from ..core.arrays import Array
 from ..touch.surface import Surface
 from ..views import scene
 from ..views.scene import QUANTITIES, Quantity
-from . import markup
 from .scan import Scan
 from .surface_field import DEVIATION
 
@@ -77,18 +76,3 @@ class Colouring(NamedTuple):
     def colours(self, values: Array) -> Array:
         """Return the colours (N, 3), from 0 to 1, of values (N,) in SI units; NaN is grey."""
         return scene.colours(self.quantity, values, self.top)
-
-    def text(self, cube: int) -> str:
-        """Return the value of a cube as text with its unit.
-
-        For pressure and its standard deviation, the pressure at the surface above the cube is
-        added if it is known.
-
-        Args:
-            cube: Index of the cube in the skin.
-        """
-        value = markup.value(self.quantity, float(self.cubes[cube]))
-        if self.above is None or self.quantity not in (QUANTITIES["pressure"], DEVIATION):
-            return value
-        surface = markup.surface_pressure(*self.above[cube])
-        return f"pressure {surface}" if self.quantity is DEVIATION else f"{value}, {surface}"

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from html import escape
@@ -150,31 +149,6 @@ def unit(name: str) -> tuple[float, str]:
     return (1e6, "kPa/mm") if "_" in name else (1e3, "kPa")
 
 
-def value(quantity: scene.Quantity, si_value: float) -> str:
-    """Return text with the label of a quantity, its value and its unit; "unknown" for NaN.
-
-    Args:
-        quantity: The quantity, which has a label and a unit for users.
-        si_value: Its value in SI units, which is converted to the unit for users.
-    """
-    if math.isnan(si_value):
-        return "unknown"
-    return f"{quantity.label} {_hundredths(si_value / quantity.size)} {quantity.unit}"
-
-
-def surface_pressure(pressure: float, sigma: float) -> str:
-    """Return text in kPa for a pressure on the surface of the skin.
-
-    Args:
-        pressure: The pressure, in Pa; NaN if it is unknown.
-        sigma: Its standard deviation, in Pa.
-    """
-    if np.isnan(pressure):
-        return "on the surface unknown"
-    deviation = "unknown" if np.isnan(sigma) else f"{sigma / 1e3:.2f}"
-    return f"on the surface {_hundredths(pressure / 1e3)} ± {deviation} kPa"
-
-
 def clock(seconds: float) -> str:
     """Return a duration in seconds as text, such as "12.3 s" or "3 min 12.3 s"."""
     minutes, rest = divmod(round(seconds, 1), 60)
@@ -308,18 +282,23 @@ def _typical(sigma: Array | None) -> str:
     return f", ±&nbsp;{np.median(known) / 1e3:.2g}&nbsp;kPa" if len(known) else ""
 
 
-def numbers(scan: Scan, cube: int) -> str:
+def numbers(scan: Scan, cube: int, above: Array | None) -> str:
     """Return an HTML table of a cube's observed components, residual, sampling rate and state.
 
     Args:
         scan: Values of all cubes.
         cube: Index of the cube.
+        above: (2,) pressure on the surface above the cube and its standard deviation, in Pa; None
+            or NaN if they are unknown.
     """
     rows = []
     for name, si_value in zip(COMPONENTS, scan.values[cube], strict=True):
         size, unit_name = unit(name)
         if np.isfinite(si_value):
             rows.append((label(name), f"{si_value / size:+.3f}", unit_name))
+    if above is not None and np.isfinite(above).all():
+        pressure, deviation = 1e-3 * above
+        rows.append(("on the surface", f"{pressure:.2f} ± {deviation:.2f}", "kPa"))
     rows.append(("residual", f"{scan.residual[cube]:.2f}", "× noise"))
     rows.append(("rate", f"{scan.rate[cube]:.0f}", "Hz"))
     rows.append(
@@ -328,9 +307,13 @@ def numbers(scan: Scan, cube: int) -> str:
     return box(_table(rows))
 
 
-def _hundredths(number: float) -> str:
-    text = f"{number:.2f}"
-    return "0.00" if text == "-0.00" else text
+def contacts(scan: Scan) -> str:
+    """Return an HTML table of the position and the forces of each contact, strongest first."""
+    rows = []
+    for contact in scan.contacts:
+        x, y, z = 1e3 * contact.position
+        rows.append((f"{x:.1f}, {y:.1f}, {z:.1f} mm", newtons(contact), ""))
+    return box(_table(rows) if rows else "none")
 
 
 def conditions(names: list[str], scan: Scan) -> str:

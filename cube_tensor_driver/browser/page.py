@@ -1,6 +1,6 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""The page of the browser view: the skin in 3-D, controls, plots, and the skin from above.
+"""The page of the browser view: the skin in 3-D, controls and plots.
 
 It uses viser but not ROS. Each browser has a page of its own, with its own settings.
 """
@@ -51,6 +51,17 @@ The origin of the scene is the centre of the skin, and `SPAN` is the length of i
 
 CAMERA_TARGET = np.array([0.0, -0.04, 0.0]) * SPAN
 """Point of the scene at which the camera looks; the origin is the centre of the skin."""
+
+INCLINED = "inclined"
+"""Name of the direction from which the camera looks at first."""
+
+CAMERA_DIRECTIONS = {
+    INCLINED: CAMERA_POSITION - CAMERA_TARGET,
+    # Exactly from above, it would not be known which side of the skin is up in the picture.
+    "from above": np.array([0.0, -0.01, 1.4]) * SPAN,
+}
+"""Name of a direction from which the camera looks -> vector in the scene from the point at which it
+looks to the camera."""
 
 PHONE_TARGET = np.array([0.0, -0.45, -0.3]) * SPAN
 """Point of the scene at which the camera looks on a phone.
@@ -268,21 +279,27 @@ class Page:
 
         with gui.add_folder("numbers of the chosen cube"):
             objects["numbers"] = gui.add_html("")
+        with gui.add_folder("contacts"):
+            objects["contacts"] = gui.add_html("")
         with gui.add_folder("what is drawn"):
             objects["meaning"] = gui.add_html("")
             self._parts = add_part_controls(gui)
+            view = gui.add_button_group("camera", tuple(CAMERA_DIRECTIONS))
+
+        @view.on_click
+        def _(_: object) -> None:
+            place_camera(self._client, self._layout, str(view.value))
+
         with gui.add_folder("health"):
             objects["health"] = gui.add_html("")
 
     def _make_panel(self, gui: viser.GuiApi) -> None:
-        """Add the second panel with two tabs: plots over time, and the skin from above."""
+        """Add the second panel, with plots over time."""
         panel = gui.add_panel()
         plots = panel.add_tab("plots of 10 s", viser.Icon.CHART_LINE)
         self._charts = Charts(gui, plots, self._skin.names)
         for number, one in enumerate(self._charts.lists):
             self._objects[f"chart list {number}"] = one
-        with panel.add_tab("from above", viser.Icon.MAP):
-            self._objects["from above"] = gui.add_html("")
         panel.dock_left()
         panel.set_width(LEFT_WIDTH)
         if self._layout.is_folded:
@@ -366,7 +383,13 @@ def set_up(
     client.scene.set_background_image(pixel, "png")
     client.gui.set_panel_label(name)
     client.gui.main_panel.dock_right()
+    place_camera(client, layout, INCLINED)
 
+
+def place_camera(client: viser.ClientHandle, layout: Layout, direction: str) -> None:
+    """Look at the skin from one of `CAMERA_DIRECTIONS`; unknown texts do nothing."""
+    if direction not in CAMERA_DIRECTIONS:  # a browser may send any text
+        return
     camera = client.camera
-    camera.position = layout.target + layout.distance * (CAMERA_POSITION - CAMERA_TARGET)
+    camera.position = layout.target + layout.distance * CAMERA_DIRECTIONS[direction]
     camera.look_at = layout.target

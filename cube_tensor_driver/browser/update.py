@@ -19,7 +19,6 @@ from .history import History
 from .scan import Scan
 from .scene_3d import Scene, Update
 from .surface_field import DEVIATION, FieldModel
-from .top_view import TopView
 
 MAX_SURFACE_POINTS = 5000
 """Approximate maximum of the number of points of the skin's surface at which the field (pressure
@@ -38,7 +37,6 @@ class ShownSkin:
         surface: Grid of points around the cubes at which the field (pressure and shear) is drawn.
         field: Computes the field at these points.
         scene: The skin in 3-D.
-        top_view: Drawing of the skin from above.
     """
 
     def __init__(
@@ -49,7 +47,7 @@ class ShownSkin:
         calibrations: Sequence[Calibration],
         depth: float,
     ) -> None:
-        """Prepare the points of the field, the 3-D view and the top view of the skin.
+        """Prepare the points of the field and the 3-D view of the skin.
 
         Args:
             name: Name of the skin.
@@ -65,7 +63,6 @@ class ShownSkin:
         self.surface = Surface(poses, depth, int(points_per_side))
         self.field = FieldModel(self.surface, calibrations)
         self.scene = Scene(names, poses, self.surface)
-        self.top_view = TopView(names, poses, self.surface)
 
 
 class Choices(NamedTuple):
@@ -117,16 +114,15 @@ def build_update(
     ranges = before.follow(scan.values, scan.residual, colouring.top)
     update = skin.scene.draw(scan, colouring, choices.parts, cube, ranges)
 
-    # A tool tip cannot be read while the page changes ten times a second.
-    above = skin.top_view.draw(colouring, scan.contacts, cube, with_texts=choices.is_paused)
+    above = None if colouring.above is None else colouring.above[cube]
     # Each text is the content of an HTML element of the same name (page.py).
     texts = {
         "headline": markup.headline(scan, choices.is_paused, choices.is_recording),
         "legend": markup.legend(choices.quantity, colouring.top, scan.field),
         "meaning": markup.explanation(skin.scene.bar, *skin.scene.per_bar(ranges), scan.field),
-        "numbers": markup.numbers(scan, cube),
+        "numbers": markup.numbers(scan, cube, above),
+        "contacts": markup.contacts(scan),
         "health": markup.conditions(skin.names, scan),
-        "from above": above,
     }
     update |= {name: {"content": text} for name, text in texts.items()}
     for number, chart in enumerate(choices.charts):

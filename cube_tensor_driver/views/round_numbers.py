@@ -39,17 +39,3 @@ def round_range(low: float, high: float) -> tuple[float, float]:
     n_below = np.floor(min(low, 0) / step)
     n_above = np.ceil(max(high, 0) / step)
     return float(n_below * step), float(n_above * step)
-
-
-def round_ticks(
-    low: float,
-    high: float,
-    step: float,
-) -> list[float]:
-    """Return the numbers on an axis: all multiples of `step` from `low` to `high`.
-
-    They are rounded to six significant digits.
-    """
-    first, last = np.ceil(low / step), np.floor(high / step)
-    numbers = np.arange(first, last + 1)
-    return [float(f"{number * step:.6g}") for number in numbers]

@@ -111,30 +111,29 @@ class PageReader(threading.Thread):
         texts = [str(one.get("content", "")) for one in self._objects.values()]
         (headline,) = [text for text in texts if "cubes" in text and "⬤" in text] or [""]
         (table,) = [text for text in texts if "residual</td>" in text] or [""]
-        (above,) = [text for text in texts if "<svg" in text] or [""]
+        (contacts,) = [text for text in texts if " mm</td>" in text] or [""]
         force = re.search(r"([0-9.]+)&nbsp;N", headline)
         zz = re.search(r"σzz</td><td[^>]*>([-+0-9.]+)<", table)
-        tip = re.search(r"c05: pressure −σzz (-?[0-9.]+) kPa, on the surface (-?[0-9.]+)", above)
-        circle = re.search(r">([0-9.]+) N", above)
+        surface = re.search(r"on the surface</td><td[^>]*>(-?[0-9.]+) ± ", table)
+        listed = re.search(r">([0-9.]+) N", contacts)
         legend = [text for text in texts if "linear-gradient" in text]
         top = re.findall(r"<span>([-0-9.]+)</span>", legend[0])[-1] if legend else "nan"
         plots = [one["data"] for one in self._objects.values() if one.get("data")]
         newest = [float(series[-1]) for series in plots[0][1:]] if plots else []
         colours = self._objects.get("/cubes", {}).get("batched_colors")
-        if colours is None or not all((force, zz, circle, newest)):
+        if colours is None or not all((force, zz, listed, newest)):
             return
         self.states.append(
             SimpleNamespace(
                 headline=headline,
                 force=float(force[1]),
                 zz=1e3 * float(zz[1]),
-                tip=1e3 * float(tip[1]) if tip else np.nan,
-                circle=float(circle[1]),
+                listed=float(listed[1]),
                 top=1e3 * float(top),
                 plotted=1e3 * newest[-1],
                 colour=colours.reshape(-1, 3)[CHOSEN].tolist(),
                 rate=re.search(r"([0-9]+) Hz", headline)[1],
-                surface=1e3 * float(tip[2]) if tip else np.nan,
+                surface=1e3 * float(surface[1]) if surface else np.nan,
                 text="".join(texts),
             )
         )
@@ -226,9 +225,9 @@ def test_all_that_a_browser_receives_at_once_is_of_one_scan(page, ros):
         number = round(-state.zz / STEP_PA)
         assert state.zz == pytest.approx(-STEP_PA * number, abs=1)
         assert state.plotted == pytest.approx(state.zz, rel=1e-5)
-        assert state.force == state.circle == pytest.approx(STEP_N * number, abs=0.005)
+        assert state.force == state.listed == pytest.approx(STEP_N * number, abs=0.005)
         # The text has hundredths of a kPa.
-        assert state.tip == state.surface == pytest.approx(-state.zz, abs=5.1)
+        assert state.surface == pytest.approx(-state.zz, abs=5.1)
         assert state.top == pytest.approx(TOP_PA)
         colour = scene.colours(scene.QUANTITIES["pressure"], np.array([-state.zz]), TOP_PA)
         assert state.colour == scene.linear_light(colour)[0].tolist()

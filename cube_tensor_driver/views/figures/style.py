@@ -15,11 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
-import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.image import imsave
-from numpy.typing import NDArray
 
 from ...config.output_files import atomic_write
 from ...core.errors import ConfigError
@@ -123,17 +120,6 @@ def png(figure: Figure) -> bytes:
     """Return a figure as the content of a PNG file."""
     content = io.BytesIO()
     figure.savefig(content, format="png")
-    return content.getvalue()
-
-
-def png_of_pixels(pixels: NDArray[np.uint8]) -> bytes:
-    """Return an image as the content of a PNG file.
-
-    Args:
-        pixels: (rows, columns, 4) red, green, blue and opacity from 0 to 255.
-    """
-    content = io.BytesIO()
-    imsave(content, pixels, format="png")
     return content.getvalue()
 
 
