@@ -280,7 +280,7 @@ class Page:
         with gui.add_folder("numbers of the chosen cube"):
             objects["numbers"] = gui.add_html("")
         with gui.add_folder("contacts"):
-            objects["contacts"] = gui.add_html("")
+            objects["contact list"] = gui.add_html("")
         with gui.add_folder("what is drawn"):
             objects["meaning"] = gui.add_html("")
             self._parts = add_part_controls(gui)

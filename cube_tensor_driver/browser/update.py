@@ -121,7 +121,7 @@ def build_update(
         "legend": markup.legend(choices.quantity, colouring.top, scan.field),
         "meaning": markup.explanation(skin.scene.bar, *skin.scene.per_bar(ranges), scan.field),
         "numbers": markup.numbers(scan, cube, above),
-        "contacts": markup.contacts(scan),
+        "contact list": markup.contacts(scan),
         "health": markup.conditions(skin.names, scan),
     }
     update |= {name: {"content": text} for name, text in texts.items()}

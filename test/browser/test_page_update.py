@@ -129,6 +129,7 @@ class PageReader(threading.Thread):
                 force=float(force[1]),
                 zz=1e3 * float(zz[1]),
                 listed=float(listed[1]),
+                ring=self._objects["/contacts"]["points"],
                 top=1e3 * float(top),
                 plotted=1e3 * newest[-1],
                 colour=colours.reshape(-1, 3)[CHOSEN].tolist(),
@@ -227,6 +228,7 @@ def test_all_that_a_browser_receives_at_once_is_of_one_scan(page, ros):
         assert state.plotted == pytest.approx(state.zz, rel=1e-5)
         assert state.force == state.listed == pytest.approx(STEP_N * number, abs=0.005)
         # The text has hundredths of a kPa.
+        assert np.ptp(state.ring) > 0
         assert state.surface == pytest.approx(-state.zz, abs=5.1)
         assert state.top == pytest.approx(TOP_PA)
         colour = scene.colours(scene.QUANTITIES["pressure"], np.array([-state.zz]), TOP_PA)
