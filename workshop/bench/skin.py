@@ -39,6 +39,7 @@ from cube_tensor_driver.simulation.sample_log import SampleTable
 from cube_tensor_driver.views.figures.style import save
 from cube_tensor_hub.firmware import FirmwareError
 
+from ..torture.memory import median_slope
 from .hubs_in_c import HubLoad, read_samples
 from .scale import draw_scale
 
@@ -67,9 +68,6 @@ MEMORY_PERIOD_S = 0.5
 
 MIN_GROWTH_DURATION_S = 60.0
 """Shortest duration, in seconds, of a measurement for which the growth of memory is reported."""
-
-GROWTH_BLOCKS = 8
-"""Number of equal blocks of time whose mean memory the growth is fitted to."""
 
 
 @dataclass(frozen=True)
@@ -402,33 +400,14 @@ def _measure(
 def summarise_memory(memory_mb: dict[str, list[float]]) -> dict[str, float]:
     """Return the largest memory of any process except the hubs, in MB.
 
-    If the measurement took a minute or more, the growth of the process that grows fastest is
-    returned as well, with its standard error. It is the slope of a line through the means of blocks
-    of time after the first fifth. Means are used because allocators grow in steps, so values that
-    are close in time are not independent.
+    If the measurement took a minute or more, the growth of the process that grows fastest after the
+    first fifth of the time is returned as well.
     """
     nodes = [np.array(values) for name, values in memory_mb.items() if name not in LOADS]
     result = {"rss_mb": round(float(np.max(nodes)), 1)}
-    n_values = len(nodes[0])
-    if n_values * MEMORY_PERIOD_S < MIN_GROWTH_DURATION_S:
+    times_s = MEMORY_PERIOD_S * np.arange(len(nodes[0]))
+    if times_s[-1] + MEMORY_PERIOD_S < MIN_GROWTH_DURATION_S:
         return result
-
-    # The last four fifths of the time are divided among the blocks.
-    block_minutes = 0.8 * n_values * MEMORY_PERIOD_S / 60 / GROWTH_BLOCKS
-    slopes = []
-    for values in nodes:
-        blocks = np.array_split(values[n_values // 5 :], GROWTH_BLOCKS)
-        means = [block.mean() for block in blocks]
-        line, covariance = np.polyfit(
-            block_minutes * np.arange(GROWTH_BLOCKS),
-            means,
-            1,
-            cov=True,
-        )
-        error = np.sqrt(covariance[0, 0])
-        slopes.append((float(line[0]), float(error)))
-    slope, error = max(slopes)
-    return result | {
-        "rss_mb_per_minute": round(slope, 3),
-        "rss_mb_per_minute_error": round(error, 3),
-    }
+    begin = len(times_s) // 5
+    slopes = [median_slope(times_s[begin:], values[begin:]) for values in nodes]
+    return result | {"rss_mb_per_minute": round(60 * max(slopes), 3)}

@@ -12,12 +12,10 @@ import contextlib
 import sys
 import tempfile
 import threading
-import time
 from pathlib import Path
 
 import msgspec
 import viser
-import zstandard
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
@@ -65,30 +63,23 @@ CAMERA = {
 """Message of a client about its camera. The view draws only for clients that have sent one."""
 
 
-class PictureCounter:
-    """A client of the page that draws nothing and counts the pictures that it receives."""
+def open_page(url: str) -> None:
+    """Open the page as a client that reads all messages and draws nothing."""
+    address = url.replace("http", "ws", 1)
+    protocol = Subprotocol(f"viser-v{viser.__version__}")
+    socket = connect(address, subprotocols=[protocol], max_size=None)
+    socket.send(msgspec.msgpack.encode(CAMERA))
 
-    def __init__(self, url: str) -> None:
-        self.pictures = 0
-        address = url.replace("http", "ws", 1)
-        self._socket = connect(
-            address, subprotocols=[Subprotocol(f"viser-v{viser.__version__}")], max_size=None
-        )
-        self._socket.send(msgspec.msgpack.encode(CAMERA))
-        threading.Thread(target=self._read, daemon=True).start()
-
-    def _read(self) -> None:
+    def read() -> None:
         with contextlib.suppress(ConnectionClosed):
-            for data in self._socket:
-                if not isinstance(data, bytes):
-                    raise TypeError("a text from viser, which sends bytes only")
-                # viser puts the length in front of the compressed message.
-                length = int.from_bytes(data[8:16], "little")
-                self.pictures += b"/field" in zstandard.decompress(data[16 : 16 + length])
+            while True:
+                socket.recv()
+
+    threading.Thread(target=read, daemon=True).start()
 
 
 def measure(cubes: int) -> dict[str, float]:
-    """Return processor time (percent of one core), pictures per second and memory of the views.
+    """Return processor time (percent of one core) and memory of the views.
 
     Args:
         cubes: Number of cubes of the skin.
@@ -104,15 +95,13 @@ def measure(cubes: int) -> dict[str, float]:
             children.start(process)
         children.start(VIEW)
         url = children.wait_for_line("view", "http://", MAX_START_S).split()[0]
-        counter = PictureCounter(url)
+        open_page(url)
         # The first picture takes seconds, which are not measured.
         observer.spin(SETTLE_S)
         usage = Usage(children, VIEWS)
-        before, begin_s = counter.pictures, time.monotonic()
         observer.spin(MEASURE_S)
-        pictures, seconds = counter.pictures - before, time.monotonic() - begin_s
         figures = {f"cpu_{name}_percent": value for name, value in usage.cpu_percent().items()}
-        figures |= {"view_hz": pictures / seconds, "rss_view_mb": usage.memory_mb()["view"]}
+        figures["rss_view_mb"] = usage.memory_mb()["view"]
         return {name: round(value, 1) for name, value in figures.items()}
 
 
