@@ -122,7 +122,8 @@ def _draw_arrows(axis: Any, deformation: Deformation) -> None:
     columns = np.linspace(1 - WINDOW, WINDOW - 1, ARROW_COLUMNS)
     rows = np.linspace(-half_height, half_height, ARROW_ROWS)
     x, z = np.meshgrid(columns, rows)
-    mesh = Triangulation(*deformation.points, deformation.triangles.T)
+    node_x, node_z = deformation.points
+    mesh = Triangulation(node_x, node_z, deformation.triangles.T)
     moved = [LinearTriInterpolator(mesh, along)(x, z) for along in deformation.displacement]
     arrows = 1e3 * d0 * np.array(moved) / np.hypot(*moved).max()
     tails = 1e3 * d0 * np.array([x, z])

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -15,12 +16,16 @@ from cube_tensor_driver.config.yaml import write_yaml
 from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import FrequencyRows, concatenate
 from cube_tensor_driver.core.status import STUCK
-from cube_tensor_driver.simulation.faults import Fault
+from cube_tensor_driver.device.wire.protocol import TEMPERATURE_UNKNOWN
+from cube_tensor_driver.simulation.cubes import SimulatedCubes
+from cube_tensor_driver.simulation.faults import PAD_FAULTS, Fault
+from cube_tensor_driver.simulation.injector import broken_reading
+from cube_tensor_driver.simulation.load import Load, default_script
 from cube_tensor_driver.simulation.sample_log import FaultRecord, LinkLog, SampleLog, SampleRun
 from workshop.checks.all_checks import check_all
-from workshop.checks.expected import ExpectedReadings, load_tables
 from workshop.checks.record import NodeAction, Received, Record, Samples
 from workshop.checks.rest import TRANSPORT_S
+from workshop.checks.sent_readings import SentReadings, reading_type
 
 INSTANTS, COUNT, PERIOD_US, EACH = 400, 2000, 2000, 2
 FAULTS = {
@@ -62,18 +67,52 @@ def played(tmp_path_factory):
     return recorded(skin, SampleLog(0, links, RECORDS))
 
 
+@cache
+def sound_readings(skin):
+    """(instants, cubes, pads) in mHz."""
+    load, cubes = Load(skin, default_script()), SimulatedCubes(skin.calibrations)
+    times = load.period * np.arange(INSTANTS) / INSTANTS
+    return np.array([cubes.frequency(*load.at(time), 0.0) for time in times])
+
+
+def sent_readings(skin, log):
+    """What the hubs send in each sample under the faults of a log."""
+    samples = Samples(log)
+    load_us = samples.time_us.copy()
+    for fault in samples.faults("hold"):
+        load_us[(samples.link == fault.link) & fault.contains(samples.time_ns)] = fault.start_us
+    instant = load_us // PERIOD_US % INSTANTS
+    cube = EACH * samples.link[:, None] + np.arange(EACH)
+    readings = np.zeros(len(samples), reading_type(EACH, 8))
+    readings["millihertz"] = sound_readings(skin)[instant[:, None], cube]
+    readings["centi_celsius"] = TEMPERATURE_UNKNOWN
+    for fault in samples.faults(*PAD_FAULTS):
+        rows = (samples.link == fault.link) & fault.contains(samples.time_ns)
+        place = np.flatnonzero(rows), fault.fault.cube, fault.fault.pad
+        if fault.kind == "report":
+            readings["pad_fault"][place[:2]] |= np.uint32(1 << fault.fault.pad)
+        else:
+            sound = readings["millihertz"][place].tolist()
+            times_us = samples.time_us[rows].tolist()
+            readings["millihertz"][place] = [
+                broken_reading(fault.fault, one, sound[0], time_us)
+                for one, time_us in zip(sound, times_us, strict=True)
+            ]
+    return readings
+
+
 def recorded(skin, log, actions=(), rest_after=None):
-    """(record, log) of what a program without a fault makes of a log.
+    """(record, log, readings) of what a program without a fault makes of a log.
 
     rest_after: (wall clock in ns, rest frequencies of all cubes) of a tare
     """
     samples = Samples(log)
-    expected = ExpectedReadings(skin, samples, INSTANTS)
+    sent = sent_readings(skin, log)
     order = np.argsort(samples.time_us, kind="stable")
     order = order[~samples.is_damaged[order]]
     cube = (EACH * samples.link[order, None] + np.arange(EACH)).ravel().astype(np.uint16)
     of = np.repeat(order, EACH)
-    readings = expected.of(cube, of)
+    readings = SentReadings(samples, sent).of(cube, of)
     frequencies = FrequencyRows(
         cube=cube,
         sequence=samples.number[of].astype(np.uint32),
@@ -93,7 +132,6 @@ def recorded(skin, log, actions=(), rest_after=None):
     stress = concatenate(made)
     record = Record(
         skin=skin,
-        instants=INSTANTS,
         frequencies=received(frequencies),
         stress=received(stress),
         actions=actions,
@@ -111,7 +149,7 @@ def recorded(skin, log, actions=(), rest_after=None):
         begin_ns=0,
         end_ns=10**12,
     )
-    return record, log
+    return record, log, sent
 
 
 def received(rows, **others):
@@ -121,13 +159,13 @@ def received(rows, **others):
 
 def found(played, frequencies=None, stress=None, **counters):
     """Names of the figures that are wrong when rows are exchanged."""
-    record, log = played
+    record, log, readings = played
     if frequencies is not None:
         record = replace(record, frequencies=received(frequencies))
     if stress is not None:
         record = replace(record, stress=received(stress))
     record = replace(record, counters={**record.counters, **counters})
-    figures = check_all(record, log)
+    figures = check_all(record, log, readings)
     return {name for name in WRONG if figures[name]}
 
 
@@ -214,10 +252,9 @@ def tared(played):
         start_us = (TARED_NS - stayed_ns) // 1000
         hold = FaultRecord(start_us, 3_900_000, Fault("hold", link="hub0"))
         held = replace(log, faults=(hold,))
-        readings, _ = load_tables(skin, INSTANTS)
         rest = np.array([cube.calibration.rest_frequency for cube in skin.cubes])
         instant = start_us // PERIOD_US % INSTANTS
-        rest[list(HELD_CUBES)] = readings[instant, HELD_CUBES] * 1e-3 * (1 + error)
+        rest[list(HELD_CUBES)] = sound_readings(skin)[instant, HELD_CUBES] * 1e-3 * (1 + error)
         action = NodeAction(
             kind="tare", begin_ns=TARED_NS, end_ns=TARED_NS, succeeded=True, cubes=HELD_CUBES
         )
@@ -234,16 +271,16 @@ def test_a_tare_of_another_load_is_found(tared):
 
 def test_what_a_tare_of_a_load_that_was_not_held_is_not_checked(tared):
     """It averages both loads, where they differ by less than noise does."""
-    record, log = tared(50e-6, 1_000_000_000)
-    assert found((record, log)) == set()
+    record, log, readings = played = tared(50e-6, 1_000_000_000)
+    assert found(played) == set()
     rows = record.stress.rows
     after = (rows.stamp_ns >= TARED_NS - round(1e9 * TRANSPORT_S)) & np.isin(rows.cube, HELD_CUBES)
-    assert check_all(record, log)["tensors_not_judged"] == np.count_nonzero(after)
+    assert check_all(record, log, readings)["tensors_not_judged"] == np.count_nonzero(after)
     other_cube = 2
     wrong = changed(
         rows, np.flatnonzero(rows.cube == other_cube)[-1], stress=lambda stress: 1.1 * stress
     )
-    assert found((record, log), stress=wrong) == {"wrong_tensors"}
+    assert found(played, stress=wrong) == {"wrong_tensors"}
 
 
 def test_what_the_driver_counts_is_checked(played):
@@ -254,17 +291,17 @@ def test_what_the_driver_counts_is_checked(played):
 
 def test_a_tensor_that_the_reconstruction_counts_as_lost_is_not_missing(played):
     """As many messages as it says, and no more."""
-    record, log = played
+    record, log, readings = played
     stress = record.stress.rows
     rest = received(stress.select(stress.stamp_ns != stress.stamp_ns[ROW]))
     for lost, figures in ((0, {"missing_tensors"}), (1, set()), (2, {"miscounted"})):
         changed_record = replace(record, stress=rest, messages_lost=lost)
-        assert {name for name in WRONG if check_all(changed_record, log)[name]} == figures
+        assert {name for name in WRONG if check_all(changed_record, log, readings)[name]} == figures
 
 
 def test_what_comes_to_a_reconstruction_that_is_down_has_no_tensor(played):
     """From the last message that it made tensors of, until it is back."""
-    record, log = played
+    record, log, readings = played
     stamp_ns = record.stress.rows.stamp_ns
     down = (stamp_ns > stamp_ns[ROW]) & (stamp_ns < stamp_ns[ROW] + 100_000_000)
     rest = received(record.stress.rows.select(~down))
@@ -273,12 +310,12 @@ def test_what_comes_to_a_reconstruction_that_is_down_has_no_tensor(played):
         action = NodeAction(
             kind="restart reconstruction", begin_ns=begin_ns, end_ns=end_ns, succeeded=True
         )
-        killed = check_all(replace(record, stress=rest, actions=(action,)), log)
+        killed = check_all(replace(record, stress=rest, actions=(action,)), log, readings)
         assert {name for name in WRONG if killed[name]} == figures
 
 
 def test_what_a_driver_counted_just_before_it_was_killed_is_not_known(played):
-    record, log = played
+    record, log, readings = played
     stamp_ns = record.frequencies.rows.stamp_ns
     dead_ns = int(stamp_ns[-1]) + 1
     dead = NodeAction(kind="restart driver", begin_ns=dead_ns, end_ns=dead_ns, succeeded=True)
@@ -286,12 +323,12 @@ def test_what_a_driver_counted_just_before_it_was_killed_is_not_known(played):
         unreported = np.count_nonzero(stamp_ns > dead_ns - unreported_ns)
         counters = {**record.counters, "rows published": len(stamp_ns) - int(unreported)}
         killed = replace(record, counters=counters, actions=(dead,))
-        assert {name for name in WRONG if check_all(killed, log)[name]} == figures
+        assert {name for name in WRONG if check_all(killed, log, readings)[name]} == figures
 
 
 def test_what_did_not_arrive_here_is_not_checked(played):
     """The numbers of DDS show that messages are missing: their rows are not checked."""
-    record, log = played
+    record, log, readings = played
     rest = np.r_[0:4000, 4400:8000]
     frequencies = record.frequencies.rows
     rest = rest[rest < len(frequencies)]
@@ -300,6 +337,6 @@ def test_what_did_not_arrive_here_is_not_checked(played):
         frequencies=received(frequencies.select(rest), gaps=((4000, 100),)),
         counters={**record.counters},
     )
-    figures = check_all(record, log)
+    figures = check_all(record, log, readings)
     assert figures["missed_by_judge"] == 100
     assert {name for name in WRONG if figures[name]} == set()

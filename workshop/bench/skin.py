@@ -403,7 +403,7 @@ def summarise_memory(memory_mb: dict[str, list[float]]) -> dict[str, float]:
     If the measurement took a minute or more, the growth of the process that grows fastest after the
     first fifth of the time is returned as well.
     """
-    nodes = [np.array(values) for name, values in memory_mb.items() if name not in LOADS]
+    nodes = [np.array(values, float) for name, values in memory_mb.items() if name not in LOADS]
     result = {"rss_mb": round(float(np.max(nodes)), 1)}
     times_s = MEMORY_PERIOD_S * np.arange(len(nodes[0]))
     if times_s[-1] + MEMORY_PERIOD_S < MIN_GROWTH_DURATION_S:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from cube_tensor_driver.core.arrays import AnyArray
 from cube_tensor_driver.core.matching import NO_MATCH
 from cube_tensor_driver.demo.verification import percentile
 from cube_tensor_driver.simulation.sample_log import SampleLog
@@ -29,9 +30,15 @@ PERCENTILES = (50, 90, 99)
 sample and its stamp."""
 
 
-def check_all(record: Record, log: SampleLog) -> dict[str, Any]:
-    """Run all checks and return their figures; counts are rows (one sample of one cube each)."""
-    run = Run(record, log)
+def check_all(record: Record, log: SampleLog, readings: AnyArray) -> dict[str, Any]:
+    """Run all checks and return their figures; counts are rows (one sample of one cube each).
+
+    Args:
+        record: What arrived and what was done.
+        log: The sample log.
+        readings: What the hubs sent in each sample, see `read_readings`.
+    """
+    run = Run(record, log, readings)
     frequencies = check_frequencies(run)
     tensors = check_tensors(run)
     # A row of stress whose source is `NO_MATCH`, the index -1, gets the appended `NO_MATCH`.

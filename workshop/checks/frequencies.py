@@ -13,9 +13,9 @@ from cube_tensor_driver.core.matching import NO_MATCH
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.core.status import STAMP
 
-from .expected import Readings, split_in_chunks
 from .record import CUT_FAULTS, DRIVER_KILLS, DRIVER_STOPS, DROPPED_BY_HOST, UNFLUSHED_S
 from .run import Findings, Run, agree, count, find_matched
+from .sent_readings import Readings, split_in_chunks
 
 RECOVERY_S = 6.0
 """Longest time, in seconds, from the end of a cut of a link until the link delivers again. The
@@ -56,8 +56,7 @@ def check_frequencies(run: Run) -> FrequencyFindings:
     is_wrong = np.zeros(len(rows), bool)
     for part in split_in_chunks(known):
         chosen = rows.select(part)
-        expected = run.expected.of(chosen.cube, sample[part])
-        is_wrong[part] = _differs(chosen, expected)
+        is_wrong[part] = _differs(chosen, run.sent.of(chosen.cube, sample[part]))
 
     # Rows with the same key are the same row, which arrived more than once.
     n_cubes = len(record.skin.cubes)
@@ -83,18 +82,12 @@ def check_frequencies(run: Run) -> FrequencyFindings:
     return FrequencyFindings(figures, examples, is_checked, missing)
 
 
-def _differs(rows: FrequencyRows, readings: Readings) -> Mask:
-    """Find the rows (N,) with a frequency, temperature or pad fault that is certain and differs, or
-    with a wrong status."""
-    certain = readings.is_certain
-    changed_bits = (rows.pad_fault ^ readings.pad_fault)[:, np.newaxis]
-    bit = np.arange(certain.shape[1])
-    differs_in_fault = changed_bits >> bit & 1 == 1
-    differs_in_pad = ~agree(rows.frequency, readings.frequency) | differs_in_fault
-    # The temperature changes together with the readings, so all pads are certain or none is.
-    differs_in_temperature = ~agree(rows.temperature, readings.temperature)
-    differs = (certain & differs_in_pad).any(axis=1)
-    differs |= certain.all(axis=1) & differs_in_temperature
+def _differs(rows: FrequencyRows, sent: Readings) -> Mask:
+    """Find the rows (N,) with another frequency, temperature or pad fault than was sent, or with a
+    wrong status."""
+    differs = ~agree(rows.frequency, sent.frequency).all(axis=1)
+    differs |= ~agree(rows.temperature, sent.temperature)
+    differs |= rows.pad_fault != sent.pad_fault
     # Doubtful stamps are the only condition that a row of frequencies may have.
     differs |= rows.status & ~np.uint16(STAMP) != 0
     return differs

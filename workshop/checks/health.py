@@ -18,9 +18,12 @@ from cube_tensor_driver.core.rows import StressRows
 from cube_tensor_driver.core.status import DRIFT, NOISY, OPEN, RANGE, REPORTED, SHORT, STUCK
 from cube_tensor_driver.simulation.faults import PAD_FAULTS
 
-from .expected import EDGE_NS
 from .record import CUT_FAULTS, DRIVER_KILLS, NODE_STARTS, NS_PER_S, HubFault, Span
 from .run import Findings, Run, count, find_matched
+
+EDGE_NS = 5_000_000
+"""Time, in nanoseconds, around the begin and around the end of a fault of a pad. A sample within it
+may have the fault or not, because the simulator sometimes carries faults out late."""
 
 STATUS_OF_FAULT = {
     "open": OPEN,
@@ -204,7 +207,7 @@ class _Evidence:
         is_chosen = (samples.link == fault.link) & span.contains(samples.time_ns)
         chosen = np.flatnonzero(is_chosen)
         cubes = np.full(len(chosen), fault.cube)
-        readings = self._run.expected.of(cubes, chosen)
+        readings = self._run.sent.of(cubes, chosen)
         window_ns = round(NS_PER_S * WINDOW_S)
         for begin_ns in range(span.begin_ns, span.end_ns - window_ns, WINDOW_STEP_NS):
             window = Span(begin_ns, begin_ns + window_ns)

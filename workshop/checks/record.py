@@ -283,7 +283,6 @@ class Record(Span):
 
     Attributes:
         skin: The skin.
-        instants: Number of instants of the load that the hubs repeat.
         frequencies: Rows of the topic `frequencies`.
         stress: Rows of the topic `stress`.
         actions: What was done to the nodes, in order.
@@ -292,7 +291,6 @@ class Record(Span):
     """
 
     skin: Skin
-    instants: int
     frequencies: Received[FrequencyRows]
     stress: Received[StressRows]
     actions: tuple[NodeAction, ...]

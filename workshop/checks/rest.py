@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cube_tensor_driver.core.arrays import AnyArray, Array, Mask, Times
+from cube_tensor_driver.core.arrays import Array, Mask, Times
 
 from .record import LATEST_NS, NS_PER_S, RECONSTRUCTION_STOPS, NodeAction, Span
 from .run import Run
@@ -96,7 +96,7 @@ class RestHistory:
         first_ns = action.begin_ns - round(NS_PER_S * AVERAGED_S)
         averaged = Span(first_ns, action.end_ns)
         cubes = list(action.cubes)
-        held = self._run.expected.find_held(cubes, averaged)
+        held = self._run.sent.find_held(cubes, averaged)
         return current.tare(cubes, held)
 
     def candidates(
@@ -111,20 +111,6 @@ class RestHistory:
         is_unclear = self._is_unclear(sent_ns)
         for span, rest in self._epochs:
             yield is_unclear | span.contains(sent_ns), rest
-
-    def is_calibrated(self, cube: AnyArray, sent_ns: Times) -> Mask:
-        """Find the rows (N,) for which the rest frequencies of the calibrations are certainly in
-        force."""
-        applies = np.zeros(len(cube), bool)
-        ever_tared = np.zeros(len(self._calibrated.values), bool)
-        for is_candidate, rest in self.candidates(sent_ns):
-            is_tared = (rest.values != self._calibrated.values).any(axis=1)
-            is_tared |= ~rest.is_known
-            applies |= is_candidate & ~is_tared[cube]
-            ever_tared |= is_tared
-        # Around a change, the old or the new values may be in force, so cubes that are tared at any
-        # time in the run are excluded.
-        return applies & ~(self._is_unclear(sent_ns) & ever_tared[cube])
 
     def _is_unclear(self, sent_ns: Times) -> Mask:
         """Find the times (N,) at which either the old or the new rest frequencies may be in

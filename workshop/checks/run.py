@@ -13,8 +13,8 @@ from cube_tensor_driver.core.arrays import AnyArray, Index, Mask, Real
 from cube_tensor_driver.core.matching import NO_MATCH
 from cube_tensor_driver.simulation.sample_log import SampleLog
 
-from .expected import ExpectedReadings
 from .record import NS_PER_S, Record, Samples
+from .sent_readings import SentReadings
 
 EXAMPLES = 3
 """Maximum number of lines that describe examples of one kind of finding."""
@@ -42,14 +42,14 @@ class Run:
     Attributes:
         record: What arrived and what was done.
         samples: All samples that the hubs took, S in number.
-        expected: Computes what the pads should read in these samples.
+        sent: Finds what the hubs sent in these samples.
         sample: Index of the sample of each row of frequencies (N,), or `NO_MATCH`.
     """
 
-    def __init__(self, record: Record, log: SampleLog) -> None:
+    def __init__(self, record: Record, log: SampleLog, readings: AnyArray) -> None:
         self.record, self.samples = record, Samples(log)
-        self.expected = ExpectedReadings(record.skin, self.samples, record.instants)
-        self.sample = self.expected.find_samples(record.frequencies.rows)
+        self.sent = SentReadings(self.samples, readings)
+        self.sample = self.sent.find_samples(record.frequencies.rows)
         self._start_ns = log.start_time_ns
 
     def describe(self, finding: str, time_ns: int) -> str:

@@ -14,11 +14,12 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
-from typing import Any
+from typing import Any, NamedTuple
 
 from cube_tensor_driver.config.grid import grid
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.config.yaml import write_yaml
+from cube_tensor_driver.core.arrays import AnyArray
 from cube_tensor_driver.core.errors import CubeError
 from cube_tensor_driver.demo.running import Observer, end_simulator
 from cube_tensor_driver.processes.children import Children
@@ -27,13 +28,14 @@ from cube_tensor_driver.simulation.inject import fault_line
 from cube_tensor_driver.simulation.sample_log import SampleLog
 from cube_tensor_driver.simulation.simulator import FAULT_PIPE
 
-from ..checks.expected import load_tables
 from ..checks.record import NS_PER_S, NodeAction, Record, Span
+from ..checks.sent_readings import read_readings
 from .actions import MAX_START_S, Actions
+from .hubs import READINGS
 from .memory import MemoryMonitor
-from .mix import CUBES_PER_HUB, HUBS, RATE, schedule
+from .mix import CUBES_PER_HUB, HUBS, PADS, RATE, schedule
 from .mutations import mutated
-from .recorder import INSTANTS, recording
+from .recorder import recording
 
 CUBES_PER_ROW = 8
 """Number of cubes side by side on the tortured skin."""
@@ -57,10 +59,24 @@ arrived."""
 NODES = ("driver", "reconstruction")
 """Names of the processes whose memory and threads are measured."""
 
+INSTANTS = 1000
+"""Number of instants of the load that the simulated hubs repeat."""
 
-Played = tuple[Record, SampleLog, dict[str, Any]]
-"""Results of a torture (run of a simulated skin under faults): what arrived and what was done; what
-the hubs did; figures of the processes, by the name that torture prints."""
+
+class Played(NamedTuple):
+    """Results of a torture (run of a simulated skin under faults).
+
+    Attributes:
+        record: What arrived and what was done.
+        log: Which samples the hubs took.
+        readings: What the hubs sent in each sample, see `read_readings`.
+        figures: Figures of the processes, by the name that torture prints.
+    """
+
+    record: Record
+    log: SampleLog
+    readings: AnyArray
+    figures: dict[str, Any]
 
 
 def play(
@@ -85,8 +101,6 @@ def play(
     ports, log_path = folder / "ports", folder / "log.json"
     skin_path = _write_skin(folder, ports)
     skin = read_skin(skin_path)
-    # The tables take seconds, which would disturb the skin later.
-    load_tables(skin, INSTANTS)
     processes = _make_processes(skin_path, ports, log_path, mutation)
 
     with Children(folder) as children:
@@ -127,6 +141,7 @@ def play(
             record = recorder.finish(Span(begin_ns, end_ns), actions.done)
         logs_text = "".join(children.log(name) for name in processes)
         log = end_simulator(children, log_path)
+        readings = read_readings(folder / READINGS, log, PADS)
     figures = {
         **_describe(actions, log),
         "counters": dict(record.counters),
@@ -134,7 +149,7 @@ def play(
         "rss_slope_mb_per_min": growth,
         "crashes": logs_text.count("Traceback"),
     }
-    return record, log, figures
+    return Played(record, log, readings, figures)
 
 
 def _describe(actions: Actions, log: SampleLog) -> dict[str, Any]:
@@ -183,7 +198,7 @@ def _make_processes(
         if process.executable == "reconstruction":
             process.parameters["tare_folder"] = str(skin_path.parent / "tare")
         if process.executable == "simulator":
-            process = replace(process, module="workshop.torture.tcp_hubs")
+            process = replace(process, module="workshop.torture.hubs")
         processes[process.executable] = mutated(process, mutation)
     return processes
 

@@ -50,9 +50,6 @@ MAX_MESSAGES_TAKEN = 300
 """Maximum number of messages that are taken at a time, so that this process also does other
 things."""
 
-INSTANTS = 1000
-"""Number of instants of the load that the simulated hubs repeat."""
-
 QUIET_S = 1.0
 """Time, in seconds, without a new message after which everything has arrived."""
 
@@ -294,7 +291,6 @@ class TortureRecorder:
             begin_ns=checked.begin_ns,
             end_ns=checked.end_ns,
             skin=self._skin,
-            instants=INSTANTS,
             frequencies=self._frequencies.received(),
             stress=self.stress.received(),
             actions=tuple(actions),

@@ -161,12 +161,12 @@ def torture(
     began_s = time.monotonic()
     # A skin that runs elsewhere on this machine must not be heard.
     with own_domain(), tempfile.TemporaryDirectory(prefix="cube_torture_") as folder:
-        record, log, figures = play(duration, seed, Path(folder), interrupted, mutation)
-        checked = check_all(record, log)
+        played = play(duration, seed, Path(folder), interrupted, mutation)
+        checked = check_all(played.record, played.log, played.readings)
     return {
         "duration_s": duration,
         "seed": seed,
         "seconds": round(time.monotonic() - began_s, 1),
         **checked,
-        **figures,
+        **played.figures,
     }

@@ -1,6 +1,6 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Process that simulates hubs like `simulation/main.py`, some of them behind a TCP bridge.
+"""Process that simulates hubs like `simulation/main.py`, and stores what they send in each sample.
 
 Links whose port in the skin file is a TCP address listen there, instead of on a pseudo-terminal.
 """
@@ -10,14 +10,26 @@ from __future__ import annotations
 import contextlib
 import socket
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-from cube_tensor_driver.config.skin import SkinLink
+import numpy as np
+
+from cube_tensor_driver.config.skin import Skin, SkinLink
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.device.links.tcp import parse_url
+from cube_tensor_driver.simulation.cubes import Millihertz
+from cube_tensor_driver.simulation.injector import Injector, SimulatedLink
 from cube_tensor_driver.simulation.line import SimulatedLine
+from cube_tensor_driver.simulation.load import Fields
 from cube_tensor_driver.simulation.main import main
 from cube_tensor_driver.simulation.simulator import Simulator
+
+from ..checks.sent_readings import reading_type
+
+READINGS = "readings"
+"""Name of the folder, beside that of the ports, for what the hubs send."""
 
 
 class TcpLine(SimulatedLine):
@@ -102,8 +114,43 @@ class TcpLine(SimulatedLine):
                 self.fd = self._listener.fileno()
 
 
-class TcpSimulator(Simulator):
-    """A simulator whose links with a TCP address in the skin file are on TCP."""
+class StoringInjector(Injector):
+    """An injector that stores what each hub sends, in one file for each link."""
+
+    def __init__(self, links: Sequence[SimulatedLink], folder: Path) -> None:
+        super().__init__(links)
+        folder.mkdir()
+        self._files = {link.name: (folder / link.name).open("wb") for link in links}
+
+    def measured(self, link: SimulatedLink, frequency: Millihertz, now_us: int) -> Millihertz:
+        """Return the frequencies that a hub measures, and store them with what the hub states."""
+        millihertz = super().measured(link, frequency, now_us)
+        size = link.size
+        reading = np.zeros((), reading_type(size.cubes, size.pads))
+        # The fault "pads" adds a pad, and no host takes its samples.
+        reading["millihertz"] = millihertz[:, : size.pads]
+        reading["centi_celsius"] = link.hub.celsius
+        if link.hub.pad_fault is not None:
+            reading["pad_fault"] = link.hub.pad_fault
+        self._files[link.name].write(reading.tobytes())
+        return millihertz
+
+    def close(self) -> None:
+        """Complete the files."""
+        for file in self._files.values():
+            file.close()
+
+
+class TorturedSimulator(Simulator):
+    """A simulator that stores what its hubs send, whose links with a TCP address are on TCP."""
+
+    def __init__(self, skin: Skin, load: Fields, ports: Path, **options: Any) -> None:
+        super().__init__(skin, load, ports, **options)
+        self._injector = self._store = StoringInjector(self._links, ports.with_name(READINGS))
+
+    def close(self) -> None:
+        self._store.close()
+        super().close()
 
     def _make_line(self, link: SkinLink) -> SimulatedLine:
         if link.port.startswith("socket://"):
@@ -112,4 +159,4 @@ class TcpSimulator(Simulator):
 
 
 if __name__ == "__main__":
-    sys.exit(main(simulator=TcpSimulator))
+    sys.exit(main(simulator=TorturedSimulator))
