@@ -119,34 +119,22 @@ def _draw_maps(
     maps: Mapping[str, Array],
 ) -> Any:
     """Draw maps (M,) in Pa by their title, with cubes and load, from 0 to the largest of all."""
-    points = example.points
-    # The points are a square grid in the order of the cubes' patches, not of rows.
-    rounded = points.round(9)
-    order = np.lexsort((rounded[:, 0], rounded[:, 1]))
-    shape = (round(np.sqrt(len(points))), -1)
-    x, y = (1e3 * column[order].reshape(shape) for column in points[:, :2].T)
+    x, y = 1e3 * example.points[:, :2].T
     top = 1e-3 * max(values.max() for values in maps.values())
     levels = np.arange(CONTOUR_STEP_KPA / 2, top, CONTOUR_STEP_KPA)
     for axis, (title, values) in zip(axes, maps.items(), strict=True):
         # A method may compute tension, which no contact makes.
-        kilopascal = 1e-3 * np.maximum(values, 0)[order].reshape(shape)
-        image = axis.pcolormesh(
+        kilopascal = 1e-3 * np.maximum(values, 0)
+        image = axis.tripcolor(
             x,
             y,
             kilopascal,
             vmin=0,
             vmax=top,
-            shading="nearest",
+            shading="gouraud",
             rasterized=True,
         )
-        axis.contour(
-            x,
-            y,
-            kilopascal,
-            levels=levels,
-            colors="white",
-            linewidths=0.5,
-        )
+        axis.tricontour(x, y, kilopascal, levels=levels, colors="white", linewidths=0.5)
         cubes = 1e3 * example.cubes[:, :2].T
         load = 1e3 * example.centre
         axis.plot(

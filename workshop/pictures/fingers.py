@@ -57,41 +57,30 @@ def draw_fingers(
         pressures[name] = 1e-3 * surface.field(values[cubes]).pressure
     # One scale for all fingers. It does not begin at zero, because the pressure hardly varies.
     values_kpa = np.concatenate(list(pressures.values()))
-    limits = float(np.nanmin(values_kpa)), float(np.nanmax(values_kpa))
+    lowest, highest = np.nanmin(values_kpa), np.nanmax(values_kpa)
 
     figure = Figure(figsize=(9, 4))
     robot, *axes = figure.subplots(1, 1 + len(fingers), width_ratios=[1.9] + [1.0] * len(fingers))
     robot.imshow(pixels)
     robot.set_axis_off()
     for axis, (name, cubes) in zip(axes, fingers.items(), strict=True):
-        image = _draw_pressure(axis, points[name], pressures[name], limits)
+        x, _, z = 1e3 * points[name].T
+        image = axis.tripcolor(
+            x,
+            z,
+            pressures[name],
+            vmin=lowest,
+            vmax=highest,
+            shading="gouraud",
+            cmap=COLOURS,
+            rasterized=True,
+        )
         _draw_shear(axis, parts[name], 1e-3 * values[cubes])
         axis.set(title=f"{name} finger\n\n", xlabel="$x$ / mm", aspect="equal")
         axis.grid(False)
     axes[0].set_ylabel("$z$ / mm")
     figure.colorbar(image, ax=axes, label="pressure in the cubes' plane / kPa")
     return figure
-
-
-def _draw_pressure(
-    axis: Any,
-    points: Array,
-    pressure: Array,
-    limits: tuple[float, float],
-) -> Any:
-    """Draw the pressure (M,) in kPa at points (M, 3) in m, in a colour scale with these limits."""
-    # The points form a grid, but are ordered cube by cube and not row by row.
-    across = points[:, 0].round(6)
-    up = points[:, 2].round(6)
-    order = np.lexsort((across, up))
-    shape = (-1, len(np.unique(across)))
-    x = 1e3 * points[order, 0].reshape(shape)
-    z = 1e3 * points[order, 2].reshape(shape)
-    image = axis.pcolormesh(
-        x, z, pressure[order].reshape(shape), vmin=limits[0], vmax=limits[1], cmap=COLOURS
-    )
-    image.set_rasterized(True)
-    return image
 
 
 def _draw_shear(axis: Any, poses: CubePoses, kilopascal: Array) -> None:
