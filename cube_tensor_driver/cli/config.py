@@ -8,7 +8,6 @@ import argparse
 import sys
 from collections import Counter
 from pathlib import Path
-from typing import Any
 
 from .parser import Parser, count, positive
 
@@ -65,7 +64,7 @@ def write_grid(options: argparse.Namespace) -> int:
         ConfigError: `./cube config check` would find a mistake in the file.
     """
     from ..config.grid import grid
-    from ..config.pose_check import MAX_SPACED_CUBES, pose_doubts
+    from ..config.pose_check import pose_doubts
     from ..config.skin import check_skin_data
     from ..config.yaml import write_yaml
     from ..core.errors import ConfigError
@@ -74,11 +73,7 @@ def write_grid(options: argparse.Namespace) -> int:
     # Each option has the name of its argument of `grid`.
     names = "name", "nx", "ny", "pitch", "links", "calibration", "layout", "rate", "port"
     skin = grid(**{name: getattr(options, name) for name in names})
-    # If the grid is large, only a few of its cubes are checked, because checking all of them would
-    # take longer than writing the file.
-    is_large = len(skin["cubes"]) > MAX_SPACED_CUBES
-    part = ends_of_links(skin) if is_large else skin
-    checked, mistakes = check_skin_data(part, options.output.parent)
+    checked, mistakes = check_skin_data(skin, options.output.parent)
     if checked is not None:
         mistakes = list(pose_doubts(checked))
     if mistakes:
@@ -90,21 +85,6 @@ def write_grid(options: argparse.Namespace) -> int:
         write_yaml(options.output, skin, f"{text}. docs/config.md describes the keys.")
     print(f"wrote {options.output}: {text}")
     return 0
-
-
-def ends_of_links(skin: dict[str, Any]) -> dict[str, Any]:
-    """Return the content of a grid's skin file, reduced to the first and last cube of each link.
-
-    It is sufficient to check these cubes, because the entries of the cubes between them differ only
-    in names, indices and positions. A link is the connection to one hub.
-    """
-    first: dict[str, Any] = {}
-    last: dict[str, Any] = {}
-    for cube in skin["cubes"]:
-        first.setdefault(cube["link"], cube)
-        last[cube["link"]] = cube
-    ends = {cube["name"]: cube for cube in (*first.values(), *last.values())}
-    return skin | {"cubes": list(ends.values())}
 
 
 def check_file(path: Path) -> int:

@@ -19,6 +19,13 @@ if TYPE_CHECKING:
     from ..core.layout import Layout
 
 
+FIGURES = (
+    *("coefficients", "deviations", "gain", "gain_deviation", "scale", "chi2", "dof"),
+    *("held_out", "undetermined", "advice"),
+)
+"""Names of the attributes of a fit that the JSON file contains."""
+
+
 def arguments(parser: Parser) -> None:
     parser.add_argument(
         "loads",
@@ -90,6 +97,8 @@ def run(options: argparse.Namespace) -> int:
     import datetime
     from dataclasses import replace
 
+    import numpy as np
+
     if options.weight is not None:
         return run_weight(options)
     if options.creep is not None:
@@ -125,7 +134,9 @@ def run(options: argparse.Namespace) -> int:
 
     show_fit(result, f"rest frequencies {rest_source}")
     if options.json is not None:
-        write_json(options.json, figures(result))
+        figures = {name: getattr(result, name) for name in FIGURES}
+        # Each outlier is a pair: index of the row among the rows with load, index of the pad.
+        write_json(options.json, figures | {"outliers": np.argwhere(result.outliers)})
     save(draw_fit(result, measured), options.figure)
     # The calibration file contains time and source, so that its origin can be found later.
     created = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
@@ -320,24 +331,3 @@ def show_fit(result: Fit, remark: str) -> None:
     )
     for sentence in result.advice:
         say(sentence, "red")
-
-
-def figures(result: Fit) -> dict[str, object]:
-    """Return the result of a fit as the content of the JSON file.
-
-    Each outlier is a pair: index of the row among the rows with load, index of the pad.
-    """
-    rows, pads = result.outliers.nonzero()
-    return {
-        "coefficients": result.coefficients,
-        "deviations": result.deviations,
-        "gain": result.gain.tolist(),
-        "gain_deviation": result.gain_deviation.tolist(),
-        "scale": result.scale,
-        "chi2": result.chi2,
-        "dof": result.dof,
-        "held_out": result.held_out,
-        "outliers": [list(pair) for pair in zip(rows.tolist(), pads.tolist(), strict=True)],
-        "undetermined": list(result.undetermined),
-        "advice": list(result.advice),
-    }
