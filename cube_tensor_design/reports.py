@@ -289,19 +289,20 @@ def show_study(result: LayoutStudy) -> None:
     )
     columns = [(name, float(side)) for name in result.error for side in result.sides]
     heads = [f"{name}\n{1e3 * side:g} mm" for name, side in columns]
-    trusted = result.trusted()
-    widths = {(row.layout, row.side, row.component): _format_width(row.width) for row in trusted}
-    rows = []
-    for component in dict.fromkeys(row.component for row in trusted):
-        cells = [widths.get((*column, component), "·") for column in columns]
-        rows.append([component, *cells])
+    widths = np.concatenate([result.trusted_widths(name) for name in result.error])
+    rows = [
+        [component, *map(_format_width, column)]
+        for component, column in zip(COMPONENTS, widths.T.tolist(), strict=True)
+    ]
     _print_table("", ["", *heads], rows)
     _console.print("· not observed by the layout")
 
 
-def _format_width(width: float | None) -> str:
-    """Format a width (m) in mm; None means that no indenter is wide enough."""
-    return "never" if width is None else f"{1e3 * width:g}"
+def _format_width(width: float) -> str:
+    """Format a width (m) in mm; infinite: no indenter is wide enough; NaN: not observed."""
+    if math.isnan(width):
+        return "·"
+    return "never" if math.isinf(width) else f"{1e3 * width:g}"
 
 
 def _print_table(

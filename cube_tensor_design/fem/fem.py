@@ -28,7 +28,7 @@ from cube_tensor_driver.core.defaults import (
     REST_FREQUENCY,
 )
 from cube_tensor_driver.core.errors import ElasticError
-from cube_tensor_driver.core.estimator import LEAK_TOLERANCE, RANK_TOLERANCE
+from cube_tensor_driver.core.estimator import RANK_TOLERANCE, summarize_response
 from cube_tensor_driver.core.layout import Layout
 from cube_tensor_driver.core.response import project
 from cube_tensor_driver.core.symmetry import (
@@ -140,7 +140,7 @@ def compute_response(
 
     matrix = results[-1].pads
     coefficients, residual = project(structure, matrix)
-    rank, unobservable = _find_observable(matrix, structure.modes.names)
+    largest = np.linalg.norm(matrix, 2)
     return Response(
         body=body,
         layout=layout,
@@ -150,8 +150,8 @@ def compute_response(
         coefficients=coefficients,
         structure_residual=residual,
         mode_residual=_mode_residual(structure, matrix, coefficients),
-        rank=rank,
-        unobservable=unobservable,
+        rank=int(np.linalg.matrix_rank(matrix, RANK_TOLERANCE * largest)),
+        unobservable=tuple(summarize_response(structure, matrix)["unobservable"]),
         convergence=tuple(rows),
         seconds=sum(result.seconds for result in results),
     )
@@ -254,17 +254,6 @@ def _mode_residual(
     return dict(zip(structure.modes.names, relative.tolist(), strict=True))
 
 
-def _find_observable(matrix: Array, names: tuple[str, ...]) -> tuple[int, tuple[str, ...]]:
-    """Return the rank of a response matrix, and the names of modes with a part in its null space,
-    which no pad measures."""
-    _, singular, rows = np.linalg.svd(matrix)
-    rank = int(np.sum(singular > RANK_TOLERANCE * singular[0]))
-    # The last rows span the null space: states that no pad measures.
-    null_part = np.linalg.norm(rows[rank:], axis=0)
-    pairs = zip(names, null_part, strict=True)
-    return rank, tuple(name for name, size in pairs if size > LEAK_TOLERANCE)
-
-
 def calibration_from_fem(
     result: Response,
     whole_matrix: bool = False,
@@ -301,14 +290,14 @@ def calibration_from_fem(
 def make_solid(
     body: Body,
     layout: Layout,
-    grid: skfem.Mesh | None = None,
+    grid: skfem.Mesh,
 ) -> Solid:
     """Return the meshed body; its moduli are relative to Young's modulus of the elastomer.
 
     Args:
         body: The body.
         layout: Pads of the cube.
-        grid: A mesh from mesh.py, by default the finest one of `compute_response`.
+        grid: A mesh from mesh.py.
     """
     plane = body.plane if layout.planar else "strain"
     cube = None
@@ -317,8 +306,7 @@ def make_solid(
     elif body.ground:
         # A rigid cube moves with a body on ground, so it is a very stiff elastic one here.
         cube = lame(STIFF_CUBE_RATIO, 0.0, plane)
-    mesh = grid or make_mesh(body, layout, MAX_MESHES - 1)
-    return Solid(mesh, lame(1.0, body.poisson, plane), cube, body.ground, body.confined)
+    return Solid(grid, lame(1.0, body.poisson, plane), cube, body.ground, body.confined)
 
 
 def load_modes(solid: Solid, layout: Layout) -> Load:

@@ -7,7 +7,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from matplotlib.figure import Figure
 
 from cube_tensor_driver.config.output_files import write_json
@@ -24,15 +23,8 @@ from .experiments import draw_experiment, draw_rod_parts, draw_rod_shear
 NEAR_PLACES = (1e-3, 2e-3, 3e-3)
 """Positions along x, in m from the cube's centre, of the rod whose force is the same with and
 without the cube. Farther away the cube changes the force of a held rod by less than 20 %."""
-PROGRESS_SPANS = {
-    "linear": (0.01, 0.17),
-    "finite": (0.17, 0.59),
-    "rod": (0.59, 0.69),
-    "rod, held force": (0.69, 0.87),
-    "shear": (0.87, 1.0),
-}
-"""Begin and end of each part of the work of `./cube paper`, as measured shares of the whole time;
-the first share belongs to Fig. 4."""
+PARTS = ("Fig. 4", "linear", "finite", "rod", "rod, held force", "shear")
+"""Names of the parts of the work of `./cube paper`, in order."""
 
 
 def save_paper(folder: Path, report: Progress) -> list[Path]:
@@ -45,32 +37,28 @@ def save_paper(folder: Path, report: Progress) -> list[Path]:
         save(figure, written[-1])
 
     # Each picture is written as soon as it is there: the whole takes many minutes.
-    report(0, 1, "Fig. 4")
+    report(0, 1, PARTS[0])
     save_picture(draw_figure_4(figure_4()), "figure_4")
     numbers: dict[str, Any] = {}
     for law in ("linear", "finite"):
         results = experiments(finite=law == "finite", progress=_report_part(report, law))
         for number, result in enumerate(results, 1):
             save_picture(draw_experiment(result, law), f"experiment_{number}_{law}")
-            numbers[f"{result.name}, {law}"] = _columns(result)
+            numbers[f"{result.name}, {law}"] = vars(result)
     # The last results are those of finite strain, in which P_normal falls.
     sheared = [result for result in results if result.name.startswith("b")]
-    numbers["fall of P_normal"] = {one.name: _columns(normal_fall(one)) for one in sheared}
+    numbers["fall of P_normal"] = {one.name: vars(normal_fall(one)) for one in sheared}
 
     parts = rod_parts(progress=_report_part(report, "rod"))
     save_picture(draw_rod_parts(parts), "rod_parts")
-    numbers["rod parts"] = {name: _columns(one) for name, one in parts.items()}
-    told = _report_part(report, "rod, held force")
-    parts = rod_parts(
-        places=NEAR_PLACES,
-        held="force",
-        progress=told,
-    )
-    numbers["rod parts, held force"] = {name: _columns(one) for name, one in parts.items()}
+    numbers["rod parts"] = {name: vars(one) for name, one in parts.items()}
+    report_held = _report_part(report, "rod, held force")
+    parts = rod_parts(places=NEAR_PLACES, held="force", progress=report_held)
+    numbers["rod parts, held force"] = {name: vars(one) for name, one in parts.items()}
 
     recovered = rod_shear(progress=_report_part(report, "shear"))
     save_picture(draw_rod_shear(recovered), "rod_shear")
-    numbers["rod shear"] = _columns(recovered)
+    numbers["rod shear"] = vars(recovered)
     written.append(folder / "paper.json")
     write_json(written[-1], numbers)
     return written
@@ -78,19 +66,5 @@ def save_paper(folder: Path, report: Progress) -> list[Path]:
 
 def _report_part(report: Progress, name: str) -> Progress:
     """Return a function that reports the progress of a part as progress of the whole."""
-    begin, end = PROGRESS_SPANS[name]
-
-    def report_part(
-        done: float,
-        total: float,
-        what: str,
-    ) -> None:
-        report(begin + (end - begin) * done / total, 1, f"{name}: {what}")
-
-    return report_part
-
-
-def _columns(table: Any) -> dict[str, object]:
-    """Return the arrays of a result by their name, as lists for JSON."""
-    columns = vars(table).items()
-    return {name: column.tolist() for name, column in columns if isinstance(column, np.ndarray)}
+    before = PARTS.index(name)
+    return lambda done, total, what: report(before + done / total, len(PARTS), f"{name}: {what}")

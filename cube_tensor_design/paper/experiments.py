@@ -11,7 +11,6 @@ pads' foam either; `FOAM_MODULUS` is ours.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -26,7 +25,7 @@ from cube_tensor_driver.core.modes import PLANE
 from cube_tensor_driver.core.oscillator import pad_frequency
 
 from ..fem.body import Body
-from ..fem.fem import Progress, Response, compute_response
+from ..fem.fem import Progress, Response, compute_response, count_steps
 from .rod import Rod
 from .virtual_bench import Deformation, LoadStep, VirtualBench
 
@@ -96,20 +95,16 @@ def experiments(
 
     Args:
         finite: Whether the material is neo-Hookean.
-        progress: Called as progress(done, total, name) after every step.
+        progress: Called as progress(done, total, name) after every step, with the number of steps
+            before it.
     """
     body = Body()
     protocols = _protocols(body)
     # The cube is calibrated in the same body, which has the symmetry of a slab.
     calibration = compute_response(body, LAYOUTS["planar"], "slab", meshes=1)
-    done = itertools.count(1)
     # Every step is solved with the cube and without it.
     total = 2 * sum(len(protocol.steps) for protocol in protocols)
-
-    def report(name: str) -> None:
-        if progress is not None:
-            progress(next(done), total, name)
-
+    report = count_steps(progress, total)
     found = [
         # Every step reports the name of its experiment.
         _run_experiment(protocol, body, finite, calibration, partial(report, protocol.name))

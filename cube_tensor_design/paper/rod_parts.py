@@ -41,7 +41,7 @@ from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.layout import LAYOUTS
 
 from ..fem.body import Body, strip_layout
-from ..fem.fem import Progress
+from ..fem.fem import Progress, count_steps
 from ..fem.solid import lame
 from .experiments import SHEAR_SIGNS, dent
 from .newton import factorise
@@ -110,13 +110,11 @@ def rod_parts(
     bench = VirtualBench(body or Body())
     signals = [P_SHEAR @ bench.pad_weights(layout) for layout in PADS.values()]
     found: dict[str, RodParts] = {}
-    total = len(RADII) * len(places)
-    for number, (rod, radius) in enumerate(RADII.items()):
+    report = count_steps(progress, len(RADII) * len(places))
+    for rod, radius in RADII.items():
         rows = []
-        for row, place in enumerate(places):
-            if progress is not None:
-                done = number * len(places) + row
-                progress(done, total, f"{rod} at {1e3 * place:g} mm")
+        for place in places:
+            report(f"{rod} at {1e3 * place:g} mm")
             step = dent(bench.body, Rod(ROD_DEPTH, place, edge_radius=radius))
             rows.append(split_signals(bench, step, signals, held))
         by_pads = np.moveaxis(np.array(rows), 1, 0)  # (pads, places, parts)

@@ -28,7 +28,7 @@ from cube_tensor_driver.mechanics.traction_prior import PRIOR_LENGTHS, SHEAR_RAT
 from cube_tensor_driver.touch.posterior import MODEL_ERROR
 
 from ..fem.body import Body
-from ..fem.fem import Progress, compute_response
+from ..fem.fem import Progress, compute_response, count_steps
 from ..fem.line_load import line_load
 from ..fem.reciprocity import compute_influence
 from .experiments import SHEAR_SIGNS, dent, plane_estimator
@@ -102,10 +102,10 @@ def rod_shear(
     from_pads = _shear_weights(pad_kernel, shear_kernel, x, depth)
 
     eq_4_gain = SHEAR_SIGNS @ response[:4, zx]
+    report = count_steps(progress, len(places))
     rows = []
-    for number, place in enumerate(places):
-        if progress is not None:
-            progress(number, len(places), f"rod at {1e3 * place:g} mm")
+    for place in places:
+        report(f"rod at {1e3 * place:g} mm")
         step = dent(body, Rod(ROD_DEPTH, place))
         # The same rod at the same depth; with the cube it needs more force.
         pads = with_cube.run([step]).pads[0]

@@ -16,7 +16,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -62,16 +62,6 @@ NEGLECTED_MODES = {
 """Names of the modes (linear stress fields) that each layout takes as zero, by its name."""
 
 
-class TrustedWidth(NamedTuple):
-    """Width of the narrowest indenter, in m, from which on the error of a component stays below the
-    limit; None if there is none. `side` is that of the cube, in m."""
-
-    layout: str
-    side: float
-    component: str
-    width: float | None
-
-
 @dataclass(frozen=True, eq=False)
 class LayoutStudy:
     """Error of each component, relative to the range of its true value as the indenter passes.
@@ -90,23 +80,22 @@ class LayoutStudy:
     offsets: Array
     error: dict[str, Array]
 
-    def trusted(self) -> list[TrustedWidth]:
-        """Return the narrowest trusted indenter for each layout, side of the cube and observed
-        component.
+    def trusted_widths(self, layout: str) -> Array:
+        """Return the width of the narrowest indenter from which on each error is below the limit.
+
+        Args:
+            layout: Name of the layout.
+
+        Returns:
+            (S, C) in m; infinite if even the widest indenter is not trusted, NaN where the layout
+            does not observe the component.
         """
-        rows = []
-        for (name, error), (i, side) in itertools.product(
-            self.error.items(), enumerate(self.sides)
-        ):
-            for k, component in enumerate(COMPONENTS):
-                if np.isnan(error[i, 0, k]):
-                    continue
-                # Every wider indenter must be trusted, too.
-                bad = np.flatnonzero(error[i, :, k] > MAX_TRUSTED_ERROR)
-                first = bad[-1] + 1 if len(bad) else 0
-                width = float(self.widths[first]) if first < len(self.widths) else None
-                rows.append(TrustedWidth(name, float(side), component, width))
-        return rows
+        error = self.error[layout]
+        # Every wider indenter must be trusted, too, so they are counted from the widest one on.
+        is_trusted = error[:, ::-1] <= MAX_TRUSTED_ERROR
+        n_trusted = np.cumprod(is_trusted, axis=1).sum(axis=1)
+        from_widest = np.append(np.inf, self.widths[::-1])
+        return np.where(np.isnan(error[:, 0]), np.nan, from_widest[n_trusted])
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of the file of --json; NaN becomes null there."""

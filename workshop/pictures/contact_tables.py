@@ -19,7 +19,7 @@ from cube_tensor_design.studies.traction_study import (
     Errors,
     traction_study,
 )
-from cube_tensor_driver.config.output_files import atomic_write, to_json
+from cube_tensor_driver.config.output_files import write_json
 from cube_tensor_driver.mechanics.influence import Influence
 
 from ..bench.contacts import SCANS, Outcomes, summarise
@@ -70,8 +70,7 @@ def write_contact_tables(path: Path, true_pads: Influence, shapes: Outcomes) -> 
             for name, figures in summarise(shapes).items()
         },
     }
-    with atomic_write(path) as partial:
-        partial.write_text(to_json(tables) + "\n", encoding="utf-8")
+    write_json(path, tables)
 
 
 def contact_tables(true_pads: Influence) -> dict[str, Any]:

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import sys
@@ -12,7 +11,6 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +23,7 @@ from cube_tensor_design.studies.field_study import field_example, field_study
 from cube_tensor_design.studies.pads_example import planar_calibration, sweep
 from cube_tensor_design.studies.pads_study import coarse_influence, layer_example
 from cube_tensor_design.studies.traction_study import traction_example
-from cube_tensor_driver.config.output_files import atomic_write, write_json
+from cube_tensor_driver.config.output_files import write_json
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.errors import ConfigError
@@ -110,15 +108,10 @@ def make_pictures(folder: Path) -> None:
     save(draw_methods(field_example()), folder / "field.png")
     study = field_study()
     save(draw_field_study(study), folder / "field_error.png")
-    table: dict[str, Any] = {name: column.tolist() for name, column in vars(study).items()}
-    for level in ERROR_LEVELS:
-        saved = study.cubes_saved(level)
-        # NaN means that no pitch reaches the error. JSON has no NaN, so null is written.
-        rows = [[value if value == value else None for value in row] for row in saved.tolist()]
-        table[f"cubes saved at an error of {level}"] = rows
-    with atomic_write(folder / "field.json") as partial:
-        partial.write_text(json.dumps(table) + "\n")
-
+    saved = {
+        f"cubes saved at an error of {level}": study.cubes_saved(level) for level in ERROR_LEVELS
+    }
+    write_json(folder / "field.json", vars(study) | saved)
     save(draw_traction(traction_example()), folder / "traction.png")
     true_pads = coarse_influence()
     save(

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from cube_tensor_driver.core.errors import ConfigError
-from cube_tensor_driver.demo.running import report
+from cube_tensor_driver.demo.running import Interrupted, report
 from cube_tensor_driver.processes.domain import own_domain
 from cube_tensor_driver.processes.stop_signals import stop_event
 from cube_tensor_driver.views.terminal.output import progress_bar
@@ -110,16 +110,19 @@ def run_mutations(
 
     Raises:
         ConfigError: There is no such mutation.
+        Interrupted: A signal asked this process to end.
     """
     names = list(MUTATIONS) if name == "all" else [name]
     if not set(names) <= set(MUTATIONS):
         raise ConfigError(f"--mutate {name!r}, allowed: all, {', '.join(MUTATIONS)}")
     # Ctrl-C must not end this process at once: it ends the child process of the torture, whose
     # error `result` raises here.
-    stop_event()
+    interrupted = stop_event()
     results: dict[str, dict[str, Any]] = {}
     with progress_bar() as progress:
         for number, name in enumerate(names):
+            if interrupted.is_set():
+                raise Interrupted("interrupted")
             progress(number, len(names), name)
             # Each runs in a process of its own: after 32 tortures in one process, Fast DDS 2.14
             # delivered nothing to it any more, each time it was tried.
