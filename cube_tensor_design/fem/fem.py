@@ -28,7 +28,7 @@ from cube_tensor_driver.core.defaults import (
     REST_FREQUENCY,
 )
 from cube_tensor_driver.core.errors import ElasticError
-from cube_tensor_driver.core.estimator import RANK_TOLERANCE, summarize_response
+from cube_tensor_driver.core.estimator import make_estimator
 from cube_tensor_driver.core.layout import Layout
 from cube_tensor_driver.core.response import project
 from cube_tensor_driver.core.symmetry import (
@@ -140,18 +140,24 @@ def compute_response(
 
     matrix = results[-1].pads
     coefficients, residual = project(structure, matrix)
-    largest = np.linalg.norm(matrix, 2)
+    modes = structure.modes
+    estimator = make_estimator(
+        matrix,
+        noise=np.ones(layout.n_pads),
+        modes=modes,
+        targets=np.eye(modes.n_modes),
+    )
     return Response(
         body=body,
         layout=layout,
         symmetry=symmetry,
-        modes=structure.modes.names,
+        modes=modes.names,
         matrix=matrix,
         coefficients=coefficients,
         structure_residual=residual,
         mode_residual=_mode_residual(structure, matrix, coefficients),
-        rank=int(np.linalg.matrix_rank(matrix, RANK_TOLERANCE * largest)),
-        unobservable=tuple(summarize_response(structure, matrix)["unobservable"]),
+        rank=estimator.rank,
+        unobservable=tuple(np.array(modes.names)[~estimator.observed].tolist()),
         convergence=tuple(rows),
         seconds=sum(result.seconds for result in results),
     )

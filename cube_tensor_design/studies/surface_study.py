@@ -25,9 +25,10 @@ import numpy as np
 
 from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.errors import ElasticError
+from cube_tensor_driver.core.estimator import make_estimator
 from cube_tensor_driver.core.layout import Layout
 from cube_tensor_driver.core.modes import PLANE
-from cube_tensor_driver.core.symmetry import largest_symmetry
+from cube_tensor_driver.core.symmetry import default_modes, largest_symmetry
 from cube_tensor_driver.mechanics.contact_response import ContactResponse
 from cube_tensor_driver.mechanics.influence import Influence
 from cube_tensor_driver.mechanics.layer import FIELD, Layer
@@ -48,10 +49,6 @@ against z and rubs along x."""
 POINTS_ACROSS = 41
 """Number of point forces across the diameter of a contact. With this number the stress of the
 contact is right to a hundredth."""
-MAX_LEAK = 1e-6
-"""Largest deviation from 1 of a component's diagonal entry in R^+ R, with the response matrix R and
-its pseudo-inverse R^+. With a larger one, the pads confuse the component with others, and it is not
-compared."""
 
 
 class SurfaceRow(NamedTuple):
@@ -158,17 +155,19 @@ def _inverse_rows(
     """Return, for each component that the pads tell from all other modes, the row (P,) of the
     pseudo-inverse of the response matrix: from pad stresses to the component."""
     response = compute_response(body, layout, largest_symmetry(layout), meshes)
-    names = [name for name in response.modes if name not in neglect]
-    columns = [response.modes.index(name) for name in names]
-    matrix = response.matrix[:, columns]
-    inverse = np.linalg.pinv(matrix)
-    # R^+ R has 1 on the diagonal for the modes that the pads tell from all others.
-    own_entry = np.diag(inverse @ matrix)
-    rows = {}
-    for name in COMPONENTS:
-        k = names.index(name) if name in names else None
-        if k is not None and abs(own_entry[k] - 1) < MAX_LEAK:
-            rows[name] = inverse[k]
+    modes = default_modes(layout)
+    estimator = make_estimator(
+        response.matrix,
+        noise=np.ones(layout.n_pads),
+        modes=modes,
+        neglect=neglect,
+        targets=np.eye(modes.n_modes),
+    )
+    rows = {
+        name: estimator.matrix[modes.names.index(name)]
+        for name in COMPONENTS
+        if name in modes.names and estimator.observed[modes.names.index(name)]
+    }
     if not rows:
         raise ElasticError(
             f"layout {layout.name!r} tells none of {', '.join(COMPONENTS)} from the other modes; "

@@ -24,7 +24,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from cube_tensor_driver.config.skin import read_skin
-from cube_tensor_driver.core.arrays import Index
+from cube_tensor_driver.core.arrays import Array, Index
 from cube_tensor_driver.core.errors import CubeError
 from cube_tensor_driver.demo.running import end_simulator, observing
 from cube_tensor_driver.demo.usage import Usage
@@ -403,7 +403,9 @@ def summarise_memory(memory_mb: dict[str, list[float]]) -> dict[str, float]:
     If the measurement took a minute or more, the growth of the process that grows fastest after the
     first fifth of the time is returned as well.
     """
-    nodes = [np.array(values, float) for name, values in memory_mb.items() if name not in LOADS]
+    nodes: list[Array] = [
+        np.array(values) for name, values in memory_mb.items() if name not in LOADS
+    ]
     result = {"rss_mb": round(float(np.max(nodes)), 1)}
     times_s = MEMORY_PERIOD_S * np.arange(len(nodes[0]))
     if times_s[-1] + MEMORY_PERIOD_S < MIN_GROWTH_DURATION_S:
