@@ -407,7 +407,7 @@ def summarise_memory(memory_mb: dict[str, list[float]]) -> dict[str, float]:
         np.array(values) for name, values in memory_mb.items() if name not in LOADS
     ]
     result = {"rss_mb": round(float(np.max(nodes)), 1)}
-    times_s = MEMORY_PERIOD_S * np.arange(len(nodes[0]))
+    times_s: Array = MEMORY_PERIOD_S * np.arange(len(nodes[0]), dtype=np.float64)
     if times_s[-1] + MEMORY_PERIOD_S < MIN_GROWTH_DURATION_S:
         return result
     begin = len(times_s) // 5
