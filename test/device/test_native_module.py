@@ -222,8 +222,8 @@ def read_of_samples(random: np.random.Generator, number: int, step_us: int) -> l
 @needs_the_module
 @pytest.mark.parametrize("seed", range(2))
 def test_usual_samples_have_the_same_stamps_and_counters_in_c(seed: int) -> None:
-    """Over the wrap of numbers; with delays, and a clock that is set. What is not usual is handled
-    in Python, and then C continues."""
+    """Over the wrap of numbers; with delays, answers to TIME, and a clock that is set. What is not
+    usual is handled in Python, and then C continues."""
     random = np.random.default_rng(seed)
     here, there = UsualLink(), UsualLink()
     near, far = os.pipe()
@@ -236,7 +236,7 @@ def test_usual_samples_have_the_same_stamps_and_counters_in_c(seed: int) -> None
         for sample in samples:
             number += (sample.sequence - number) % 2**32
         sampled_ns = 1_000_000 * number
-        arrival_ns = max(arrival_ns, sampled_ns + 200_000 + int(random.exponential(3e5)))
+        arrival_ns = max(arrival_ns, sampled_ns + 2_200_000 + int(random.exponential(3e5)))
         data = b"".join(map(encode, samples))
         # Data that come during the wait show that this process is in time.
         timer = threading.Timer(2e-4 if turn % 5 else 0, os.write, (far, data))
@@ -250,6 +250,11 @@ def test_usual_samples_have_the_same_stamps_and_counters_in_c(seed: int) -> None
         if events:
             stamps = here.handle(samples, arrival_ns, is_late)
         assert stamps == there.handle(samples, arrival_ns, is_late)
+        if turn % 800 == 300:
+            # The answer shows that stamps are 2 ms late. Corrected ones must not go back.
+            device_us = arrival_ns // 1000 + step_us + 50
+            for link in (here, there):
+                link.clock.add_answer(arrival_ns, device_us, arrival_ns + 100_000)
         assert here.account.counters() == there.account.counters()
         for name in LinkTrack.__annotations__:
             if name not in ("is_native_allowed", "n_native", "seen"):
