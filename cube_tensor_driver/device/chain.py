@@ -559,14 +559,14 @@ def _report_values(link: Link, record: _LinkRecord) -> dict[str, object]:
 
     The names carry the units. Values that are not known yet are "unknown".
     """
-    clock = record.clock
-    bound_ns = clock.bound_ns
+    clock, track = record.clock, record.track
+    bound_ns = clock.line.error_bound
     values: dict[str, object] = {
         **link.counters,
         **record.reported,
         "clock offset s": round(1e-9 * clock.offset_ns, 6),
-        "clock drift ppm": round(clock.drift_ppm, 2),
-        "clock jitter us": round(1e-3 * clock.jitter_ns, 1),
+        "clock drift ppm": round(1e6 * track.drift, 2),
+        "clock jitter us": round(1e-3 * track.jitter_ns, 1),
         "clock delay us": "unknown",
         "clock error at most us": "unknown",
         "clock resets": clock.resets,
@@ -574,7 +574,7 @@ def _report_values(link: Link, record: _LinkRecord) -> dict[str, object]:
         "log lines left out": record.logger.left_out,
     }
     if bound_ns is not None:
-        values["clock delay us"] = round(1e-3 * clock.delay_ns, 1)
+        values["clock delay us"] = round(1e-3 * (track.offset - track.bounded_offset), 1)
         values["clock error at most us"] = round(1e-3 * bound_ns, 1)
     stats = record.account.stats_frame
     if stats is not None:

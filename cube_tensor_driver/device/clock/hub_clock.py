@@ -64,25 +64,27 @@ class HubClock:
         in_doubt: Whether the stamps of the last `update` may be wrong, because the hub's clock may
             have been set or cannot be used.
         problems: Texts of problems, which the caller reports and removes.
+        track: Sample numbers and clock values of the hub, which the module in C changes, too.
+        line: The straight line from device times to host times.
     """
 
     # Times are stored relative to track.first_us (device) and track.first_ns (host), because a
     # float would round absolute times to 256 ns.
 
     def __init__(self, track: LinkTrack | None = None) -> None:
-        self._track = LinkTrack() if track is None else track
+        self.track = LinkTrack() if track is None else track
         self.resets = 0
         self.in_doubt = False
         self.problems: set[str] = set()
-        self._line = ClockLine(self._track)
+        self.line = ClockLine(self.track)
         self._is_late = False  # whether the samples of the last update were read late
         self._last_us = -1  # newest device time, in µs, in the last read
         self._moved_ns = 0  # arrival time at which _last_us changed last
         self._n_still = 0  # number of reads since _last_us changed
         self._steps_ns: deque[int] = deque(maxlen=MAX_STEPS)
         self._n_bad_answers = 0
-        self._track.last_arrival_ns = NEVER
-        self._track.last_stamp_ns = NEVER
+        self.track.last_arrival_ns = NEVER
+        self.track.last_stamp_ns = NEVER
         # Last stamp given while a step of the hub's clock was suspected that was confirmed later.
         # It was computed without the step and may be later than the true time.
         self._doubtful_stamp = NEVER
@@ -94,54 +96,21 @@ class HubClock:
 
         The sample period must be known up to the newest sample, and no step of the clock suspected.
         """
-        track = self._track
+        track = self.track
         is_newest = 1000 * (track.newest_us - track.first_us) == track.newest_ns
         in_step = is_newest and track.reference_us == track.newest_us and track.period_us > 0
         is_suspected = self.in_doubt or self._decision is not None or self._n_still > 0
         return in_step and not is_suspected and len(self._steps_ns) < MAX_STEPS
 
     @property
-    def drift_ppm(self) -> float:
-        """Drift of the hub's clock, in parts per million; 0 until it is estimated.
-
-        It is positive if host time runs faster than device time.
-        """
-        return 1e6 * self._track.drift
-
-    @property
-    def jitter_ns(self) -> float:
-        """Mean excess of the samples' delays over the smallest delay, in ns, over about 64 reads.
-
-        The delay is the time between the sampling of a sample and its arrival at the host.
-        """
-        return self._track.jitter_ns
-
-    @property
     def offset_ns(self) -> int:
         """Host time minus hub's time at the newest sample, in ns; 0 before the first sample."""
         if self._is_fresh:
             return 0
-        track = self._track
+        track = self.track
         between_origins = track.first_ns - 1000 * track.first_us
         since_origins = track.bounded_offset + track.drift * track.newest_ns
         return between_origins + round(since_origins)
-
-    @property
-    def delay_ns(self) -> float:
-        """Smallest delay between sampling and arrival, in ns; 0 without round trips.
-
-        It is estimated from round trips: questions for the hub's time and their answers.
-        """
-        return self._track.offset - self._track.bounded_offset
-
-    @property
-    def bound_ns(self) -> float | None:
-        """Largest error of stamps (host times), in ns; None without round trips.
-
-        It does not hold for stamps of an `update` after which `in_doubt` is true, because the hub's
-        clock may have been set. A round trip is a question for the hub's time and its answer.
-        """
-        return self._line.error_bound
 
     def reset(self) -> None:
         """Discard the line (host time over device time) and its samples, because the hub restarted.
@@ -157,13 +126,13 @@ class HubClock:
         Args:
             step_ns: New time minus old time of the host's clock, in ns.
         """
-        self._track.first_ns += step_ns
+        self.track.first_ns += step_ns
         self._moved_ns += step_ns
         self._steps_ns = deque((at + step_ns for at in self._steps_ns), MAX_STEPS)
-        if self._track.last_arrival_ns != NEVER:
-            self._track.last_arrival_ns += step_ns
-        if self._track.last_stamp_ns != NEVER:
-            self._track.last_stamp_ns += step_ns
+        if self.track.last_arrival_ns != NEVER:
+            self.track.last_arrival_ns += step_ns
+        if self.track.last_stamp_ns != NEVER:
+            self.track.last_stamp_ns += step_ns
             self._doubtful_stamp += step_ns
 
     def add_answer(self, sent_ns: int, device_us: int, arrival_ns: int) -> None:
@@ -179,10 +148,10 @@ class HubClock:
         """
         if self._is_fresh or self.in_doubt or not sent_ns <= arrival_ns:
             return
-        device_ns = 1000.0 * (device_us - self._track.first_us)
-        since_first = -self._track.first_ns - device_ns
+        device_ns = 1000.0 * (device_us - self.track.first_us)
+        since_first = -self.track.first_ns - device_ns
         trip = ClockRoundTrip(device_ns, sent_ns + since_first, arrival_ns + since_first)
-        if self._line.add_round_trip(trip):
+        if self.line.add_round_trip(trip):
             self._n_bad_answers = 0
             return
         self._n_bad_answers += 1
@@ -219,7 +188,7 @@ class HubClock:
         stamps: list[int] = []
         start = 0
         for k, number in enumerate(numbers):
-            step_us = find_step(self._track, number, device_us[k])
+            step_us = find_step(self.track, number, device_us[k])
             if not step_us:
                 continue
             # Samples before a step of the hub's clock are converted by the line before the step.
@@ -232,15 +201,15 @@ class HubClock:
     @property
     def _is_fresh(self) -> bool:
         """Whether no sample has come since the start or the last restart of the hub."""
-        return self._track.newest_ns == NEVER
+        return self.track.newest_ns == NEVER
 
     def _restart(self) -> None:
         """Discard the clock line and all samples; keep the drift and the last stamp (host time)."""
-        self._track.first_us = self._track.first_ns = 0
-        self._track.newest_ns = NEVER
-        self._track.reference = -1
-        self._track.period_us = 0.0
-        self._line.restart()
+        self.track.first_us = self.track.first_ns = 0
+        self.track.newest_ns = NEVER
+        self.track.reference = -1
+        self.track.period_us = 0.0
+        self.line.restart()
         self._decision: StepDecision | None = None
 
     def _count_reset(self) -> None:
@@ -249,7 +218,7 @@ class HubClock:
         The time of the event is kept, to find a clock that is set again and again.
         """
         self.resets += 1
-        self._steps_ns.append(self._track.last_arrival_ns)
+        self._steps_ns.append(self.track.last_arrival_ns)
 
     def _convert(self, times: Sequence[int], arrival_ns: int) -> list[int]:
         """Fit the clock line to the newest of some samples, and convert the device times of all.
@@ -265,7 +234,7 @@ class HubClock:
         """
         if not times:
             return []
-        track = self._track
+        track = self.track
         # The clock line is determined by the smallest delays. Of samples that arrive together, only
         # the newest one can have the smallest delay.
         is_usable = self._learn(max(times), arrival_ns)
@@ -302,7 +271,7 @@ class HubClock:
         Returns:
             Whether device times of this hub can be converted now.
         """
-        track = self._track
+        track = self.track
         goes_back = arrival_ns < track.last_arrival_ns
         pause_ns = min(
             arrival_ns - track.last_arrival_ns,
@@ -334,7 +303,7 @@ class HubClock:
         # The line is not fitted while a step of the hub's clock is undecided, because the delay of
         # a sample (arrival minus sampling) is unknown then.
         arrival = arrival_ns - track.first_ns
-        if self._decision is None and self._line.add(device_ns, arrival, self._is_late):
+        if self._decision is None and self.line.add(device_ns, arrival, self._is_late):
             self.problems.add(CLOCK_SET)
             self._count_reset()
         if problem or self._decision is not None:
@@ -374,14 +343,14 @@ class HubClock:
                 µs.
             arrival_ns: Host time at which the sample after the step arrived, in ns.
         """
-        track = self._track
+        track = self.track
         if self._decision is None:
             self._decision = StepDecision(
                 step_us,
                 newest_ns=track.newest_ns,
                 before_ns=track.last_arrival_ns - track.first_ns,
                 since_ns=arrival_ns - track.first_ns,
-                usual_delay_ns=self._line.recent_min_height,
+                usual_delay_ns=self.line.recent_min_height,
             )
             return
         step_us += self._decision.step_us
@@ -396,11 +365,11 @@ class HubClock:
             newest_us: Device time of the newest sample, in µs.
             arrival_ns: Host time at which it arrived, in ns.
         """
-        device_ns = 1000 * (newest_us - self._track.first_us)
-        arrival = arrival_ns - self._track.first_ns
+        device_ns = 1000 * (newest_us - self.track.first_us)
+        arrival = arrival_ns - self.track.first_ns
         if not self._is_late:
-            delay = self._line.height(device_ns, arrival)
-            was_set = decision.was_set(device_ns, delay, arrival, self._track.jitter_ns)
+            delay = self.line.height(device_ns, arrival)
+            was_set = decision.was_set(device_ns, delay, arrival, self.track.jitter_ns)
         else:
             # The delays of samples that this host reads too late do not show whether the hub's
             # clock was set. After the time limit, this is left to the check of later delays.
@@ -410,13 +379,13 @@ class HubClock:
             return
         self._decision = None
         if not was_set:
-            self._track.period_us = 0.0
+            self.track.period_us = 0.0
             return
         # The origin of device times is moved by the step, so that times relative to it continue
         # without a step and the clock line stays valid.
-        self._track.first_us += decision.step_us
-        self._track.newest_ns = min(self._track.newest_ns, decision.newest_ns)
-        self._doubtful_stamp = self._track.last_stamp_ns
-        self._line.discard_round_trips_after(decision.before_ns)
+        self.track.first_us += decision.step_us
+        self.track.newest_ns = min(self.track.newest_ns, decision.newest_ns)
+        self._doubtful_stamp = self.track.last_stamp_ns
+        self.line.discard_round_trips_after(decision.before_ns)
         self.problems.add(CLOCK_SET)
         self._count_reset()

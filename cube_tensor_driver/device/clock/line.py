@@ -123,10 +123,6 @@ class ClockLine:
         self._fall = 0.0
         self._n_high = 0
 
-    def __len__(self) -> int:
-        """Return the number of kept points, one for each complete bucket (interval of 1 s)."""
-        return len(self._points)
-
     @property
     def recent_min_height(self) -> float:
         """Smallest delay, in ns, of the samples of this and the previous bucket of 1 s.
