@@ -15,7 +15,6 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 from ..core.errors import LinkError
 from ..core.rows import FrequencyRows
@@ -290,16 +289,6 @@ class LiveLinks:
             self._missing_before = None
         return now < self._overloaded_until
 
-    def _count_overload(self, n_rows: int) -> None:
-        """Count rows (samples of cubes) that were dropped because this host is too slow.
-
-        Args:
-            n_rows: Number of rows dropped; 0 if none were.
-        """
-        if n_rows:
-            self._rows.overload += n_rows
-            self._overloaded_until = time.monotonic() + OVERLOAD_S
-
     def _handle_received(self, received: Sequence[LinkFrames]) -> None:
         """Handle frames that the module in C does not handle itself, for example HELLO.
 
@@ -400,23 +389,18 @@ class LiveLinks:
         discarded. If this host is too slow, the oldest scans are dropped and counted instead.
         """
         if self._is_overloaded():
-            self._count_overload(self._scans.drop_oldest(self._max_scans))
+            n_dropped = self._scans.drop_oldest(self._max_scans)
+            self._rows.overload += n_dropped
+            if n_dropped:
+                self._overloaded_until = time.monotonic() + OVERLOAD_S
         while self._scans.is_complete(self._scans_per_call):
-            self._give_rows(partial(self._scans.build, self._max_scans))
-
-    def _give_rows(self, build: Callable[[], FrequencyRows | None]) -> None:
-        """Call `on_rows` with the rows (samples of cubes) that a function builds, if there are any.
-
-        Args:
-            build: Function that removes scans from those that wait and returns their rows.
-        """
-        try:
-            rows = build()
-            if rows is not None:
-                self._on_rows(rows)
-                self._rows.delivered += len(rows)
-        except Exception as error:  # noqa: BLE001  (later rows must still be delivered)
-            self._count_error(error)
+            try:
+                rows = self._scans.build(self._max_scans)
+                if rows is not None:
+                    self._on_rows(rows)
+                    self._rows.delivered += len(rows)
+            except Exception as error:  # noqa: BLE001  (later rows must still be delivered)
+                self._count_error(error)
 
     def _count_error(self, error: Exception) -> None:
         """Count and log an error, and count the rows (samples of cubes) that it has lost."""

@@ -5,13 +5,12 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 
 from ...core.errors import ConfigError, CubeError, MessageError
@@ -166,7 +165,9 @@ class _Listener:
             # On a large skin the publisher of a single cube's topic is made only when somebody
             # subscribes, so the subscription comes before the search for the publisher.
             profile = offered_profile([], QUEUE_DEPTH)
-            self._early_subscription = self._add(StressTensorStamped, self._on_message, profile)
+            self._early_subscription = node.create_subscription(
+                StressTensorStamped, topic, self._on_message, profile
+            )
 
     @property
     def has_names(self) -> bool:
@@ -205,9 +206,9 @@ class _Listener:
             namespace = self._topic.rpartition("/")[0]
             info = f"{namespace}/info"
             self._node.create_subscription(SkinInfo, info, self._on_info, LATCHED)
-            self._add(SkinStress, self._on_stress, profile, raw=True)
+            self._node.create_subscription(kind, self._topic, self._on_stress, profile, raw=True)
         else:
-            self._add(kind, self._on_message, profile)
+            self._node.create_subscription(kind, self._topic, self._on_message, profile)
 
     def take(self) -> list[Item]:
         """Remove the oldest message from `waiting`, and return its content.
@@ -221,21 +222,6 @@ class _Listener:
         if isinstance(message, StressTensorStamped):
             return [self._read_tensor(message)]
         return [to_plain(message)]
-
-    def _add(
-        self,
-        kind: type,
-        receive: Callable[[Any], None],
-        profile: QoSProfile,
-        raw: bool = False,
-    ) -> Subscription:
-        return self._node.create_subscription(
-            kind,
-            self._topic,
-            receive,
-            profile,
-            raw=raw,
-        )
 
     def _on_message(self, message: object) -> None:
         self.waiting.append(message)
