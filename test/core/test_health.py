@@ -88,7 +88,7 @@ def test_last_is_the_newest_row():
         )
         frequency += 1  # the caller's own, to fill again
         if n % 3 == 0:
-            assert (skin.health.last == 100e3 + n).all()
+            assert (skin.health.sums.pads("last") == 100e3 + n).all()
             assert (skin.health.window().rows == n).all()
 
 
@@ -286,7 +286,7 @@ def test_one_pad_that_wanders_while_all_rest_is_drifting_and_still_used():
     expected = np.zeros((6, 8), np.uint16)
     expected[2, 5] = DRIFT
     np.testing.assert_array_equal(skin.health.state, expected)
-    assert not skin.health.mask.any()
+    assert not skin.health.sums.cubes["mask"].any()
 
     # all together is temperature or load, not a pad
     skin = Skin(moving=False)
@@ -353,9 +353,8 @@ def test_a_cube_twice_in_a_batch_and_cubes_in_any_order():
     for row in range(6):
         one = slice(row, row + 1)
         check(singly, stamped(cube[one], frequency[one], none[one], 0))
-    for one, other in zip(
-        (together.last, *together.window()), (singly.last, *singly.window()), strict=True
-    ):
+    np.testing.assert_array_equal(together.sums.pads("last"), singly.sums.pads("last"))
+    for one, other in zip(together.window(), singly.window(), strict=True):
         np.testing.assert_array_equal(one, other)
     assert together.collect()[2].tolist() == [1, 2, 0, 0, 3, 0]
 

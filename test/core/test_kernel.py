@@ -240,7 +240,12 @@ def played(kernel, calibrations, seed: int, dtype=np.float32) -> list[object]:
             found.append(reconstructor.process_known(rows, recorded))
             found += reconstructor.compensation.states().values()
             found += [array.copy() for array in reconstructor.compensation.offsets]
-            found += [health.state, health.mask.copy(), *health.collect(), *health.window()]
+            found += [
+                health.state,
+                health.sums.cubes["mask"].copy(),
+                *health.collect(),
+                *health.window(),
+            ]
         found += [column for window in health.history for column in window]
         found += [health.sums.cubes[name] for name in health.sums.cubes.dtype.names]
         found += [health.sums.quantities, health.sums.window_ns, health.closed]

@@ -167,7 +167,7 @@ class DriftTracker:
         with np.errstate(invalid="ignore"):  # NaN where a cube has no such pad
             is_close = np.abs(measured / self._tracked_rest - 1) < CONTACT_THRESHOLD
         all_close = (is_close | ~usable).all(axis=1)
-        return all_close & usable.any(axis=1) & self._health.still
+        return all_close & usable.any(axis=1) & self._health.diagnosis.still
 
     def _count_unloaded_windows(self, at_rest: Mask, has_rows: Mask) -> None:
         """Count the windows (of 0.5 s) for which each cube has been unloaded.

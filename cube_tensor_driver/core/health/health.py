@@ -14,7 +14,7 @@ from collections import deque
 
 import numpy as np
 
-from ..arrays import Array, Index, Mask, PadMasks, Single, StatusBits, Times, pad_table
+from ..arrays import Index, Mask, Single, StatusBits, pad_table
 from ..kernel.contract import Columns, Tables
 from ..kernel.rows import find_impossible, mask_bits
 from ..oscillator import pad_frequency, stress_slope
@@ -73,6 +73,7 @@ class Health:
             frequencies) changes with each row.
         high_residual: Whether the residual of a cube is high by `has_high_residual` (cubes,).
         history: Statistics of the last `HISTORY_WINDOWS` windows that have ended.
+        diagnosis: Diagnosis of the pads, with their noise, and with the cubes that are still.
         closed: Number of windows that have ended so far.
     """
 
@@ -83,7 +84,7 @@ class Health:
         self.sums = make_state(rest)
         exists = ~np.isnan(rest)
         self._conditions = Conditions(self.sums, exists)
-        self._diagnosis = PadDiagnosis(exists)
+        self.diagnosis = PadDiagnosis(exists)
         self.high_residual = np.zeros(n_cubes, bool)
         self.history: deque[Window] = deque(maxlen=HISTORY_WINDOWS)
         self.closed = 0
@@ -101,26 +102,6 @@ class Health:
         return self._conditions.state
 
     @property
-    def mask(self) -> PadMasks:
-        """Bit masks of the pads that are not used, because of their conditions (cubes,)."""
-        return self.sums.cubes["mask"]
-
-    @property
-    def still(self) -> Mask:
-        """Whether the frequency of no usable pad of a cube moved in the last window (cubes,)."""
-        return self._diagnosis.still
-
-    @property
-    def noise(self) -> Array:
-        """Standard deviation of each pad's frequency (cubes, P), in Hz, by the calibration."""
-        return self._diagnosis.noise
-
-    @property
-    def last(self) -> Single:
-        """Newest frequency of each pad (cubes, P), in Hz."""
-        return self.sums.pads("last")
-
-    @property
     def temperature(self) -> Single:
         """Newest temperature of each cube (cubes,), in °C."""
         return self.sums.cubes["temperature"]
@@ -129,11 +110,6 @@ class Health:
     def newest_ns(self) -> int:
         """Newest time stamp of the last scan, in ns; 0 before the first one."""
         return int(self.sums.window_ns[2])
-
-    @property
-    def age_ns(self) -> Times:
-        """Time from the newest row of each cube to the newest row of any cube (cubes,), in ns."""
-        return self.newest_ns - self.sums.cubes["time_ns"]
 
     def window(self) -> Window:
         """Return the statistics of the present window, which has not ended."""
@@ -154,7 +130,7 @@ class Health:
             self.sums.pads(name)[:] = pad_frequency(strain * modulus, rest, beta, modulus)
         self._open = pad_frequency(OPEN_STRAIN * modulus, rest, beta, modulus).astype(np.float32)
         slope = stress_slope(rest, rest, beta, modulus)
-        self._diagnosis.set_reference(rest, noise / slope)
+        self.diagnosis.set_reference(rest, noise / slope)
 
     def advance(self) -> None:
         """End the present window, because the next scan lies outside it, and start the next one.
@@ -209,7 +185,7 @@ class Health:
         window = self.window()
         self.history.append(window)
         self.closed += 1
-        found = self._diagnosis.examine(window, self.state)
+        found = self.diagnosis.examine(window, self.state)
         self._set_bound()
         over_limit = self.sums.cubes["over_limit"]
         self.high_residual = has_high_residual(self.high_residual, over_limit, window.rows)
@@ -218,4 +194,4 @@ class Health:
 
     def _set_bound(self) -> None:
         """Set the limit to which squared second differences of a frequency are cut from now on."""
-        self.sums.pads("bound")[:] = np.nan_to_num(self._diagnosis.bound)
+        self.sums.pads("bound")[:] = np.nan_to_num(self.diagnosis.bound)

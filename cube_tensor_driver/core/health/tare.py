@@ -200,7 +200,8 @@ def _refuse_gaps(
     before = [window.gap_before[chosen] for window in windows[1:]]
     within = [window.gap_within[chosen] for window in windows]
     # The time from the newest row of a cube to the newest row of any cube is a gap, too.
-    gaps_ns = [*before, *within, health.age_ns[chosen]]
+    age_ns = health.newest_ns - health.sums.cubes["time_ns"][chosen]
+    gaps_ns = [*before, *within, age_ns]
     gaps_s = 1e-9 * np.abs(gaps_ns)
     mean_interval_s = len(windows) * WINDOW_S / rows
     limit_s = np.maximum(MAX_GAP_S, MAX_GAP_ROWS * mean_interval_s)
@@ -266,7 +267,7 @@ def _check_pads(
     calibrations = [pipeline.calibrations[cube] for cube in chosen.tolist()]
     frequencies = [calibration.rest_frequency for calibration in calibrations]
     calibrated = pad_table(frequencies, pipeline.n_pads, np.nan)
-    noise = health.noise[chosen]
+    noise = health.diagnosis.noise[chosen]
     jumped = means.span > JUMP_SPAN_RATIO * means.noise
     noise_ratio = np.where(jumped, 0, means.noise / noise)
     change_percent = 100 * np.abs(rest - calibrated) / calibrated

@@ -289,7 +289,7 @@ class ScanBuilder:
 
         A link has reached a scan if it has a sample in this scan or in a later one.
         """
-        return min((self._n_pending[link] for link in self._live), default=0)
+        return min(map(self._n_pending.__getitem__, self._live), default=0)
 
     def _align_by_order(self) -> None:
         """Put the first pending samples of all links into one scan, the second ones into the next.

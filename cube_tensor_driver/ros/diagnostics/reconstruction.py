@@ -264,10 +264,10 @@ class CubeHealth:
         health = self._health
         newest = FrequencyRows.of(
             cubes,
-            health.last[cubes],
+            health.sums.pads("last")[cubes],
             temperature=health.temperature[cubes],
         )
-        is_suspect = self._pipeline.suspects(newest, health.mask[cubes])
+        is_suspect = self._pipeline.suspects(newest, health.sums.cubes["mask"][cubes])
         names = {}
         for cube, suspects in zip(cubes.tolist(), is_suspect, strict=True):
             pads = self._skin.cubes[cube].calibration.layout.pads
