@@ -18,14 +18,16 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+# On every processor there is a worker, or a node: threads of a matrix product only get in the way.
+# The library reads this when numpy is imported.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import numpy as np
 import pytest
 
 from cube_tensor_driver.core.rows import FrequencyRows
 
 # A shell that starts us in the background has SIGINT ignored, in all that we start too.
-# On every processor there is a worker, or a node: threads of a matrix product only get in the way.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 ROOT = Path(__file__).resolve().parents[1]

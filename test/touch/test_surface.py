@@ -49,7 +49,7 @@ def measured(places: CubePoses, width: float, force: tuple, centre: np.ndarray) 
 def errors(pitch: float, width: float, places: int = 4) -> tuple[float, float]:
     """Relative rms error of the pressure without and with gradients; contacts all over a cell."""
     skin = flat(7, 7, pitch)
-    without, with_them = Surface(skin, DEPTH, 6, gradients=False), Surface(skin, DEPTH, 6)
+    without, with_them = Surface(skin, DEPTH, 3, gradients=False), Surface(skin, DEPTH, 3)
     random = np.random.default_rng(1)
     squares = np.zeros((places, 2))
     for row in squares:

@@ -31,6 +31,8 @@ def run(options: argparse.Namespace) -> int:
             workers = 2 * len(os.sched_getaffinity(0))
             words += ["-n", str(workers), "--dist", "loadgroup"]
     os.chdir(ROOT)
+    # The suite starts hundreds of processes, each of which would compile the package.
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     os.execv(
         sys.executable,
         [
