@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
@@ -51,14 +52,7 @@ class Influence:
             Stress (P, m, dim) of each pad per unit force, where the last index is the direction of
             the force; 0 for positions outside of the grid.
         """
-        # The grid contains all combinations of its x and y coordinates, sorted by x, then by y.
-        axes = [np.unique(column) for column in self.place.T]
-        nodes = np.moveaxis(self.pads, 1, 0)
-        grid = nodes.reshape(*map(len, axes), *nodes.shape[1:])
-        interpolate = RegularGridInterpolator(
-            tuple(axes), grid, "cubic", bounds_error=False, fill_value=0.0
-        )
-        return np.moveaxis(interpolate(place), 0, 1)
+        return np.moveaxis(self._splines(place), 0, 1)
 
     @property
     def reach(self) -> float:
@@ -66,3 +60,14 @@ class Influence:
         smallest = -self.place.min(axis=0).max()
         largest = self.place.max(axis=0).min()
         return float(min(smallest, largest))
+
+    @cached_property
+    def _splines(self) -> RegularGridInterpolator:
+        """Cubic splines through the tabulated stresses, whose set-up takes tenths of a second."""
+        # The grid contains all combinations of its x and y coordinates, sorted by x, then by y.
+        axes = [np.unique(column) for column in self.place.T]
+        nodes = np.moveaxis(self.pads, 1, 0)
+        grid = nodes.reshape(*map(len, axes), *nodes.shape[1:])
+        return RegularGridInterpolator(
+            tuple(axes), grid, "cubic", bounds_error=False, fill_value=0.0
+        )

@@ -34,6 +34,7 @@ from ..core.arrays import Array
 from ..core.calibration import Calibration
 from ..core.errors import ElasticError
 from ..core.pipeline import Pipeline
+from ..mechanics.cache import Arrays, load_or_compute
 from ..mechanics.influence import Influence
 from ..mechanics.measurement_model import MeasurementModel
 from ..mechanics.spectra import BesselTable, Spectra, tabulate_bessel, wavenumber_quadrature
@@ -59,6 +60,10 @@ _N_DISTANCES = 400
 """Number of Gauss points in r, the distance between force and cube. They resolve the oscillations
 of the Bessel functions up to the largest distance (half the width of the finite element body)."""
 
+_PADS = "pads"
+"""Name of the matrix to the pads' stresses in the cached file, beside the attributes of
+`Spectra`."""
+
 _LENGTH_TOLERANCE = 1e-6
 """Difference below which two lengths count as equal. It is relative for the sides of two cubes, and
 in units of half a side for the positions, normals and sizes of two pads (sensing elements)."""
@@ -80,7 +85,7 @@ def model_pads(influence: Influence, calibrations: Sequence[Calibration]) -> Mea
     # calibrations are found by identity.
     variants = list({id(one): one for one in calibrations}.values())
     variant_numbers = {id(one): number for number, one in enumerate(variants)}
-    spectra, all_pads = _decompose(influence)
+    spectra, all_pads = _load_decomposition(influence)
 
     pipeline = Pipeline(variants)
     components = []
@@ -141,6 +146,19 @@ def _match_pads(influence: Influence, calibration: Calibration) -> list[int]:
             )
         matches.append(nearest)
     return matches
+
+
+def _load_decomposition(influence: Influence) -> tuple[Spectra, Array]:
+    """Return the result of `_decompose`, from the cache if it is there."""
+
+    def compute() -> Arrays:
+        spectra, pads = _decompose(influence)
+        return {**vars(spectra), _PADS: pads}
+
+    inputs = [influence.depth, influence.place, influence.pads]
+    arrays = load_or_compute("pads", inputs, compute)
+    pads = arrays.pop(_PADS)
+    return Spectra(**arrays), pads
 
 
 def _decompose(influence: Influence) -> tuple[Spectra, Array]:
