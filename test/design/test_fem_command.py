@@ -532,6 +532,7 @@ def test_paper_makes_its_pictures(monkeypatch, tmp_path):
     monkeypatch.setattr("cube_tensor_driver.views.terminal.output.progress_bar", bar)
     monkeypatch.setattr("cube_tensor_design.figures.paper.experiments", one)
     monkeypatch.setattr("cube_tensor_design.paper.virtual_bench.CUBE_REFINEMENTS", 0)
+    monkeypatch.setattr(rod_parts, "split_signals", lambda *_: np.ones((2, 5)))
     monkeypatch.setattr(
         "cube_tensor_design.figures.paper.rod_parts",
         lambda progress, places=(2e-3,), held="": (
