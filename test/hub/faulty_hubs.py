@@ -1,7 +1,7 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Hubs that are wrong in one way each, as firmware is; written from docs/protocol.md, not from the
-rules of the check."""
+"""Hubs that are wrong in one way each, as firmware is, by the rules that they break; written from
+docs/protocol.md, not from the rules of the check."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from cube_tensor_driver.device.wire.protocol import (
 
 Changed = Iterable[Frame | bytes]
 FAULTY: dict[str, type[HubInMemory]] = {}
-"""What is wrong -> hub."""
+"""Rules that the check finds broken, and what is wrong -> hub."""
 
 
 def faulty(what: str) -> Callable[[type[HubInMemory]], type[HubInMemory]]:
@@ -99,55 +99,56 @@ def every(n: int) -> Callable[[HubInMemory], bool]:
 
 
 # Frequencies.
-sends("frequencies in Hz", values(lambda f: f // 1000))
-sends("frequencies in 0.01 Hz", values(lambda f: f // 10_000))
-sends("big-endian frequencies", values(lambda f: (f // 1000).byteswap() & 0xFFFF))
-sends("not measured is 0xFFFFFFFF", values(lambda f: np.where(f[0] == f[0, 0], 2**32 - 1, f)))
+sends("S6: frequencies in Hz", values(lambda f: f // 1000))
+sends("S6: frequencies in 0.01 Hz", values(lambda f: f // 10_000))
+sends("S6: big-endian frequencies", values(lambda f: (f // 1000).byteswap() & 0xFFFF))
+sends("S6: not measured is 0xFFFFFFFF", values(lambda f: np.where(f[0] == f[0, 0], 2**32 - 1, f)))
 sends(
-    "one pad not measured is 0xFFFFFFFF",
+    "S6: one pad not measured is 0xFFFFFFFF",
     values(lambda f: np.where(np.arange(f.shape[1]) == 2, 2**32 - 1, f)),
 )
-sends("periods in ns", values(lambda f: 10**12 // f.astype(np.int64)))
+sends("S6: periods in ns", values(lambda f: 10**12 // f.astype(np.int64)))
 
 # Cubes and pads of samples.
-sends("the last cube is never sent", of(Sample, lambda hub, one: [cubes(one, 0, 2)]))
-sends("the first cube is never sent", of(Sample, lambda hub, one: [cubes(one, 1, 3)]))
-sends("one cube of each sample", of(Sample, lambda hub, one: [cubes(one, 0, 1)]))
-sends("samples without cubes", of(Sample, lambda hub, one: [cubes(one, 0, 0)]))
+sends("S5: the last cube is never sent", of(Sample, lambda hub, one: [cubes(one, 0, 2)]))
+sends("S5: the first cube is never sent", of(Sample, lambda hub, one: [cubes(one, 1, 3)]))
+sends("S5: one cube of each sample", of(Sample, lambda hub, one: [cubes(one, 0, 1)]))
+sends("S5: samples without cubes", of(Sample, lambda hub, one: [cubes(one, 0, 0)]))
 sends(
-    "samples without pads", of(Sample, lambda hub, one: [rows(one, frequency=one.frequency[:, :0])])
+    "S5: samples without pads",
+    of(Sample, lambda hub, one: [rows(one, frequency=one.frequency[:, :0])]),
 )
 sends(
-    "fewer pads than HELLO says",
+    "S5: fewer pads than HELLO says",
     of(Sample, lambda hub, one: [rows(one, frequency=one.frequency[:, :4])]),
 )
-sends("cubes counted from 1", of(Sample, lambda hub, one: [rows(one, first_cube=1)]))
+sends("S5: cubes counted from 1", of(Sample, lambda hub, one: [rows(one, first_cube=1)]))
 sends(
-    "a cube is missing now and then",
+    "H4: a cube is missing now and then",
     of(Sample, lambda hub, one: [cubes(one, 0, 2 if one.sequence % 20 == 7 else 3)]),
 )
 for bits in (1 << 8, 1 << 31, 0xFFFFFFFF):
     sends(
-        f"faults of pads that do not exist: {bits:#x}",
+        f"S5: faults of pads that do not exist: {bits:#x}",
         of(Sample, lambda hub, one, b=bits: [rows(one, pad_fault=one.pad_fault | np.uint32(b))]),
     )
 sends(
-    "overlapping frames of a sample",
+    "S5: overlapping frames of a sample",
     of(Sample, lambda hub, one: [cubes(one, 0, 2), cubes(one, 1, 3)]),
 )
 sends(
-    "half samples, not counted",
+    "S4: half samples, not counted",
     of(
         Sample,
         lambda hub, one: [cubes(one, 0, 2), *([cubes(one, 2, 3)] if one.sequence % 10 else [])],
     ),
 )
 sends(
-    "frames of a sample at two times",
+    "S3: frames of a sample at two times",
     of(Sample, lambda hub, one: [cubes(one, 0, 2), cubes(one, 2, 3, 40)]),
 )
 sends(
-    "frames of a sample split anywhere",
+    "S3: frames of a sample split anywhere",
     of(
         Sample,
         lambda hub, one: [
@@ -157,7 +158,7 @@ sends(
     ),
 )
 sends(
-    "the second frame has the next number",
+    "L5 H4 S2 S3 S4 S7 R3 R7: the second frame has the next number",
     of(
         Sample,
         lambda hub, one: [
@@ -169,12 +170,17 @@ sends(
 
 # Numbers.
 sends(
-    "numbers in steps of two", of(Sample, lambda hub, one: [rows(one, sequence=2 * one.sequence)])
+    "L5 S4 S7 R3 R7: numbers in steps of two",
+    of(Sample, lambda hub, one: [rows(one, sequence=2 * one.sequence)]),
 )
-sends("numbers of 6 bits", of(Sample, lambda hub, one: [rows(one, sequence=one.sequence % 64)]))
-sends("each sample twice", of(Sample, lambda hub, one: [one, one]))
 sends(
-    "one of 50 samples is lost in silence",
+    "S1 S4 S7: numbers of 6 bits",
+    of(Sample, lambda hub, one: [rows(one, sequence=one.sequence % 64)]),
+)
+sends("S1: each sample twice", of(Sample, lambda hub, one: [one, one]))
+sends("S1: one sample twice", of(Sample, lambda hub, one: [one] * (1 + (one.sequence == 100))))
+sends(
+    "S4: one of 50 samples is lost in silence",
     of(Sample, lambda hub, one: [one] * (one.sequence % 50 != 9)),
 )
 
@@ -192,10 +198,10 @@ def swapped(hub: HubInMemory, frame: Frame) -> Changed:
     return [frame]
 
 
-sends("two samples exchanged", swapped)
+sends("S1: two samples exchanged", swapped)
 
 
-@faulty("numbers from 0 at each START")
+@faulty("S1: numbers from 0 at each START")
 class CountsFromStart(HubInMemory):
     def _answer(self, request, now_us):
         if request.request == Command.START and not self.started:
@@ -203,19 +209,19 @@ class CountsFromStart(HubInMemory):
         return super()._answer(request, now_us)
 
 
-@faulty("numbers back to 0 after reopening")
+@faulty("L5: numbers back to 0 after reopening")
 class CountsFromOpening(HubInMemory):
     def host_left(self):
         self.sequence = 0
 
 
-@faulty("numbers and dropped back to 0 after reopening")
+@faulty("L5: numbers and dropped back to 0 after reopening")
 class CountersFromOpening(HubInMemory):
     def host_left(self):
         self.sequence = self.dropped = 0
 
 
-@faulty("restarts when the port is opened, and starts by itself")
+@faulty("R8: restarts when the port is opened, and starts by itself")
 class RestartsStarted(HubInMemory):
     def host_came(self, now_us):
         self.reset(now_us, 0)
@@ -223,7 +229,7 @@ class RestartsStarted(HubInMemory):
         self.skip(now_us)
 
 
-@faulty("restarts when a TCP connection is made")
+@faulty("L5: restarts when a TCP connection is made")
 class RestartsAtTcp(HubInMemory):
     only_tcp = True
 
@@ -231,7 +237,7 @@ class RestartsAtTcp(HubInMemory):
         self.reset(now_us, 0)
 
 
-@faulty("starts by itself when the port is opened")
+@faulty("L5: starts by itself when the port is opened")
 class StartsAtOpening(HubInMemory):
     def host_came(self, now_us):
         if not self.started:
@@ -239,25 +245,25 @@ class StartsAtOpening(HubInMemory):
         self.started = True
 
 
-@faulty("another period after reopening")
+@faulty("L5: another period after reopening")
 class PeriodOfOpening(HubInMemory):
     def host_came(self, now_us):
         self.period_us = 10_000
 
 
-@faulty("another uid after reopening")
+@faulty("H2: another uid after reopening")
 class UidOfOpening(HubInMemory):
     def host_came(self, now_us):
         self.uid += 1
 
 
-@faulty("stops when the port is closed")
+@faulty("L5: stops when the port is closed")
 class StopsAtClosing(HubInMemory):
     def host_left(self):
         self.started = False
 
 
-@faulty("starts by itself after power-up")
+@faulty("R8: starts by itself after power-up")
 class StartsByItself(HubInMemory):
     def hello(self):
         if not self.sequence:
@@ -270,27 +276,29 @@ def device_time(change: Callable[[int], float]) -> Callable[[HubInMemory, Frame]
     return of(Sample, lambda hub, one: [rows(one, device_us=int(change(one.device_us)))])
 
 
-sends("device time in ms", device_time(lambda us: us // 1000))
-sends("device time in ns", device_time(lambda us: us * 1000))
-sends("device time of 22 bits", device_time(lambda us: us % (1 << 22)))
+sends("L5 S2 R3 R7 T3: device time in ms", device_time(lambda us: us // 1000))
+sends("S2 R3 R7 T3: device time in ns", device_time(lambda us: us * 1000))
+sends("S2 T3: device time of 22 bits", device_time(lambda us: us % (1 << 22)))
 sends(
-    "device time back by 30 ms once",
+    "S2: device time back by 30 ms once",
     of(
         Sample,
         lambda hub, one: [rows(one, device_us=one.device_us - 90_000 * (one.sequence == 60))],
     ),
 )
 sends(
-    "device time of every second sample",
+    "S2 R3 R7: device time of every second sample",
     of(Sample, lambda hub, one: [rows(one, device_us=one.device_us - 40_000 * (one.sequence % 2))]),
 )
-sends("device time that stands still", device_time(lambda us: 5_000_000))
-sends("device time 3000 ppm fast", device_time(lambda us: us * 1.003))
-sends("device time ahead by 2 s", device_time(lambda us: us + 2_000_000))
-sends("device time of ticks of 100 ms", device_time(lambda us: us // 100_000 * 100_000))
+sends("S2 R3 R7 T3: device time that stands still", device_time(lambda us: 5_000_000))
+sends("S2 T3: device time 3000 ppm fast", device_time(lambda us: us * 1.003))
+sends("T3: device time ahead by 2 s", device_time(lambda us: us + 2_000_000))
+sends(
+    "S2 R3 R7 T3: device time of ticks of 100 ms", device_time(lambda us: us // 100_000 * 100_000)
+)
 
 
-@faulty("device time from START on")
+@faulty("S2 T3: device time from START on")
 class ClockOfStart(HubInMemory):
     since_us = 0
 
@@ -311,28 +319,44 @@ class ClockOfStart(HubInMemory):
 
 # TIME.
 for what, change in {
-    "TIME early by 30 ms": lambda us: us - 30_000,
-    "TIME late by 30 ms": lambda us: us + 30_000,
-    "TIME in ms": lambda us: us // 1000,
-    "TIME stands still": lambda us: 3_000_000,
-    "TIME in steps of 50 ms": lambda us: us // 50_000 * 50_000,
-    "TIME of another clock": lambda us: us + 10**8,
+    "T3: TIME early by 30 ms": lambda us: us - 30_000,
+    "T3: TIME late by 30 ms": lambda us: us + 30_000,
+    "T1 T3: TIME in ms": lambda us: us // 1000,
+    "T1 T3: TIME stands still": lambda us: 3_000_000,
+    "T3: TIME in steps of 50 ms": lambda us: us // 50_000 * 50_000,
+    "T3: TIME of another clock": lambda us: us + 10**8,
 }.items():
     sends(
         what,
         of(Time, lambda hub, one, c=change: [replace(one, device_us=max(0, c(one.device_us)))]),
     )
-sends("TIME and ACK", of(Time, lambda hub, one: [one, Ack(Command.TIME)]))
-sends("ACK and TIME", of(Time, lambda hub, one: [Ack(Command.TIME), one]))
-sends("TIME twice", of(Time, lambda hub, one: [one, one]))
+
+
+@faulty("T1: TIME in steps of 100 ms until the port is closed")
+class TimeInSteps(HubInMemory):
+    step_us = 100_000
+
+    def _answer(self, request, now_us):
+        # T3 looks at it after that.
+        if request.request == Command.TIME:
+            now_us = -(-now_us // self.step_us) * self.step_us
+        return super()._answer(request, now_us)
+
+    def host_left(self):
+        self.step_us = 1
+
+
+sends("T2: TIME and ACK", of(Time, lambda hub, one: [one, Ack(Command.TIME)]))
+sends("T2: ACK and TIME", of(Time, lambda hub, one: [Ack(Command.TIME), one]))
+sends("T2: TIME twice", of(Time, lambda hub, one: [one, one]))
 sends(
-    "TIME with 16 bits of its number",
+    "T2: TIME with 16 bits of its number",
     of(Time, lambda hub, one: [replace(one, number=one.number & 0xFFFF)]),
 )
-sends("TIME only while started", of(Time, lambda hub, one: [one] * hub.started))
-sends("TIME only while stopped", of(Time, lambda hub, one: [one] * (not hub.started)))
+sends("T2: TIME only while started", of(Time, lambda hub, one: [one] * hub.started))
+sends("T2: TIME only while stopped", of(Time, lambda hub, one: [one] * (not hub.started)))
 answers(
-    "TIME is unknown and answered done",
+    "T4: TIME is unknown and answered done",
     lambda hub, ask, now, right: encode(Ack(6)) if ask.request == Command.TIME else right,
 )
 
@@ -357,21 +381,23 @@ def with_period(hub: HubInMemory, period_us: int, answer: bytes) -> bytes:
     return answer
 
 
-period_0("period 0 is answered done", lambda hub, right: encode(Ack(PERIOD, 0, 0)))
-period_0("period 0 stops the samples", stopped)
-period_0("period 0 is refused with 0", lambda hub, right: encode(Ack(PERIOD, Result.REFUSED, 0)))
+period_0("R4: period 0 is answered done", lambda hub, right: encode(Ack(PERIOD, 0, 0)))
+period_0("R4 R7: period 0 stops the samples", stopped)
 period_0(
-    "period 0 is an unknown request", lambda hub, right: encode(Ack(PERIOD, Result.UNKNOWN, 0))
+    "R4: period 0 is refused with 0", lambda hub, right: encode(Ack(PERIOD, Result.REFUSED, 0))
 )
 period_0(
-    "period 0 is refused and sets another", lambda hub, right: with_period(hub, 100_000, right)
+    "R4: period 0 is an unknown request", lambda hub, right: encode(Ack(PERIOD, Result.UNKNOWN, 0))
 )
 period_0(
-    "period 0 is done with the old period, and HELLO says another",
+    "R4: period 0 is refused and sets another", lambda hub, right: with_period(hub, 100_000, right)
+)
+period_0(
+    "R3 R4: period 0 is done with the old period, and HELLO says another",
     lambda hub, right: with_period(hub, 20_000, encode(Ack(PERIOD, 0, 10_000))),
 )
 answers(
-    "the period is in ms",
+    "R3 R6 R7: the period is in ms",
     lambda hub, ask, now, right: (
         with_period(hub, ask.argument * 10, right)
         if ask.request == PERIOD and ask.argument
@@ -379,24 +405,24 @@ answers(
     ),
 )
 answers(
-    "the ACK of a period says 0",
+    "R3: the ACK of a period says 0",
     lambda hub, ask, now, right: (
         encode(Ack(PERIOD, 0, 0)) if ask.request == PERIOD and ask.argument else right
     ),
 )
 answers(
-    "a new period stops the samples",
+    "S2 R4 R7: a new period stops the samples",
     lambda hub, ask, now, right: stopped(hub, right) if ask.request == PERIOD else right,
 )
 answers(
-    "STOP forgets the period",
+    "R3: STOP forgets the period",
     lambda hub, ask, now, right: (
         with_period(hub, 10_000, right) if ask.request == Command.STOP else right
     ),
 )
 
 
-@faulty("a period 3 % too long")
+@faulty("R3 R6: a period 3 % too long")
 class LongPeriod(HubInMemory):
     def take(self, room):
         data = super().take(room)
@@ -404,8 +430,8 @@ class LongPeriod(HubInMemory):
         return data
 
 
-sends("HELLO with an old period", of(Hello, lambda hub, one: [replace(one, period_us=10_000)]))
-sends("HELLO without a period", of(Hello, lambda hub, one: [replace(one, period_us=0)]))
+sends("R3: HELLO with an old period", of(Hello, lambda hub, one: [replace(one, period_us=10_000)]))
+sends("R3 R4: HELLO without a period", of(Hello, lambda hub, one: [replace(one, period_us=0)]))
 
 # HELLO.
 
@@ -415,37 +441,39 @@ def other_uids(change: Callable[[HubInMemory, np.ndarray], np.ndarray]):
 
 
 third = every(3)
-sends("uids change between HELLOs", other_uids(lambda hub, uids: uids + np.uint64(third(hub))))
-sends("the order of uids changes", other_uids(lambda hub, uids: uids[:: -1 if third(hub) else 1]))
+sends("H2: uids change between HELLOs", other_uids(lambda hub, uids: uids + np.uint64(third(hub))))
 sends(
-    "the number of cubes in HELLO changes",
+    "H2: the order of uids changes", other_uids(lambda hub, uids: uids[:: -1 if third(hub) else 1])
+)
+sends(
+    "S5: the number of cubes in HELLO changes",
     other_uids(lambda hub, uids: uids[: 2 if third(hub) else 3]),
 )
-sends("two cubes with one uid", other_uids(lambda hub, uids: uids[[0, 1, 0]]))
+sends("H2: two cubes with one uid", other_uids(lambda hub, uids: uids[[0, 1, 0]]))
 sends(
-    "the hub's uid changes",
+    "H2: the hub's uid changes",
     of(Hello, lambda hub, one: [replace(one, hub_uid=one.hub_uid + third(hub))]),
 )
 sends(
-    "the pads of HELLO change",
+    "S5: the pads of HELLO change",
     of(Hello, lambda hub, one: [replace(one, n_pads=one.n_pads + third(hub))]),
 )
-sends("HELLO says a cube less", other_uids(lambda hub, uids: uids[:2]))
-sends("HELLO says a cube more", other_uids(lambda hub, uids: np.append(uids, np.uint64(99))))
-sends("HELLO with flags", of(Hello, lambda hub, one: [replace(one, flags=4)]))
+sends("S5: HELLO says a cube less", other_uids(lambda hub, uids: uids[:2]))
+sends("S5: HELLO says a cube more", other_uids(lambda hub, uids: np.append(uids, np.uint64(99))))
+sends("F4: HELLO with flags", of(Hello, lambda hub, one: [replace(one, flags=4)]))
 
 
 def hello_first(hub, ask, now, right):
     return hub.hello() + encode(Ack(1)) if ask.request == Command.HELLO else right
 
 
-answers("HELLO before its ACK", hello_first)
+answers("H1: HELLO before its ACK", hello_first)
 answers(
-    "no HELLO when asked",
+    "H1: no HELLO when asked",
     lambda hub, ask, now, right: encode(Ack(1)) if ask.request == 1 else right,
 )
 answers(
-    "HELLO stops the samples",
+    "L5: HELLO stops the samples",
     lambda hub, ask, now, right: stopped(hub, right) if ask.request == 1 else right,
 )
 
@@ -458,25 +486,25 @@ class Seconds(HubInMemory):
         return self.at(now_us)
 
 
-@faulty("HELLO every two seconds")
+@faulty("H1: HELLO every two seconds")
 class SlowHello(Seconds):
     def at(self, now_us):
         return (self.hello() if self.n % 2 else b"") + self.stats(now_us)
 
 
-@faulty("HELLO twice a second")
+@faulty("H1: HELLO twice a second")
 class FastHello(Seconds):
     def at(self, now_us):
         return 2 * self.hello() + self.stats(now_us)
 
 
-@faulty("no HELLO while started")
+@faulty("H1: no HELLO while started")
 class HelloStopped(Seconds):
     def at(self, now_us):
         return (b"" if self.started else self.hello()) + self.stats(now_us)
 
 
-@faulty("no HELLO after power-up")
+@faulty("H1: no HELLO after power-up")
 class NoFirstHello(HubInMemory):
     has_begun = False
 
@@ -486,13 +514,13 @@ class NoFirstHello(HubInMemory):
         return b"" if is_first else data
 
 
-@faulty("STATS every two seconds")
+@faulty("L5 S8: STATS every two seconds")
 class SlowStats(Seconds):
     def at(self, now_us):
         return self.hello() + (self.stats(now_us) if self.n % 2 else b"")
 
 
-@faulty("no STATS while stopped")
+@faulty("S8: no STATS while stopped")
 class StatsStarted(Seconds):
     def at(self, now_us):
         return self.hello() + (self.stats(now_us) if self.started else b"")
@@ -500,19 +528,32 @@ class StatsStarted(Seconds):
 
 # STATS.
 sends(
-    "samples taken is the last number",
+    "S4 S7: samples taken is the last number",
     of(Stats, lambda hub, one: [replace(one, taken=max(0, one.taken - 1))]),
 )
-sends("samples taken is one ahead", of(Stats, lambda hub, one: [replace(one, taken=one.taken + 1)]))
-sends("uptime in s", of(Stats, lambda hub, one: [replace(one, uptime_ms=one.uptime_ms // 1000)]))
-sends("uptime in µs", of(Stats, lambda hub, one: [replace(one, uptime_ms=one.uptime_ms * 1000)]))
-sends("uptime stands still", of(Stats, lambda hub, one: [replace(one, uptime_ms=1000)]))
-sends("dropped stays 0", of(Stats, lambda hub, one: [replace(one, dropped=0)]))
-sends("dropped counts cubes", of(Stats, lambda hub, one: [replace(one, dropped=3 * one.dropped)]))
-sends("dropped counts what was sent", of(Stats, lambda hub, one: [replace(one, dropped=one.taken)]))
+sends(
+    "S7: samples taken is one ahead",
+    of(Stats, lambda hub, one: [replace(one, taken=one.taken + 1)]),
+)
+sends(
+    "S2: uptime in s", of(Stats, lambda hub, one: [replace(one, uptime_ms=one.uptime_ms // 1000)])
+)
+sends(
+    "L5 S2: uptime in µs",
+    of(Stats, lambda hub, one: [replace(one, uptime_ms=one.uptime_ms * 1000)]),
+)
+sends("S2: uptime stands still", of(Stats, lambda hub, one: [replace(one, uptime_ms=1000)]))
+sends("S4: dropped stays 0", of(Stats, lambda hub, one: [replace(one, dropped=0)]))
+sends(
+    "S4: dropped counts cubes", of(Stats, lambda hub, one: [replace(one, dropped=3 * one.dropped)])
+)
+sends(
+    "S4: dropped counts what was sent",
+    of(Stats, lambda hub, one: [replace(one, dropped=one.taken)]),
+)
 
 
-@faulty("dropped is cleared by each STATS")
+@faulty("S4: dropped is cleared by each STATS")
 class ClearsDropped(HubInMemory):
     def stats(self, now_us):
         frame = super().stats(now_us)
@@ -520,7 +561,7 @@ class ClearsDropped(HubInMemory):
         return frame
 
 
-@faulty("samples taken counts from START")
+@faulty("S4 S7: samples taken counts from START")
 class TakenFromStart(HubInMemory):
     since = 0
 
@@ -535,39 +576,41 @@ class TakenFromStart(HubInMemory):
 
 
 # Requests.
-answers("IDENTIFY is not answered", lambda hub, ask, now, right: b"" if ask.request == 5 else right)
 answers(
-    "IDENTIFY is answered twice",
+    "R1: IDENTIFY is not answered", lambda hub, ask, now, right: b"" if ask.request == 5 else right
+)
+answers(
+    "R1: IDENTIFY is answered twice",
     lambda hub, ask, now, right: 2 * right if ask.request == 5 else right,
 )
 answers(
-    "IDENTIFY is unknown",
+    "R2: IDENTIFY is unknown",
     lambda hub, ask, now, right: encode(Ack(5, 1)) if ask.request == 5 else right,
 )
 answers(
-    "an unknown request is done",
+    "R2: an unknown request is done",
     lambda hub, ask, now, right: encode(Ack(ask.request)) if ask.request > 6 else right,
 )
 answers(
-    "an unknown request is not answered",
+    "F2 F3 R1: an unknown request is not answered",
     lambda hub, ask, now, right: b"" if ask.request > 6 else right,
 )
 answers(
-    "ACKs repeat the argument",
+    "R2: ACKs repeat the argument",
     lambda hub, ask, now, right: (
         encode(Ack(ask.request, 0, ask.argument)) if ask.request in (2, 3, 5) else right
     ),
 )
 answers(
-    "a second STOP is refused",
+    "R6: a second STOP is refused",
     lambda hub, ask, now, right: encode(Ack(3, 2)) if ask.request == 3 and ask.argument else right,
 )
 answers(
-    "STOP is answered and not done",
+    "L5 R1: STOP is answered and not done",
     lambda hub, ask, now, right: started(hub, right, ask.request == 3),
 )
 answers(
-    "START is answered and not done",
+    "R1: START is answered and not done",
     lambda hub, ask, now, right: stopped(hub, right) if ask.request == 2 else right,
 )
 
@@ -577,7 +620,7 @@ def started(hub: HubInMemory, answer: bytes, is_started: bool) -> bytes:
     return answer
 
 
-@faulty("START needs the argument 0")
+@faulty("R1: START needs the argument 0")
 class StartOfZero(HubInMemory):
     def _answer(self, request, now_us):
         if request.request == Command.START and request.argument:
@@ -585,7 +628,7 @@ class StartOfZero(HubInMemory):
         return super()._answer(request, now_us)
 
 
-@faulty("a second START moves the samples")
+@faulty("R6: a second START moves the samples")
 class StartsAnew(HubInMemory):
     def _answer(self, request, now_us):
         answer = super()._answer(request, now_us)
@@ -594,7 +637,7 @@ class StartsAnew(HubInMemory):
         return answer
 
 
-@faulty("a new period counts from the next START on")
+@faulty("R7: a new period counts from the next START on")
 class LatePeriod(HubInMemory):
     asked_us = 10_000
 
@@ -613,21 +656,21 @@ class LatePeriod(HubInMemory):
         return super()._answer(request, now_us)
 
 
-@faulty("one request of a packet is carried out")
+@faulty("R1: one request of a packet is carried out")
 class OneRequest(HubInMemory):
     def receive(self, data, now_us):
         frames = [frame for frame in Decoder().feed(data) if isinstance(frame, Request)]
         return super().receive(encode(frames[-1]) if frames else data, now_us)
 
 
-@faulty("requests of a packet in reverse order")
+@faulty("R1: requests of a packet in reverse order")
 class Reversed(HubInMemory):
     def receive(self, data, now_us):
         frames = [frame for frame in Decoder().feed(data) if isinstance(frame, Request)]
         return super().receive(b"".join(map(encode, frames[::-1])) or data, now_us)
 
 
-@faulty("a sample comes behind the ACK of STOP")
+@faulty("R1: a sample comes behind the ACK of STOP")
 class LateStop(HubInMemory):
     def receive(self, data, now_us):
         was_started = self.started
@@ -637,13 +680,13 @@ class LateStop(HubInMemory):
         return answer
 
 
-@faulty("echoes what it hears")
+@faulty("F3 F5 H2 S1 S4 S7 T2: echoes what it hears")
 class Echo(HubInMemory):
     def receive(self, data, now_us):
         return data + super().receive(data, now_us)
 
 
-@faulty("deaf after XOFF")
+@faulty("L1: deaf after XOFF")
 class Deaf(HubInMemory):
     deaf = False
 
@@ -652,34 +695,45 @@ class Deaf(HubInMemory):
         return b"" if self.deaf else super().receive(data, now_us)
 
 
-@faulty("answers requests of version 2")
+@faulty("F2: answers requests of version 2")
 class Version2(HubInMemory):
     def receive(self, data, now_us):
         also = encode(Ack(233, 1)) if encode(Request(233), version=2) in data else b""
         return also + super().receive(data, now_us)
 
 
-@faulty("noise makes it deaf")
+@faulty("F2: noise makes it deaf")
 class LostByNoise(HubInMemory):
     def receive(self, data, now_us):
         return b"" if len(data) > 256 else super().receive(data, now_us)
 
 
+@faulty("F3: answers ACKs")
+class AnswersAcks(HubInMemory):
+    def receive(self, data, now_us):
+        acks = [frame for frame in Decoder().feed(data) if isinstance(frame, Ack)]
+        return b"".join(map(encode, acks)) + super().receive(data, now_us)
+
+
 # Frames.
-sends("no zero before a frame", lambda hub, one: [encode(one)[1:]])
+sends("L2: says nothing", lambda hub, one: [])
+sends("F1: no zero before a frame", lambda hub, one: [encode(one)[1:]])
 sends(
-    "every 100th frame is damaged",
+    "F5 S4: every 100th frame is damaged",
     lambda hub, one: [encode(one)[:-3] + b"\x55\x55\0" if hundredth(hub) else one],
 )
 hundredth = every(100)
-sends("a line of text at times", of(Stats, lambda hub, one: [b"\0hello\0", one]))
-sends("requests instead of frames at times", of(Stats, lambda hub, one: [one, Request(1)]))
-sends("frames of version 2", of(Stats, lambda hub, one: [encode(one, version=2)]))
-sends("spare bytes", of(Sample, lambda hub, one: [wire(one.raw[:21] + b"\0\7\0" + one.raw[24:-4])]))
+sends("F5: a line of text at times", of(Stats, lambda hub, one: [b"\0hello\0", one]))
+sends("F5: requests instead of frames at times", of(Stats, lambda hub, one: [one, Request(1)]))
+sends("F5 S8: frames of version 2", of(Stats, lambda hub, one: [encode(one, version=2)]))
+sends(
+    "F4: spare bytes",
+    of(Sample, lambda hub, one: [wire(one.raw[:21] + b"\0\7\0" + one.raw[24:-4])]),
+)
 
 
 # A host that does not read.
-@faulty("waits while the host does not read")
+@faulty("S9: waits while the host does not read")
 class Waits(HubInMemory):
     def take(self, room):
         if room:
@@ -688,7 +742,19 @@ class Waits(HubInMemory):
         return b""
 
 
-@faulty("drops in silence")
+@faulty("S9: stands still while the host does not read")
+class StandsStill(Waits):
+    is_full = False
+
+    def take(self, room):
+        self.is_full = not room
+        return super().take(room)
+
+    def once_a_second(self, now_us):
+        return b"" if self.is_full else super().once_a_second(now_us)
+
+
+@faulty("S4: drops in silence")
 class SilentDrops(HubInMemory):
     def take(self, room):
         data = super().take(room)
@@ -696,7 +762,7 @@ class SilentDrops(HubInMemory):
         return data
 
 
-@faulty("cuts frames that find no room")
+@faulty("S9: cuts frames that find no room")
 class Cuts(HubInMemory):
     def take(self, room):
         if not room and self.dropped % 10 == 0:
@@ -705,7 +771,7 @@ class Cuts(HubInMemory):
         return super().take(room)
 
 
-@faulty("does not number samples without room")
+@faulty("S4: does not number samples without room")
 class NotNumbered(HubInMemory):
     def take(self, room):
         if room:
@@ -715,7 +781,7 @@ class NotNumbered(HubInMemory):
         return b""
 
 
-@faulty("stops after a full buffer")
+@faulty("S9: stops after a full buffer")
 class StopsWhenFull(HubInMemory):
     def take(self, room):
         self.started = self.started and room
