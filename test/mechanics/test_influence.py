@@ -41,8 +41,7 @@ def test_reciprocity_gives_what_a_force_on_the_surface_does(influence):
 
 
 def test_reciprocity_in_space(monkeypatch):
-    """The same for a pad on each face: forces on the plane y = 0, on a body without the mirror along
-    x."""
+    """The same for a pad on each face: forces at y = 0, on a body without the mirror along x."""
     monkeypatch.setattr(bodies, "BRICK_SIZES", (bodies.BrickSizes(1.0, 0.3, 6.0),))
     layer = Body(9e-3, 9e-3, 7e-3, ground=True, cube_young=float("inf"))
     faces = np.concatenate([np.eye(3), -np.eye(3)])
