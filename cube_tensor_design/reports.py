@@ -1,6 +1,6 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Results of `./cube fem` and `./cube study` as tables on the terminal and files."""
+"""Results of `./cube fem` and `./cube study` as tables on the terminal, files and pictures."""
 
 from __future__ import annotations
 
@@ -279,6 +279,27 @@ def _write_weight(
     )
     write_calibration(path, calibration, header)
     print(f"wrote {path}: calibration {calibration.id}")
+
+
+def draw(result: Result, folder: Path) -> None:
+    """Draw influence functions, or convergence, response and the loads of a layout in a plane."""
+    from cube_tensor_driver.views.figures.style import save
+
+    from .figures.deformation import draw_loads
+    from .figures.response import draw_convergence, draw_influence, draw_response
+    from .paper.experiments import mode_deformations
+
+    folder.mkdir(parents=True, exist_ok=True)
+    body, layout = result.body, result.layout
+    if isinstance(result, SurfaceStudy):
+        figure = draw_influence(result.influence, layout, body.side / 2)
+        save(figure, folder / "influence.png")
+    elif isinstance(result, Response):
+        save(draw_convergence(result), folder / "convergence.png")
+        save(draw_response(result), folder / "response.png")
+        if layout.planar:
+            save(draw_loads(layout, mode_deformations(body, layout)), folder / "loads.png")
+    print(f"pictures in {folder}")
 
 
 def show_study(result: LayoutStudy) -> None:

@@ -1,6 +1,6 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""./cube fem: the response of a cube's pads by finite elements, as tables and files."""
+"""./cube fem: the response of a cube's pads by finite elements, as tables, files and pictures."""
 
 from __future__ import annotations
 
@@ -51,6 +51,11 @@ def arguments(parser: Parser) -> None:
         help="write the calibration (.yaml), with --surface the influence functions (.npz), or "
         "with --temperature the thermal stress for the simulator (.yaml)",
     )
+    parser.add_output(
+        "--figures",
+        kind="folder",
+        help="write pictures of convergence, response and each load",
+    )
     parser.add_json()
     parser.add_argument(
         "--meshes",
@@ -95,6 +100,8 @@ def run(options: argparse.Namespace) -> int:
     if options.json is not None:
         write_json(options.json, result.to_dict())
     reports.show(result)
+    if options.figures is not None:
+        reports.draw(result, options.figures)
     if options.output is not None:
         command = _command(options)
         reports.write(options.output, result, command, model.neglect, options.base)
@@ -112,6 +119,8 @@ def _check_options(options: argparse.Namespace, model: Model) -> None:
         raise ConfigError(f"{' and '.join(chosen)} are different computations; give one of them")
     if options.base is not None and not options.weight:
         raise ConfigError("--base is for --weight, which adds its result to a calibration")
+    if options.figures is not None and (options.temperature or options.weight):
+        raise ConfigError(f"--figures: there are no pictures of {chosen[0]}; leave it out")
     path = options.output
     if not options.surface:
         check_yaml("-o", path)

@@ -1,6 +1,6 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Fig. 4 of the source paper: σzz on the deformed section of a body, with the cube in it."""
+"""Pictures of σzz on the deformed section of a body, with the cube in it."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
+from matplotlib.patches import Patch, Rectangle
 from matplotlib.tri import LinearTriInterpolator, Triangulation
 
 from cube_tensor_driver.core.arrays import Array
-from cube_tensor_driver.views.figures.style import SIGNED_COLOURS, print_style
+from cube_tensor_driver.core.layout import Layout
+from cube_tensor_driver.views.figures.style import SIGNED_COLOURS, print_style, symbol
 
 from ..paper.virtual_bench import Deformation
 
@@ -22,8 +23,10 @@ TITLES = {
 }
 """Titles of the panels of the paper's Fig. 4, by the name of the mode (linear stress field)
 shown."""
-WINDOW = 6.0
-"""Half width of the part of the body that is drawn, in d0 (half the side of the cube)."""
+FIGURE_4_WINDOW = 6.0
+"""Half width of the part of the body that Fig. 4 shows, in d0 (half the side of the cube)."""
+LOADS_WINDOW = 4.0
+"""Half width of the part of the body in pictures of loads, in d0: pads must be large enough."""
 MAX_DISPLACEMENT = 0.4
 """Largest displacement that is drawn, in d0 (half the side of the cube); all are scaled to it."""
 COLOUR_PERCENTILE = 95
@@ -46,7 +49,7 @@ def draw_figure_4(deformations: dict[str, Deformation]) -> Figure:
     figure = Figure(figsize=(6, 6))
     axes = figure.subplots(len(TITLES), 1)
     for axis, (name, deformation) in zip(axes, deformations.items(), strict=True):
-        scale = _draw_deformation(axis, deformation)
+        scale = _draw_deformation(axis, deformation, FIGURE_4_WINDOW)
         axis.set(title=TITLES[name])
     axes[-1].set_xlabel(r"$x$ / mm")
     figure.supxlabel(
@@ -57,8 +60,39 @@ def draw_figure_4(deformations: dict[str, Deformation]) -> Figure:
     return figure
 
 
-def _draw_deformation(axis: Any, deformation: Deformation) -> float:
-    """Draw σzz on the deformed body, the cube, and displacements as arrows.
+@print_style()
+def draw_loads(layout: Layout, deformations: dict[str, Deformation]) -> Figure:
+    """Draw the section under every plane mode, with pads, deformed outline and displacements.
+
+    Args:
+        layout: Pads of the cube.
+        deformations: Deformation under 10 kPa of each plane mode, by the mode's name.
+    """
+    figure = Figure(figsize=(10, 12))
+    axes = figure.subplots(4, 2)
+    for axis, (name, deformation) in zip(axes.flat, deformations.items(), strict=False):
+        scale = _draw_deformation(axis, deformation, LOADS_WINDOW)
+        axis.set_title(f"{symbol(name)}, 10 kPa (displacements times {scale:.2g})")
+        _draw_pads(axis, layout, 1e3 * deformation.half_side)
+    pad = Patch(color="tab:red", label="pad")
+    axes.flat[-1].axis("off")
+    axes.flat[-1].legend(handles=[pad], loc="center")
+    figure.supxlabel(r"$x$ / mm")
+    return figure
+
+
+def _draw_pads(axis: Any, layout: Layout, half_side: float) -> None:
+    """Draw pads on the faces of an undeformed cube whose half side is `half_side` mm."""
+    centres = layout.positions[:, [0, 2]]
+    normals = layout.normals[:, [0, 2]]
+    for centre, normal in zip(centres, normals, strict=True):
+        along_face = layout.pad_size * (1 - np.abs(normal))
+        ends = half_side * (centre + np.outer((-0.5, 0.5), along_face)).T
+        axis.plot(*ends, color="tab:red", linewidth=5, solid_capstyle="butt")
+
+
+def _draw_deformation(axis: Any, deformation: Deformation, window: float) -> float:
+    """Draw σzz on the deformed body within `window` d0, the cube, and displacements as arrows.
 
     Returns:
         Scale of the displacements.
@@ -67,11 +101,11 @@ def _draw_deformation(axis: Any, deformation: Deformation) -> float:
     points = deformation.points
     moved = deformation.displacement
     # Displacements far away are large and not drawn.
-    is_near = np.abs(points[0]) < WINDOW
+    is_near = np.abs(points[0]) < window
     scale = MAX_DISPLACEMENT * d0 / np.hypot(*moved[:, is_near]).max()
     drawn = 1e3 * (d0 * points + scale * moved)
-    _draw_stress(axis, deformation, drawn)
-    _draw_arrows(axis, deformation)
+    _draw_stress(axis, deformation, drawn, window)
+    _draw_arrows(axis, deformation, window)
 
     # The cube before the deformation is dotted, and after it white.
     side = 2e3 * d0
@@ -82,15 +116,18 @@ def _draw_deformation(axis: Any, deformation: Deformation) -> float:
     outline = drawn[:, face[by_angle]]
     axis.fill(*outline, facecolor="white", edgecolor="black", linewidth=1.2)
 
-    x = 1e3 * d0 * WINDOW
-    z = 600 * deformation.height
+    x = 1e3 * d0 * window
+    z = min(x, 600 * deformation.height)
     axis.set(xlim=(-x, x), ylim=(-z, z), aspect="equal", ylabel=r"$z$ / mm")
     axis.grid(False)
     return float(scale)
 
 
-def _draw_stress(axis: Any, deformation: Deformation, drawn: Array) -> None:
-    """Draw σzz of the elastomer as colours and contour lines on the points `drawn` (2, n), mm."""
+def _draw_stress(axis: Any, deformation: Deformation, drawn: Array, window: float) -> None:
+    """Draw σzz of the elastomer as colours and contour lines on the points `drawn` (2, n), mm.
+
+    The colour scale follows the stress within `window` d0 of the cube.
+    """
     points = deformation.points
     ring = np.abs(points).max(axis=0)
     is_outside = ring[deformation.triangles].max(axis=0) > 1 + 1e-9
@@ -101,7 +138,7 @@ def _draw_stress(axis: Any, deformation: Deformation, drawn: Array) -> None:
     total = np.bincount(triangles.ravel(), stress, len(ring))
     count = np.bincount(triangles.ravel(), minlength=len(ring))
     kilopascal = total / np.maximum(count, 1)
-    is_near = (np.abs(points[0]) < WINDOW) & (ring >= 1)
+    is_near = (np.abs(points[0]) < window) & (ring >= 1)
     limit = np.percentile(np.abs(kilopascal[is_near]), COLOUR_PERCENTILE)
 
     mesh = Triangulation(drawn[0], drawn[1], triangles.T)
@@ -113,13 +150,15 @@ def _draw_stress(axis: Any, deformation: Deformation, drawn: Array) -> None:
     colorbar.add_lines(lines)
 
 
-def _draw_arrows(axis: Any, deformation: Deformation) -> None:
-    """Draw the displacements at the points of a regular grid; the longest arrow is as long as
-    d0."""
+def _draw_arrows(axis: Any, deformation: Deformation, window: float) -> None:
+    """Draw the displacements at the points of a regular grid within `window` d0 of the cube.
+
+    The longest arrow is as long as d0.
+    """
     d0 = deformation.half_side
     # Arrows at the edges of the picture would leave it.
-    half_height = deformation.height / 2 / d0 - 0.5
-    columns = np.linspace(1 - WINDOW, WINDOW - 1, ARROW_COLUMNS)
+    half_height = min(window - 1, deformation.height / 2 / d0 - 0.5)
+    columns = np.linspace(1 - window, window - 1, ARROW_COLUMNS)
     rows = np.linspace(-half_height, half_height, ARROW_ROWS)
     x, z = np.meshgrid(columns, rows)
     node_x, node_z = deformation.points

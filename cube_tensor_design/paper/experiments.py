@@ -11,7 +11,7 @@ pads' foam either; `FOAM_MODULUS` is ours.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 
@@ -20,7 +20,7 @@ import numpy as np
 from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.defaults import BETA, REST_FREQUENCY
 from cube_tensor_driver.core.estimator import make_estimator
-from cube_tensor_driver.core.layout import LAYOUTS
+from cube_tensor_driver.core.layout import LAYOUTS, Layout
 from cube_tensor_driver.core.modes import PLANE
 from cube_tensor_driver.core.oscillator import pad_frequency
 
@@ -250,10 +250,19 @@ def dent(
 def figure_4() -> dict[str, Deformation]:
     """Return the deformations of the paper's section 3: under shear only (key "zx"), and under a
     normal stress that grows along x (key "zz_x")."""
-    bench = VirtualBench(Body(), size=0.2)
+    return _deformations(VirtualBench(Body(), size=0.2), ("zx", "zz_x"))
+
+
+def mode_deformations(body: Body, layout: Layout) -> dict[str, Deformation]:
+    """Return the section deformed by `MODE_AMPLITUDE` of each plane mode (linear stress field), by
+    the mode's name."""
+    return _deformations(VirtualBench(body, layout=layout, size=0.3), PLANE.names)
+
+
+def _deformations(bench: VirtualBench, names: Iterable[str]) -> dict[str, Deformation]:
     axes = (0, 2)
     deformations = {}
-    for name in ("zx", "zz_x"):
+    for name in names:
         mode = PLANE.names.index(name)
         stress = PLANE.stress[mode][np.ix_(axes, axes)]
         gradient = PLANE.gradient[mode][np.ix_(axes, axes, axes)]

@@ -55,7 +55,7 @@ def cube(*arguments: object) -> list[str]:
 def test_fem_shows_and_writes_what_is_asked(tmp_path):
     model, out, saved = tmp_path / "small.yaml", tmp_path / "fem.json", tmp_path / "mine.yaml"
     model.write_text(SMALL)
-    command = cube("fem", model, "--meshes", 2, "--json", out)
+    command = cube("fem", model, "--meshes", 2, "--json", out, "--figures", tmp_path / "pictures")
     done = subprocess.run(
         [*command, "-o", str(saved)],
         env=os.environ | {"COLUMNS": "60"},
@@ -78,6 +78,9 @@ def test_fem_shows_and_writes_what_is_asked(tmp_path):
     assert f"{matrix[0, -1]:.4f}" in done.stdout and "…" not in done.stdout
     for words in ("c_plus_d", "change to the next", "left, %", "rank 7 of 7"):
         assert words in done.stdout
+    pictures = sorted((tmp_path / "pictures").iterdir())
+    assert [path.name for path in pictures] == ["convergence.png", "loads.png", "response.png"]
+    assert all(path.stat().st_size > 10_000 for path in pictures)
     assert saved.read_text().startswith(f"# Made by: ./cube fem {model} --meshes 2 -o {saved}\n")
     # A slab has not the full symmetry: seven coefficients would lose part of it.
     assert result["structure_residual"] > 1e-3
@@ -98,12 +101,12 @@ def fem(tmp_path):
 
 def test_space_on_a_coarse_mesh(coarse, fem, tmp_path, capsys):
     out, saved = tmp_path / "fem.json", tmp_path / "cube.yaml"
-    files = ("--json", out, "-o", saved)
+    files = ("--json", out, "--figures", tmp_path, "-o", saved)
     assert fem(SMALL_IN_SPACE, "--meshes", 1, *files) == 0
     result = json.loads(out.read_text())
     assert np.array(result["matrix"]).shape == (24, 21)
     assert result["rank"] == 18 and result["unobservable"] == ["yz_x", "zx_y", "xy_z"]
-    assert len(result["coefficients"]) == 12
+    assert len(result["coefficients"]) == 12 and (tmp_path / "response.png").exists()
     np.testing.assert_allclose(read_calibration(saved).response, result["matrix"], atol=1e-9)
     assert "unobservable: yz_x, zx_y, xy_z" in capsys.readouterr().out
 
@@ -152,7 +155,7 @@ def test_pads_under_loads_on_the_surface(coarse, fem, tmp_path, capsys, layout):
     out, table = tmp_path / "surface.json", tmp_path / "table.npz"
     in_space = layout == "cube"
     model = f"{{layout: {layout}, body: {{width: 0.014, height: 0.007}}, cube: {{rigid: true}}}}"
-    files = ["--json", out, *(["-o", table] if in_space else [])]
+    files = ["--json", out, "--figures", tmp_path, *(["-o", table] if in_space else [])]
     assert fem(model, "--surface", "--meshes", 1, *files) == 0
     printed = capsys.readouterr().out
     study = json.loads(out.read_text())
@@ -170,6 +173,7 @@ def test_pads_under_loads_on_the_surface(coarse, fem, tmp_path, capsys, layout):
     numbers = [above[key]["zz"] / unit for key in ("said", "there")]
     row = "press +2 +0 " + " ".join(f"+{number:.{places}f}" for number in numbers)
     assert re.search(rf"{row} +{ratio:.2f}", printed)
+    assert (tmp_path / "influence.png").stat().st_size > 10_000
     if in_space:
         written = read_influence(table)
         assert (written.depth, written.layer.thickness) == (3.5e-3, 7e-3)
@@ -320,6 +324,7 @@ def test_a_mistake_in_a_model_is_one_line_before_any_work(
         ("--surface -o x.yaml", ["-o x.yaml", "ends in .npz"]),
         ("--surface -o x.npz", ["-o x.npz", "layout: cube"]),
         ("--temperature --surface", ["different computations", "give one"]),
+        ("--temperature --figures x", ["no pictures of --temperature", "leave it out"]),
         ("--temperature -o x.npz", ["-o x.npz", "a YAML file ends in .yaml"]),
         ("-o x.npz", ["-o x.npz", "a YAML file ends in .yaml"]),
         ("-o none/cube.yaml", ["-o none/cube.yaml", "a folder that can be written"]),
@@ -327,6 +332,8 @@ def test_a_mistake_in_a_model_is_one_line_before_any_work(
         ("--json .", ["--json .", "is no file"]),
         ("--json /dev/null", ["--json /dev/null", "is no file"]),
         ("--json x.yaml -o x.yaml", ["-o and --json", "name two files"]),
+        ("--figures /proc/x", ["--figures /proc/x", "name a folder"]),
+        ("--figures narrow.yaml", ["--figures narrow.yaml", "name a folder"]),
     ],
 )
 def test_a_mistake_is_one_line_before_any_work(monkeypatch, capsys, tmp_path, arguments, words):
