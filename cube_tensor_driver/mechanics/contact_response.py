@@ -293,10 +293,10 @@ class ContactResponse:
             force: Force (N, 3) in N of the contact, along x, y and z.
 
         Returns:
-            Components (N, S, n) in the frames of the cubes; 0 beyond `REACH_DEPTHS`.
+            Components (N, S, n) in the frames of the cubes.
         """
         distance, direction = to_polar(place)
-        index = np.minimum(distance / self._table.step, self._table.last)
+        index, decay = self._table.locate(distance)
         below = index.astype(np.intp)
         size_index = _size_index(size, self._depth)
         narrower = size_index.astype(np.intp)
@@ -309,8 +309,7 @@ class ContactResponse:
         neighbours = rows.take(first[:, None] + steps, axis=0)
         farther = index - below
         wider = size_index - narrower
-        is_near = index < self._table.last
-        by_distance = np.stack([1 - farther, farther]) * is_near
+        by_distance = np.stack([1 - farther, farther]) * decay
         weights = np.concatenate([(1 - wider) * by_distance, wider * by_distance])
         weights = weights.T.astype(np.float32)[:, None]
         n, n_orders = len(place), len(order)

@@ -20,7 +20,9 @@ value."""
 
 REACH_DEPTHS = 20
 """Largest tabulated distance along the surface from a load to a cube, divided by the depth of the
-cubes' centres below the surface. Responses and covariances at larger distances count as zero."""
+cubes' centres below the surface. Responses and covariances at larger distances are those at this
+one times the inverse square of the distance, as the stress by a tangential force on a half space
+falls."""
 
 _CUBIC_LAGRANGE = (
     np.array(
@@ -68,14 +70,24 @@ class DistanceTable:
 
         Returns:
             Index (N,) of the first of the four rows from which each value is interpolated, and for
-            each derivative the weights (4, N) of these rows; 0 beyond `REACH_DEPTHS`.
+            each derivative the weights (4, N) of these rows.
         """
-        index = distance / self.step
+        index, decay = self.locate(distance)
         # The table begins one step before the distance 0. The row with the number `below` is
         # therefore one step before the entry below the distance, and so is the first of the four.
-        below, *weights = cubic_weights(np.minimum(index, self.last), count)
-        is_within = index <= self.last
-        return below, *(one * is_within for one in weights)
+        below, *weights = cubic_weights(index, count)
+        return below, *(one * decay for one in weights)
+
+    def locate(self, distance: Array) -> tuple[Array, Array]:
+        """Return fractional indices (N,) of distances, at most `last`, and factors (N,) by which
+        the tabulated values are multiplied beyond `REACH_DEPTHS`.
+
+        Args:
+            distance: Distances (N,) in m.
+        """
+        index = distance / self.step
+        decay = (self.last / np.maximum(index, self.last)) ** 2
+        return np.minimum(index, self.last), decay
 
     def interpolate(self, table: Array, distance: Array) -> Array:
         """Interpolate a table over the distance between load and cube, or between two cubes.
@@ -85,7 +97,7 @@ class DistanceTable:
             distance: Distances (N,) in m.
 
         Returns:
-            Values (N, ...); 0 at distances of more than `REACH_DEPTHS` depths of the cubes.
+            Values (N, ...).
         """
         first, weights = self.weights(distance)
         shape = (len(distance),) + (1,) * (table.ndim - 1)

@@ -1,12 +1,14 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Derivatives of the response to Hertz contacts, against finite differences of the response."""
+"""Response to Hertz contacts: its derivatives, and the stress far beyond the tables."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
+from cube_tensor_driver.core.modes import STRESS
+from cube_tensor_driver.mechanics import contact
 from cube_tensor_driver.mechanics.contact_response import ContactResponse
 from cube_tensor_driver.mechanics.layer import Layer
 from cube_tensor_driver.mechanics.measurement_model import CubeMeasurement
@@ -74,3 +76,22 @@ def test_a_moment_is_a_pair_of_forces(responses):
             unit = responses.response(place - centre, angle, variant, size)
             moment = moment + sign * turn * unit[:, :, across] / (4 * h)
     np.testing.assert_allclose(slopes[:, 7], moment, rtol=0, atol=2e-5 * np.abs(moment).max())
+
+
+def test_distant_contacts_cause_stress_beyond_the_tables():
+    """At 19 depths the tables hold the stress, at 21 and 40 it is extrapolated.
+
+    The tolerance of 0.5 Pa is a sixth of the noise of a pad.
+    """
+    half_space = ContactResponse(CubeMeasurement(Layer(np.inf, 0.48), DEPTH, 2e-3))
+    direction = np.array([0.8, 0.6])
+    for depths in (19, 21, 40):
+        place = depths * DEPTH * direction
+        expected, _ = contact.field(np.array([[*place, -DEPTH]]), np.zeros((1, 3)), FORCE[None], 0.48)
+        size, variant = 0.7 * DEPTH, np.zeros(1, np.intp)
+        cubic = half_space.response(place[None], np.zeros(1), variant, size) @ FORCE
+        linear = half_space.response_to_forces(
+            place[None], np.zeros(1), variant, np.array([size]), FORCE[None]
+        )
+        for found in (cubic, linear):
+            np.testing.assert_allclose(found[:, : len(STRESS)], expected, rtol=0, atol=0.5)
