@@ -116,10 +116,8 @@ class ContactResponse:
             Components (N, 15, 3) in Pa/N, for a force along x, y and z.
         """
         table = self._interpolate_size(self._response, size, place)
-        return self._cubes.measure(
-            self._rotate_loads(table, place, angle, self._order),
-            variant,
-        )
+        circular = self._rotate_loads(table, place, angle, self._order)
+        return np.asarray(self._cubes.measure(circular, variant).swapaxes(1, 2))
 
     def response_slopes(
         self,
@@ -187,8 +185,7 @@ class ContactResponse:
         circular[:, 7] = moment
         phases = _fast_phases(direction - angle, self._order)
         circular *= phases[:, None]
-        measured = self._cubes.measure(_split(circular), variant)
-        return np.asarray(measured.swapaxes(1, 2))
+        return self._cubes.measure(_split(circular), variant)
 
     def _interpolate_slopes(self, distance: Array, size: Array) -> Single:
         """Interpolate the radial functions R, Z and T (circular.py), and their derivatives.
@@ -247,7 +244,7 @@ class ContactResponse:
             Components (N, 15) in Pa.
         """
         circular = self._respond_fast(self._rows, self._order, place, angle, size, force)
-        return self._cubes.measure(_split(circular), variant)[:, :, 0]
+        return self._cubes.measure(_split(circular), variant)[:, 0]
 
     def sensitivity(
         self,

@@ -145,17 +145,18 @@ class CubeMeasurement:
         """Convert the n circular components at N cubes to the components that the cubes measure.
 
         Args:
-            circular: Real parts and then imaginary parts (N, 3, 2 n), for loads along x, y and z.
+            circular: Real parts and then imaginary parts (N, L, 2 n), for L loads on each cube.
             variant: Index (N,) of each cube's variant in the measurement model.
 
         Returns:
-            Measured components (N, 15, 3), for the same loads.
+            Measured components (N, L, 15), for the same loads.
         """
-        matrices = self.matrices
+        matrices = self.matrices.astype(circular.dtype)
+        if len(matrices) > 1:
+            return np.asarray(circular @ matrices[variant])
         # With only one variant, a single matrix product for all cubes is faster than one per cube.
-        matrix = matrices[0] if len(matrices) == 1 else matrices[variant]
-        matrix = matrix.astype(circular.dtype)
-        return np.asarray((circular @ matrix).swapaxes(1, 2))
+        n, loads, width = circular.shape
+        return np.asarray((circular.reshape(-1, width) @ matrices[0]).reshape(n, loads, -1))
 
     def matrices_towards(self, angle: Array, variant: Index) -> tuple[Array, Array]:
         """Return the matrices from circular components to measured components of N cubes.

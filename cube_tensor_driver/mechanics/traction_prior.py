@@ -135,7 +135,7 @@ class TractionPrior:
         parts = self._table.interpolate(self._cross, distance)
         order = self._cubes.spectra.order
         circular = rotate_loads(parts, direction, direction - angle, order)
-        return self._cubes.measure(circular, variant)
+        return np.asarray(self._cubes.measure(circular, variant).swapaxes(1, 2))
 
     def covariance(
         self,

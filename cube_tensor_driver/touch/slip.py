@@ -457,7 +457,7 @@ class SlipEstimator:
         linearise(inverse, [fit])
 
         # The first five parameters of the fit are force (3) and position (2) of this contact.
-        solved = fit.covariance[:5] @ fit.jacobian.T
+        solved = fit.linear.covariance[:5] @ fit.linear.jacobian.T
         solved = solved.reshape(5, len(cubes), -1)
         weights = np.einsum("knc,ncd->knd", solved, local.whitening)
 

@@ -87,7 +87,9 @@ def test_distant_contacts_cause_stress_beyond_the_tables():
     direction = np.array([0.8, 0.6])
     for depths in (19, 21, 40):
         place = depths * DEPTH * direction
-        expected, _ = contact.field(np.array([[*place, -DEPTH]]), np.zeros((1, 3)), FORCE[None], 0.48)
+        expected, _ = contact.field(
+            np.array([[*place, -DEPTH]]), np.zeros((1, 3)), FORCE[None], 0.48
+        )
         size, variant = 0.7 * DEPTH, np.zeros(1, np.intp)
         cubic = half_space.response(place[None], np.zeros(1), variant, size) @ FORCE
         linear = half_space.response_to_forces(

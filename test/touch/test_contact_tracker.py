@@ -14,7 +14,6 @@ from cube_tensor_driver.core.tensor import rotate_gradient, rotate_stress, rotat
 from cube_tensor_driver.mechanics import contact
 from cube_tensor_driver.mechanics.layer import Layer
 from cube_tensor_driver.touch.inverse import SurfaceInverse
-from cube_tensor_driver.touch.tracker import contact_tracker
 from cube_tensor_driver.touch.tracker.contact_tracker import ContactTracker
 from cube_tensor_driver.touch.tracker.local_values import CubeNoise, LocalValues
 from cube_tensor_driver.touch.tracker.tracked_region import TrackedRegion
@@ -348,10 +347,9 @@ def test_cubes_that_fail_beside_a_contact_and_a_skin_without_values(inverse):
 
 
 @pytest.mark.parametrize("work_before", [1, np.inf], ids=["nodes", "Hertz contact"])
-def test_a_cube_that_fails_during_a_contact(inverse, work_before, monkeypatch):
-    """In the very next scan, the fit may not compute with values that are unknown since, even if
-    there is no time to linearise fits that have only moved. Without noise, a ball has its force."""
-    monkeypatch.setattr(contact_tracker, "MAX_LINEARISED_FITS", 0)
+def test_a_cube_that_fails_during_a_contact(inverse, work_before):
+    """In the very next scan, the fit may not compute with values that are unknown since. Without
+    noise, a ball has its force."""
     values = ball(inverse, 8e-3, np.array([2e-3, 1e-3]), (0, 0, -3.0))
     tracker = ContactTracker(inverse, LEAST)
     tracker.update(values, max_work=work_before)

@@ -49,11 +49,6 @@ traction of a region), so a new fit with 80 nodes counts 80. The limit bounds th
 the remaining steps are made in the next scans.
 """
 
-MAX_LINEARISED_FITS = 6
-"""Largest number of fits of Hertz contacts for which the response of the cubes is linearised again
-in one scan (set of values of all cubes). Those whose contacts have moved farthest since their last
-linearisation come first."""
-
 MAX_FIT_STEPS = 12
 """Largest number of steps (new fits and improvements of fits) in one scan (set of values of all
 cubes), divided by the number of regions of contact. It ends a scan whose work is not limited by
@@ -148,13 +143,11 @@ class ContactTracker:
         field = inverse.field_of_scaled(scaled)
         self._follow_regions(field.depth_pressure)
         regions = self._regions
-        fits = self._fits
-        if fits:
-            cubes = np.unique(np.concatenate([one.values.cubes for one in fits]))
-            self._noise.update(scaled, cubes)
+        self._noise.update(scaled, self._fitted_cubes)
         for region in regions:
             region.drop_nodes_of_other_values()
-        self._linearise_moving_fits()
+        hertz_fits = [fit for fit in self._fits if isinstance(fit, HertzFit)]
+        linearise(inverse, [fit for fit in hertz_fits if fit.needs_linearisation])
         self._update_fits()
 
         # Contacts in regions without a fit are integrals of the traction field.
@@ -178,23 +171,18 @@ class ContactTracker:
                 contacts.append(self._to_parent_frame(one, region.fit, is_refined))
         return self._number_contacts([one for one in contacts if one.normal_force > 0])
 
-    def _linearise_moving_fits(self) -> None:
-        """Linearise the response of the cubes to the Hertz contacts that have moved farthest.
-
-        At most `MAX_LINEARISED_FITS` fits are linearised, but always those whose cubes have lost or
-        regained values: a step from their old linearisation would use values that are unknown now.
-        """
-        moving = [
-            one for one in self._fits if isinstance(one, HertzFit) and one.needs_linearisation
-        ]
-        moving.sort(key=lambda fit: (fit.values.has_same_values, -fit.displacement))
-        n_required = sum(not fit.values.has_same_values for fit in moving)
-        linearise(self._inverse, moving[: max(n_required, MAX_LINEARISED_FITS)])
-
     @property
     def _fits(self) -> list[HertzFit | NodeFit]:
         """Fits of all regions that are fitted."""
         return [region.fit for region in self._regions if region.fit is not None]
+
+    @property
+    def _fitted_cubes(self) -> Index:
+        """Indices (n,) of the cubes of all fits."""
+        is_fitted = np.zeros(len(self._scaled), bool)
+        for fit in self._fits:
+            is_fitted[fit.values.cubes] = True
+        return np.flatnonzero(is_fitted)
 
     @property
     def field(self) -> TractionField:
@@ -291,10 +279,8 @@ class ContactTracker:
         """
         fitted = [region for region in self._regions if region.fit is not None]
         if len(fitted) > 1:
-            cubes = np.unique(np.concatenate([fit.values.cubes for fit in self._fits]))
-            update_responses(self._inverse, fitted, cubes)
-        all_cubes = np.arange(len(self._scaled))
-        total, deviation = self._sum_responses(all_cubes, None)
+            update_responses(self._inverse, fitted, self._fitted_cubes)
+        total, deviation = self._sum_responses(slice(None), None)
         for region in fitted:
             if region.fit is not None:
                 values = region.fit.values
@@ -328,7 +314,9 @@ class ContactTracker:
         update_responses(self._inverse, others, cubes)
         return self._sum_responses(cubes, excluded)
 
-    def _sum_responses(self, cubes: Index, excluded: TrackedRegion | None) -> tuple[Array, Array]:
+    def _sum_responses(
+        self, cubes: Index | slice, excluded: TrackedRegion | None
+    ) -> tuple[Array, Array]:
         """Return the sum of the stored responses of some cubes to all regions of contact but one.
 
         Args:
@@ -339,7 +327,7 @@ class ContactTracker:
             Change (n, C), in Pa, of the C measured components of each cube by the other regions,
             and its standard deviation (n, C), in Pa.
         """
-        total = np.zeros((len(cubes), len(self._inverse.columns)))
+        total = np.zeros_like(self._scaled[cubes])
         deviation = np.zeros_like(total)
         for region in self._regions:
             if region is not excluded:
@@ -468,12 +456,12 @@ class ContactTracker:
         """
         inverse = self._inverse
         around = fit.values
-        distance = np.linalg.norm(around.place - estimate.place, axis=1)
-        nearest = int(distance.argmin())
+        offset = estimate.place - around.place
+        nearest = int((offset**2).sum(axis=1).argmin())
         to_cube = rotations_about_normal(around.angle[nearest])
         cube = around.cubes[nearest]
         rotation = inverse.poses.rotation[cube]
-        local = to_cube[:2, :2] @ (estimate.place - around.place[nearest])
+        local = to_cube[:2, :2] @ offset[nearest]
         from_cube = np.array([*local, inverse.depth])
         position = inverse.poses.position[cube] + rotation @ from_cube
 

@@ -17,10 +17,11 @@ interpolation, Neural Computation 4 (1992) 415 (evidence).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from ...core.arrays import Array
+from ...core.arrays import Array, Index
 from ...mechanics.contact_response import DISC_SIZES
 from ..inverse import SurfaceInverse
 from .contact_estimate import ContactEstimate, ContactSum, Discs
@@ -88,6 +89,40 @@ _STENCIL = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], float)
 then both directions along x and along y."""
 
 
+class Linearisation(NamedTuple):
+    """Values of C components of n cubes under J Hertz contacts, and how these values change.
+
+    The parameters are the 8 of each contact (force, centre, logarithm of the radius, flatness,
+    moment), and then the errors of S quantities of the elastomer (sensitivity.py), in standard
+    deviations. Together they are p = 8 J + S.
+
+    Attributes:
+        contacts: The contacts.
+        cubes: Positions and noise of the cubes.
+        values: Values (n, C) under the contacts, in Pa.
+        derivatives: Derivatives (n, C, p) of the values by the parameters.
+        white_values: Values (n C,), whitened.
+        jacobian: Derivatives (n C, p) of the whitened values.
+        offset: Parameters (p,) of the contacts minus their prior mean.
+        precision: Prior precisions (p,) of the parameters.
+        information: Posterior precision (p, p) of the parameters for a misfit of 1.
+        covariance: Inverse (p, p) of `information`.
+        nearest: Indices of the `SHAPE_CUBES` cubes nearest to the contacts.
+    """
+
+    contacts: Discs
+    cubes: LocalValues
+    values: Array
+    derivatives: Array
+    white_values: Array
+    jacobian: Array
+    offset: Array
+    precision: Array
+    information: Array
+    covariance: Array
+    nearest: Index
+
+
 class HertzFit:
     """J Hertz contacts in a region, fitted to C components of each of n cubes around the region.
 
@@ -95,6 +130,7 @@ class HertzFit:
     components transformed so that their noise has variance 1 and no correlation.
 
     Attributes:
+        values: Positions and noise of the cubes.
         found: Parameters (force, centre, radius) of the contacts that the last step has found.
         misfit: Chi-squared (squared whitened residual and prior terms) divided by the number of
             known values; at least 1.
@@ -102,10 +138,10 @@ class HertzFit:
             contacts. A wrong shape changes it more than contacts elsewhere do.
         last_step: Size of the last Gauss-Newton step, as in `SETTLED_STEP`; infinite before the
             first step.
-        jacobian: Derivatives (n C, 8 J) of the whitened values by the 8 parameters of each contact:
-            force (3), centre (2), logarithm of the radius, flatness, moment.
-        covariance: Covariance (8 J, 8 J) of these parameters for a misfit of 1.
+        linear: Response of the cubes for the next Gauss-Newton step, from `linearise`.
     """
+
+    linear: Linearisation
 
     def __init__(self, inverse: SurfaceInverse, values: LocalValues, starts: Discs) -> None:
         """Start without a step; `linearise` and `step` have to follow.
@@ -123,9 +159,7 @@ class HertzFit:
         self.misfit = 1.0
         self.shape_misfit = 1.0
         self.last_step = np.inf
-        self._elastomer_precision = 1.0
         self._previous = self.found
-        self._base = self.found
         self._flatness = self._moments = np.zeros(len(starts.forces))
         flatness_deviation = 1.0
         moment_deviation = FORCE_DEVIATION * depth
@@ -140,28 +174,37 @@ class HertzFit:
         self._contact_precision = np.tile(precision, len(starts.forces))
         self._elastomer_errors = np.zeros(0)
 
+    def prior_precision(self, quantities: int) -> Array:
+        """Return the prior precisions (p,) of the parameters for the next linearisation.
+
+        Args:
+            quantities: Number S of quantities of the elastomer.
+        """
+        is_first = not np.isfinite(self.last_step)
+        elastomer_precision = START_ELASTOMER_PRECISION if is_first else self.misfit
+        return np.append(self._contact_precision, np.full(quantities, elastomer_precision))
+
     @property
     def displacement(self) -> float:
-        """Distance of the contacts from those at which the response was linearised.
-
-        It is measured as the step in `SETTLED_STEP`, and infinite if no step was made yet.
-        """
-        if not np.isfinite(self.last_step):
-            return np.inf
-        shift = np.abs(self.found.centres - self._base.centres)
-        growth = np.abs(self.found.log_sizes - self._base.log_sizes)
-        return float(max(shift.max() / self._depth, growth.max()))
+        """Distance of the contacts from those at which the response was linearised, measured as the
+        step in `SETTLED_STEP`."""
+        base = self.linear.contacts
+        shift = np.abs(self.found.centres - base.centres).max() / self._depth
+        growth = np.abs(self.found.log_sizes - base.log_sizes).max()
+        return float(max(shift, growth))
 
     @property
     def needs_linearisation(self) -> bool:
         """Whether the response of the cubes must be linearised again before the next step.
 
-        It must if the `displacement` exceeds `SETTLED_STEP`, if the misfit has fallen so far that
-        the prior is too narrow (`MAX_PRECISION_RATIO`), or if the noise of the cubes has changed.
+        It must if the cubes or their noise have changed, if the `displacement` exceeds
+        `SETTLED_STEP`, or if the misfit has fallen so far that the prior is too narrow
+        (`MAX_PRECISION_RATIO`).
         """
-        is_far = self.displacement >= SETTLED_STEP
-        is_prior_narrow = self._elastomer_precision > MAX_PRECISION_RATIO * self.misfit
-        return is_far or is_prior_narrow or self.values.is_stale
+        if self.linear.cubes is not self.values or self.displacement >= SETTLED_STEP:
+            return True
+        is_prior_narrow = self.linear.precision[-1] > MAX_PRECISION_RATIO * self.misfit
+        return bool(is_prior_narrow) or self.values.is_stale
 
     @property
     def is_unsettled(self) -> bool:
@@ -182,8 +225,8 @@ class HertzFit:
     def score(self) -> float:
         """-2 ln of the evidence (probability of the values, in Laplace approximation), up to a
         constant that is the same for `Posterior.score` of a fit of the traction on nodes."""
-        _, log_posterior_precision = np.linalg.slogdet(self._information)
-        log_prior_precision = np.log(self._precision).sum()
+        _, log_posterior_precision = np.linalg.slogdet(self.linear.information)
+        log_prior_precision = np.log(self.linear.precision).sum()
         occam_term = log_posterior_precision - log_prior_precision
         noise_term = max(self.values.count, 1) * np.log(self.misfit)
         return float(self._chi_squared / self.misfit + noise_term + occam_term)
@@ -195,20 +238,16 @@ class HertzFit:
 
     @property
     def explained(self) -> Array:
-        """Values that the contacts `found` (result of the last step) cause.
-
-        They are the C components of stress and gradient (times d0, half the side of a cube) of each
-        of n cubes around the region, (n, C), in Pa.
-        """
-        found, base = self.found, self._base
-        change = np.zeros((len(found.forces), _N_PARAMETERS))
+        """Values (n, C), in Pa, of the cubes around the region under the contacts `found`."""
+        found, base = self.found, self.linear.contacts
+        change = np.empty((len(found.forces), _N_PARAMETERS))
         change[:, :3] = found.forces - base.forces
         change[:, 3:5] = found.centres - base.centres
         change[:, 5] = found.log_sizes - base.log_sizes
         change[:, 6] = self._flatness
         change[:, 7] = self._moments
         all_changes = np.append(change, self._elastomer_errors)
-        return np.asarray(self._base_values + self._derivatives @ all_changes)
+        return np.asarray(self.linear.values + self.linear.derivatives @ all_changes)
 
     def predict(self, extrapolates: bool) -> None:
         """Set the contacts at which the fit of a new scan (set of values of all cubes) begins.
@@ -246,79 +285,27 @@ class HertzFit:
         self.found = transform(self.found)
         self._previous = transform(self._previous)
         self.values = values
-        self.last_step = np.inf
-
-    def linearise(self, slopes: Array, sensitivity: Array) -> None:
-        """Store the values of the cubes under the contacts `found`, and how these values change.
-
-        The results (`jacobian`, `covariance`) serve the next Gauss-Newton step.
-
-        Args:
-            slopes: For each of J contacts and n cubes, 8 sets of the C components of stress and
-                gradient (times d0, half the side of a cube): (J, n, 8, C). Sets 0 to 2 are those
-                under a force of 1 N along x, y and z, in Pa/N. Sets 3 to 6 are the derivatives
-                by x and y of the contact's centre (Pa/m), and the first and second derivative by
-                the logarithm of its radius (Pa). Set 7 is that under a moment of 1 N m about z, in
-                Pa/(N m).
-            sensitivity: Changes (n, S, C) in Pa of the values under the contacts by one standard
-                deviation of each of S quantities of the elastomer (sensitivity.py).
-        """
-        base = self._base = self.found
-        to_contacts = self.values.place[:, None] - base.centres
-        distance = np.linalg.norm(to_contacts, axis=2).min(axis=1)
-        self._near = np.argsort(distance, kind="stable")[:SHAPE_CUBES]
-
-        derivatives = slopes.astype(float)
-        base_values = np.einsum("jnac,ja->nc", derivatives[:, :, :3], base.forces)
-        # With h = FLATNESS_STEP and the derivatives by the logarithm of the radius, the response to
-        # the difference of contact and mixture is h^2 (first - second / 2), to order h^2.
-        first, second = derivatives[:, :, 5], derivatives[:, :, 6]
-        derivatives[:, :, 6] = FLATNESS_STEP**2 * (first - second / 2)
-        by_contacts = derivatives.transpose(1, 3, 0, 2)
-        by_contacts = by_contacts.reshape(*base_values.shape, -1)
-        by_elastomer = sensitivity.swapaxes(1, 2)
-        self._base_values = base_values
-        self._derivatives = np.concatenate([by_contacts, by_elastomer], axis=2)
-
-        has_misfit = np.isfinite(self.last_step)
-        self._elastomer_precision = self.misfit if has_misfit else START_ELASTOMER_PRECISION
-        elastomer_precision = np.full(sensitivity.shape[1], self._elastomer_precision)
-        self._precision = np.append(self._contact_precision, elastomer_precision)
-
-        whitening = self.values.whitening
-        jacobian = whitening @ self._derivatives
-        self.jacobian = jacobian.reshape(-1, jacobian.shape[2])
-        self._white_base = (whitening @ base_values[:, :, None]).ravel()
-        information = self.jacobian.T @ self.jacobian
-        information[np.diag_indices(len(information))] += self._precision
-        self.covariance = np.linalg.inv(information)
-        self._information = information
 
     def step(self, white: Array) -> None:
-        """Make a Gauss-Newton step from the parameters at which the response is linearised.
+        """Make a Gauss-Newton step from the contacts at which the response is linearised.
 
         Args:
             white: Whitened values (n C,), C components of each of n cubes, transformed by
                 `LocalValues.whiten` so that their noise has variance 1 and no correlation.
         """
-        base, values = self._base, self.values
-        n_parameters = len(self._contact_precision)
-        from_prior_mean = np.zeros(len(self._precision))
-        of_contacts = from_prior_mean[:n_parameters].reshape(-1, _N_PARAMETERS)
-        of_contacts[:, :3] = base.forces
-        of_contacts[:, 5] = base.log_sizes - np.log(USUAL_SIZE * self._depth)
-
-        residual = white - self._white_base
-        prior_gradient = self._precision * from_prior_mean
-        gradient = self.jacobian.T @ residual - prior_gradient
-        change = self.covariance @ gradient
-        penalty = from_prior_mean @ prior_gradient
+        linear, known = self.linear, self.values.known
+        residual = white - linear.white_values
+        prior_gradient = linear.precision * linear.offset
+        gradient = residual @ linear.jacobian - prior_gradient
+        change = linear.covariance @ gradient
+        penalty = linear.offset @ prior_gradient
         self._chi_squared = float(residual @ residual + penalty - gradient @ change)
-        self.misfit = max(self._chi_squared / max(values.count, 1), 1.0)
+        self.misfit = max(self._chi_squared / max(self.values.count, 1), 1.0)
 
-        new_residual = (residual - self.jacobian @ change).reshape(values.known.shape)
-        n_near = max(int(values.known[self._near].sum()), 1)
-        self.shape_misfit = float((new_residual[self._near] ** 2).sum()) / n_near
+        new_residual = (residual - linear.jacobian @ change).reshape(known.shape)[linear.nearest]
+        n_near = max(int(known[linear.nearest].sum()), 1)
+        self.shape_misfit = float((new_residual**2).sum()) / n_near
+        n_parameters = len(self._contact_precision)
         self._elastomer_errors = change[n_parameters:]
         self._move_contacts(change[:n_parameters].reshape(-1, _N_PARAMETERS))
 
@@ -329,17 +316,15 @@ class HertzFit:
             change: Changes (J, 8) of the 8 parameters of each contact. Shifts and changes of radii
                 are limited to `_MAX_STEP`.
         """
-        base = self._base
+        base = self.linear.contacts
         limit = _MAX_STEP * self._depth
-        shift = np.clip(change[:, 3:5], -limit, limit)
-        growth = np.clip(change[:, 5], -_MAX_STEP, _MAX_STEP)
-        largest_shift = float(np.abs(shift).max()) / self._depth
-        largest_growth = float(np.abs(growth).max())
-        self.last_step = max(largest_shift, largest_growth)
+        shift = change[:, 3:5].clip(-limit, limit)
+        growth = change[:, 5].clip(-_MAX_STEP, _MAX_STEP)
+        self.last_step = float(max(np.abs(shift).max() / self._depth, np.abs(growth).max()))
         self.found = Discs(
             forces=base.forces + change[:, :3],
             centres=base.centres + shift,
-            log_sizes=np.clip(base.log_sizes + growth, *self._log_range),
+            log_sizes=(base.log_sizes + growth).clip(*self._log_range),
         )
         self._flatness = change[:, 6]
         self._moments = change[:, 7]
@@ -385,7 +370,7 @@ class HertzFit:
         forces[:, :, 0] += self.found.forces.T
 
         n_parameters = _N_PARAMETERS * count
-        covariance = self.inflation * self.covariance[:n_parameters, :n_parameters]
+        covariance = self.inflation * self.linear.covariance[:n_parameters, :n_parameters]
         cholesky_factor = np.linalg.cholesky(covariance)
         return ContactSum(
             places=places.reshape(-1, 2),
@@ -399,7 +384,7 @@ class HertzFit:
         estimates = []
         for j, log_size in enumerate(self.found.log_sizes.tolist()):
             own = slice(_N_PARAMETERS * j, _N_PARAMETERS * (j + 1))
-            covariance = self.inflation * self.covariance[own, own]
+            covariance = self.inflation * self.linear.covariance[own, own]
             area = float(np.pi * np.exp(2 * log_size))
             estimates.append(
                 ContactEstimate(
@@ -418,41 +403,86 @@ class HertzFit:
 
 
 def linearise(inverse: SurfaceInverse, fits: Sequence[HertzFit]) -> None:
-    """Compute the stress of the cubes under the contacts of each fit, and store it in the fits.
+    """Linearise the response of the cubes at the contacts of each fit, for its next step.
 
-    Its derivatives by the parameters of the contacts (force, centre, radius, flatness, moment) are
-    computed and stored, too. All fits together take little longer than one.
+    All fits with the same numbers of contacts and cubes together take little longer than one.
 
     Args:
         inverse: Responses (stress in the skin under contacts of unit force).
-        fits: Fits, whose `linearise` gets the results.
+        fits: Fits, whose attribute `linear` is set.
     """
-    if not fits:
-        return
-    offsets, angles, variants, sizes, forces = [], [], [], [], []
+    by_shape: dict[tuple[int, int], list[HertzFit]] = {}
     for fit in fits:
         fit.values.refresh()
-        values, found = fit.values, fit.found
-        count, n = len(found.forces), len(values.cubes)
-        from_centres = values.place - found.centres[:, None]
-        offsets.append(from_centres.reshape(-1, 2))
-        angles.append(np.tile(values.angle, count))
-        variants.append(np.tile(values.variant, count))
-        sizes.append(np.repeat(np.exp(found.log_sizes), n))
-        forces.append(np.repeat(found.forces, n, axis=0))
-    offset = np.concatenate(offsets)
-    angle = np.concatenate(angles)
-    variant = np.concatenate(variants)
-    size = np.concatenate(sizes)
-    force = np.concatenate(forces)
+        shape = len(fit.found.forces), len(fit.values.cubes)
+        by_shape.setdefault(shape, []).append(fit)
+    for (contacts, cubes), alike in by_shape.items():
+        _linearise_alike(inverse, alike, contacts, cubes)
+
+
+def _linearise_alike(
+    inverse: SurfaceInverse, fits: list[HertzFit], contacts: int, cubes: int
+) -> None:
+    """Linearise the response of the cubes at the contacts of K fits of the same shape.
+
+    Args:
+        inverse: Responses of the cubes.
+        fits: The K fits.
+        contacts: Number J of contacts of each fit.
+        cubes: Number n of cubes of each fit.
+    """
+    shape = len(fits), contacts, cubes
+    forces = np.stack([fit.found.forces for fit in fits])
+    centres = np.stack([fit.found.centres for fit in fits])
+    log_sizes = np.stack([fit.found.log_sizes for fit in fits])
+    place = np.stack([fit.values.place for fit in fits])
+    angle = np.stack([fit.values.angle for fit in fits])
+    variant = np.stack([fit.values.variant for fit in fits])
+    offset = place[:, None] - centres[:, :, None]
+
+    # The responses are computed for all fits, contacts and cubes in one call.
+    positions = offset.reshape(-1, 2)
+    angles = np.broadcast_to(angle[:, None], shape).ravel()
+    variants = np.broadcast_to(variant[:, None], shape).ravel()
+    load = np.repeat(np.exp(log_sizes), cubes), np.repeat(forces.reshape(-1, 3), cubes, axis=0)
     response, observed = inverse.contact_response, inverse.columns
-    slopes = response.response_slopes(offset, angle, variant, size, force)[:, :, observed]
-    sensitivity = response.sensitivity(offset, angle, size, force)[:, :, observed]
-    starts = np.cumsum([len(one) for one in angles])[:-1]
-    slopes_by_fit = np.split(slopes, starts)
-    sensitivity_by_fit = np.split(sensitivity, starts)
-    for fit, own, changes in zip(fits, slopes_by_fit, sensitivity_by_fit, strict=True):
-        count = len(fit.found.forces)
-        own = own.reshape(count, -1, *own.shape[1:])
-        changes = changes.reshape(count, -1, *changes.shape[1:])
-        fit.linearise(own, changes.sum(axis=0))
+    slopes = response.response_slopes(positions, angles, variants, *load)[:, :, observed]
+    sensitivity = response.sensitivity(positions, angles, *load)[:, :, observed]
+
+    by_contact = slopes.reshape(*shape, *slopes.shape[1:]).astype(float)
+    values = np.einsum("kjnac,kja->knc", by_contact[:, :, :, :3], forces)
+    # With h = FLATNESS_STEP and the derivatives by the logarithm of the radius, the response to the
+    # difference of contact and mixture is h^2 (first - second / 2), to order h^2.
+    first, second = by_contact[:, :, :, 5], by_contact[:, :, :, 6]
+    by_contact[:, :, :, 6] = FLATNESS_STEP**2 * (first - second / 2)
+    by_contacts = by_contact.transpose(0, 2, 4, 1, 3).reshape(*values.shape, -1)
+    by_elastomer = sensitivity.reshape(*shape, *sensitivity.shape[1:]).sum(axis=1)
+    derivatives = np.concatenate([by_contacts, by_elastomer.swapaxes(2, 3)], axis=3)
+
+    whitening = np.stack([fit.values.whitening for fit in fits])
+    jacobian = (whitening @ derivatives).reshape(len(fits), -1, derivatives.shape[3])
+    white_values = (whitening @ values[..., None]).reshape(len(fits), -1)
+    precision = np.stack([fit.prior_precision(sensitivity.shape[1]) for fit in fits])
+    prior_offset = np.zeros_like(precision)
+    of_contacts = prior_offset[:, : _N_PARAMETERS * contacts].reshape(*shape[:2], _N_PARAMETERS)
+    of_contacts[:, :, :3] = forces
+    of_contacts[:, :, 5] = log_sizes - np.log(USUAL_SIZE * inverse.depth)
+    information = jacobian.swapaxes(1, 2) @ jacobian
+    information += precision[:, None] * np.eye(precision.shape[1])
+    covariance = np.linalg.inv(information)
+    distance = np.linalg.norm(offset, axis=3).min(axis=1)
+    nearest = np.argsort(distance, axis=1, kind="stable")[:, :SHAPE_CUBES]
+    results = zip(
+        values,
+        derivatives,
+        white_values,
+        jacobian,
+        prior_offset,
+        precision,
+        information,
+        covariance,
+        nearest,
+        strict=True,
+    )
+    for fit, result in zip(fits, results, strict=True):
+        fit.linear = Linearisation(fit.found, fit.values, *result)

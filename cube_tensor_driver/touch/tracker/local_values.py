@@ -18,7 +18,7 @@ MIN_FACING = 0.5
 """Smallest cosine of the angle between the outward normals of two cubes at which one of them
 responds to a contact above the other. On a bent skin, cubes that face away do not respond."""
 
-MAX_NOISE_CHANGE = 1.6
+MAX_NOISE_CHANGE = 3.0
 """Factor between the present variance of a pad's error and the one in use, in either direction,
 above which the noise of its cube is computed again."""
 
@@ -80,11 +80,11 @@ class CubeNoise:
             self.known[outdated] = known_there
             by_pad = np.where(known_there[:, :, None], inverse.by_pad[outdated], 0.0)
             self._by_pad[outdated] = by_pad
-            self._to_pads[outdated] = np.linalg.pinv(by_pad)
+            covariance = _regularise(by_pad @ by_pad.swapaxes(1, 2), known_there)
+            self._to_pads[outdated] = np.linalg.solve(covariance, by_pad).swapaxes(1, 2)
             self._variance[outdated] = 0.0
         values = np.where(known, scaled[cubes], 0.0)
-        as_columns = self._to_pads[cubes] @ values[:, :, None]
-        stresses = as_columns[:, :, 0]
+        stresses = (self._to_pads[cubes] @ values[:, :, None])[:, :, 0]
 
         # The predicted stress of a pad is wrong by interpolation errors of the tabulated response
         # and by contacts that are not found yet. Both grow with the stress in the cubes around.
@@ -109,15 +109,23 @@ class CubeNoise:
         """
         by_pad = self._by_pad[cubes]
         covariance = (by_pad * variance[:, None]) @ by_pad.swapaxes(1, 2)
-        # Rows of unknown values are 0, and components may be almost linearly dependent. In both
-        # cases an addition to the diagonal keeps the covariance invertible.
-        is_known = self.known[cubes][:, None]
-        identity = np.eye(covariance.shape[1])
-        covariance += identity * ~is_known + 1e-9 * identity * covariance
+        is_known = self.known[cubes]
+        covariance = _regularise(covariance, is_known)
         inverse_factor = np.linalg.inv(np.linalg.cholesky(covariance))
-        self.whitening[cubes] = inverse_factor * is_known
+        self.whitening[cubes] = inverse_factor * is_known[:, None]
         self._variance[cubes] = variance
         self.version[cubes] += 1
+
+
+def _regularise(covariance: Array, known: Mask) -> Array:
+    """Add to the diagonal of covariances (n, C, C) what makes them invertible, and return them.
+
+    Rows of unknown values are 0, and components may be almost linearly dependent.
+    """
+    diagonal = np.einsum("ncc->nc", covariance)
+    diagonal *= 1 + 1e-9
+    diagonal += ~known
+    return covariance
 
 
 class LocalValues:
@@ -179,6 +187,11 @@ class LocalValues:
         self.whitening = whitening * weight[:, None, None]
         self.known = self._noise.known[self.cubes]
         self.count = int(self.known.sum())
+
+    def nearest_cubes(self, places: Array) -> Index:
+        """Return the indices (J,) of the cubes nearest to places (J, 2) on the skin laid flat."""
+        squared_distance = ((places[:, None] - self.place) ** 2).sum(axis=2)
+        return np.asarray(self.cubes[squared_distance.argmin(axis=1)])
 
     @property
     def is_stale(self) -> bool:

@@ -213,22 +213,20 @@ class TrackedRegion:
 
         A fit whose contacts have left the region, or pull at the surface, is dropped.
         """
-        inverse, values = self._inverse, fit.values
-        centres = fit.found.centres
-        from_cubes = np.linalg.norm(centres[:, None] - values.place, axis=2)
-        below = values.cubes[from_cubes.argmin(axis=1)]
+        inverse, values, found = self._inverse, fit.values, fit.found
+        below = values.nearest_cubes(found.centres)
         cubes_of_region = inverse.near[inverse.cube[self.points], : NEAREST_CUBES[-1]]
-        is_pressing = fit.found.forces[:, 2] < 0
-        if not (is_pressing & np.isin(below, cubes_of_region)).all():
+        is_in_region = (cubes_of_region == below[:, None, None]).any(axis=(1, 2))
+        if not (is_in_region & (found.forces[:, 2] < 0)).all():
             self.fit = None
             return
-        mean_centre = centres.mean(axis=0)
-        to_cubes = np.linalg.norm(mean_centre - values.place, axis=1)
-        nearest = int(values.cubes[to_cubes.argmin()])
-        from_home = float(to_cubes[values.cubes == values.home][0])
-        if nearest != values.home and from_home > HOME_PITCHES * inverse.pitch:
-            cubes = np.unique(inverse.near[np.append(below, nearest)])
-            fit.move_home(self._collect(nearest, cubes))
+        # The home cube is the origin of the frame of the contacts.
+        mean_centre = found.centres.mean(axis=0)
+        if np.hypot(*mean_centre) > HOME_PITCHES * inverse.pitch:
+            home = int(values.nearest_cubes(mean_centre[None])[0])
+            if home != values.home:
+                cubes = np.unique(inverse.near[np.append(below, home)])
+                fit.move_home(self._collect(home, cubes))
 
     def _collect(self, home: int, cubes: Index) -> LocalValues:
         """Return noise and positions, for a fit, of the cubes that respond to contacts above its
@@ -460,33 +458,30 @@ def update_responses(
         cubes: Indices (n,) of the cubes.
     """
     stale = [region for region in regions if region.is_response_stale(cubes)]
-    offsets, angles, sizes, forces = [], [], [], []
-    normals = inverse.poses.rotation[:, :, 2]
-    for region in stale:
-        home, discs = region.discs
-        place, angle = inverse.unroll(home, cubes)
-        # On a bent skin, cubes that face away from a contact do not respond to it.
-        is_facing = normals[cubes] @ normals[home] > MIN_FACING
-        for force, centre, log_size in zip(*discs, strict=True):
-            offsets.append(place - centre)
-            angles.append(angle)
-            sizes.append(np.full(len(cubes), np.exp(log_size)))
-            forces.append(is_facing[:, None] * force)
     if stale:
-        variants = np.tile(inverse.variant[cubes], len(offsets))
+        homes = np.array([region.discs[0] for region in stale])
+        discs = [region.discs[1] for region in stale]
+        counts = np.array([len(one.forces) for one in discs])
+        of_disc = np.repeat(np.arange(len(stale)), counts)
+        unrolled = [inverse.unroll(home, cubes) for home in homes.tolist()]
+        place, angle = (np.stack(one)[of_disc] for one in zip(*unrolled, strict=True))
+        forces, centres, log_sizes = map(np.concatenate, zip(*discs, strict=True))
+        # On a bent skin, cubes that face away from a contact do not respond to it.
+        normals = inverse.poses.rotation[:, :, 2]
+        is_facing = normals[homes] @ normals[cubes].T > MIN_FACING
+        forces = is_facing[of_disc][:, :, None] * forces[:, None]
         response = inverse.contact_response.response_to_forces(
-            np.concatenate(offsets),
-            np.concatenate(angles),
-            variants,
-            np.concatenate(sizes),
-            np.concatenate(forces),
+            (place - centres[:, None]).reshape(-1, 2),
+            angle.ravel(),
+            np.tile(inverse.variant[cubes], len(of_disc)),
+            np.repeat(np.exp(log_sizes), len(cubes)),
+            forces.reshape(-1, 3),
         )
-        measured = response[:, inverse.columns]
-        by_disc = measured.reshape(len(offsets), len(cubes), -1)
-        for region in stale:
-            count = len(region.discs[1].forces)
-            region.take_response(cubes, by_disc[:count].sum(axis=0))
-            by_disc = by_disc[count:]
+        measured = response[:, inverse.columns].reshape(len(of_disc), len(cubes), -1)
+        first = np.cumsum(counts) - counts
+        by_region = np.add.reduceat(measured, first, axis=0)
+        for region, own in zip(stale, by_region, strict=True):
+            region.take_response(cubes, own)
     for region in regions:
         if region.fit is not None:
             region.response[region.fit.values.cubes] = region.fit.explained
