@@ -23,7 +23,8 @@ def tcp_address(url: str) -> tuple[str, int] | None:
     """
     try:
         parts = urlsplit(url)
-        host, port = parts.hostname, parts.port
+        host = parts.hostname
+        port = parts.port
     except ValueError:
         return None
 

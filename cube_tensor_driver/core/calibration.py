@@ -294,7 +294,8 @@ class Calibration:
         attributes = {item.name for item in fields(cls)}
         _check_keys(data, attributes)
         values = {key: data[key] for key in attributes & set(data)}
-        layout, neglect = values["layout"], values.get("neglect", ())
+        layout = values["layout"]
+        neglect = values.get("neglect", ())
         try:
             if isinstance(layout, Mapping):
                 values["layout"] = Layout.from_dict(layout)
@@ -369,7 +370,8 @@ def _check_keys(data: Mapping[str, Any], attributes: set[str]) -> None:
     """
     allowed = attributes | {"id", "schema"}
     required = {"layout", "rest_frequency", "noise", "modulus", "half_side", "schema"}
-    unknown, missing = set(data) - allowed, required - set(data)
+    unknown = set(data) - allowed
+    missing = required - set(data)
     if unknown or missing:
         raise CalibrationError(
             f"calibration: unknown keys {sorted(map(str, unknown))}, missing keys "

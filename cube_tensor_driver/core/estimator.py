@@ -158,12 +158,10 @@ def make_estimator(
         targets: Map (T, M) from a state (amplitudes of the modes) to the quantities to estimate; by
             default the 15 components of stress and gradient.
     """
-    response = np.asarray(response, dtype=float)
-    noise = np.asarray(noise, dtype=float)
     if targets is None:
         targets = modes.components
-    targets = np.asarray(targets, dtype=float)
-    n_pads, n_targets = len(response), len(targets)
+    n_pads = len(response)
+    n_targets = len(targets)
     all_pads = np.arange(n_pads)
     all_modes = np.arange(modes.n_modes)
     present = np.setdiff1d(all_pads, np.asarray(missing, dtype=int))
@@ -341,9 +339,11 @@ def chi2_tail(x: float, dof: int) -> float:
         return 1.0
     h = x / 2
     if dof % 2:
-        a, tail = 0.5, math.erfc(math.sqrt(h))
+        a = 0.5
+        tail = math.erfc(math.sqrt(h))
     else:
-        a, tail = 1.0, math.exp(-h)
+        a = 1.0
+        tail = math.exp(-h)
     while a < dof / 2:
         # The product h^a exp(-h) / Gamma(a + 1) is computed by logarithms, because h^a alone
         # overflows for many degrees of freedom.
@@ -365,7 +365,8 @@ def chi2_limit(dof: int, probability: float) -> float:
     """
     if dof < 1:
         return math.nan
-    low, high = 0.0, 1.0
+    low = 0.0
+    high = 1.0
     while chi2_tail(high, dof) > probability:
         high *= 2
     # Each bisection halves the interval, and a float has 53 bits of precision.

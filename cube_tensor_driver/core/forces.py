@@ -13,11 +13,7 @@ import numpy as np
 from .arguments import check_number, check_skin
 from .arrays import Array
 from .rows import StressRows
-from .tensor import face_force, rotation_from_rpy
-
-TRACTION_COMPONENTS = [4, 3, 2]
-"""Columns of a stress (N, 6) in the order xx, yy, zz, yz, zx, xy whose components act on the face
-+z of a cube: zx, yz and zz."""
+from .tensor import TRACTION_COMPONENTS, face_force, rotation_from_rpy
 
 
 class PlacedSkin(Protocol):

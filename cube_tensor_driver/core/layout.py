@@ -92,7 +92,8 @@ class Layout:
         Args:
             number: Number of the pad (from 0); it is compared with the pads of lower numbers.
         """
-        position, normal = self.positions[number], self.normals[number]
+        position = self.positions[number]
+        normal = self.normals[number]
         pad = f"pad {number + 1}"
         if sorted(np.abs(normal)) != [0, 0, 1]:
             self._refuse(

@@ -68,7 +68,8 @@ def match_rows(known: SampleRows, wanted: SampleRows) -> Index:
         several times, the known row with the nearest time stamp is chosen. Time stamps need not be
         equal; a caller that needs equal ones compares them afterwards.
     """
-    known_keys, wanted_keys = _keys(known), _keys(wanted)
+    known_keys = _keys(known)
+    wanted_keys = _keys(wanted)
     order = np.argsort(known_keys, kind="stable")
     sorted_keys = known_keys[order]
     begin = np.searchsorted(sorted_keys, wanted_keys, side="left")

@@ -222,7 +222,8 @@ def _split_fields(flat: Array) -> tuple[Array, Array]:
     Returns:
         Stress (N, 3, 3), and gradient times half the side of the cube (N, 3, 3, 3).
     """
-    stress, gradient = flat[:, :9], flat[:, 9:]
+    stress = flat[:, :9]
+    gradient = flat[:, 9:]
     return stress.reshape(-1, 3, 3), gradient.reshape(-1, 3, 3, 3)
 
 
@@ -235,7 +236,8 @@ def _parse_terms(name: str) -> list[tuple[float, int]]:
     """
     terms = []
     for number, part in enumerate(name.split("-")):
-        i, j = AXES.index(part[0]), AXES.index(part[1])
+        i = AXES.index(part[0])
+        j = AXES.index(part[1])
         place = 3 * i + j
         if "_" in part:
             k = AXES.index(part[3])

@@ -50,7 +50,8 @@ def pad_stress(
         Stresses; NaN for frequencies outside 0 < f < `highest_frequency`, which no thickness of
         the foam explains.
     """
-    f, f0 = np.asarray(frequency), np.asarray(rest_frequency)
+    f = np.asarray(frequency)
+    f0 = np.asarray(rest_frequency)
     with np.errstate(all="ignore"):
         # The difference of the frequencies is formed first: f / f0 - 1 would lose digits in
         # float32, as f / f0 is near 1.
@@ -104,7 +105,8 @@ def stress_slope(
         beta: Ratio of the parasitic to the active capacitance without load.
         modulus: Modulus E of the pad's foam, in Pa.
     """
-    f, f0 = np.asarray(frequency), np.asarray(rest_frequency)
+    f = np.asarray(frequency)
+    f0 = np.asarray(rest_frequency)
     with np.errstate(all="ignore"):
         denominator = 1 - beta * (f - f0) / f0
         slope = modulus * (1 + beta) / (f0 * denominator**2)
@@ -122,7 +124,8 @@ def highest_frequency(rest_frequency: ArrayLike, beta: ArrayLike) -> Array:
         rest_frequency: Frequency f0 without load, in Hz.
         beta: Ratio of the parasitic capacitance to the active capacitance at rest.
     """
-    f0, beta = np.asarray(rest_frequency), np.asarray(beta, dtype=float)
+    f0 = np.asarray(rest_frequency)
+    beta = np.asarray(beta, dtype=float)
     with np.errstate(divide="ignore", over="ignore"):
         highest: Array = f0 * (1 + beta) / beta
         return highest

@@ -525,17 +525,21 @@ class Pipeline:
         Args:
             key: Number of the calibration * 2**32 + bit mask of the bad pads.
         """
-        keys, numbers = self._tables.keys, self._tables.numbers
+        keys = self._tables.keys
+        numbers = self._tables.numbers
         if self._n_extra == len(keys):
             self._n_extra = 0
             keys[:] = NO_KEY
         number = len(self._groups) + self._n_extra
-        group, mask = key >> 32, key & 0xFFFFFFFF
+        group = key >> 32
+        mask = key & 0xFFFFFFFF
         self._store_table(number, group, _find_estimator(self._groups[group], mask))
         self._n_extra += 1
         place = int(np.searchsorted(keys, key))
-        keys[place + 1 :], numbers[place + 1 :] = keys[place:-1].copy(), numbers[place:-1].copy()
-        keys[place], numbers[place] = key, number
+        keys[place + 1 :] = keys[place:-1].copy()
+        numbers[place + 1 :] = numbers[place:-1].copy()
+        keys[place] = key
+        numbers[place] = number
 
     def _store_table(self, number: int, group: int, estimator: Estimator) -> None:
         """Write the matrix and limits of rows with the same calibration and the same good pads.

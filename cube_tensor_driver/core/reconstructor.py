@@ -185,7 +185,8 @@ class Reconstructor:
         out = self.pipeline.make_rows(rows) if out is None else out
         left_out = known = None
         if recorded is not None:
-            left_out, known = recorded.left_out, recorded.known
+            left_out = recorded.left_out
+            known = recorded.known
             out.status[:] = recorded.status
         return self.compensation.process(rows, left_out, watch=health, known=known, out=out)
 

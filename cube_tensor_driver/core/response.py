@@ -149,7 +149,6 @@ def project(structure: Structure, matrix: Array) -> tuple[dict[str, float], floa
     Raises:
         CalibrationError: The matrix has another shape.
     """
-    matrix = np.asarray(matrix, dtype=float)
     basis = structure.basis
     if matrix.shape != basis.shape[1:]:
         raise CalibrationError(
@@ -164,32 +163,6 @@ def project(structure: Structure, matrix: Array) -> tuple[dict[str, float], floa
     size = np.linalg.norm(matrix)
     relative = float(remainder / size) if size else 0.0
     return coefficients, relative
-
-
-def prototype(shift: Array) -> Array:
-    """Compute the three readings of the prototype of Kiyota & Shinoda, eqs. 8 to 10 as printed.
-
-    In terms of their eq. 1 (letters: response coefficients, names: amplitudes of modes) they are
-
-        -4 (a zz - b xx),   4 (c + d) zx,   -4 (e zz_x - h xx_x)
-
-    So the normal reading mixes sigma_zz with sigma_xx, and the gradient reading mixes the gradient
-    of sigma_zz with that of sigma_xx.
-
-    Args:
-        shift: Frequency shifts of the pads V1 to V4, (N, 4).
-
-    Returns:
-        Normal, shear and gradient readings (N, 3), uncalibrated, in the unit of the shifts.
-    """
-    weights = [
-        [-1, -1, 1],
-        [-1, 1, -1],
-        [-1, 1, 1],
-        [-1, -1, -1],
-    ]
-    readings: Array = np.asarray(shift) @ np.array(weights)
-    return readings
 
 
 def _list_names(names: Iterable[str]) -> str:

@@ -143,10 +143,9 @@ def map_pads(layout: Layout, rotation: Array | Index) -> Index:
     Raises:
         SymmetryError: There is no pad at the position to which a pad is mapped.
     """
-    r = np.asarray(rotation, dtype=float)
     images = np.empty(layout.n_pads, dtype=int)
-    positions = layout.positions @ r.T
-    normals = layout.normals @ r.T
+    positions = layout.positions @ rotation.T
+    normals = layout.normals @ rotation.T
     for pad in range(layout.n_pads):
         offset = np.abs(layout.positions - positions[pad])
         rotation_error = np.abs(layout.normals - normals[pad])
@@ -245,7 +244,8 @@ def find_structure(
     for pad, mode in np.ndindex(is_assigned.shape):
         if is_assigned[pad, mode]:
             continue
-        rows, columns = pad_images[:, pad], mode_images[:, mode]
+        rows = pad_images[:, pad]
+        columns = mode_images[:, mode]
         signs = mode_signs[:, mode]
         is_assigned[rows, columns] = True
         is_same_entry = (rows == pad) & (columns == mode)
@@ -283,7 +283,8 @@ def _read_signed_permutations(matrices: Array) -> tuple[Index, Index]:
         SymmetryError: A matrix is not a signed permutation.
     """
     magnitude = np.abs(matrices)
-    sums, largest = magnitude.sum(axis=1), magnitude.max(axis=1)
+    sums = magnitude.sum(axis=1)
+    largest = magnitude.max(axis=1)
     if not (np.allclose(sums, 1) and np.allclose(largest, 1)):
         raise SymmetryError("the group does not act on these modes as signed permutations")
     signs = np.sign(matrices.sum(axis=1)).astype(int)

@@ -19,6 +19,10 @@ from .arrays import AnyArray, Array, Real
 from .errors import CubeError
 from .modes import to_matrix, to_voigt
 
+TRACTION_COMPONENTS = [4, 3, 2]
+"""Columns of a stress (N, 6) in the order xx, yy, zz, yz, zx, xy whose components act on the face
++z of a cube: zx, yz and zz."""
+
 _FIXED_AXES = "sxyz"
 """Name by which the library transforms3d means roll, pitch and yaw about fixed axes, as in URDF and
 REP 103."""
@@ -209,8 +213,7 @@ def face_force(stress: Real, side: Array | float) -> Array:
     Returns:
         Force (N, 3) in the frame of the stress, in N.
     """
-    zx_yz_zz = [4, 3, 2]
-    traction: AnyArray = np.nan_to_num(stress)[..., zx_yz_zz]
+    traction: AnyArray = np.nan_to_num(stress)[..., TRACTION_COMPONENTS]
     return side**2 * traction
 
 
@@ -237,7 +240,8 @@ def contact_wrench(
         Force (N, 3) in N and torque (N, 3) in N m.
     """
     known: AnyArray = np.nan_to_num(gradient)
-    zz_x, zz_y = known[..., 6], known[..., 7]
+    zz_x = known[..., 6]
+    zz_y = known[..., 7]
     unknown_twist = np.zeros_like(zz_x)
     direction = np.stack([zz_y, -zz_x, unknown_twist], axis=-1)
     # A normal stress that grows linearly over the square causes a torque, as in a bent beam.

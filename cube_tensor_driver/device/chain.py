@@ -484,7 +484,8 @@ def _report(link: Link, record: _LinkRecord, lag_s: float) -> LinkReport:
 
     # The reader's thread may add problems and events meanwhile. Nothing is lost, because replacing
     # the set and removing an event are atomic in Python.
-    problems, record.clock.problems = record.clock.problems, set()
+    problems = record.clock.problems
+    record.clock.problems = set()
     notes += sorted(problems)
     past_states = []
     while record.events:
@@ -543,7 +544,8 @@ def _report_values(link: Link, record: _LinkRecord) -> dict[str, object]:
 
     The names carry the units. Values that are not known yet are "unknown".
     """
-    clock, track = record.clock, record.track
+    clock = record.clock
+    track = record.track
     bound_ns = clock.line.error_bound
     values: dict[str, object] = {
         **link.counters,

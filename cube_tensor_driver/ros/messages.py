@@ -87,7 +87,9 @@ class CheckedSubscription:
             callback: Called with each message.
             profile: Quality of service of the subscription, or the depth of its queue.
         """
-        self._node, self._kind, self._topic = node, kind, topic
+        self._node = node
+        self._kind = kind
+        self._topic = topic
         self._callback = callback
         self._waiting: bytes | None = None
         # The timer runs only during the pause that follows a damaged message.
@@ -124,7 +126,8 @@ class CheckedSubscription:
 
     def _end_pause(self) -> None:
         self._pause.cancel()
-        data, self._waiting = self._waiting, None
+        data = self._waiting
+        self._waiting = None
         if data is not None:
             self._decode(data)
 
@@ -267,7 +270,8 @@ def wrench_message(
         torque_nm: Torque (3,), in N m.
     """
     message = WrenchStamped(header=header)
-    force, torque = message.wrench.force, message.wrench.torque
+    force = message.wrench.force
+    torque = message.wrench.torque
     force.x, force.y, force.z = force_n.tolist()
     torque.x, torque.y, torque.z = torque_nm.tolist()
     return message

@@ -100,7 +100,8 @@ class Transforms:
         except ModuleNotFoundError:
             self._buffer: Any = None
             return
-        self._buffer, self._error = tf2_ros.Buffer(), tf2_ros.TransformException
+        self._buffer = tf2_ros.Buffer()
+        self._error = tf2_ros.TransformException
         listener = tf2_ros.TransformListener(self._buffer, node)
         node.call_at_cleanup(listener.unregister)
 
@@ -126,7 +127,8 @@ class Transforms:
             raise MissingMotion(
                 f"no transform from {source} to {target}: {error}; publish it on /tf or /tf_static"
             ) from None
-        p, q = found.transform.translation, found.transform.rotation
+        p = found.transform.translation
+        q = found.transform.rotation
         rotation = rotation_from_quaternion([q.x, q.y, q.z, q.w])
         position = np.array([p.x, p.y, p.z])
         time_ns = to_ns(found.header.stamp)
@@ -148,7 +150,8 @@ class GravityMotion:
             frame: Frame whose z axis points up.
             parent_frame: Parent frame of the skin.
         """
-        self._frame, self._parent_frame = frame, parent_frame
+        self._frame = frame
+        self._parent_frame = parent_frame
         self._transforms = Transforms(node)
 
     def motion(self, first_ns: int, last_ns: int) -> Motion:
@@ -199,7 +202,8 @@ class ImuMotion:
             topic: Topic of sensor_msgs/Imu.
             parent_frame: Parent frame of the skin.
         """
-        self._topic, self._parent_frame = topic, parent_frame
+        self._topic = topic
+        self._parent_frame = parent_frame
         self._transforms = Transforms(node)
         self._samples: deque[_Sample] = deque(maxlen=MAX_SAMPLES)
         self._imu_frame = parent_frame
@@ -213,7 +217,8 @@ class ImuMotion:
         A message that cannot be used is ignored; the reason is stored as the text of the error that
         `motion` raises.
         """
-        a, w = message.linear_acceleration, message.angular_velocity
+        a = message.linear_acceleration
+        w = message.angular_velocity
         velocity = w.x, w.y, w.z
         sample = _Sample(to_ns(message.header.stamp), (a.x, a.y, a.z), velocity)
         # According to sensor_msgs/Imu, -1 means that the IMU does not measure the acceleration.

@@ -63,7 +63,8 @@ def node_session(name: str) -> Iterator[Session]:
     """
     start_ros()
     try:
-        node, executor = rclpy.create_node(name), make_executor()
+        node = rclpy.create_node(name)
+        executor = make_executor()
         executor.add_node(node)
         try:
             yield Session(node, executor)

@@ -76,7 +76,8 @@ class SkinSubscriber:
         self._on_skin = on_skin
         self._on_stress = on_stress
         catch = CallbackErrors(node).catch
-        on_info, on_stress = catch(self._receive_info), catch(self._receive_stress)
+        on_info = catch(self._receive_info)
+        on_stress = catch(self._receive_stress)
         self._info = CheckedSubscription(node, SkinInfo, "info", on_info, LATCHED)
         self._stress = node.create_subscription(SkinStress, "stress", on_stress, NEWEST, raw=True)
 

@@ -13,11 +13,9 @@ from cube_tensor_driver.core.estimator import make_estimator
 from cube_tensor_driver.core.layout import LAYOUTS, Layout, find_layout
 from cube_tensor_driver.core.modes import COMPONENTS, PAPER, PLANE, SPACE, to_matrix, to_voigt
 from cube_tensor_driver.core.response import (
-    ILLUSTRATIVE,
     ILLUSTRATIVE_CUBE,
     illustrative_coefficients,
     project,
-    prototype,
     response,
 )
 from cube_tensor_driver.core.symmetry import (
@@ -295,28 +293,6 @@ def test_the_printed_inverses_fail_and_the_corrected_ones_agree_with_least_squar
         response(structure, coefficients), np.ones(8), PLANE, targets=np.eye(7)
     )
     np.testing.assert_allclose(estimator.matrix @ v, state, atol=1e-13)
-
-
-def test_the_prototypes_readings_are_sums_of_the_response():
-    """Eqs. 8 to 10 with V for the frequency shift: P_grad is the true gradient only where xx_x is
-    known."""
-    structure = find_structure(LAYOUTS["quad"], "slab")
-    a = response(structure, ILLUSTRATIVE)
-    shown = {
-        "zz": (0, -4 * 1.4),
-        "xx": (0, 4 * 0.3),
-        "zx": (1, 4 * 0.5),
-        "zz_x": (2, -4 * 0.9),
-        "xx_x": (2, 4 * 0.3),
-    }
-    expected = np.zeros((7, 3))
-    for mode, (reading, value) in shown.items():
-        expected[PLANE.names.index(mode), reading] = value
-    np.testing.assert_allclose(prototype(a.T), expected, atol=1e-14)
-    v1, v2, v3, v4 = shift = np.array([1.0, 20, 300, 4000])
-    np.testing.assert_array_equal(
-        prototype(shift), [-v1 - v2 - v3 - v4, -v1 + v2 + v3 - v4, v1 - v2 + v3 - v4]
-    )
 
 
 def test_a_symmetry_that_the_layout_lacks_names_the_pad():

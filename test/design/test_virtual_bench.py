@@ -18,8 +18,12 @@ from cube_tensor_design.paper.rod import Rod
 from cube_tensor_design.paper.rod_parts import P_SHEAR, PARTS, draw_back, split_signals
 from cube_tensor_design.paper.virtual_bench import LoadStep, VirtualBench
 from cube_tensor_design.studies.layout_study import layout_study
+from cube_tensor_driver.core.defaults import REST_FREQUENCY
 from cube_tensor_driver.core.errors import ElasticError
-from cube_tensor_driver.core.modes import COMPONENTS
+from cube_tensor_driver.core.layout import LAYOUTS
+from cube_tensor_driver.core.modes import COMPONENTS, PLANE
+from cube_tensor_driver.core.response import ILLUSTRATIVE, response
+from cube_tensor_driver.core.symmetry import find_structure
 
 BODY, NARROW = Body(), Body(width=20e-3)
 NU = BODY.poisson
@@ -205,6 +209,24 @@ def bottom_weights(basis, along=0):
         weights[basis.nodal_dofs[along, corners]] += length / 6
         weights[basis.facet_dofs[along, facet]] += 2 * length / 3
     return weights
+
+
+def test_the_prototypes_readings_are_sums_of_the_response():
+    """Eqs. 8 to 10 with V for the frequency shift: P_grad is the true gradient only where xx_x is
+    known."""
+    structure = find_structure(LAYOUTS["quad"], "slab")
+    a = response(structure, ILLUSTRATIVE)
+    shown = {
+        "zz": (0, -4 * 1.4),
+        "xx": (0, 4 * 0.3),
+        "zx": (1, 4 * 0.5),
+        "zz_x": (2, -4 * 0.9),
+        "xx_x": (2, 4 * 0.3),
+    }
+    expected = np.zeros((7, 3))
+    for mode, (reading, value) in shown.items():
+        expected[PLANE.names.index(mode), reading] = value
+    np.testing.assert_allclose(paper.prototype(REST_FREQUENCY + a.T), expected, atol=1e-9)
 
 
 def test_prototype_signs():

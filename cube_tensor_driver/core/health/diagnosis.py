@@ -129,7 +129,8 @@ class Conditions:
             cube: Numbers of different cubes (n,).
             bits: Conditions of their pads (n, P), bits of `status.py`.
         """
-        cubes, present = self._sums.cubes, self._recent[0]
+        cubes = self._sums.cubes
+        present = self._recent[0]
         is_first = present[cube] & SHOWN == 0
         new_bits = np.where(is_first, bits, 0)
         present[cube] |= new_bits
@@ -151,7 +152,8 @@ class Conditions:
         # A cube without rows keeps its conditions, because nothing shows that its pads recovered.
         self._recent[1:, has_rows] = self._recent[:-1, has_rows]
         self._recent[0, has_rows] = 0
-        cubes, state = self._sums.cubes, self.state
+        cubes = self._sums.cubes
+        state = self.state
         cubes["found"][has_rows] = 0
         cubes["mask"] = pack_bits(state & LEFT_OUT > 0)
         cubes["status"] = np.bitwise_or.reduce(state, axis=1)

@@ -121,7 +121,8 @@ class Health:
         The caller must do this after a tare or the tracking of drift has changed the rest
         frequencies (frequencies without load) of the pipeline, from which the range follows.
         """
-        calibrations, n_pads = self.pipeline.calibrations, self.pipeline.n_pads
+        calibrations = self.pipeline.calibrations
+        n_pads = self.pipeline.n_pads
         beta = pad_table([c.beta for c in calibrations], n_pads, fill=1.0)
         modulus = pad_table([c.modulus for c in calibrations], n_pads, fill=1.0)
         noise = pad_table([c.noise for c in calibrations], n_pads, fill=1.0)
@@ -154,7 +155,8 @@ class Health:
             row: Number of the first row to check; all rows of its scan after it are checked, too.
         """
         rows = columns.select(columns.find_scan(row))
-        cube, f = rows.cube.astype(np.intp), rows.frequency.astype(np.float32)
+        cube = rows.cube.astype(np.intp)
+        f = rows.frequency.astype(np.float32)
         reported = mask_bits(tables, tables.calibration[cube], rows.pad_fault)
         bits = np.where(f >= self._open[cube], OPEN, RANGE)
         # The comparison is also false for NaN, which stands for a pad without a frequency.

@@ -130,7 +130,8 @@ def make_window(state: HealthState) -> Window:
     is_measured = (rows[:, None] > 0) & ~np.isnan(base)
     mean = base + state.pads("sum") / count
     noise = np.sqrt(state.pads("bounded_squares") / count / 6)
-    first_squares, second_squares = state.pads("first_squares"), state.pads("second_squares")
+    first_squares = state.pads("first_squares")
+    second_squares = state.pads("second_squares")
     with np.errstate(invalid="ignore"):  # NaN where a frequency was not measured
         rough = second_squares > MAX_SMOOTH_ROUGHNESS * first_squares
     return Window(

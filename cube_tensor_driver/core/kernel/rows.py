@@ -202,7 +202,8 @@ def _process(
         Number of the first row that is not processed, and what the caller has to do: `DONE`,
         `NEEDS_CONDITION`, or the key (see `Tables.keys`) of a matrix that must be added.
     """
-    rows, out = columns.select(scan), results.select(scan)
+    rows = columns.select(scan)
+    out = results.select(scan)
     cube = rows.cube.astype(np.intp)
     calibration = tables.calibration[cube]
     has_new_condition = np.zeros(len(cube), bool)
@@ -227,7 +228,8 @@ def _process(
     v[is_bad] = 0
     table, key = _find_tables(tables, calibration, bad)
     stops = np.flatnonzero(has_new_condition | (key != DONE))
-    end, request = len(cube), DONE
+    end = len(cube)
+    request = DONE
     if len(stops):
         end = int(stops[0])
         request = NEEDS_CONDITION if has_new_condition[end] else int(key[end])

@@ -53,5 +53,6 @@ def run(
     # The kernel in C computes in float32, the precision of messages.
     if native is None or columns.frequency.dtype != np.float32:
         return rows.run(start, n_residuals, tables, health, offsets, columns, results)
-    state, subtracted = health or _NO_HEALTH, offsets or _NO_OFFSETS
+    state = health or _NO_HEALTH
+    subtracted = offsets or _NO_OFFSETS
     return native.run(start, n_residuals, *tables, *state, *subtracted, *columns, *results)

@@ -238,7 +238,8 @@ class HubClock:
         # The clock line is determined by the smallest delays. Of samples that arrive together, only
         # the newest one can have the smallest delay.
         is_usable = self._learn(max(times), arrival_ns)
-        offset, drift = track.bounded_offset, track.drift
+        offset = track.bounded_offset
+        drift = track.drift
         stamps = []
         for time_us in times:
             device_ns = 1000 * (time_us - track.first_us)
@@ -297,7 +298,8 @@ class HubClock:
         if device_ns + 1000 * RESTART_US < track.newest_ns:
             self.reset()
         if track.newest_ns == NEVER:
-            track.first_us, track.first_ns = newest_us, arrival_ns
+            track.first_us = newest_us
+            track.first_ns = arrival_ns
             device_ns = 0
 
         # The line is not fitted while a step of the hub's clock is undecided, because the delay of
@@ -327,7 +329,9 @@ class HubClock:
             if stood_still:
                 # The clock runs again, but it is unknown for how long it stood still.
                 self.reset()
-            self._last_us, self._moved_ns, self._n_still = device_us, arrival_ns, 0
+            self._last_us = device_us
+            self._moved_ns = arrival_ns
+            self._n_still = 0
         steps_ns = self._steps_ns
         if steps_ns and arrival_ns - steps_ns[0] > STEPS_NS:
             steps_ns.popleft()

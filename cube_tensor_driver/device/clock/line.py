@@ -243,7 +243,8 @@ class ClockLine:
             was_set = self._add_point()
         self._track.bucket_end = arrival_ns + BUCKET_NS
         self._fall = 0.0
-        self._previous_height, self._track.bucket_height = self._track.bucket_height, math.inf
+        self._previous_height = self._track.bucket_height
+        self._track.bucket_height = math.inf
         self._intersect_bounds()
         return was_set
 
@@ -256,7 +257,8 @@ class ClockLine:
             Whether the last `MIN_BUCKETS_HIGH` buckets show that a clock was set before them.
         """
         track = self._track
-        device_ns, delay = track.earliest_ns, track.earliest_delay
+        device_ns = track.earliest_ns
+        delay = track.earliest_delay
         height = delay - track.offset - track.drift * device_ns
         self._n_high = self._n_high + 1 if height > MAX_RISE_NS else 0
         was_set = self._n_high >= MIN_BUCKETS_HIGH
@@ -296,8 +298,10 @@ class ClockLine:
         trips, and the largest possible error half their distance. Both are stored. Without round
         trips, the offset is infinite (not bounded) and the error None.
         """
-        self._trip_offset, self.error_bound = math.inf, None
-        low, high = -math.inf, math.inf
+        self._trip_offset = math.inf
+        self.error_bound = None
+        low = -math.inf
+        high = math.inf
         drift_error = self._drift_error()
         for trip in reversed(self._round_trips):
             drifted = self._track.drift * trip.device_ns
@@ -311,7 +315,8 @@ class ClockLine:
                 # Bounds of the offset that do not overlap show that a clock was set between the
                 # measurements, so the older ones are not used.
                 break
-            low, high = next_low, next_high
+            low = next_low
+            high = next_high
             self._trip_offset = (low + high) / 2
             self.error_bound = (high - low) / 2
         self._set_bounded_offset()
@@ -338,7 +343,8 @@ def _slope_at_centre(x: Array, y: Array) -> float:
     # of it (column) that passes the centre lowest.
     left_x = x[is_left, np.newaxis]
     left_y = y[is_left, np.newaxis]
-    right_x, right_y = x[~is_left], y[~is_left]
+    right_x = x[~is_left]
+    right_y = y[~is_left]
     slopes = (right_y - left_y) / (right_x - left_x)
     heights = left_y + slopes * (x.mean() - left_x)
     return float(slopes.flat[heights.argmin()])

@@ -71,7 +71,8 @@ class HostClockWatch:
         clock_ns: Callable[[], int],
         steady_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        self._clock_ns, self._steady_ns = clock_ns, steady_ns
+        self._clock_ns = clock_ns
+        self._steady_ns = steady_ns
         self._offset: int | None = None
 
     def look(self) -> tuple[int, int]:
@@ -113,7 +114,8 @@ def find_step(track: LinkTrack, number: int, device_us: int) -> int:
         of the hub's clock; else 0.
     """
     if track.reference < 0:
-        track.reference, track.reference_us = number, device_us
+        track.reference = number
+        track.reference_us = device_us
         return 0
     # A number that is not ahead of the reference belongs to a sample that came out of order or to
     # another frame of the same sample, which cannot be checked.
@@ -138,7 +140,8 @@ def find_step(track: LinkTrack, number: int, device_us: int) -> int:
     # The reference sample is kept while the hub's clock stands still, so that the deviation from
     # the expected time grows until it counts as a step.
     if interval or is_step or period <= 0.0:
-        track.reference, track.reference_us = number, device_us
+        track.reference = number
+        track.reference_us = device_us
     return round(error) if is_step else 0
 
 

@@ -130,7 +130,8 @@ class Reader:
         self._lag_s = 0.0
         # Number of links that deliver samples, and the longest wait for the frames of all of them
         # after the first frame, in s.
-        self._expected, self._gather_s = 0, 0.0
+        self._expected = 0
+        self._gather_s = 0.0
         self._thread: threading.Thread | None = None
         self._wake_lock = threading.Lock()
         self._wake_write = -1
@@ -165,7 +166,8 @@ class Reader:
         Returns:
             Largest value of `behind_s`, in s.
         """
-        lag_s, self._lag_s = self._lag_s, 0.0
+        lag_s = self._lag_s
+        self._lag_s = 0.0
         return lag_s
 
     def forget_questions(self) -> None:

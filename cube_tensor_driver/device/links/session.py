@@ -74,7 +74,8 @@ class Session:
         self.actual_us = period_us or 0
         self.last_byte = 0.0
         self.asked_ns: int | None = None
-        self._clock_ns, self._on_state = clock_ns, on_state
+        self._clock_ns = clock_ns
+        self._on_state = on_state
         self._period_us = period_us
         # Sample period, in µs, in the hub's answer to the last SET_PERIOD; None before the answer.
         self._answered_us: int | None = None
@@ -246,7 +247,8 @@ class Session:
         """
         link = self.link
         before = link.state, link.error and link.error.kind
-        link.state, link.error = state, error
+        link.state = state
+        link.error = error
         if (state, error and error.kind) != before:
             self._on_state(state, error)
 
@@ -261,9 +263,11 @@ class Session:
         n_bytes = self.link.decoder.counters.bytes
         n_native = self.link.track.n_native
         if n_bytes != self._n_bytes:
-            self._n_bytes, self.last_byte = n_bytes, now
+            self._n_bytes = n_bytes
+            self.last_byte = now
         if n_native != self._n_native:
-            self._n_native, self._last_sample = n_native, now
+            self._n_native = n_native
+            self._last_sample = now
 
     def _handle_hello(self, frame: Hello) -> None:
         """Check the unique number and the sample period of a hub, and send its settings if needed.

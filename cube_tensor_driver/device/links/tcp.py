@@ -99,9 +99,12 @@ class TcpConnection:
         code = getattr(error, "errno", None)
         reason = str(error) if code is None else os.strerror(code)
         if isinstance(error, ConnectionRefusedError):
-            kind, fix = "refused", "start the bridge there or correct the port"
+            kind = "refused"
+            fix = "start the bridge there or correct the port"
         elif isinstance(error, TimeoutError):
-            kind, fix = "no_answer", "switch the bridge on, or check the address and the network"
+            kind = "no_answer"
+            fix = "switch the bridge on, or check the address and the network"
         else:
-            kind, fix = "unreachable", "check the address and the network"
+            kind = "unreachable"
+            fix = "check the address and the network"
         return LinkError(f"{self._url}: {reason}: {fix}", kind)

@@ -135,7 +135,8 @@ class SequenceTracker:
             # A late sample that is older than the first counted one becomes the first, and the
             # samples between the two count as missing.
             self.counters.missing += self.first - number - 1
-            self.first, self._first_us = number, device_us
+            self.first = number
+            self._first_us = device_us
         else:
             self.counters.missing -= 1
         self.counters.out_of_order += 1
@@ -198,7 +199,8 @@ class SequenceTracker:
         if number in time_of:
             return False
         # The time is not limited on a side without a sample.
-        below_us, above_us = 0, MAX_DEVICE_US
+        below_us = 0
+        above_us = MAX_DEVICE_US
         smaller = [other for other in time_of if other < number]
         larger = [other for other in time_of if other > number]
         if smaller:
@@ -305,7 +307,8 @@ class SampleAccount:
             n_cubes: Number of cubes of the hub.
             n_pads: Number of pads of each cube.
         """
-        self._track.n_cubes, self._track.n_pads = n_cubes, n_pads
+        self._track.n_cubes = n_cubes
+        self._track.n_pads = n_pads
         self._end_parts(n_cubes, _MAX_CUBES)
 
     def expect_restart(self) -> None:
@@ -322,7 +325,8 @@ class SampleAccount:
 
         Samples that the hub has taken but that have not arrived are then counted as missing.
         """
-        last, self.stats_frame = self.stats_frame, frame
+        last = self.stats_frame
+        self.stats_frame = frame
         joined_late = all(tracker.first for tracker in self._trackers.values())
         if last is None and joined_late:
             # This driver connected while the hub was already sampling. Samples that the hub had

@@ -165,7 +165,9 @@ class Sample:
         pad_fault: NDArray[np.uint32],
         temperature: NDArray[np.int16],
     ) -> None:
-        self.sequence, self.first_cube, self.device_us = sequence, first_cube, device_us
+        self.sequence = sequence
+        self.first_cube = first_cube
+        self.device_us = device_us
         self.shape: tuple[int, int] = frequency.shape
         self._arrays: _Arrays | None = (frequency, pad_fault, temperature)
         self.raw = b""
@@ -245,9 +247,12 @@ class Sample:
         if size != _SAMPLE.size + n_cubes * (4 * n_pads + 6):
             return None
         sample = cls.__new__(cls)
-        sample.sequence, sample.first_cube, sample.device_us = sequence, first_cube, device_us
+        sample.sequence = sequence
+        sample.first_cube = first_cube
+        sample.device_us = device_us
         sample.shape = n_cubes, n_pads
-        sample.raw, sample._arrays = raw, None
+        sample.raw = raw
+        sample._arrays = None
         return sample
 
 

@@ -155,7 +155,8 @@ class _Listener:
 
     def __init__(self, node: Node, topic: str) -> None:
         self.waiting: deque[object] = deque(maxlen=QUEUE_DEPTH)
-        self._node, self._topic = node, topic
+        self._node = node
+        self._topic = topic
         self._names: list[str] | None = None
         self._needs_names = False
         self._early_subscription: Subscription | None = None
@@ -255,7 +256,8 @@ class _Listener:
 
     def _read_tensor(self, message: StressTensorStamped) -> StressReading:
         tensor = message.tensor
-        normal, shear = tensor.normal, tensor.shear
+        normal = tensor.normal
+        shear = tensor.shear
         stress = [normal.x, normal.y, normal.z, shear.x, shear.y, shear.z]
         values = [*stress, *tensor.normal_gradient.tolist()]
         stamp_ns = to_ns(message.header.stamp)

@@ -103,7 +103,8 @@ class Recorder:
         self.counts: dict[str, int] = {}
         self.refused: dict[str, str] = {}
         self.error: BagError | None = None
-        self._node, self._bag = node, bag
+        self._node = node
+        self._bag = bag
         self._wanted = list(topics)
         self._subscriptions: list[Subscription] = []
         self._unconnected: dict[str, Subscription] = {}
@@ -166,7 +167,8 @@ class Recorder:
             kept = [one for one in self._waiting if one[0] in self._latched]
             self._received_bytes = sum(len(data) for _, _, data in kept)
             self._waiting = deque(kept)
-            self.has_begun, self._begin_s = True, now
+            self.has_begun = True
+            self._begin_s = now
         for topic, count in early.items():
             self.counts[topic] -= count
         self.received -= early.total()

@@ -114,13 +114,16 @@ class Player:
         self.published = 0
         self.position = 0.0
         self.length = (bag.end_ns - bag.start_ns) / SECOND
-        self._paused, self._steps = False, 0
+        self._paused = False
+        self._steps = 0
         self._jump_ns: int | None = None
         self._shown_until_ns = 0
         # This condition variable guards the variables for pausing, stepping and jumping, which
         # other threads change. It wakes the thread of `run` after a change.
         self._wake = threading.Condition()
-        self._node, self._bag, self._rate = node, bag, rate
+        self._node = node
+        self._bag = bag
+        self._rate = rate
         self._publishers: dict[str, Publisher] = {}
         self._latched: set[str] = set()
         # A bag may contain several skins in different namespaces; each has a topic `frequencies`.
@@ -145,7 +148,8 @@ class Player:
     def pause(self, paused: bool) -> None:
         """Pause the replay, or continue it if `paused` is false."""
         with self._wake:
-            self._paused, self._steps = paused, 0
+            self._paused = paused
+            self._steps = 0
             self._wake.notify()
 
     def step(self) -> None:
@@ -173,7 +177,9 @@ class Player:
         to_ns = min(self._to_ns(position), latest_ns)
         to_ns = max(self._bag.start_ns, to_ns)
         with self._wake:
-            self._jump_ns, self._paused, self._steps = to_ns, paused, 0
+            self._jump_ns = to_ns
+            self._paused = paused
+            self._steps = 0
             self._wake.notify()
 
     def end(self) -> None:
@@ -302,7 +308,8 @@ class Player:
             bag_ns: Time of recording, in ns since the Unix epoch, that corresponds to the present
                 time of the monotonic clock.
         """
-        self._anchor_ns, self._anchor_s = bag_ns, time.monotonic()
+        self._anchor_ns = bag_ns
+        self._anchor_s = time.monotonic()
 
     def _wait_until_due(self, bag_ns: int) -> bool:
         """Wait until a message is due.
@@ -392,7 +399,8 @@ class ReplayControl:
         except BagError as error:
             answer.message = str(error)
             return answer
-        answer.success, answer.message = True, "holds" if request.paused else "goes on"
+        answer.success = True
+        answer.message = "holds" if request.paused else "goes on"
         return answer
 
 

@@ -59,7 +59,8 @@ def _rows_status(
         counts: Numbers of rows (samples of one cube each) since the start.
         before: The same numbers at the previous status, one second earlier.
     """
-    level, text = DiagnosticStatus.OK, ""
+    level = DiagnosticStatus.OK
+    text = ""
     if counts.unaccounted:
         level = DiagnosticStatus.ERROR
         text = f"{counts.unaccounted} rows are lost in the driver: please report it"

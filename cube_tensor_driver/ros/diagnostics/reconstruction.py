@@ -69,7 +69,9 @@ class ReconstructionDiagnostics:
     ) -> None:
         self.refused_messages = 0
         self.compensation_problem = ""
-        self._skin, self._tare, self._lost = skin, tare, lost
+        self._skin = skin
+        self._tare = tare
+        self._lost = lost
         self._cubes = CubeHealth(skin, reconstructor)
         self._rows = self._invalid_rows = 0
         self._rows_before = self._lost_before = 0
@@ -115,7 +117,8 @@ class ReconstructionDiagnostics:
             **self._tare.age(),
             **self._cubes.summary(),
         }
-        self._rows_before, self._lost_before = self._rows, self._lost.count
+        self._rows_before = self._rows
+        self._lost_before = self._lost.count
 
         texts = [] if is_active else ["inactive: the node processes no rows until it is activated"]
         if lost > 0:
@@ -145,7 +148,8 @@ class CubeHealth:
     """
 
     def __init__(self, skin: Skin, reconstructor: Reconstructor) -> None:
-        self._skin, self._pipeline = skin, reconstructor.pipeline
+        self._skin = skin
+        self._pipeline = reconstructor.pipeline
         self._health = reconstructor.health
         self._has_come = np.zeros(len(skin.cubes), bool)
         # Index of a cube with a fault -> text of its previous diagnostic status.
@@ -324,7 +328,8 @@ class LostMessages:
         Args:
             number: Sequence number that DDS gave the message; None: rclpy does not provide it.
         """
-        newest, self._newest = self._newest, number
+        newest = self._newest
+        self._newest = number
         if number is None or newest is None:
             return
         is_next = number == newest + 1

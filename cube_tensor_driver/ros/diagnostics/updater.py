@@ -48,7 +48,9 @@ class Diagnostics:
             count_errors: Returns the number of calls of the node's callbacks that have raised an
                 exception so far. It is added to the first status.
         """
-        self._node, self._statuses, self._count_errors = node, statuses, count_errors
+        self._node = node
+        self._statuses = statuses
+        self._count_errors = count_errors
         self._errors_before = 0
         # In a node without a namespace both names resolve to the same topic, which then gets only
         # one publisher.

@@ -78,7 +78,8 @@ class Contacts(SkinSubscriberNode):
         if finder is None or skin.messages == self._processed_messages:
             return None
         self._processed_messages = skin.messages
-        values, frame_id = skin.newest.usable_values(health), skin.info.header.frame_id
+        values = skin.newest.usable_values(health)
+        frame_id = skin.info.header.frame_id
         finder.update(1e-9 * skin.stamp_ns, values, skin.newest.left_out)
         # Computing the point cloud takes time, so it is done only while somebody subscribes.
         if self._has_traction_listeners():

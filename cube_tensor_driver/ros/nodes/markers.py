@@ -51,9 +51,11 @@ class Markers(SkinSubscriberNode):
         self._ranges = scene.Ranges()
 
     def compute_message(self, skin: FollowedSkin, health: Index) -> bytes:
-        values, residual = skin.newest.usable_values(health), skin.newest.residual
+        values = skin.newest.usable_values(health)
+        residual = skin.newest.residual
         shown = self._quantity.of(values, residual)
-        fixed, last = float(self.value("range")), self._ranges.colours
+        fixed = float(self.value("range"))
+        last = self._ranges.colours
         top = fixed or scene.automatic_top(self._quantity, shown, last)
         ranges = self._ranges = self._ranges.follow(values, residual, top)
         canvas = self._canvas

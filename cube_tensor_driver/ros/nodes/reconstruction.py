@@ -214,7 +214,8 @@ class Reconstruction(CubeNode):
             rows: Rows of frequencies, one sample of one cube each.
             stamp_ns: Stamp of their message, in ns since the Unix epoch.
         """
-        compensation, problem = self._reconstructor.compensation, ""
+        compensation = self._reconstructor.compensation
+        problem = ""
         motion: Motion | None = None
         if self._recorded:
             motion = self._recorded.compensation_at(stamp_ns, self._reconstructor)
@@ -224,14 +225,16 @@ class Reconstruction(CubeNode):
                 last_ns = int(rows.stamp_ns.max(initial=stamp_ns))
                 motion = self._motion.motion(first_ns, last_ns)
             except MissingMotion as error:
-                motion, problem = UNKNOWN_MOTION, f"weight is not compensated: {error}"
+                motion = UNKNOWN_MOTION
+                problem = f"weight is not compensated: {error}"
                 self.get_logger().warning(problem, throttle_duration_sec=LOG_PERIOD_S)
         self._diagnostics.compensation_problem = problem
         # Only a recorder needs the message.
         if self._compensation.get_subscription_count():
             states: Mapping[str, Array] = {}
             if abs(stamp_ns - self._states_ns) >= STATES_PERIOD_NS:
-                self._states_ns, states = stamp_ns, compensation.states()
+                self._states_ns = stamp_ns
+                states = compensation.states()
             if motion is not None or states:
                 frame_id = self._skin.parent_frame
                 message = compensation_message(frame_id, stamp_ns, motion, states)

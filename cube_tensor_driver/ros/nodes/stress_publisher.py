@@ -195,7 +195,9 @@ class CubeTopics:
         reconstructor: Reconstructor,
         side: float | None,
     ) -> None:
-        self._node, self._skin, self._reconstructor = node, skin, reconstructor
+        self._node = node
+        self._skin = skin
+        self._reconstructor = reconstructor
         own_sides = [2 * cube.calibration.half_side for cube in skin.cubes]
         self._sides = np.array([side or own_side for own_side in own_sides])
         self._tensors = _CubePublishers(node, skin, "stress", StressTensorStamped)
@@ -216,7 +218,8 @@ class CubeTopics:
         """
         # The lists are read only once: `find_listeners` may replace them meanwhile in the main
         # thread, if a driver in this process calls this method in its own thread.
-        tensors, wrenches = self._tensors.listened, self._wrenches.listened
+        tensors = self._tensors.listened
+        wrenches = self._wrenches.listened
         if wrenches:
             self._publish_wrenches(rows, wrenches)
         if tensors:
@@ -239,7 +242,8 @@ class CubeTopics:
         is_valid = rows.status & INVALID == 0
         chosen = np.flatnonzero(is_listened & is_valid)
         cubes = rows.cube[chosen].tolist()
-        stress, gradient = rows.stress[chosen], rows.gradient[chosen]
+        stress = rows.stress[chosen]
+        gradient = rows.gradient[chosen]
         sides = self._sides[cubes][:, None]
         forces, torques = contact_wrench(stress, gradient, sides)
         each = zip(
@@ -283,7 +287,8 @@ class _CubePublishers:
             message_type: Type of the messages.
         """
         self.listened: list[int] = []
-        self._node, self._message_type = node, message_type
+        self._node = node
+        self._message_type = message_type
         self._publishers: dict[int, Publisher] = {}
         # Name of a topic that has no publisher yet -> index of its cube.
         self._unannounced = {

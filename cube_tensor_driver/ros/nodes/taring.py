@@ -77,9 +77,12 @@ class Taring:
             lock: Held by this class while it uses the reconstructor.
             on_change: Called, while the lock is held, when rest frequencies or uids have changed.
         """
-        self._node, self._reconstructor = node, reconstructor
-        self._skin, self._folder = skin, folder
-        self._lock, self._on_change = lock, on_change
+        self._node = node
+        self._reconstructor = reconstructor
+        self._skin = skin
+        self._folder = folder
+        self._lock = lock
+        self._on_change = on_change
         self.uids: dict[int, int] = {}
         self.created: dict[int, datetime | None] = {}
 
@@ -204,7 +207,8 @@ class Taring:
         """
         if self._folder is None or number not in self.uids:
             return
-        uid, created = self.uids[number], self.created[number]
+        uid = self.uids[number]
+        created = self.created[number]
         if created is None:
             remove_tare(self._folder, uid)
             return
@@ -223,7 +227,8 @@ class Taring:
             response.message = self._tare(request.cubes, request.duration)
             response.success = True
         except CubeError as error:
-            response.success, response.message = False, shorten(str(error))
+            response.success = False
+            response.message = shorten(str(error))
         self._node.get_logger().info(f"tare: {response.message}")
         return response
 
@@ -258,7 +263,8 @@ class Taring:
         return f"{len(cubes)} cubes, rest frequencies moved by up to {moved_ppm:.0f} ppm{kept}"
 
     def _on_clear(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success, response.message = True, "rest frequencies are the calibrations' again"
+        response.success = True
+        response.message = "rest frequencies are the calibrations' again"
         with self._lock:
             self._reconstructor.clear_tare()
             self._on_change()
@@ -268,7 +274,8 @@ class Taring:
             for number in self.created:
                 self._store(number, rest)
         except ConfigError as error:
-            response.success, response.message = False, str(error)
+            response.success = False
+            response.message = str(error)
         self._node.get_logger().info(f"clear_tare: {response.message}")
         return response
 
