@@ -125,10 +125,10 @@ class Pipeline:
         dtype: Precision of the computation.
         newest_offset: What was subtracted from the newest rows (cubes, P), stress / stiffness, as
             weight, creep or temperature; None: nothing is compensated.
-        rest_version: Number of times that the rest frequencies were set.
+        rest_changes: Number of changes of the rest frequencies so far, by tare or drift.
     """
 
-    rest_version = 0
+    rest_changes = -1  # the calibrated rest frequencies, which are set first, are no change
 
     def __init__(self, calibrations: Sequence[Calibration], dtype: type = np.float64) -> None:
         """Prepare the matrices of all calibrations.
@@ -206,7 +206,7 @@ class Pipeline:
                 "every pad's must be finite and above 0"
             )
         self._rest = np.where(exists, rest, np.nan)
-        self.rest_version += 1
+        self.rest_changes += 1
         self._tables.rest[:] = self._rest
         self._tables.highest[:] = highest_frequency(self._rest, self._beta[group])
 

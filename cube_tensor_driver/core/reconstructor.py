@@ -70,7 +70,6 @@ class Reconstructor:
         names: Names of the cubes, for messages.
         drift_time: Time constant of the tracking of slow drift of the rest frequencies (frequencies
             without load), in s. 0 turns the tracking off.
-        rest_changes: Number of changes of the rest frequencies so far, by tare or drift.
     """
 
     def __init__(
@@ -97,7 +96,6 @@ class Reconstructor:
         self.health = Health(self.pipeline)
         self.compensation = Compensation(self.pipeline)
         self.drift_time = 0.0
-        self.rest_changes = 0
         self._calibrated_rest = self.pipeline.rest_frequency
         self._drift = DriftTracker(self.pipeline, self.health)
 
@@ -123,7 +121,11 @@ class Reconstructor:
     def rest_frequency(self, value: Array) -> None:
         self.pipeline.rest_frequency = value
         self.health.refresh()
-        self.rest_changes += 1
+
+    @property
+    def rest_changes(self) -> int:
+        """Number of changes of the rest frequencies so far, by tare or drift."""
+        return self.pipeline.rest_changes
 
     def process(
         self,
@@ -150,8 +152,8 @@ class Reconstructor:
         # Drift is tracked after the rows are computed, so that the same rest frequencies hold for
         # all of them.
         has_closed_window = self.health.closed != windows
-        if self.drift_time and has_closed_window and self._drift.step(self.drift_time):
-            self.rest_changes += 1
+        if self.drift_time and has_closed_window:
+            self._drift.step(self.drift_time)
         return stress
 
     __call__ = process

@@ -92,7 +92,7 @@ class Creep:
         self._total = self._amplitude.sum(axis=0)
         self._stiffness = pipeline.stiffness
         self._rest = pipeline.rest_frequency
-        self._rest_version = pipeline.rest_version
+        self._rest_version = pipeline.rest_changes
 
         shape = n_cubes, n_pads
         # Time stamp, in ns, and readings of the newest row of each cube at the last step.
@@ -270,11 +270,11 @@ class Creep:
             Whether a reading changed, so that `offset`, `slope` and `gain` must be computed again.
         """
         pipeline = self._pipeline
-        if self._rest_version == pipeline.rest_version:
+        if self._rest_version == pipeline.rest_changes:
             return False
         shift = np.nan_to_num(pipeline.shift_of_zero(self._rest))
         self._rest[:] = pipeline.rest_frequency
-        self._rest_version = pipeline.rest_version
+        self._rest_version = pipeline.rest_changes
         self._reading -= shift
         self._newest.reading[:] -= shift
         # The known fraction of a low-passed reading shifts with the readings. So the lag, reading

@@ -88,14 +88,11 @@ class DriftTracker:
         self._layouts = [np.flatnonzero(names == name) for name in np.unique(names)]
         self.deviation = np.zeros(n_cubes)
 
-    def step(self, time_constant: float) -> bool:
+    def step(self, time_constant: float) -> None:
         """Move the tracked rest frequencies by the statistics of the window that has just ended.
 
         Args:
             time_constant: Time constant of the low-pass filter, in seconds.
-
-        Returns:
-            Whether stress is computed from new rest frequencies from now on.
         """
         self._adopt_tare()
         window = self._health.history[-1]
@@ -115,7 +112,7 @@ class DriftTracker:
         follows_others = (~is_settled & has_rows)[:, np.newaxis] & usable
         self._follow_others(change, follows, follows_others)
         self._tracked_rest = self._tracked_rest + change
-        return self._update_when_due()
+        self._update_when_due()
 
     def _follow_others(self, change: Array, follows: Mask, follows_others: Mask) -> None:
         """Correct the drift of loaded cubes by the median of unloaded ones, and set `deviation`.
@@ -181,16 +178,10 @@ class DriftTracker:
         counted = np.where(at_rest, self._unloaded_windows + 1, 0)
         self._unloaded_windows = np.where(has_rows, counted, self._unloaded_windows)
 
-    def _update_when_due(self) -> bool:
-        """Give the tracked rest frequencies to the pipeline every `WINDOWS_PER_UPDATE` windows.
-
-        Returns:
-            Whether the rest frequencies of the pipeline changed.
-        """
+    def _update_when_due(self) -> None:
+        """Give the tracked rest frequencies to the pipeline every `WINDOWS_PER_UPDATE` windows."""
         self._windows += 1
         unchanged = np.array_equal(self._tracked_rest, self._rest_in_use, equal_nan=True)
-        if self._windows % WINDOWS_PER_UPDATE or unchanged:
-            return False
-        self._rest_in_use = self._pipeline.rest_frequency = self._tracked_rest
-        self._health.refresh()
-        return True
+        if self._windows % WINDOWS_PER_UPDATE == 0 and not unchanged:
+            self._rest_in_use = self._pipeline.rest_frequency = self._tracked_rest
+            self._health.refresh()
