@@ -39,10 +39,23 @@ _domains = itertools.cycle(range(1, 101))
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests that run alone do so one after the other."""
+    """Tests that run alone do so one after the other, and one worker runs all tests that share a
+    fixture of their module, which is then set up once."""
     for item in items:
         if is_alone(item):
             item.add_marker(pytest.mark.xdist_group("alone"))
+        elif (shared := _shared_fixtures(item)) and not item.get_closest_marker("xdist_group"):
+            # Without brackets, after which xdist would find no group.
+            name = " ".join([item.path.stem, *filter(None, shared)])
+            item.add_marker(pytest.mark.xdist_group(name))
+
+
+def _shared_fixtures(item: pytest.Item) -> list[str]:
+    """Values of the parametrised fixtures of its module that a test uses, "" for each other one."""
+    parameters = item.callspec.params if hasattr(item, "callspec") else {}
+    fixtures = item._fixtureinfo.name2fixturedefs
+    shared = [name for name, known in fixtures.items() if known[-1].scope == "module"]
+    return sorted({str(parameters.get(name, "")) for name in shared})
 
 
 @pytest.hookimpl(wrapper=True)

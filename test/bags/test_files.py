@@ -306,7 +306,14 @@ def test_tables_hold_the_same_numbers_with_units(bag, tmp_path):
     assert parquet["stamp_ns"].to_pylist()[1] == START_NS + 100
 
 
-def test_another_calibration_and_tare(bag, tmp_path, capsys):
+@pytest.fixture
+def one_process(monkeypatch):
+    """`./cube reprocess` without worker processes, each of which takes half a second to start."""
+    name = "cube_tensor_driver.bags.reprocess.all_bags.workers"
+    monkeypatch.setattr(name, lambda *_: ThreadPoolExecutor(1))
+
+
+def test_another_calibration_and_tare(bag, tmp_path, capsys, one_process):
     """Twice the modulus is twice the stress; after a tare over one instant that instant has
     none."""
     known = read_skin(SKIN).cubes[0].calibration
@@ -337,7 +344,9 @@ def test_another_calibration_and_tare(bag, tmp_path, capsys):
     assert "0 to 2.990 s" in " ".join(capsys.readouterr().err.split())
 
 
-def test_calibrations_of_another_skin_file_go_by_the_names_of_cubes(bag, tmp_path, capsys):
+def test_calibrations_of_another_skin_file_go_by_the_names_of_cubes(
+    bag, tmp_path, capsys, one_process
+):
     """Twice the modulus for one cube; the cubes stand in another order in the file."""
     known = read_skin(SKIN).cubes[0].calibration
     write_calibration(
@@ -512,7 +521,9 @@ def test_the_command_that_is_advised_for_a_cut_file_works_on_it(bag, tmp_path, c
     assert main(["bag", "repair", str(tmp_path / "nothing.mcap")]) == 1
 
 
-def test_a_reprocess_that_failed_does_not_refuse_the_corrected_command(bag, tmp_path, capsys):
+def test_a_reprocess_that_failed_does_not_refuse_the_corrected_command(
+    bag, tmp_path, capsys, one_process
+):
     cut, out = tmp_path / "cut.mcap", tmp_path / "out"
     cut.write_bytes(b"no bag")
     assert main(["reprocess", str(cut), "-o", str(out), "--jobs", "1"]) == 1

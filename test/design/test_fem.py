@@ -37,13 +37,8 @@ from cube_tensor_driver.core.layout import LAYOUTS, Layout
 from cube_tensor_driver.core.modes import PLANE
 from cube_tensor_driver.core.response import project
 
-# The bodies of its fixtures are computed once.
-pytestmark = pytest.mark.xdist_group("finite elements")
-
 HALVES = strip_layout(LAYOUTS["planar"], 1.0)
 RIGID = float("inf")
-# With several workers, one of them computes the responses that several tests look at.
-shared_responses = pytest.mark.xdist_group("responses of the slab and the square body")
 
 
 def applied(layout, modes):
@@ -221,7 +216,6 @@ def square():
     return compute_response(Body(height=60e-3), HALVES)
 
 
-@shared_responses
 def test_square_body_has_the_papers_structure(square):
     assert square.structure_residual < 1e-9
     c = square.coefficients
@@ -229,7 +223,6 @@ def test_square_body_has_the_papers_structure(square):
     assert c["f"] == pytest.approx(0, abs=0.01)  # near zero, as the paper's pictures suggest
 
 
-@shared_responses
 def test_slab_deviates_from_the_papers_structure(slab):
     """Measured with this code, 60 x 11 mm; mirrors explain all of it, the exchange of x and z does
     not."""
@@ -239,15 +232,13 @@ def test_slab_deviates_from_the_papers_structure(slab):
     assert mirrors.structure_residual < 1e-9 and len(mirrors.coefficients) == 14
 
 
-@shared_responses
-@pytest.mark.parametrize("result", ["slab", "square"])
-def test_coefficients_converge_with_the_mesh(result, request):
+def test_coefficients_converge_with_the_mesh(slab, square):
     """The middle mesh is within 0.5 % of the finest in every coefficient; f, near zero, within
     1e-4."""
-    rows = request.getfixturevalue(result).convergence
-    assert rows[1]["coefficients"] == pytest.approx(rows[2]["coefficients"], rel=5e-3, abs=1e-4)
-    assert rows[0]["change"] < 1e-3 and rows[1]["change"] < 1e-3
-    assert rows[2]["change"] is None
+    for rows in (slab.convergence, square.convergence):
+        assert rows[1]["coefficients"] == pytest.approx(rows[2]["coefficients"], rel=5e-3, abs=1e-4)
+        assert rows[0]["change"] < 1e-3 and rows[1]["change"] < 1e-3
+        assert rows[2]["change"] is None
 
 
 def test_the_default_is_right():
@@ -274,8 +265,7 @@ def test_the_default_is_right():
     assert coefficients == pytest.approx(truth, rel=5e-4)
 
 
-@shared_responses
-def test_elastic_steel_is_as_good_as_rigid(slab):
+def test_elastic_steel_is_as_good_as_rigid():
     rigid = compute_response(Body(cube_young=RIGID), HALVES, meshes=1).matrix
     steel = compute_response(Body(), HALVES, meshes=1).matrix
     assert 0 < np.abs(rigid - steel).max() < 5e-6  # E / E_cube = 1.5e-6
@@ -426,7 +416,6 @@ def test_a_layout_without_the_symmetry():
 # results as files
 
 
-@shared_responses
 def test_calibration_holds_the_response(square):
     calibration = calibration_from_fem(square, source="test")
     assert np.allclose(calibration.response, square.matrix, atol=1e-8)
@@ -436,7 +425,6 @@ def test_calibration_holds_the_response(square):
     assert again.id == calibration.id
 
 
-@shared_responses
 def test_result_as_plain_types(square):
     data = json.loads(to_json(square.to_dict()))
     assert {"matrix", "coefficients", "structure_residual", "convergence", "seconds"} <= set(data)

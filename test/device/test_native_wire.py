@@ -31,10 +31,7 @@ GAP = 8
 COUNTERS = struct.Struct("<8Qq")
 NAMES = ("bytes", "frames", "crc", "framing", "length", "version", "unknown_type", "overrun")
 
-pytestmark = [
-    pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc"),
-    pytest.mark.xdist_group("native_wire"),
-]
+pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler: apt install gcc")
 
 
 class Frame(NamedTuple):

@@ -48,10 +48,7 @@ SKIN = package_data() / "config" / "skin_firmware.yaml"
 OF_PERIODS = {"H1", "R3", "R6", "R7"}
 NO_CC, NO_ARM = missing("make", "cc"), missing("make", "arm-none-eabi-gcc", "qemu-system-arm")
 
-pytestmark = [
-    pytest.mark.skipif(bool(NO_CC), reason=NO_CC),
-    pytest.mark.xdist_group("firmware"),
-]
+pytestmark = pytest.mark.skipif(bool(NO_CC), reason=NO_CC)
 emulated = pytest.mark.skipif(bool(NO_ARM), reason=NO_ARM)
 
 

@@ -6,7 +6,9 @@ of files."""
 from __future__ import annotations
 
 import tracemalloc
+from collections.abc import Callable
 
+import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
@@ -24,12 +26,32 @@ from cube_tensor_driver.device.wire.protocol import Ack, Request, Stats, encode
 from cube_tensor_driver.msg import SkinInfo
 from cube_tensor_driver.ros import messages
 from cube_tensor_driver.ros.markers.legend import four_characters
-from workshop.bench.decode import NOISE, READ
+from workshop.bench.decode import INTACT_COBS, LATE_FAILURE, READ, clean_frames
 
 EACH = 2_000_000
 SHIPPED = {
     read_calibration: package_data() / "config" / "calibration" / "cube.yaml",
     read_skin: package_data() / "config" / "skin_demo.yaml",
+}
+
+
+def damaged_frames(size: int) -> bytes:
+    """Frames of which one byte in a hundred was replaced."""
+    random = np.random.default_rng(2)
+    data = np.frombuffer(clean_frames(size), np.uint8).copy()
+    where = random.integers(0, len(data), len(data) // 100)
+    data[where] = random.integers(0, 256, len(where))
+    return bytes(data)
+
+
+NOISE: dict[str, Callable[[int], bytes]] = {
+    "random": np.random.default_rng(3).bytes,
+    "mostly zeros and ones": lambda n: bytes(np.random.default_rng(4).integers(0, 2, n).tolist()),
+    "harmed frames": damaged_frames,
+    "no zero at all": lambda n: b"\x55" * n,
+    "late failures": lambda n: LATE_FAILURE * (n // 16),
+    "late failures, sound ones between": lambda n: (LATE_FAILURE + INTACT_COBS) * (n // 32),
+    "zeros and ones in turn": lambda n: b"\0\1" * (n // 2),
 }
 
 

@@ -24,8 +24,6 @@ from cube_tensor_driver.msg import SkinFrequencies, SkinStress
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import SimulatedHubs, skin_processes
 
-pytestmark = pytest.mark.xdist_group("nodes with a hub")
-
 
 class Nodes:
     """Both nodes in processes of their own, and what they say since the last hub was plugged in."""

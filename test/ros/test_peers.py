@@ -32,9 +32,6 @@ from cube_tensor_driver.srv import Tare
 ACTIVE = 3
 
 
-pytestmark = pytest.mark.xdist_group("peers")
-
-
 @pytest.fixture(scope="module")
 def running(tmp_path_factory):
     """A running simulated skin of one cube with all its nodes, and we among its peers."""
