@@ -215,7 +215,11 @@ def _show_surface(study: SurfaceStudy) -> None:
     )
 
 
-def _surface_cells(row: SurfaceRow, unit: float, digits: int) -> list[str]:
+def _surface_cells(
+    row: SurfaceRow,
+    unit: float,
+    digits: int,
+) -> list[str]:
     """Return the load, and measured stress, true stress and their ratio for each component."""
     cells = [row.load, f"{1e3 * row.width:g}", f"{1e3 * row.offset:g}"]
     largest = max(map(abs, row.true.values()))
@@ -351,7 +355,11 @@ def _print_table(
     Console(highlight=False).print(table)
 
 
-def _rows(names: Iterable[str], values: Array, digits: int) -> list[list[str]]:
+def _rows(
+    names: Iterable[str],
+    values: Array,
+    digits: int,
+) -> list[list[str]]:
     """Return the cells of rows of numbers, with a name before each."""
     pairs = zip(names, values.tolist(), strict=True)
     return [[name, *(_format_number(value, digits) for value in row)] for name, row in pairs]

@@ -151,7 +151,12 @@ def choose_skin_file(settings: DemoSettings, folder: Path) -> Path:
     return package_data() / "config" / "skin_demo.yaml"
 
 
-def write_grid(path: Path, cubes: int, rate: float, cubes_per_hub: int = CUBES_PER_HUB) -> Path:
+def write_grid(
+    path: Path,
+    cubes: int,
+    rate: float,
+    cubes_per_hub: int = CUBES_PER_HUB,
+) -> Path:
     """Write the skin file of a grid that is as nearly square as possible, and return its path.
 
     Args:

@@ -30,7 +30,11 @@ PERCENTILES = (50, 90, 99)
 sample and its stamp."""
 
 
-def check_all(record: Record, log: SampleLog, readings: AnyArray) -> dict[str, Any]:
+def check_all(
+    record: Record,
+    log: SampleLog,
+    readings: AnyArray,
+) -> dict[str, Any]:
     """Run all checks and return their figures; counts are rows (one sample of one cube each).
 
     Args:

@@ -30,7 +30,11 @@ def find_matched(index: Index) -> Index:
     return np.flatnonzero(index != NO_MATCH)
 
 
-def agree(found: Real, wanted: Real, allowed: Real | float = 0.0) -> Mask:
+def agree(
+    found: Real,
+    wanted: Real,
+    allowed: Real | float = 0.0,
+) -> Mask:
     """Return where two arrays differ by at most a tolerance; NaN (unknown) agrees only with NaN."""
     near = np.abs(found - wanted) <= allowed
     return near | (np.isnan(found) & np.isnan(wanted))
@@ -46,7 +50,12 @@ class Run:
         sample: Index of the sample of each row of frequencies (N,), or `NO_MATCH`.
     """
 
-    def __init__(self, record: Record, log: SampleLog, readings: AnyArray) -> None:
+    def __init__(
+        self,
+        record: Record,
+        log: SampleLog,
+        readings: AnyArray,
+    ) -> None:
         self.record, self.samples = record, Samples(log)
         self.sent = SentReadings(self.samples, readings)
         self.sample = self.sent.find_samples(record.frequencies.rows)

@@ -44,7 +44,11 @@ def reading_type(n_cubes: int, n_pads: int) -> np.dtype[np.void]:
     )
 
 
-def read_readings(folder: Path, log: SampleLog, n_pads: int) -> AnyArray:
+def read_readings(
+    folder: Path,
+    log: SampleLog,
+    n_pads: int,
+) -> AnyArray:
     """Read the readings of all S samples, in the order of the log's table.
 
     Args:

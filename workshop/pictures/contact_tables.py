@@ -52,7 +52,11 @@ QUANTITIES = {
 """Quantities of each row: name, which is that of the attribute of `Errors`, and meaning."""
 
 
-def write_contact_tables(path: Path, true_pads: Influence, shapes: Outcomes) -> None:
+def write_contact_tables(
+    path: Path,
+    true_pads: Influence,
+    shapes: Outcomes,
+) -> None:
     """Run the studies and write their tables; other tables of the file stay as they are.
 
     Args:

@@ -83,7 +83,11 @@ def draw_fingers(
     return figure
 
 
-def _draw_shear(axis: Any, poses: CubePoses, kilopascal: Array) -> None:
+def _draw_shear(
+    axis: Any,
+    poses: CubePoses,
+    kilopascal: Array,
+) -> None:
     """Draw the shear of cubes, whose components are (cubes, 15), as arrows."""
     shear = kilopascal[:, [STRESS.index("zx"), STRESS.index("yz")]]
     # The shear acts along the x and y axes of each cube.

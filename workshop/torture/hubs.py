@@ -122,7 +122,12 @@ class StoringInjector(Injector):
         folder.mkdir()
         self._files = {link.name: (folder / link.name).open("wb") for link in links}
 
-    def measured(self, link: SimulatedLink, frequency: Millihertz, now_us: int) -> Millihertz:
+    def measured(
+        self,
+        link: SimulatedLink,
+        frequency: Millihertz,
+        now_us: int,
+    ) -> Millihertz:
         """Return the frequencies that a hub measures, and store them with what the hub states."""
         millihertz = super().measured(link, frequency, now_us)
         size = link.size
