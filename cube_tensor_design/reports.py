@@ -180,7 +180,8 @@ def _write_response(
     source = f"computed by {command}"
     calibration = calibration_from_fem(result, needs_matrix, neglect, source)
     # A pad is crushed where its stress reaches the modulus of its foam.
-    largest = np.abs(result.matrix[:, result.modes.index("zz")]).max()
+    to_pressure = result.matrix[:, result.modes.index("zz")]
+    largest = np.abs(to_pressure).max()
     crushing_kpa = calibration.modulus.max() / largest / 1e3
     header = (
         f"Made by: {command} -o {path}\n"
@@ -226,7 +227,8 @@ def _surface_cells(
     for name, measured in row.measured.items():
         true = row.true[name]
         ratio = f"{measured / true:.2f}" if abs(true) > MIN_SHOWN_SHARE * largest else ""
-        cells += [_format_number(value / unit, digits) for value in (measured, true)] + [ratio]
+        cells += [_format_number(value / unit, digits) for value in (measured, true)]
+        cells.append(ratio)
     return cells
 
 
@@ -252,7 +254,8 @@ def _show_volume(result: VolumeResponse) -> None:
         return
     matrix = Pipeline([calibration]).matrix(0)
     for label, pads, unit in cases:
-        for name, value in zip(COMPONENTS, (matrix @ pads).tolist(), strict=True):
+        values = matrix @ pads
+        for name, value in zip(COMPONENTS, values.tolist(), strict=True):
             # Symmetry makes most components vanish but for rounding.
             if abs(value) > SMALLEST_SHOWN_STRESS:
                 text = f"{value:+.1f} Pa" if name in STRESS else f"{1e-3 * value:+.1f} Pa/mm"

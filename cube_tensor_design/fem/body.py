@@ -205,7 +205,8 @@ def make_mesh(
     centre = np.array([body.x, 0.0, body.z])
     offset = centre[axes] / (body.side / 2)
     # Ground below the body makes it unequal to its mirror image along z.
-    no_mirror = (offset != 0) | (body.ground & (np.array(axes) == 2))
+    is_vertical = np.array(axes) == 2
+    no_mirror = (offset != 0) | (body.ground & is_vertical)
     lower = np.where(no_mirror, half + offset, 0.0).tolist()
     upper = (half - offset).tolist()
 

@@ -147,6 +147,7 @@ def compute_response(
         modes=modes,
         targets=np.eye(modes.n_modes),
     )
+    unobservable = np.array(modes.names)[~estimator.observed]
     return Response(
         body=body,
         layout=layout,
@@ -157,7 +158,7 @@ def compute_response(
         structure_residual=residual,
         mode_residual=_mode_residual(structure, matrix, coefficients),
         rank=estimator.rank,
-        unobservable=tuple(np.array(modes.names)[~estimator.observed].tolist()),
+        unobservable=tuple(unobservable.tolist()),
         convergence=tuple(rows),
         seconds=sum(result.seconds for result in results),
     )
@@ -218,7 +219,8 @@ def solve_meshes(
     grids = [make_mesh(body, layout, level) for level in range(meshes)]
     check_memory(grids[-1])
     # Each axis with a mirror has two parities, and each parity is one solve.
-    n_mirrors = int(np.sum(grids[0].p.min(axis=1) >= 0))
+    has_mirror = grids[0].p.min(axis=1) >= 0
+    n_mirrors = int(np.sum(has_mirror))
     report = count_steps(progress, meshes * 2**n_mirrors)
 
     results: list[MeshResult] = []
@@ -312,7 +314,8 @@ def make_solid(
     elif body.ground:
         # A rigid cube moves with a body on ground, so it is a very stiff elastic one here.
         cube = lame(STIFF_CUBE_RATIO, 0.0, plane)
-    return Solid(grid, lame(1.0, body.poisson, plane), cube, body.ground, body.confined)
+    elastomer = lame(1.0, body.poisson, plane)
+    return Solid(grid, elastomer, cube, body.ground, body.confined)
 
 
 def load_modes(solid: Solid, layout: Layout) -> Load:
@@ -371,7 +374,10 @@ def pad_stresses(
     return stresses
 
 
-def each_parity(solid: Solid, report: Callable[[str], None] = lambda _: None) -> Iterator[Parity]:
+def each_parity(
+    solid: Solid,
+    report: Callable[[str], None] = lambda _: None,
+) -> Iterator[Parity]:
     """Yield the parities of a body and report each. Parities that share a factorisation of the
     stiffness matrix follow one another."""
 

@@ -50,6 +50,7 @@ def line_load(
     # The integrand at -k is the complex conjugate of that at k. So the integral over all k is twice
     # the real part of that over k > 0, and the factor of the inverse transform is 2 / (2 pi).
     step = k[1] - k[0]
-    wave = np.exp(-1j * np.outer(x, k)) * (step / np.pi)
+    phase = np.outer(x, k)
+    wave = np.exp(-1j * phase) * (step / np.pi)
     modes = np.tensordot(wave, rows, axes=1).real  # (m, 7, 2)
     return np.moveaxis(modes, 0, 1)

@@ -111,7 +111,8 @@ def mesh_section(
         sides.append(halves)
     parts = []
     for (sign_x, x), (sign_z, z) in itertools.product(*sides):
-        parts.append((mesh_quarter((x, z), stops, level, ring=ring), (sign_x, sign_z)))
+        quarter = mesh_quarter((x, z), stops, level, ring=ring)
+        parts.append((quarter, (sign_x, sign_z)))
     return _join_quarters(parts)
 
 
@@ -174,7 +175,8 @@ def mesh_box(
         largest: Size of a brick far away from the cube.
     """
     inner = sorted({0.0, *(s for s in stops if 0.0 < s < 1.0)})
-    to_edge = 1.0 - _graded(1.0 - inner[-1], smallest, growth)[::-1]
+    from_edge = _graded(1.0 - inner[-1], smallest, growth)
+    to_edge = 1.0 - from_edge[::-1]
     to_last_pad = _split(inner, inner[-1], size)
     face = np.concatenate([to_last_pad, to_edge[1:]])
 

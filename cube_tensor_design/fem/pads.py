@@ -63,7 +63,9 @@ def pad_weights(
     half = layout.pad_size / 2
     component = np.arange(positions.shape[1]) % dim
     weights = np.zeros((layout.n_pads, positions.shape[1]))
-    pads = zip(layout.positions[:, axes], layout.normals[:, axes], strict=True)
+    centres = layout.positions[:, axes]
+    normals = layout.normals[:, axes]
+    pads = zip(centres, normals, strict=True)
     for pad, (centre, normal) in enumerate(pads):
         axis = int(np.argmax(np.abs(normal)))
         others = [k for k in range(dim) if k != axis]
@@ -158,5 +160,6 @@ def _line_element(order: int) -> tuple[Array, Array]:
 def _continuation(order: int) -> Array:
     """Return the values (order,) at the end 1 of an element [0, 1] of the polynomials that are 1 at
     one of its other nodes and 0 at the rest: binomial coefficients of alternating sign."""
-    signed = [(-1) ** (order - 1 - k) * comb(order, k) for k in range(order)]
-    return np.array(signed, float)
+    signs = [(-1) ** (order - 1 - k) for k in range(order)]
+    coefficients = [comb(order, k) for k in range(order)]
+    return np.multiply(signs, coefficients, dtype=float)

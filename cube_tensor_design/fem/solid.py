@@ -79,7 +79,8 @@ def stiffness(scalar: skfem.Basis, moduli: tuple[float, float]) -> sp.csr_matrix
         form = skfem.BilinearForm(lambda u, w, _, a=a, b=b: w.grad[a] * u.grad[b])
         slopes = form.assemble(scalar)
         # Components a of the test function and b of the displacement are coupled by this block.
-        place = np.outer(np.eye(dim)[a], np.eye(dim)[b])
+        place = np.zeros((dim, dim))
+        place[a, b] = 1.0
         total = total + sp.kron(lam * slopes + mu * slopes.T, place)
         if a == b:
             # The part of mu grad u : grad w couples equal components only.
@@ -301,7 +302,8 @@ class Solid:
                 held |= _is_at(x[k], 0.0) & (is_normal == (sign > 0))
         if self._confined:
             for k in range(self.dim - 1):
-                at_end = _is_at(x[k], x[k].max()) | _is_at(x[k], x[k].min())
+                at_end = _is_at(x[k], x[k].max())
+                at_end |= _is_at(x[k], x[k].min())
                 # The other end is a mirror if only the positive part is meshed.
                 at_side = at_end & (np.abs(x[k]) > 1.0)
                 is_normal = component == k
@@ -356,7 +358,8 @@ def mirror_images(parity: Parity) -> tuple[Array, Array]:
     # Along an axis without a mirror the body is meshed as a whole.
     signs = [(1.0, -1.0) if sign else (1.0,) for sign in parity]
     images = np.array(list(itertools.product(*signs)))
-    weights = np.where(images < 0, parity, 1).prod(axis=1) / len(images)
+    signs_by_axis = np.where(images < 0, parity, 1)
+    weights = signs_by_axis.prod(axis=1) / len(images)
     return images, weights
 
 

@@ -137,7 +137,8 @@ def compute_thermal_stress(
         return lambda parity: [part * (min(parity) >= 0) for part in parts]
 
     results = solve_meshes(body, layout, meshes, load, progress)
-    return ThermalStress(body, layout, body.young * results[-1].pads, results[-1].change)
+    finest = results[-1]
+    return ThermalStress(body, layout, body.young * finest.pads, finest.change)
 
 
 def compute_weight(
@@ -169,7 +170,8 @@ def compute_weight(
             elements = solid.scalar_elements(in_cube=number == 1)
             volume = skfem.LinearForm(lambda w, _: w).assemble(elements)
             # A force along one axis acts on this component of each node.
-            parts.append(-density * np.kron(volume[:, None], np.eye(solid.dim)))
+            by_component = np.kron(volume[:, None], np.eye(solid.dim))
+            parts.append(-density * by_component)
 
         def of_parity(parity: Parity) -> Sequence[Array]:
             images, weights = mirror_images(parity)

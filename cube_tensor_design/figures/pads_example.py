@@ -40,7 +40,8 @@ def draw_pads(calibration: Calibration) -> Figure:
     loads = simple_loads(calibration)
     figure = Figure(figsize=(9, 5.6))
     axes = figure.subplots(2, len(loads))
-    pads = 1e-3 * np.array([calibration.response @ state for state in loads.values()])
+    states = np.array(list(loads.values()))
+    pads = 1e-3 * states @ calibration.response.T
     # One scale for all loads.
     limit = np.abs(pads).max()
     colours = ScalarMappable(Normalize(-limit, limit), colormaps[SIGNED_COLOURS])

@@ -412,7 +412,8 @@ class VirtualBench:
         f = section.deformation(u)
         stress = section.material.cauchy(f)[:, :, is_near]
         x = section.points[:, is_near]
-        design = np.vstack([np.ones(x.shape[1]), x]).T
+        ones = np.ones(x.shape[1])
+        design = np.vstack([ones, x]).T
         columns = stress[[0, 1, 0], [0, 1, 1]].T  # xx, zz, zx
         # The fit has the value, the slope along x and the slope along z of each component.
         fit = np.linalg.lstsq(design, columns, rcond=None)[0]

@@ -99,7 +99,8 @@ class FieldStudy:
         # Errors are nearly powers of the pitch, so logarithms are interpolated.
         log_error = np.log(rising)
         log_pitches = np.log(self.pitches)
-        return float(np.exp(np.interp(np.log(error), log_error, log_pitches)))
+        log_pitch = np.interp(np.log(error), log_error, log_pitches)
+        return float(np.exp(log_pitch))
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,9 +181,11 @@ def field_below(
         poisson: Poisson's ratio.
     """
     # The contact model has its origin on the surface.
-    below = np.column_stack([points[:, :2], np.full(len(points), -depth)])
+    height = np.full(len(points), -depth)
+    below = np.column_stack([points[:, :2], height])
     stress, gradient = contact.field(below, *load, poisson)
-    return np.concatenate([stress, gradient.reshape(len(points), 18)], axis=1)
+    slopes = gradient.reshape(len(points), 18)
+    return np.concatenate([stress, slopes], axis=1)
 
 
 def field_example() -> FieldExample:
@@ -263,7 +266,8 @@ class _Trial:
             force_error = -1.0
             contacts = surface.contacts(values, CONTACT_PRESSURE)
             if contacts:
-                distance = float(np.linalg.norm(contacts[0].position[:2] - centre))
+                offset = contacts[0].position[:2] - centre
+                distance = float(np.linalg.norm(offset))
                 force_error = contacts[0].normal_force / FORCE - 1
             columns.append([square, distance, force_error])
         return np.transpose(columns)

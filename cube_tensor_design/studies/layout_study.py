@@ -95,7 +95,8 @@ class LayoutStudy:
         is_trusted = error[:, ::-1] <= MAX_TRUSTED_ERROR
         n_trusted = np.cumprod(is_trusted, axis=1).sum(axis=1)
         from_widest = np.append(np.inf, self.widths[::-1])
-        return np.where(np.isnan(error[:, 0]), np.nan, from_widest[n_trusted])
+        is_observed = ~np.isnan(error[:, 0])
+        return np.where(is_observed, from_widest[n_trusted], np.nan)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of the file of --json; NaN becomes null there."""

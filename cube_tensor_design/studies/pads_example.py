@@ -119,4 +119,5 @@ def _beside_ball(x: Array) -> Array:
     """Return stress in Pa and gradient in Pa/m (N, 6 + 18) at distances x (N,) from the ball's
     centre, in m, in the plane of the sensor."""
     ball = contact.hertz(BALL_RADIUS, BALL_FORCE)
-    return field_below(np.stack([x, 0 * x], axis=1), SURFACE_DEPTH, ball, POISSONS_RATIO)
+    points = np.stack([x, 0 * x], axis=1)
+    return field_below(points, SURFACE_DEPTH, ball, POISSONS_RATIO)

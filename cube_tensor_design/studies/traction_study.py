@@ -265,7 +265,8 @@ class TractionBench:
         # Tensors of the skin's frame become those of each cube's frame.
         to_cube = self.poses.rotation.swapaxes(1, 2)
         stress = rotate_stress(field[:, :6], to_cube)
-        by_axis = to_matrix(field[:, 6:].reshape(-1, 6, 3).swapaxes(1, 2))
+        slopes = field[:, 6:].reshape(-1, 6, 3)
+        by_axis = to_matrix(slopes.swapaxes(1, 2))
         gradient = rotate_gradient(np.moveaxis(by_axis, 1, -1), to_cube)
         state = calibration.modes.state(stress, calibration.half_side * gradient)
         return state @ calibration.response.T
@@ -343,7 +344,8 @@ class TractionBench:
         interpolated = self.surface.contacts(values, CONTACT_PRESSURE)
         tracker, tracked, pressures = self._solve(values)
         errors = np.array(pressures)[:, self.window] - true
-        field = (errors**2).mean(axis=1) / (true**2).mean()
+        mean_square = (true**2).mean()
+        field = (errors**2).mean(axis=1) / mean_square
 
         predicted = tracker.deviation(values)
         on_surface = self.surface_truth(width, force, centre)
@@ -463,7 +465,8 @@ def _place_cubes(setting: Setting) -> CubePoses:
 def traction_example() -> FieldExample:
     """Return the pressure under a contact of 6 mm between planar cubes, every second one turned."""
     setting = Setting(cubes=CUBES[2], pitch=10e-3, depth=4e-3)
-    return TractionBench(setting, side=10).example(6e-3, setting.pitch * np.array([0.35, 0.25]))
+    centre = setting.pitch * np.array([0.35, 0.25])
+    return TractionBench(setting, side=10).example(6e-3, centre)
 
 
 def flat_punch(
@@ -485,7 +488,8 @@ def flat_punch(
     sources, forces = contact.hertz(radius, force, centre, order)
     # The rings are Gauss points of s = sqrt(1 - r^2 / a^2), in which Hertz's traction is 3 s^2 and
     # that of the punch is uniform.
-    r_square = ((sources[:, :2] - centre) ** 2).sum(axis=1)
+    from_centre = sources[:, :2] - centre
+    r_square = (from_centre**2).sum(axis=1)
     s_square = 1 - r_square / radius**2
     return sources, forces / (3 * s_square[:, None])
 
