@@ -78,9 +78,12 @@ def sound_readings(skin):
 def sent_readings(skin, log):
     """What the hubs send in each sample under the faults of a log."""
     samples = Samples(log)
-    load_us = samples.time_us.copy()
+    times_us = samples.time_ns // 1000
+    load_us = times_us.copy()
     for fault in samples.faults("hold"):
-        load_us[(samples.link == fault.link) & fault.contains(samples.time_ns)] = fault.start_us
+        load_us[(samples.link == fault.link) & fault.contains(samples.time_ns)] = (
+            fault.begin_ns // 1000
+        )
     instant = load_us // PERIOD_US % INSTANTS
     cube = EACH * samples.link[:, None] + np.arange(EACH)
     readings = np.zeros(len(samples), reading_type(EACH, 8))
@@ -93,10 +96,9 @@ def sent_readings(skin, log):
             readings["pad_fault"][place[:2]] |= np.uint32(1 << fault.fault.pad)
         else:
             sound = readings["millihertz"][place].tolist()
-            times_us = samples.time_us[rows].tolist()
             readings["millihertz"][place] = [
                 broken_reading(fault.fault, one, sound[0], time_us)
-                for one, time_us in zip(sound, times_us, strict=True)
+                for one, time_us in zip(sound, times_us[rows].tolist(), strict=True)
             ]
     return readings
 
@@ -108,7 +110,7 @@ def recorded(skin, log, actions=(), rest_after=None):
     """
     samples = Samples(log)
     sent = sent_readings(skin, log)
-    order = np.argsort(samples.time_us, kind="stable")
+    order = np.argsort(samples.time_ns, kind="stable")
     order = order[~samples.is_damaged[order]]
     cube = (EACH * samples.link[order, None] + np.arange(EACH)).ravel().astype(np.uint16)
     of = np.repeat(order, EACH)
@@ -123,7 +125,7 @@ def recorded(skin, log, actions=(), rest_after=None):
         status=np.zeros(len(cube), np.uint16),
     )
     reconstruct = Reconstructor(skin)
-    scans = np.split(np.arange(len(cube)), np.flatnonzero(np.diff(samples.time_us[of])) + 1)
+    scans = np.split(np.arange(len(cube)), np.flatnonzero(np.diff(samples.time_ns[of])) + 1)
     made = []
     for scan in map(frequencies.select, scans):
         if rest_after is not None and scan.stamp_ns[0] > rest_after[0]:

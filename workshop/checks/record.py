@@ -106,13 +106,11 @@ class HubFault(Span):
 
     Attributes:
         fault: Kind and values of the fault.
-        start_us: Simulated time of its begin, in µs.
         link: Index of the link in the log.
         cube: Index in the skin of the cube that a fault of a pad is on.
     """
 
     fault: Fault
-    start_us: int
     link: int
     cube: int
 
@@ -128,7 +126,6 @@ class Samples:
         log: The sample log.
         table: Columns that every simulated hub has.
         link, number, time_ns: As in the table (S,).
-        time_us: Simulated time (S,), in µs.
         boot: Number of restarts of the hub before the sample (S,).
         period_us: Time from sample to sample (S,), in µs.
         row_count: Number of the skin's cubes on the link, so the number of rows (S,).
@@ -141,7 +138,6 @@ class Samples:
         self.link = self.table.link
         self.number = self.table.number
         self.time_ns = self.table.time_ns
-        self.time_us = (self.time_ns - log.start_time_ns) // 1000
         self.row_count = self.table.rows_per_sample[self.link]
 
         runs = [run for link in log.links for run in link.runs]
@@ -181,7 +177,6 @@ class Samples:
             begin_ns=start_ns + 1000 * record.start_us,
             end_ns=start_ns + 1000 * record.end_us,
             fault=fault,
-            start_us=record.start_us,
             link=link,
             cube=self.log.links[link].cubes[fault.cube],
         )
