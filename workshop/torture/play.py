@@ -117,7 +117,7 @@ def play(
             # Faults begin only when every cube delivers.
             observer.spin(
                 MAX_START_S,
-                lambda: stress.count_cubes() == len(skin.cubes),
+                lambda: stress.count > 0 and len(stress.newest_rows()) == len(skin.cubes),
             )
             if not stress.count:
                 logs = "\n".join(children.log(name)[-500:] for name in NODES)

@@ -24,7 +24,6 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from cube_tensor_driver.config.skin import Skin
-from cube_tensor_driver.core.arrays import AnyArray
 from cube_tensor_driver.core.errors import MessageError
 from cube_tensor_driver.core.rows import concatenate
 from cube_tensor_driver.demo.running import Observer, observing
@@ -73,11 +72,7 @@ class Message(NamedTuple):
 
 
 class TopicLog(Generic[AnyRows]):
-    """Collects all rows (one cube at one sampling time each) of one batch topic.
-
-    Attributes:
-        count: Number of messages so far.
-    """
+    """Collects the messages of one batch topic, and decodes them when all have arrived."""
 
     def __init__(
         self,
@@ -98,33 +93,31 @@ class TopicLog(Generic[AnyRows]):
             codec: Codec of the messages.
             skin: The skin.
         """
-        self.count = 0
         self._kind = kind
         self._codec: MessageCodec[AnyRows] = codec
         self._frame_id = skin.parent_frame.encode() + b"\0"
         self._subscription: Any = node.create_subscription(
             kind, topic, lambda _: None, quality, raw=True
         )
-        self._decoded: list[AnyRows] = []
-        self._waiting: list[Message] = []
-        self._sent_ns: list[AnyArray] = []
-        self._last_number = self._n_rows = self._unreadable = 0
+        self._messages: list[Message] = []
+        self._last_number = 0
+        # For each gap: number of messages before it, and number of messages that are missing.
         self._gaps: list[tuple[int, int]] = []
+
+    @property
+    def count(self) -> int:
+        """Number of messages so far."""
+        return len(self._messages)
 
     def take(self) -> None:
         """Take what has arrived; to be called again and again."""
         for message in self._take_raw():
-            self.count += 1
             # If the number is not larger than the last one, a new publisher has started at 1.
             expected = self._last_number + 1 if message.number > self._last_number else 1
             self._last_number = message.number
             if message.number > expected:
-                # A gap is stored as the number of rows before it, so these are decoded first.
-                self._decode()
-                self._gaps.append((self._n_rows, message.number - expected))
-            self._waiting.append(message)
-        if len(self._waiting) >= MESSAGES_PER_DECODING:
-            self._decode()
+                self._gaps.append((self.count, message.number - expected))
+            self._messages.append(message)
 
     def _take_raw(self) -> list[Message]:
         """Return messages that have arrived since the last call, with the numbers of DDS."""
@@ -146,59 +139,46 @@ class TopicLog(Generic[AnyRows]):
         self.take()
         self._last_number = 0
 
-    def count_cubes(self) -> int:
-        """Return the number of cubes of which rows have arrived."""
-        self._decode()
-        return len({cube for rows in self._decoded for cube in rows.cube.tolist()})
-
-    def newest_ns(self) -> int:
-        """Return the stamp of the newest row, in ns since the Unix epoch; 0 before the first
-        message."""
-        self._decode()
-        if not self._decoded:
-            return 0
-        return int(self._decoded[-1].stamp_ns[-1])
+    def newest_rows(self) -> AnyRows:
+        """Return the rows of the newest message; there must be one."""
+        return self._codec.decode(self._messages[-1].data).rows
 
     def received(self) -> Received[AnyRows]:
-        """Return all that arrived.
+        """Return the rows (one cube at one sampling time each) of all messages.
 
         Raises:
             MessageError: Nothing arrived.
         """
-        self._decode()
-        if not self._decoded:
-            raise MessageError("the driver or the reconstruction published nothing: see their logs")
-        sent_ns = np.concatenate(self._sent_ns)
-        return Received(
-            concatenate(self._decoded),
-            sent_ns,
-            tuple(self._gaps),
-            self._unreadable,
-        )
-
-    def _decode(self) -> None:
-        """Decode the waiting messages; neighbours with the same number of rows and pads
-        together."""
-        waiting, self._waiting = self._waiting, []
-        for _, group in groupby(waiting, self._shape_of):
-            messages = list(group)
+        decoded: list[AnyRows] = []
+        # Wall clock of sending, and number of rows, of each message.
+        sent_ns = np.array([message.sent_ns for message in self._messages])
+        n_rows: list[int] = []
+        unreadable = 0
+        for _, group in groupby(enumerate(self._messages), self._batch_of):
+            messages = [message.data for _, message in group]
             try:
-                decoded = self._codec.decode(*(message.data for message in messages))
+                batch = self._codec.decode(*messages)
             except MessageError:
                 # The checks report unreadable messages, so the run goes on.
-                self._unreadable += len(messages)
+                unreadable += len(messages)
+                n_rows += [0] * len(messages)
                 continue
-            if decoded.frame_id != self._frame_id:
-                self._unreadable += len(messages)
-            self._n_rows += len(decoded.rows)
-            self._decoded.append(decoded.rows)
-            sent_ns = [message.sent_ns for message in messages]
+            if batch.frame_id != self._frame_id:
+                unreadable += len(messages)
+            decoded.append(batch.rows)
             # Messages of one shape have the same number of rows.
-            rows_per_message = len(decoded.rows) // len(messages)
-            self._sent_ns.append(np.repeat(sent_ns, rows_per_message))
+            n_rows += [len(batch.rows) // len(messages)] * len(messages)
+        if not decoded:
+            raise MessageError("the driver or the reconstruction published nothing: see their logs")
+        first_row = np.cumsum([0, *n_rows]).tolist()
+        gaps = tuple((first_row[before], missing) for before, missing in self._gaps)
+        return Received(concatenate(decoded), np.repeat(sent_ns, n_rows), gaps, unreadable)
 
-    def _shape_of(self, message: Message) -> tuple[int, bytes]:
-        return len(message.data), self._codec.shape_bytes(message.data)
+    def _batch_of(self, item: tuple[int, Message]) -> tuple[int, int, bytes]:
+        """Return what successive messages that are decoded together have in common."""
+        number, message = item
+        shape = self._codec.shape_bytes(message.data)
+        return number // MESSAGES_PER_DECODING, len(message.data), shape
 
 
 class TortureRecorder:
