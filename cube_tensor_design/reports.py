@@ -5,14 +5,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.table import Table
 
 from cube_tensor_driver.config.calibration import (
     read_calibration,
@@ -28,6 +26,7 @@ from cube_tensor_driver.core.layout import Layout
 from cube_tensor_driver.core.modes import COMPONENTS, STRESS
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.mechanics.influence_file import write_influence
+from cube_tensor_driver.views.terminal.output import print_table
 
 from .fem.body import Body
 from .fem.fem import Response, calibration_from_fem
@@ -109,7 +108,8 @@ def _show_response(result: Response) -> None:
         names = modes[start : start + count]
         numbers = result.matrix[:, start : start + count]
         left = [f"{100 * result.mode_residual[name]:.2f}" for name in names]
-        _print_table(title, ("pad", *names), _rows(labels, numbers, 4), [["left, %", *left]])
+        rows = _rows(labels, numbers, 4)
+        print_table(("pad",), names, rows, title=title, footer=[["left, %", *left]])
         title = ""
     _show_convergence(result)
     hidden = len(result.coefficients) - MAX_COEFFICIENTS_SHOWN
@@ -137,7 +137,13 @@ def _show_convergence(result: Response) -> None:
     seconds = [f"{mesh['seconds']:.1f}" for mesh in meshes]
     footer = [["change to the next", *changes], ["seconds", *seconds]]
     unknowns = [str(mesh["unknowns"]) for mesh in meshes]
-    _print_table("coefficients on each mesh", ["unknowns", *unknowns, "last step"], rows, footer)
+    print_table(
+        ("unknowns",),
+        [*unknowns, "last step"],
+        rows,
+        title="coefficients on each mesh",
+        footer=footer,
+    )
 
 
 def write(
@@ -209,10 +215,11 @@ def _show_surface(study: SurfaceStudy) -> None:
     heads = [f"{name} {column}" for name in names for column in ("cube", "true", "ratio")]
     # A stress in Pa under 1 N/m has the same number in kPa under 1 N/mm.
     force, unit, digits = ("1 N/mm", 1.0, 1) if study.layout.planar else ("1 N", 1e3, 2)
-    _print_table(
-        f"stress in kPa under {force}: measured by the cube, and true",
-        ["load", "width, mm", "at x, mm", *heads],
+    print_table(
+        ("load",),
+        ("width, mm", "at x, mm", *heads),
         [_surface_cells(row, unit, digits) for row in study.rows],
+        title=f"stress in kPa under {force}: measured by the cube, and true",
     )
 
 
@@ -246,7 +253,8 @@ def _show_volume(result: VolumeResponse) -> None:
         by_axis = STANDARD_GRAVITY * result.pads.T
         cases = [(f"{axis} up, ", pads, "") for axis, pads in zip("xyz", by_axis, strict=True)]
 
-    _print_table(title, ["pad", *heads], _rows(result.layout.pads, result.pads, digits))
+    rows = _rows(result.layout.pads, result.pads, digits)
+    print_table(("pad",), heads, rows, title=title)
     if result.change is not None:
         _console.print(f"change from the mesh before: {100 * result.change:.2g} %")
     calibration = shipped_calibration(result.layout)
@@ -322,7 +330,7 @@ def show_study(result: LayoutStudy) -> None:
         [component, *map(_format_width, column)]
         for component, column in zip(COMPONENTS, widths.T.tolist(), strict=True)
     ]
-    _print_table("", ["", *heads], rows)
+    print_table(("",), heads, rows)
     _console.print("· not observed by the layout")
 
 
@@ -331,31 +339,6 @@ def _format_width(width: float) -> str:
     if math.isnan(width):
         return "·"
     return "never" if math.isinf(width) else f"{1e3 * width:g}"
-
-
-def _print_table(
-    title: str,
-    heads: Sequence[str],
-    rows: Iterable[Iterable[str]],
-    footer: Iterable[Iterable[str]] = (),
-) -> None:
-    """Print a table with a first column of names and columns of numbers.
-
-    Args:
-        title: Line above the table, or "".
-        heads: Heading of each column.
-        rows: Texts of the cells of each row.
-        footer: The same for the rows below a line.
-    """
-    table = Table(title=title or None, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
-    for number, head in enumerate(heads):
-        table.add_column(head, justify="right" if number else "left")
-    for row in rows:
-        table.add_row(*row)
-    table.add_section()
-    for row in footer:
-        table.add_row(*row)
-    Console(highlight=False).print(table)
 
 
 def _rows(

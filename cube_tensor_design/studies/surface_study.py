@@ -83,11 +83,10 @@ class SurfaceStudy:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of the file of --json."""
-        keys = ("load", "width", "place", "said", "there")
         return {
             "body": vars(self.body),
             "layout": self.layout.to_dict(),
-            "rows": [dict(zip(keys, row, strict=True)) for row in self.rows],
+            "rows": [row._asdict() for row in self.rows],
             "place": self.influence.place,
             "pads": self.influence.pads,
         }

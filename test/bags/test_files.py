@@ -705,8 +705,10 @@ def test_plot_and_info(bag, tmp_path, capsys):
     assert main(["bag", "info", str(bag)]) == 0
     text = capsys.readouterr().out
     assert "skin 'skin': 16 cubes" in text and read_skin(SKIN).cubes[0].calibration.id in text
-    row = next(line for line in text.splitlines() if " c07 " in line)
-    assert [cell.strip() for cell in row.split("│")[3:6]] == ["300", "100.0", "0"]
+    row = next(
+        line for line in text.splitlines() if line.startswith(" c07 ") or line.startswith("c07 ")
+    )
+    assert row.split()[2:5] == ["300", "100.0", "0"]
     with BagWriter(tmp_path / "empty"):
         pass
     assert main(["bag", "info", str(tmp_path / "empty")]) == 0

@@ -161,7 +161,7 @@ def test_pads_under_loads_on_the_surface(coarse, fem, tmp_path, capsys, layout):
     study = json.loads(out.read_text())
     place, pads = np.array(study["place"]), np.array(study["pads"])
     assert pads.shape == ((24, len(place), 3) if in_space else (8, len(place), 2))
-    assert [(row["load"], row["width"], row["place"]) for row in study["rows"]] == [
+    assert [(row["load"], row["width"], row["offset"]) for row in study["rows"]] == [
         (load, width, place)
         for load in ("press", "rub")
         for width in (2e-3, 5e-3)
@@ -169,8 +169,8 @@ def test_pads_under_loads_on_the_surface(coarse, fem, tmp_path, capsys, layout):
     ]
     above = study["rows"][0]
     unit, places = (1e3, 2) if in_space else (1.0, 1)
-    ratio = above["said"]["zz"] / above["there"]["zz"]
-    numbers = [above[key]["zz"] / unit for key in ("said", "there")]
+    ratio = above["measured"]["zz"] / above["true"]["zz"]
+    numbers = [above[key]["zz"] / unit for key in ("measured", "true")]
     row = "press +2 +0 " + " ".join(f"+{number:.{places}f}" for number in numbers)
     assert re.search(rf"{row} +{ratio:.2f}", printed)
     assert (tmp_path / "influence.png").stat().st_size > 10_000

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Column, Table
@@ -41,14 +42,16 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
-def make_table(names: Iterable[str], numbers: Iterable[str]) -> Table:
+def make_table(names: Iterable[str], numbers: Iterable[str], title: str = "") -> Table:
     """Make a table without rows, with left-justified columns and then right-justified columns.
 
     Args:
         names: Headings of the left-justified columns, which are for names.
         numbers: Headings of the right-justified columns, which are for numbers.
+        title: Line above the table; empty: none.
     """
-    table = Table()
+    # Without lines between the columns, most tables fit into 80 characters.
+    table = Table(title=title or None, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     for heading in names:
         table.add_column(heading, overflow="fold")
     for heading in numbers:
@@ -57,7 +60,12 @@ def make_table(names: Iterable[str], numbers: Iterable[str]) -> Table:
 
 
 def print_table(
-    names: Iterable[str], numbers: Iterable[str], rows: Iterable[Iterable[str]]
+    names: Iterable[str],
+    numbers: Iterable[str],
+    rows: Iterable[Iterable[str]],
+    *,
+    title: str = "",
+    footer: Iterable[Iterable[str]] = (),
 ) -> None:
     """Print a table with left-justified columns and then right-justified columns.
 
@@ -65,9 +73,14 @@ def print_table(
         names: Headings of the left-justified columns, which are for names.
         numbers: Headings of the right-justified columns, which are for numbers.
         rows: Cells of each row.
+        title: Line above the table; empty: none.
+        footer: Cells of each row below a line.
     """
-    table = make_table(names, numbers)
+    table = make_table(names, numbers, title)
     for cells in rows:
+        table.add_row(*cells)
+    table.add_section()
+    for cells in footer:
         table.add_row(*cells)
     Console(highlight=False).print(table)
 
