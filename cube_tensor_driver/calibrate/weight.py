@@ -72,8 +72,7 @@ def fit_weight(path: Path, name: str | None = None) -> WeightFit:
         if len({calibrations[cube].id for cube in cubes}) > 1:
             raise BagError(f"{path}: its cubes have different calibrations; name one with --cube")
         pipeline = Pipeline(calibrations)
-        n_pads = np.array([calibration.layout.n_pads for calibration in calibrations])
-        pads = np.arange(pipeline.n_pads)
+        is_absent = np.isnan(pipeline.rest_frequency)
         blocks = BlockMeans(source, BLOCK_NS, pipeline.n_pads + 3)
         for rows in source:
             if rows.specific_force is None:
@@ -81,9 +80,7 @@ def fit_weight(path: Path, name: str | None = None) -> WeightFit:
                     f"{path}: it states no motion of the skin; record it while the parameter imu "
                     "or gravity of the reconstruction is set"
                 )
-            stress = pipeline.pad_stress(rows)
-            is_absent = pads >= n_pads[rows.cube, None]
-            stress[is_absent] = 0
+            stress = np.where(is_absent[rows.cube], 0, pipeline.pad_stress(rows))
             blocks.add(rows, np.hstack([stress, rows.specific_force]))
 
     responses = []

@@ -37,7 +37,6 @@ from ..kernel.contract import Offsets
 from ..pipeline import Pipeline
 from ..status import CREEP
 from .low_pass import MAX_STEP_NS, STEP_NS, LowPass
-from .models import CreepModel
 
 MAX_UNKNOWN = 100.0
 """Standard deviation of the stress on a pad, in Pa, above which the compensation of creep counts as
@@ -78,17 +77,15 @@ class Creep:
         self._models = [calibration.creep for calibration in pipeline.calibrations]
         self.has_model = np.array([model is not None for model in self._models])
         n_cubes, n_pads = offsets.reading.shape
-        times: set[float] = set()
-        for model in self._models:
-            if model is not None:
-                times.update(model.time.tolist())
+        present = {cube: model for cube, model in enumerate(self._models) if model is not None}
+        times = {time for model in present.values() for time in model.time.tolist()}
         self._times = np.array(sorted(times))
         time = np.repeat(self._times[:, None], n_cubes, axis=1)
         self._memories = LowPass(time, n_pads)
         self._amplitude = np.zeros_like(self._memories.lag)
-        for cube, model in enumerate(self._models):
-            if model is not None:
-                self._fill_amplitude(cube, model)
+        for cube, model in present.items():
+            places = np.searchsorted(self._times, model.time)
+            self._amplitude[places, cube, : model.n_pads] = model.amplitude.T
         self._total = self._amplitude.sum(axis=0)
         self._stiffness = pipeline.stiffness
         self._rest = pipeline.rest_frequency
@@ -107,12 +104,6 @@ class Creep:
         self.offset = np.zeros(shape)
         self.slope = np.zeros(shape)
         self.gain = np.zeros(shape)
-
-    def _fill_amplitude(self, cube: int, model: CreepModel) -> None:
-        """Copy the amplitudes of a cube's law to the table of all relaxation times of the skin."""
-        places = np.searchsorted(self._times, model.time)
-        pads = slice(model.n_pads)
-        self._amplitude[places, cube, pads] = model.amplitude.T
 
     @property
     def is_known(self) -> Mask:
@@ -217,12 +208,10 @@ class Creep:
             places = np.searchsorted(self._times, model.time)
             memory = reading - self._memories.lag[places, cube]
             pads = slice(model.n_pads)
-            shape = len(model.deviation), len(reading)
-            known = np.zeros(shape)
             amplitude = model.deviation.swapaxes(1, 2)
             products = amplitude * memory[:, pads]
-            known[:, pads] = products.sum(axis=1)
-            errors += list(known * stiffness)
+            known = products.sum(axis=1) * stiffness[pads]
+            errors += list(np.pad(known, [(0, 0), (0, len(reading) - model.n_pads)]))
         return np.stack(errors, axis=1)
 
     def _update_certainty(self) -> None:

@@ -62,12 +62,9 @@ class Thermal:
         """
         self._models = [calibration.thermal for calibration in pipeline.calibrations]
         self.has_model = np.array([model is not None for model in self._models])
-        n_lags = n_degrees = 0
-        for model in self._models:
-            if model is not None:
-                n_lags = max(n_lags, len(model.lag))
-                n_degrees = max(n_degrees, model.coefficient.shape[1])
-
+        present = [model for model in self._models if model is not None]
+        n_lags = max((len(model.lag) for model in present), default=0)
+        n_degrees = max((model.coefficient.shape[1] for model in present), default=0)
         stiffness = np.where(pipeline.stiffness > 0, pipeline.stiffness, np.inf)
         n = len(self._models)
         times = np.full((n_lags, n), MIN_LAG_S)
@@ -90,12 +87,9 @@ class Thermal:
             self._reference[number] = model.reference
             pads, degrees = model.coefficient.shape
             self._coefficient[:degrees, number, :pads] = model.coefficient.T
-            linear = model.coefficient[:, 0]
-            mean_square = (linear**2).mean()
-            self._slope[number] = np.sqrt(mean_square)
+            self._slope[number] = _typical_size(model.coefficient[:, :1])
             if model.ramp is not None:
-                total = (model.ramp**2).sum()
-                self._ramp[number] = np.sqrt(total / pads)
+                self._ramp[number] = _typical_size(model.ramp)
         self._coefficient /= stiffness
         self._filters = LowPass(times, n_signals=1)
 
@@ -186,10 +180,7 @@ class Thermal:
             powers = 1 + np.arange(n_degrees)
             errors.append(model.deviation * self._level[cube] ** powers)
         found = np.hstack(errors)
-        shape = n_pads, found.shape[1]
-        padded = np.zeros(shape)
-        padded[: len(found)] = found
-        return padded
+        return np.pad(found, [(0, n_pads - len(found)), (0, 0)])
 
     def parts(self) -> list[Array]:
         """Return the arrays of the state. To restore a recorded state, write into them."""
@@ -199,6 +190,11 @@ class Thermal:
             self._unknown,
             self._filters.lag,
         ]
+
+
+def _typical_size(values: Array) -> float:
+    """Return the root sum of squares of the K values of a pad, as rms over the pads (P, K)."""
+    return float(np.sqrt((values**2).sum() / len(values)))
 
 
 def filter_weights(lag: Array) -> Array:
