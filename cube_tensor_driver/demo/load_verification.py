@@ -16,10 +16,10 @@ from ..config.skin import Skin
 from ..core.arrays import AnyArray, Array, Index
 from ..core.defaults import CONTACT_PRESSURE
 from ..core.errors import MessageError
-from ..core.estimator import make_estimator
-from ..core.modes import COMPONENTS, STRESS
+from ..core.modes import COMPONENTS
+from ..core.pipeline import Pipeline
 from ..core.rows import FrequencyRows, StressRows
-from ..simulation.cubes import calibration_groups, skin_components
+from ..simulation.cubes import skin_components
 from ..simulation.load import AnyLoad
 from ..simulation.sample_log import SampleLog
 from ..touch.surface import Contact, Surface
@@ -319,21 +319,9 @@ def component_noise(skin: Skin) -> Array:
     Returns:
         Standard deviations (cubes, 15) in Pa and Pa/m; NaN where a component is not observed.
     """
-    deviations = np.empty((len(skin.cubes), len(COMPONENTS)))
-    is_stress = np.arange(len(COMPONENTS)) < len(STRESS)
-    for calibration, rows in calibration_groups(skin.calibrations):
-        estimator = make_estimator(
-            calibration.response,
-            calibration.noise,
-            calibration.modes,
-            neglect=calibration.neglect,
-        )
-        # The estimator multiplies gradients by half the side of the cube, so that they are in Pa
-        # like the stresses; this is undone here.
-        scale = np.where(is_stress, 1.0, 1 / calibration.half_side)
-        variance = np.diag(estimator.covariance)
-        deviations[rows] = np.sqrt(variance) * scale
-    return deviations
+    pipeline = Pipeline(skin.calibrations)
+    variances = [np.diag(pipeline.covariance(cube)) for cube in range(len(skin.cubes))]
+    return np.sqrt(np.array(variances))
 
 
 def thin_out(times_ns: Index) -> Index:
