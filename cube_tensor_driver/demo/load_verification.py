@@ -20,9 +20,9 @@ from ..core.modes import COMPONENTS
 from ..core.pipeline import Pipeline
 from ..core.rows import FrequencyRows, StressRows
 from ..simulation.cubes import skin_components
-from ..simulation.load import AnyLoad
+from ..simulation.load import AnyLoad, total
 from ..simulation.sample_log import SampleLog
-from ..touch.surface import Contact, Surface
+from ..touch.surface import Surface
 from .verification import Arrivals, Comparison, compare, percentile
 
 MIN_TIMES_COMPARED = 500
@@ -221,8 +221,8 @@ class LoadVerification:
             values = np.empty((self._n_cubes, len(COMPONENTS)))
             values[cube[rows]] = components[rows]
             contacts = surface.contacts(values, CONTACT_PRESSURE)
-            measured.append(total_force(contacts))
-        measured_force, measured_centre = map(np.array, zip(*measured, strict=True))
+            measured.append(total(contacts))
+        measured_force, measured_centre, _ = map(np.array, zip(*measured, strict=True))
         return ForceHistory(
             seconds=seconds,
             force=force,
@@ -331,23 +331,3 @@ def thin_out(times_ns: Index) -> Index:
         times_ns: (T,) sampling times, in ns, in ascending order.
     """
     return times_ns[:: max(1, len(times_ns) // MIN_TIMES_COMPARED)]
-
-
-def total_force(contacts: list[Contact]) -> tuple[Array, Array]:
-    """Return the sum of the forces of all contacts and their common centre of pressure.
-
-    Args:
-        contacts: Contacts with forces and positions in the parent frame of the skin.
-
-    Returns:
-        Force (3,) in N; centre of pressure (3,) in metres, NaN if there is no contact. Both are in
-        the parent frame of the skin.
-    """
-    if not contacts:
-        return np.zeros(3), np.full(3, np.nan)
-    # The common centre of pressure is the mean of the contacts' positions, weighted by their normal
-    # forces.
-    weights = [contact.normal_force for contact in contacts]
-    positions = [contact.position for contact in contacts]
-    force = np.sum([contact.force for contact in contacts], axis=0)
-    return force, np.average(positions, axis=0, weights=weights)

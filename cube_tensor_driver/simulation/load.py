@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
@@ -20,6 +20,9 @@ from ..core.errors import ConfigError
 from ..core.poses import CubePoses
 from ..mechanics import contact
 from .spline import CubicSpline
+
+if TYPE_CHECKING:
+    from ..touch.surface import Contact
 
 FRICTION_SPEED = 1e-3
 """Speed, in m/s, at which the friction force of a slide has 0.7 of its full size. It lets the force
@@ -377,7 +380,7 @@ def surface_normal(
     return np.asarray(poses.rotation[nearest, :, 2])
 
 
-def total(loads: Sequence[ContactLoad]) -> Resultant:
+def total(loads: Sequence[ContactLoad | Contact]) -> Resultant:
     """Return the total force of some contacts, their centre of pressure and mean normal.
 
     Returns:
