@@ -17,8 +17,8 @@ from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.calibration import Calibration
 from cube_tensor_driver.core.defaults import POISSONS_RATIO, SURFACE_DEPTH
-from cube_tensor_driver.core.estimator import make_estimator
 from cube_tensor_driver.core.modes import COMPONENTS
+from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.mechanics import contact
 from cube_tensor_driver.simulation.cubes import true_state
 
@@ -99,7 +99,7 @@ def sweep(points: int = 129) -> Sweep:
     gradient = passing[:, 6:].reshape(points, 6, 3)
     pads = true_state(calibration, passing[:, :6], gradient) @ calibration.response.T
 
-    estimator = make_estimator(calibration.response, calibration.noise, calibration.modes)
+    to_components = Pipeline([calibration]).matrix(0)
     left, right = (calibration.layout.pads.index(name) for name in PAIR)
     # The difference of the two pads counts as shear, with the gain of uniform shear.
     to_shear = calibration.response[:, calibration.modes.names.index("zx")]
@@ -110,7 +110,7 @@ def sweep(points: int = 129) -> Sweep:
         value=float(at_sensor[zz]),
         slope=float(at_sensor[zz_x]),
         truth=passing[:, zx],
-        cube=pads @ estimator.matrix[zx],
+        cube=pads @ to_components[zx],
         pair=(pads[:, left] - pads[:, right]) / pair_gain,
     )
 
