@@ -9,6 +9,7 @@ until each is answered, or for `ANSWER_S`; then it listens for as long as the st
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import asdict
 from typing import Protocol
 
 import numpy as np
@@ -192,7 +193,7 @@ class Conversation:
                 error.kind,
             ) from error
         # Bytes and frames are counted as well, but are no damage.
-        counters = self._listener.decoder.counters.as_dict()
+        counters = asdict(self._listener.decoder.counters)
         for name in ("bytes", "frames"):
             counters.pop(name)
         self._transcript.damage = {name: count for name, count in counters.items() if count}

@@ -303,30 +303,20 @@ class CubeNode(LifecycleNode):
 
     def _check_parameters(self, parameters: list[RclpyParameter]) -> SetParametersResult:
         for parameter in parameters:
-            reason = self._refusal(parameter.name, parameter.value)
+            # rclpy also asks about its own parameters, such as use_sim_time, which have no entry.
+            # They are not checked here.
+            known = self._parameters_by_name.get(parameter.name)
+            if known is None:
+                continue
+            reason = known.refusal(parameter.value)
+            if not reason and self.is_configured and not known.live:
+                reason = (
+                    f"parameter {known.name} cannot change while the node is configured: "
+                    "clean it up first (lifecycle)"
+                )
             if reason:
                 return SetParametersResult(successful=False, reason=shorten(reason))
         return SetParametersResult(successful=True)
-
-    def _refusal(self, name: str, value: Any) -> str:
-        """Return the reason why a parameter must not get a value now, or "" if it may.
-
-        Args:
-            name: Name of the parameter.
-            value: The requested value.
-        """
-        known = self._parameters_by_name.get(name)
-        # rclpy also asks about its own parameters, such as use_sim_time, which have no entry. They
-        # are not checked here.
-        if known is None:
-            return ""
-        refusal = known.refusal(value)
-        if not refusal and self.is_configured and not known.live:
-            return (
-                f"parameter {name} cannot change while the node is configured: "
-                "clean it up first (lifecycle)"
-            )
-        return refusal
 
     # rclpy calls the following methods at the transitions of the lifecycle.
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 import zlib
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -93,7 +94,7 @@ def same(got: list[Frame], want: list[Frame]) -> bool:
 
 
 def errors(decoder: Decoder) -> dict[str, int]:
-    counts = decoder.counters.as_dict()
+    counts = asdict(decoder.counters)
     return {name: n for name, n in counts.items() if n and name not in ("bytes", "frames")}
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import tracemalloc
 from collections.abc import Callable
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -69,7 +70,7 @@ def test_two_million_bytes_of_noise(name: str, effort: int) -> None:
     feed(decoder, noise)
     feed(decoder, b"\0")
     counters = decoder.counters
-    counted = sum(value for key, value in counters.as_dict().items() if key != "bytes")
+    counted = sum(value for key, value in asdict(counters).items() if key != "bytes")
     runs = sum(1 for run in noise.split(b"\0") if run)
     assert counted == runs and counters.bytes == len(noise) + 1
     alone = Decoder()
@@ -119,7 +120,7 @@ def test_a_crowd_of_short_runs_is_what_they_are_one_by_one(pieces: list[bytes], 
     found = together.feed(data[:cut]) + together.feed(data[cut:])
     expected = [frame for run in data.split(b"\0") for frame in alone.feed(run + b"\0")]
     assert repr(found) == repr(expected)
-    counts, others = together.counters.as_dict(), alone.counters.as_dict()
+    counts, others = asdict(together.counters), asdict(alone.counters)
     del counts["bytes"], others["bytes"]
     assert counts == others
 

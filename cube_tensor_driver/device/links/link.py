@@ -21,7 +21,7 @@ import glob
 import os
 import socket
 import sys
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
@@ -179,7 +179,7 @@ class Link:
         since the port was opened. `bytes_out` counts the sent bytes.
         """
         return {
-            **self.decoder.counters.as_dict(),
+            **asdict(self.decoder.counters),
             "opened": self.opened,
             "lost": self.lost,
             "silences": self.silences,

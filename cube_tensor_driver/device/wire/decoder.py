@@ -10,7 +10,7 @@ counter of `Counters`. `PythonDecoder` is easy to read and is used where no C co
 from __future__ import annotations
 
 import zlib
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 from . import cobs
 from .native import NOT_COMPILED, wire
@@ -52,10 +52,6 @@ class Counters:
     version: int = 0
     unknown_type: int = 0
     overrun: int = 0
-
-    def as_dict(self) -> dict[str, int]:
-        """Return the counters by name."""
-        return asdict(self)
 
 
 class PythonDecoder:
