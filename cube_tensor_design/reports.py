@@ -26,7 +26,7 @@ from cube_tensor_driver.core.layout import Layout
 from cube_tensor_driver.core.modes import COMPONENTS, STRESS
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.mechanics.influence_file import write_influence
-from cube_tensor_driver.views.terminal.output import print_table
+from cube_tensor_driver.views.terminal.output import print_table, say
 
 from .fem.body import Body
 from .fem.fem import Response, calibration_from_fem
@@ -59,8 +59,6 @@ printed, because it would be noise."""
 
 Result = Response | SurfaceStudy | VolumeResponse
 """Result of a computation of `./cube fem`."""
-
-_console = Console(highlight=False, soft_wrap=True)
 
 
 def describe(body: Body, layout: Layout) -> str:
@@ -102,7 +100,7 @@ def _show_response(result: Response) -> None:
     title = "response, Pa per Pa; below, what the symmetry does not explain"
     # A narrow terminal gets several tables one below the other.
     column = max(MIN_COLUMN_WIDTH, *(2 + len(name) for name in modes))
-    fitting = (_console.width - LABEL_WIDTH) // column
+    fitting = (Console().width - LABEL_WIDTH) // column
     count = max(1, min(MAX_MODE_COLUMNS, fitting))
     for start in range(0, len(modes), count):
         names = modes[start : start + count]
@@ -114,8 +112,8 @@ def _show_response(result: Response) -> None:
     _show_convergence(result)
     hidden = len(result.coefficients) - MAX_COEFFICIENTS_SHOWN
     if hidden > 0:
-        _console.print(f"and {hidden} coefficients more, in the --json file")
-    _console.print(
+        say(f"and {hidden} coefficients more, in the --json file")
+    say(
         f"symmetry {result.symmetry} leaves {100 * result.structure_residual:.3g} % "
         f"of the response unexplained; rank {result.rank} of {len(modes)}; "
         f"unobservable: {', '.join(result.unobservable) or 'nothing'}; {result.seconds:.1f} s"
@@ -256,7 +254,7 @@ def _show_volume(result: VolumeResponse) -> None:
     rows = _rows(result.layout.pads, result.pads, digits)
     print_table(("pad",), heads, rows, title=title)
     if result.change is not None:
-        _console.print(f"change from the mesh before: {100 * result.change:.2g} %")
+        say(f"change from the mesh before: {100 * result.change:.2g} %")
     calibration = shipped_calibration(result.layout)
     if calibration is None:
         return
@@ -267,7 +265,7 @@ def _show_volume(result: VolumeResponse) -> None:
             # Symmetry makes most components vanish but for rounding.
             if abs(value) > SMALLEST_SHOWN_STRESS:
                 text = f"{value:+.1f} Pa" if name in STRESS else f"{1e-3 * value:+.1f} Pa/mm"
-                _console.print(f"{label}measured with the shipped calibration: {name} {text}{unit}")
+                say(f"{label}measured with the shipped calibration: {name} {text}{unit}")
 
 
 def _write_weight(
@@ -319,7 +317,7 @@ def draw(result: Result, folder: Path) -> None:
 
 def show_study(result: LayoutStudy) -> None:
     """Print the narrowest trusted indenter for each component, layout and side of the cube."""
-    _console.print(
+    say(
         "narrowest indenter, mm, from which on the error stays below 20 % "
         f"of the component's range; cube's centre {1e3 * DEPTH:g} mm deep"
     )
@@ -331,7 +329,7 @@ def show_study(result: LayoutStudy) -> None:
         for component, column in zip(COMPONENTS, widths.T.tolist(), strict=True)
     ]
     print_table(("",), heads, rows)
-    _console.print("· not observed by the layout")
+    say("· not observed by the layout")
 
 
 def _format_width(width: float) -> str:
