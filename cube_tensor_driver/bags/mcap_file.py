@@ -10,16 +10,15 @@ one read per chunk instead of several per message. Source of the format: https:/
 from __future__ import annotations
 
 import struct
-from bisect import bisect_left
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from functools import lru_cache
 from io import SEEK_END, BytesIO
-from operator import itemgetter
 from pathlib import Path
 from typing import BinaryIO
 from zlib import crc32
 
+import numpy as np
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -30,7 +29,9 @@ from mcap.summary import Summary
 from mcap.writer import CompressionType, Writer
 
 from ..config.yaml import to_yaml
+from ..core.arrays import AnyArray
 from .metadata import Connection, FileSummary, QosProfile, bag_information, parse_profiles
+from .stored_messages import StoredMessages, join, join_in_blocks
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 """The bytes with which every complete MCAP file begins and ends."""
@@ -39,12 +40,24 @@ RECORD_HEAD = struct.Struct("<BQ")
 """Layout of the 9 bytes in front of each record of an MCAP file: the opcode, which is the record's
 type, and the length of the record's content in bytes."""
 
-MESSAGE_HEAD = struct.Struct("<BQHIQQ")
+_MESSAGE_HEAD = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("recorded_ns", "<i8"),
+        ("published_ns", "<i8"),
+    ]
+)
 """Layout of the 31 bytes in front of the serialised message in a message record of an MCAP file.
 
-The fields are: opcode and length (`RECORD_HEAD`), channel (number of the topic in the file),
-sequence number, time of recording and time of publication (both in ns since the Unix epoch).
+Opcode and length are those of `RECORD_HEAD`, the channel is the number of the topic in the file,
+and the times are in ns since the Unix epoch.
 """
+
+_N_CHANNELS = 1 << 16
+"""Number of different channels (numbers of topics) that an MCAP file can have."""
 
 CHUNK_BYTES = 1 << 18
 """Size, in bytes, at which the writer completes a chunk (block of messages) of an MCAP file.
@@ -80,16 +93,13 @@ CHECKSUM_BYTES = 4
 """Size, in bytes, of the checksum (CRC-32) at the end of an MCAP file's footer record. It covers
 the summary (topics and offsets of chunks)."""
 
-StoredMessage = tuple[int, int, int, bytes]
-"""A message of an MCAP file: time of recording in ns since the Unix epoch, byte offset of its chunk
-from the start of the file, channel (number of its topic), and its serialised bytes."""
-
 
 class McapReader:
     """An MCAP file open for reading.
 
     Attributes:
         summary: Topics, times and numbers of messages of the file.
+        connections: Topics of the file by their channels (numbers of the topics in the file).
     """
 
     def __init__(self, path: Path) -> None:
@@ -121,7 +131,7 @@ class McapReader:
             self._stream.close()
             raise
         self._index = index
-        self._connections = read_connections(index)
+        self.connections = read_connections(index)
         # One cache per open file, so that its chunks are freed together with this object.
         self._load_chunk = lru_cache(CACHED_CHUNKS)(self._read_chunk)
         self.summary = summarise(path.name, index)
@@ -135,8 +145,10 @@ class McapReader:
         topics: Collection[str],
         start_ns: int,
         stop_ns: int,
-    ) -> Iterator[tuple[Connection, int, bytes]]:
+    ) -> Iterator[StoredMessages]:
         """Read messages in the order of their times of recording.
+
+        If the time spans of chunks (blocks of messages) overlap, their messages are merged.
 
         Args:
             topics: Names of the topics to read.
@@ -144,41 +156,13 @@ class McapReader:
             stop_ns: Time of recording, in ns since the Unix epoch, before which messages are read.
 
         Yields:
-            The topic, the time of recording in ns, and the serialised message.
+            Groups of successive messages.
         """
         # Several channels can stand for the same topic, for example after a recorder was restarted.
-        channels = {
-            number: connection
-            for number, connection in self._connections.items()
-            if connection.topic in topics
-        }
+        channels = [number for number, one in self.connections.items() if one.topic in topics]
         if not self._index.chunk_indexes:
             yield from self._unindexed_messages(channels, start_ns, stop_ns)
             return
-        for stored in self._read_sorted(channels, start_ns, stop_ns):
-            for time_ns, _, channel, data in stored:
-                # A chunk also contains messages of other topics, and of times outside the span.
-                if channel in channels and start_ns <= time_ns < stop_ns:
-                    yield channels[channel], time_ns, data
-
-    def _read_sorted(
-        self,
-        channels: Collection[int],
-        start_ns: int,
-        stop_ns: int,
-    ) -> Iterator[Sequence[StoredMessage]]:
-        """Read the chunks (blocks of messages) that can contain wanted messages, sorted by time.
-
-        If the time spans of chunks overlap, their messages are merged.
-
-        Args:
-            channels: Wanted channels (numbers of topics in the file).
-            start_ns: Begin of the wanted span of time, in ns since the Unix epoch.
-            stop_ns: End of the wanted span of time, in ns since the Unix epoch.
-
-        Yields:
-            Groups of successive messages, which include the unwanted messages of these chunks.
-        """
         chunks = [
             chunk
             for chunk in self._index.chunk_indexes
@@ -190,23 +174,35 @@ class McapReader:
                 and chunk.message_index_offsets.keys().isdisjoint(channels)
             )
         ]
-        pending: Sequence[StoredMessage] = ()
+        is_wanted = np.zeros(_N_CHANNELS, bool)
+        is_wanted[channels] = True
+        # Messages of the chunks read so far that are not delivered yet, and the byte offsets of
+        # their chunks from the start of the file.
+        pending: StoredMessages | None = None
+        offsets = np.empty(0, int)
         chunks.sort(key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset))
         for chunk in chunks:
-            # The chunks are sorted by the times of their first messages, so waiting messages that
-            # are older than this chunk are delivered: no message that follows is older.
-            ready = bisect_left(pending, chunk.message_start_time, key=itemgetter(0))
-            yield pending[:ready]
             loaded = self._load_chunk(chunk.chunk_start_offset, chunk.chunk_length)
-            waiting = pending[ready:]
-            if not waiting:
-                pending = loaded
-                continue
-            # Messages with equal times stay in the order in which they were written to the file.
-            pending = sorted([*waiting, *loaded], key=itemgetter(0, 1))
-        yield pending
+            inside = (start_ns <= loaded.time_ns) & (loaded.time_ns < stop_ns)
+            loaded = loaded.select(inside & is_wanted[loaded.channel])
+            loaded_offsets = np.full(len(loaded), chunk.chunk_start_offset)
+            if pending is not None:
+                # The chunks are sorted by the times of their first messages, so pending messages
+                # that are older than this chunk are delivered: no message that follows is older.
+                ready = int(np.searchsorted(pending.time_ns, chunk.message_start_time))
+                yield pending.select(slice(ready))
+                late = pending.select(slice(ready, None))
+                if len(late):
+                    loaded = join([*late, *loaded])
+                    loaded_offsets = np.concatenate([offsets[ready:], loaded_offsets])
+                    # Messages with equal times stay in the order in which they were written.
+                    order = np.lexsort([loaded_offsets, loaded.time_ns])
+                    loaded, loaded_offsets = loaded.select(order), loaded_offsets[order]
+            pending, offsets = loaded, loaded_offsets
+        if pending is not None:
+            yield pending
 
-    def _read_chunk(self, offset: int, length: int) -> Sequence[StoredMessage]:
+    def _read_chunk(self, offset: int, length: int) -> StoredMessages:
         """Read one chunk (block of messages) of the file.
 
         Args:
@@ -221,34 +217,43 @@ class McapReader:
         # stops at the end of the record instead of allocating any amount of memory.
         record = BytesIO(self._stream.read(length - RECORD_HEAD.size))
         data = unpack_chunk(Chunk.read(ReadDataStream(record)))
-        # The records are parsed here, because the library mcap takes several times as long. Zeros
-        # are appended so that the head of a message can be unpacked from short records, too.
-        padded = data + bytes(MESSAGE_HEAD.size)
-        messages = []
+        # The records are found here, because the library mcap takes many times as long. What is
+        # shorter than the head of a message is none.
+        begins = []
         begin = 0
-        while begin < len(data):
-            opcode, size, channel, _, time_ns, _ = MESSAGE_HEAD.unpack_from(padded, begin)
-            end = begin + RECORD_HEAD.size + size
-            if opcode == Opcode.MESSAGE:
-                content = data[begin + MESSAGE_HEAD.size : end]
-                messages.append((time_ns, offset, channel, content))
-            begin = end
+        n_heads = max(0, len(data) - _MESSAGE_HEAD.itemsize + 1)
+        read_head = RECORD_HEAD.unpack_from
+        while begin < n_heads:
+            begins.append(begin)
+            begin += RECORD_HEAD.size + read_head(data, begin)[1]
+        # This array has a head at every byte of the data, without copying it.
+        heads: AnyArray = np.ndarray(n_heads, f"V{_MESSAGE_HEAD.itemsize}", data, strides=(1,))
+        record_begin = np.array(begins, np.intp)
+        head = heads[record_begin].view(_MESSAGE_HEAD)
+        message_begin = record_begin + _MESSAGE_HEAD.itemsize
+        # In a damaged chunk without a checksum, a record can be longer than the chunk.
+        length = np.minimum(head["length"], len(data)).astype(np.intp)
+        message_end = record_begin + RECORD_HEAD.size + length
+        is_whole = (message_begin <= message_end) & (message_end <= len(data))
+        (chosen,) = np.nonzero(is_whole & (head["opcode"] == Opcode.MESSAGE))
         # Recorders write messages of several topics slightly out of the order of their times.
-        messages.sort(key=itemgetter(0))
-        return messages
+        chosen = chosen[np.argsort(head["recorded_ns"][chosen], kind="stable")]
+        return StoredMessages(
+            data, message_begin, message_end, head["recorded_ns"], head["channel"]
+        ).select(chosen)
 
     def _unindexed_messages(
         self,
-        channels: dict[int, Connection],
+        channels: Collection[int],
         start_ns: int,
         stop_ns: int,
-    ) -> Iterator[tuple[Connection, int, bytes]]:
+    ) -> Iterator[StoredMessages]:
         """Read a file without an index of chunks (rosbag2's preset ``fastwrite``).
 
         Messages are read in the order of writing, because sorting them requires an index.
 
         Args:
-            channels: Topic of each channel (number of a topic in the file) that is read.
+            channels: Channels (numbers of topics in the file) that are read.
             start_ns: Earliest time of recording that is read, in ns since the Unix epoch.
             stop_ns: Time of recording, in ns since the Unix epoch, before which messages are read.
         """
@@ -258,9 +263,11 @@ class McapReader:
             validate_crcs=True,
             record_size_limit=MAX_CHUNK_BYTES,
         )
-        for _, channel, message in reader.iter_messages(log_time_order=False):
-            if channel.id in channels and start_ns <= message.log_time < stop_ns:
-                yield channels[channel.id], message.log_time, message.data
+        return join_in_blocks(
+            (channel.id, message.log_time, message.data)
+            for _, channel, message in reader.iter_messages(log_time_order=False)
+            if channel.id in channels and start_ns <= message.log_time < stop_ns
+        )
 
 
 class McapWriter:

@@ -9,6 +9,7 @@ types and the hashes that identify them.
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -18,8 +19,9 @@ from typing import TYPE_CHECKING, Any
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
+from ..config.input_files import read_bounded
 from ..config.package_data import package_data
-from ..config.yaml import parse_yaml, read_yaml, write_yaml
+from ..config.yaml import MAX_BYTES, parse_yaml, write_yaml
 from ..core.errors import BagError, ConfigError
 from ..messages.types import PACKAGE
 
@@ -34,6 +36,10 @@ METADATA_VERSION = 9
 
 SUFFIXES = {"mcap": ".mcap", "sqlite3": ".db3"}
 """File name suffix of each storage format; the keys are rosbag2's names of the formats."""
+
+_TOPICS = re.compile(rb"^  topics_with_message_count:\n((    |  -).*\n)*", re.MULTILINE)
+"""Pattern of the list of topics in metadata.yaml. It is most of the text, and parsing it takes
+longer than reading the messages of a bag of a few seconds."""
 
 _UNLIMITED_DURATION = {"sec": 9223372036, "nsec": 854775807}
 """Duration that states "no limit" in a quality of service profile of DDS (the middleware of ROS 2):
@@ -208,7 +214,8 @@ def read_metadata(folder: Path) -> BagFiles:
     # the storage files, which also state them.
     reason = "damaged"
     try:
-        about = read_yaml(path)["rosbag2_bagfile_information"]
+        text = _TOPICS.sub(b"", read_bounded(path, MAX_BYTES, "metadata of a bag"))
+        about = parse_yaml(text, str(path))["rosbag2_bagfile_information"]
         if (version := about.get("version", 0)) > METADATA_VERSION:
             reason = f"its version {version} is newer than {METADATA_VERSION}, the newest known one"
             _log.warning("%s: %s", path, reason)
@@ -216,7 +223,7 @@ def read_metadata(folder: Path) -> BagFiles:
         mode = str(about.get("compression_mode") or "").lower()
         # Some versions of rosbag2 write "folder/file" instead of the name of the file.
         paths = [folder / Path(name).name for name in names]
-    except (ConfigError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ConfigError, KeyError, TypeError, AttributeError) as error:
         raise BagError(
             f"{path}: {reason} ({error}); ./cube bag repair {folder} writes it again"
         ) from None

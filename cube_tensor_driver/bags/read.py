@@ -12,7 +12,7 @@ import logging
 import sqlite3
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import lru_cache, partial
 from pathlib import Path
@@ -28,16 +28,17 @@ from rosbags.typesys import TypesysError, get_types_from_msg
 from ..core.arrays import AnyArray, Times
 from ..core.errors import BagError, ConfigError, MessageError
 from ..core.rows import FrequencyRows, StressRows
-from ..messages.codec import SECOND, SHAPE_AT, Decoded, MessageCodec, frequency_codec, stress_codec
+from ..messages.codec import SECOND, Decoded, MessageCodec, frequency_codec, stress_codec
 from ..messages.types import FREQUENCIES, PACKAGE
 from .mcap_file import McapReader
 from .metadata import SUFFIXES, BagFiles, Connection, merge_connections, read_metadata, typestore
 from .sqlite_file import SqliteReader
+from .stored_messages import StoredMessages, join_in_blocks
 
 VERSION = 4
 """Version of this package's message definitions that can be read: ``SkinInfo.VERSION``."""
 
-MAX_BATCH_MESSAGES = 128
+MAX_BATCH_MESSAGES = 1 << 11
 """Largest number of messages decoded by one call of numpy. With more messages, the fixed cost of
 the call is already negligible."""
 
@@ -58,6 +59,14 @@ the memory.
 MAX_TIME_NS = (1 << 63) - 1
 """Largest time in 64 bits, in ns since the Unix epoch. It stands for the end of the bag where the
 caller gives no end."""
+
+WORKING_BLOCK_BYTES = 30 << 20
+"""Size, in bytes, of a memory block that is allocated and freed once before a bag is read.
+
+The allocator of glibc keeps freed memory up to twice the size of the largest block freed so far.
+Without this block it would return the arrays of every batch to the operating system, which takes
+time.
+"""
 
 READ_ERRORS = (
     McapError,
@@ -232,6 +241,8 @@ class Bag:
             BagError: A file is missing or damaged, or was recorded with another version of this
                 package's messages.
         """
+        # Freeing this block makes the allocator reuse the memory of each batch for the next one.
+        np.empty(WORKING_BLOCK_BYTES, np.uint8)
         # If one file cannot be opened, the files that were opened before are closed again.
         try:
             for path in self._unpacked_paths():
@@ -293,6 +304,21 @@ class Bag:
             BagError: A file of the bag is damaged, or has another number of messages than its
                 summary states.
         """
+        for file, messages in self._stored(topics, start_ns, stop_ns):
+            for channel, time_ns, data in messages:
+                connection = file.connections[channel]
+                yield Entry(connection.topic, connection.msgtype, time_ns, data)
+
+    def _stored(
+        self,
+        topics: set[str] | None,
+        start_ns: int = 0,
+        stop_ns: int = MAX_TIME_NS,
+    ) -> Iterator[tuple[McapReader | SqliteReader, StoredMessages]]:
+        """Yield groups of successive messages, and the file in which they are.
+
+        Arguments and errors are those of `entries`.
+        """
         wanted = {one.topic for one in self.connections}
         if topics is not None:
             wanted &= topics
@@ -302,15 +328,13 @@ class Bag:
             # A recorder begins a new file after the last message of the one before, so messages of
             # different files need not be merged by time.
             for file in self._files:
-                for connection, time_ns, data in file.messages(wanted, start_ns, stop_ns):
-                    count += 1
+                for messages in file.messages(wanted, start_ns, stop_ns):
+                    count += len(messages)
+                    groups: Iterable[StoredMessages] = [messages]
                     if is_packed:
-                        try:
-                            data = _decompress(data)
-                        except READ_ERRORS as error:
-                            self.skip(connection.topic, time_ns, error)
-                            continue
-                    yield Entry(connection.topic, connection.msgtype, time_ns, data)
+                        groups = join_in_blocks(self._unpack(file, messages))
+                    for group in groups:
+                        yield file, group
 
         # A damaged topic name or channel number raises no error in the libraries, but its messages
         # are missing. Therefore the number of messages is compared with the one in the summary.
@@ -320,6 +344,16 @@ class Bag:
                 f"{self.path}: damaged: {count} messages on {', '.join(sorted(wanted))}, the bag "
                 f"says {promised}; ./cube bag repair {self.path} may help"
             )
+
+    def _unpack(
+        self, file: McapReader | SqliteReader, messages: StoredMessages
+    ) -> Iterator[tuple[int, int, bytes]]:
+        """Decompress messages that rosbag2 compressed one by one; damaged ones are left out."""
+        for channel, time_ns, data in messages:
+            try:
+                yield channel, time_ns, _decompress(data)
+            except READ_ERRORS as error:
+                self.skip(file.connections[channel].topic, time_ns, error)
 
     def decoded(self, topics: set[str]) -> Iterator[tuple[int, Any]]:
         """Read messages as objects, in the order of recording; damaged ones are left out.
@@ -437,43 +471,54 @@ class Bag:
         Args:
             topic: Topic of the messages.
             codec: Codec of the message type, which determines the shape of a message.
-            decode: Function whose arguments are serialised messages and which decodes them.
+            decode: Function that decodes M serialised messages, given as bytes (M, length).
 
         Yields:
             The result of `decode` for M messages, and an array (M,) of the times at which they were
             recorded, in ns since the Unix epoch.
         """
         # Decoding many messages with one call of numpy takes hardly longer than decoding one.
-        waiting: list[bytes] = []
-        times_ns: list[int] = []
-        size = limit = 0
-        shape = b""
+        waiting: list[AnyArray] = []
+        times_ns: list[Times] = []
+        shape: tuple[int, bytes] = 0, b""
+        limit = room = 0
 
         def decode_waiting() -> Iterator[tuple[Any, Times]]:
             """Decode the collected messages together or, if one is damaged, each alone."""
+            together, at_ns = np.concatenate(waiting), np.concatenate(times_ns)
             try:
-                yield decode(*waiting), np.array(times_ns)
+                yield decode(together), at_ns
             except MessageError:
                 # One message is damaged, but the others are not, so each is decoded alone.
-                for time_ns, data in zip(times_ns, waiting, strict=True):
+                for number, time_ns in enumerate(at_ns.tolist()):
+                    one = slice(number, number + 1)
                     try:
-                        yield decode(data), np.array([time_ns])
+                        yield decode(together[one]), at_ns[one]
                     except MessageError as error:
                         self.skip(topic, time_ns, error)
 
-        for _, _, time_ns, data in self.entries({topic}):
-            has_same_shape = len(data) == size and data.startswith(shape, SHAPE_AT)
-            if len(waiting) >= limit or not has_same_shape:
-                if waiting:
-                    yield from decode_waiting()
-                waiting, times_ns = [], []
-                size, shape = len(data), codec.shape_bytes(data)
-                # The last 4 bytes of the shape are the number of rows in the message.
-                rows = int.from_bytes(shape[-4:], "little")
-                fitting = MAX_BATCH_ROWS // max(1, rows)
-                limit = max(1, min(MAX_BATCH_MESSAGES, fitting))
-            waiting.append(data)
-            times_ns.append(time_ns)
+        for _, stored in self._stored({topic}):
+            for at_ns, messages in stored.equally_long():
+                first = messages[0].tobytes()
+                new_shape = len(first), codec.shape_bytes(first)
+                if new_shape != shape:
+                    if waiting:
+                        yield from decode_waiting()
+                    waiting, times_ns, shape = [], [], new_shape
+                    # The last 4 bytes of the shape are the number of rows in the message.
+                    rows = int.from_bytes(shape[1][-4:], "little")
+                    fitting = MAX_BATCH_ROWS // max(1, rows)
+                    room = limit = max(1, min(MAX_BATCH_MESSAGES, fitting))
+                begin = 0
+                while begin < len(messages):
+                    part = slice(begin, begin + room)
+                    waiting.append(messages[part])
+                    times_ns.append(at_ns[part])
+                    begin += len(waiting[-1])
+                    room -= len(waiting[-1])
+                    if not room:
+                        yield from decode_waiting()
+                        waiting, times_ns, room = [], [], limit
         if waiting:
             yield from decode_waiting()
 

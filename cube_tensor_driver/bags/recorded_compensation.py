@@ -88,6 +88,8 @@ class CompensationReader:
             such message: unknown motion if a message read before states a motion, otherwise no
             compensation.
         """
+        if not self.is_recorded:
+            return self._default
         if wanted_ns < self._wanted_ns - MAX_DISORDER_NS:
             self._restart()
         self._wanted_ns = wanted_ns

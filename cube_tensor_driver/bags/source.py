@@ -14,6 +14,7 @@ import numpy as np
 from ..config.skin import Skin
 from ..core.arrays import AnyArray, Array, Index, Mask, Times
 from ..core.errors import BagError
+from ..core.reconstructor import RecordedHealth
 from ..core.rows import FrequencyRows
 from ..messages.codec import Decoded
 from ..messages.types import FREQUENCIES
@@ -32,12 +33,14 @@ class Segment(NamedTuple):
             frequencies) with which these frequencies were reconstructed.
         states: States of creep and temperature, by name, that the reconstruction had before the
             first of these messages; empty: it continued with its states after the message before.
+        health: Recorded health of the pads for the rows; None: it was not asked for.
     """
 
     messages: Decoded[FrequencyRows]
     recorded_ns: Times
     number: int
     states: Mapping[str, Array]
+    health: RecordedHealth | None
 
 
 class BagSource:
@@ -112,29 +115,38 @@ class BagSource:
         self.rows -= len(segment.messages.rows)
         self.bag.skip(self.topic, int(segment.recorded_ns[0]), error, count)
 
-    def segments(self) -> Iterator[Segment]:
+    def segments(self, *, use_health: bool = False) -> Iterator[Segment]:
         """Yield all messages in the order of recording, with their rows (samples of cubes).
 
         Each segment has successive messages with the same cubes, SkinInfo (calibrations and rest
         frequencies) and compensation (removal of weight, creep and temperature).
 
+        Args:
+            use_health: Whether to read the recorded health of the pads, too.
+
         Raises:
             BagError: The bag is damaged.
         """
         for messages, recorded_ns in self.bag.frequencies(self.topic):
-            yield from self._divide(messages, recorded_ns)
+            # The health is read before messages are divided, because the recorded stress was
+            # decoded in the same groups.
+            health = self.recording.health_at(messages.rows) if use_health else None
+            yield from self._divide(messages, recorded_ns, health)
 
     def _divide(
         self,
         messages: Decoded[FrequencyRows],
         recorded_ns: Times,
+        health: RecordedHealth | None,
     ) -> Iterator[Segment]:
         """Divide successive messages of frequencies into segments.
 
         Args:
             messages: M messages of frequencies.
             recorded_ns: (M,) time at which each was recorded, in ns since the Unix epoch.
+            health: Recorded health of the pads for their rows, or None.
         """
+        n_rows = len(messages.rows) // len(messages)
         cube = messages.by_message(messages.rows.cube)
         info_index = self._find_infos(messages)
         compensation = self.recording.compensation
@@ -153,11 +165,13 @@ class BagSource:
                 part = compensation.add_forces(messages.select(chosen), recorded[chosen])
                 self.messages += len(part)
                 self.rows += len(part.rows)
+                rows = slice(first * n_rows, (first + step) * n_rows)
                 yield Segment(
                     messages=part,
                     recorded_ns=recorded_ns[chosen],
                     number=int(info_index[first]),
                     states=recorded[first].states,
+                    health=health.select(rows) if health else None,
                 )
 
     def _find_infos(self, messages: Decoded[FrequencyRows]) -> Index:

@@ -20,6 +20,7 @@ from .metadata import (
     parse_profiles,
     type_hash,
 )
+from .stored_messages import StoredMessages, join_in_blocks
 
 _TABLES = """
 CREATE TABLE schema(schema_version INTEGER PRIMARY KEY, ros_distro TEXT NOT NULL);
@@ -56,6 +57,7 @@ class SqliteReader:
 
     Attributes:
         summary: Topics, times and numbers of messages of the file.
+        connections: Topics of the file by their ids in the table ``topics``.
     """
 
     def __init__(self, path: Path) -> None:
@@ -73,7 +75,7 @@ class SqliteReader:
             check_same_thread=False,
         )
         try:
-            self._connections = self._read_connections()
+            self.connections = self._read_connections()
             (found,) = self._database.execute(
                 "SELECT min(timestamp), max(timestamp), (SELECT count(*) FROM messages)"
                 " FROM messages WHERE typeof(timestamp) = 'integer'"
@@ -81,7 +83,7 @@ class SqliteReader:
         except BaseException:
             self._database.close()
             raise
-        connections = list(self._connections.values())
+        connections = list(self.connections.values())
         # SQL's min and max are NULL (None) if the file has no message.
         start_ns, end_ns, total = found
         self.summary = FileSummary(
@@ -103,7 +105,7 @@ class SqliteReader:
         topics: Collection[str],
         start_ns: int,
         stop_ns: int,
-    ) -> Iterator[tuple[Connection, int, bytes]]:
+    ) -> Iterator[StoredMessages]:
         """Read messages in the order of their times of recording.
 
         Args:
@@ -112,17 +114,16 @@ class SqliteReader:
             stop_ns: Time of recording, in ns since the Unix epoch, before which messages are read.
 
         Yields:
-            The topic, the time of recording in ns, and the serialised message.
+            Groups of successive messages, whose channels are ids in the table ``topics``.
         """
-        numbers = [number for number, one in self._connections.items() if one.topic in topics]
+        numbers = [number for number, one in self.connections.items() if one.topic in topics]
         places = ",".join("?" * len(numbers))
-        rows = self._database.execute(
+        rows: Iterator[tuple[int, int, bytes]] = self._database.execute(
             f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({places})"
             f" AND {_IS_SOUND} AND timestamp >= ? AND timestamp < ? ORDER BY timestamp, id",
             [*numbers, start_ns, stop_ns],
         )
-        for number, time_ns, data in rows:
-            yield self._connections[number], time_ns, data
+        return join_in_blocks(rows)
 
     def _read_connections(self) -> dict[int, Connection]:
         """Read the topics of the file by their ids in the table ``topics``."""

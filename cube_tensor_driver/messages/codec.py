@@ -262,25 +262,28 @@ class MessageCodec(Generic[AnyRows]):
         self._find_end = lru_cache(MAX_CACHED_LAYOUTS)(self._compute_end)
         self._find_layout = lru_cache(MAX_CACHED_LAYOUTS)(self._make_layout)
 
-    def decode(self, *messages: bytes) -> Decoded[AnyRows]:
-        """Decode one or several serialised messages whose lengths and `shape_bytes` are equal.
+    def decode(self, messages: bytes | AnyArray) -> Decoded[AnyRows]:
+        """Decode one or several serialised messages.
+
+        Args:
+            messages: The bytes of one message, or an array (M, length) of the bytes of M messages.
 
         Raises:
             MessageError: A message is too short, its fields contradict each other, or the messages
-                have different numbers of rows or pads.
+                have different frame ids or numbers of rows or pads.
         """
-        layout, record, stamp_ns = self._read_records(messages)
+        record, stamp_ns = self._read_records(messages)
         times_ns = _row_times(record, stamp_ns)
         rows: AnyRows = self.make_rows(record, times_ns)
-        frame_id = messages[0][_FRAME_AT : _FRAME_AT + layout.shape.frame]
+        frame_id = record["frame_id"][0].tobytes()
         return Decoded(rows, stamp_ns, frame_id)
 
-    def decode_columns(self, names: Sequence[str], *messages: bytes) -> list[AnyArray]:
+    def decode_columns(self, names: Sequence[str], messages: bytes | AnyArray) -> list[AnyArray]:
         """Decode only some columns of the rows, without copying the others.
 
         Args:
             names: Names of the columns, for example "cube".
-            messages: Serialised messages whose lengths and `shape_bytes` are equal.
+            messages: See `decode`.
 
         Returns:
             The column `stamp_ns`, in ns since the Unix epoch, then the named columns.
@@ -288,7 +291,7 @@ class MessageCodec(Generic[AnyRows]):
         Raises:
             MessageError: See `decode`.
         """
-        _, record, stamp_ns = self._read_records(messages)
+        record, stamp_ns = self._read_records(messages)
         columns = [_row_times(record, stamp_ns)]
         for name in names:
             columns.append(_read_column(record, name))
@@ -404,41 +407,36 @@ class MessageCodec(Generic[AnyRows]):
         if self._n_fields_before_pads is not None:
             record["n_pads"] = layout.shape.pads
 
-    def _read_records(self, messages: Sequence[bytes]) -> tuple[_Layout, AnyArray, Times]:
+    def _read_records(self, messages: bytes | AnyArray) -> tuple[AnyArray, Times]:
         """View serialised messages as an array (M,) of the structured dtype of their layout.
 
         The layout states the byte offset and type of each field.
 
         Args:
-            messages: M serialised messages whose lengths and `shape_bytes` are equal.
+            messages: See `decode`.
 
         Returns:
-            The layout of the messages, the array, and the time stamps of the headers (M,), in ns
-            since the Unix epoch.
+            The array, and the time stamps of the headers (M,), in ns since the Unix epoch.
 
         Raises:
             MessageError: See `decode`.
         """
-        layout = self._find_layout(self._read_shape(messages[0]))
-        size, count = layout.record.itemsize, len(messages)
-        data = messages[0]
-        if count > 1:
-            # DDS middleware may have added bytes at the end of a message, which are cut off.
-            data = b"".join(message[:size] for message in messages)
-            if len(data) != count * size:
+        first = messages if isinstance(messages, bytes) else messages[0].tobytes()
+        layout: _Layout = self._find_layout(self._read_shape(first))
+        stamp_ns = np.array([self._read_stamp(layout, first)])
+        if isinstance(messages, bytes) or len(messages) == 1:
+            return np.frombuffer(first, layout.record, 1), stamp_ns
+        # DDS middleware may have added bytes at the end of the messages, which are cut off.
+        content = np.ascontiguousarray(messages[:, : layout.record.itemsize])
+        record: AnyArray = content.view(layout.record)[:, 0]
+        for name in ("frame_id", *(f"length of {name}" for name in layout.sequences)):
+            if (record[name] != record[name][0]).any():
                 raise MessageError(
-                    f"{self._name}: {count} messages of different lengths; decode them one by one"
+                    f"{self._name}: {len(messages)} messages differ in the {name}; decode them one "
+                    "by one"
                 )
-        record: AnyArray = np.frombuffer(data, layout.record, count)
-        # The lengths of many messages are compared by numpy. Only if some differ, or for a single
-        # message, each is checked by `_read_stamp`.
-        lengths = record[[f"length of {name}" for name in layout.sequences]]
-        checked = messages if (lengths != lengths[0]).any() else messages[:1]
-        stamps = [self._read_stamp(layout, message) for message in checked]
-        if len(stamps) == count:
-            return layout, record, np.array(stamps)
         stamp_ns = record["sec"].astype(np.int64) * SECOND + record["nanosec"]
-        return layout, record, stamp_ns
+        return record, stamp_ns
 
     def _read_shape(self, data: bytes) -> _Shape:
         """Return the length of the frame id and the numbers of rows and pads that a message states.

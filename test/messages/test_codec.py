@@ -98,12 +98,17 @@ def test_bytes_are_those_of_rosbags_both_ways(kind, frame_id, n):
     assert_equal(read.rows, rows)
 
 
+def joined(*messages: bytes) -> np.ndarray:
+    """The bytes of messages of equal length, one row each."""
+    return np.frombuffer(b"".join(messages), np.uint8).reshape(len(messages), -1)
+
+
 @pytest.mark.parametrize("kind", [FREQUENCIES, STRESS])
 def test_several_messages_are_decoded_and_encoded_together(kind):
     codec = CODECS[kind]
     each = [rows_of(kind, 5) for _ in range(3)]
     data = [by_rosbags(kind, rows, "skin") for rows in each]
-    read = codec.decode(*data)
+    read = codec.decode(joined(*data))
     assert len(read) == 3 and read.by_message(read.rows.cube).shape == (3, 5)
     for k, rows in enumerate(each):
         assert_equal(read.rows.select(slice(5 * k, 5 * k + 5)), rows)
@@ -137,7 +142,7 @@ def test_every_count_that_contradicts_the_rows_is_refused(kind):
                 codec.decode(bytes(wrong))
             if name != "cube":
                 with pytest.raises(MessageError):
-                    codec.decode(data, bytes(wrong))
+                    codec.decode(joined(data, bytes(wrong)))
 
 
 @pytest.mark.parametrize("kind", [FREQUENCIES, STRESS])
@@ -164,9 +169,12 @@ def test_a_message_cut_off_anywhere_is_refused(kind):
     for end in range(len(data)):
         with pytest.raises(MessageError):
             codec.decode(data[:end])
-        with pytest.raises(MessageError):
-            codec.decode(data, data[:end])
-    assert len(codec.decode(data + bytes(3)).rows) == 2  # middleware fills up to a multiple of 4
+    for padded in (data + bytes(3), joined(data + bytes(3))):
+        assert len(codec.decode(padded).rows) == 2  # middleware fills up to a multiple of 4
+    read = codec.decode(joined(data + bytes(3), data + bytes(3)))
+    assert codec.encode_many(read.rows, read.stamp_ns, read.frame_id) == [data, data]
+    with pytest.raises(MessageError, match="differ in the frame_id"):
+        codec.decode(joined(data, data.replace(b"skin", b"skim")))
     with pytest.raises(MessageError):
         codec.decode(data + bytes(4))
     with pytest.raises(MessageError, match="little-endian"):

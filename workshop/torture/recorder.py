@@ -156,8 +156,9 @@ class TopicLog(Generic[AnyRows]):
         unreadable = 0
         for _, group in groupby(enumerate(self._messages), self._batch_of):
             messages = [message.data for _, message in group]
+            data = np.frombuffer(b"".join(messages), np.uint8)
             try:
-                batch = self._codec.decode(*messages)
+                batch = self._codec.decode(data.reshape(len(messages), -1))
             except MessageError:
                 # The checks report unreadable messages, so the run goes on.
                 unreadable += len(messages)

@@ -11,12 +11,14 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ...config.yaml import read_yaml, write_yaml
 from ...core.errors import BagError, CubeError
-from .contacts import ContactOptions
 from .job import PARTIAL_FOLDER, Overrides, ReprocessJob, ReprocessResult, reprocess
+
+if TYPE_CHECKING:
+    from .contacts import ContactOptions
 
 SUFFIXES = {
     "bag": "",

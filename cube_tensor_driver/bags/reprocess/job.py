@@ -34,22 +34,14 @@ from ..recording import Settings, reconstruct_rows
 from ..source import BagSource, Segment
 from ..tables import TableWriter
 from ..write import BagWriter
-from .contacts import ContactOptions, ContactWriter
 
 if TYPE_CHECKING:
     from ..zarr_table import ZarrWriter
+    from .contacts import ContactOptions
 
 PARTIAL_FOLDER = ".partial"
 """Name of the folder, beside the results, for incomplete results. After an interruption, incomplete
 results are computed again from the start."""
-
-WORKING_BLOCK_BYTES = 30 << 20
-"""Size, in bytes, of a memory block that is allocated and freed once before reprocessing.
-
-The allocator of glibc keeps freed memory up to twice the size of the largest block freed so far.
-Without this block it would return the arrays of every batch to the operating system, which takes
-time.
-"""
 
 MAX_NAMED_CUBES = 5
 """Largest number of cubes that one error message names."""
@@ -127,8 +119,6 @@ def reprocess(job: ReprocessJob) -> ReprocessResult:
         BagError: The bag is damaged, the overrides do not fit its cubes, or the output cannot be
             written.
     """
-    # Freeing this block makes the allocator reuse the memory of each batch for the next one.
-    np.empty(WORKING_BLOCK_BYTES, np.uint8)
     # Renaming the complete output requires that both names are in the same file system.
     partial = job.output.parent / PARTIAL_FOLDER / job.output.name
     try:
@@ -278,6 +268,9 @@ def _write_skin(
 
     contacts = None
     if job.contacts is not None:
+        # Importing the models of contacts takes longer than reprocessing a small bag.
+        from .contacts import ContactWriter
+
         contacts = ContactWriter(writer, skin, job.contacts)
     use_health = not job.overrides.any
     for segment, stress in _reconstruct(source, settings, use_health=use_health):
@@ -309,9 +302,7 @@ def _reconstruct(
     number = -1
     ids: list[str] = []
     refused: CubeError | None = None
-    for segment in source.segments():
-        rows = segment.messages.rows
-        health = source.recording.health_at(rows) if use_health else None
+    for segment in source.segments(use_health=use_health):
         if segment.number != number:
             number = segment.number
             current = settings[number]
@@ -325,7 +316,7 @@ def _reconstruct(
         if use_health:
             reconstructor.compensation.restore(segment.states)
         try:
-            stress = reconstruct_rows(reconstructor, rows, health)
+            stress = reconstruct_rows(reconstructor, segment.messages.rows, segment.health)
         except CubeError as error:
             # These messages do not fit the skin, for example in the number of pads. The ROS node
             # leaves them out, too.

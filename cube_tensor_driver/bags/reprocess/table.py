@@ -73,17 +73,17 @@ def frequency_table(source: BagSource) -> pyarrow.Table:
     # Values that apply from the next row on: rest frequencies, states of creep and temperature.
     changes: dict[str, Array] = {}
     parts: list[pyarrow.Table] = []
-    for segment in source.segments():
+    for segment in source.segments(use_health=True):
         rows = segment.messages.rows
         changes |= segment.states
         if segment.number != number:
             number = segment.number
             changes["rest_frequency"] = recording.settings[number].rest_frequency
         # Changes that come with messages without rows are kept until there is a row.
-        if not len(rows):
+        health = segment.health
+        if not len(rows) or health is None:
             continue
 
-        health = recording.health_at(rows)
         unknown = ~health.known
         part = np.full(len(rows), len(parts), np.int32)
         columns = {
@@ -156,9 +156,13 @@ def reprocess_table(frequencies: pyarrow.Table, skin: CalibratedSkin) -> pyarrow
         if missing:
             names = ", ".join(sorted(missing))
             raise LayoutError(f"no {names} in the table; frequency_table makes one of a bag")
-        cube = columns["cube"].cast(pyarrow.string())
-        number = pyarrow.compute.index_in(cube, value_set=known_names)
-        columns["cube"] = number.fill_null(len(known_names)).cast(pyarrow.uint16())
+        cube = columns["cube"]
+        if not pyarrow.types.is_dictionary(cube.type):
+            cube = cube.dictionary_encode()
+        names = cube.dictionary.cast(pyarrow.string())
+        found = pyarrow.compute.index_in(names, value_set=known_names)
+        number = found.take(cube.indices).fill_null(len(known_names))
+        columns["cube"] = number.cast(pyarrow.uint16())
         _restore(reconstructor, columns)
         attributes = {
             attribute: as_array(columns[name])

@@ -1,0 +1,102 @@
+# Copyright 2026 cube_tensor_driver authors
+# SPDX-License-Identifier: Apache-2.0
+"""Messages of a storage file in arrays, so that numpy finds and copies many of them at once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from ..core.arrays import AnyArray, Index, Times
+
+BLOCK_BYTES = 1 << 18
+"""Total size, in bytes, of messages that are put together where the file itself has no blocks."""
+
+
+@dataclass(frozen=True, slots=True)
+class StoredMessages:
+    """N messages in the order of their times of recording.
+
+    Attributes:
+        data: Bytes in which the serialised messages lie.
+        begin: (N,) byte offsets in `data` at which the messages begin.
+        end: (N,) byte offsets in `data` at which they end.
+        time_ns: (N,) times of recording, in ns since the Unix epoch.
+        channel: (N,) number of each message's topic in the file.
+    """
+
+    data: bytes
+    begin: Index
+    end: Index
+    time_ns: Times
+    channel: AnyArray
+
+    def __len__(self) -> int:
+        return len(self.begin)
+
+    def __iter__(self) -> Iterator[tuple[int, int, bytes]]:
+        """Yield channel, time of recording in ns, and serialised bytes of each message."""
+        columns = (self.channel, self.time_ns, self.begin, self.end)
+        for channel, time_ns, begin, end in zip(*(one.tolist() for one in columns), strict=True):
+            yield channel, time_ns, self.data[begin:end]
+
+    def select(self, chosen: Any) -> StoredMessages:
+        """Return the messages that a slice, a mask or numbers of messages choose."""
+        return StoredMessages(
+            self.data,
+            self.begin[chosen],
+            self.end[chosen],
+            self.time_ns[chosen],
+            self.channel[chosen],
+        )
+
+    def equally_long(self) -> Iterator[tuple[Times, AnyArray]]:
+        """Divide the messages into groups of successive messages of equal length.
+
+        Yields:
+            For each group of M messages: times of recording (M,) in ns, and bytes (M, length).
+        """
+        sizes = self.end - self.begin
+        bounds = [0, *(np.flatnonzero(np.diff(sizes)) + 1).tolist(), len(self)]
+        for first, last in pairwise(bounds):
+            if first < last:
+                size = int(sizes[first])
+                # All windows of this length within the data, which overlap; none is copied.
+                shape = (len(self.data) - size + 1, size)
+                windows: AnyArray = np.ndarray(shape, np.uint8, self.data, strides=(1, 1))
+                yield self.time_ns[first:last], windows[self.begin[first:last]]
+
+
+def join(messages: Sequence[tuple[int, int, bytes]]) -> StoredMessages:
+    """Put single messages together.
+
+    Args:
+        messages: Channel, time of recording in ns, and serialised bytes of each message; at least
+            one.
+    """
+    channel, time_ns, data = zip(*messages, strict=True)
+    sizes = np.array([len(one) for one in data])
+    end = np.cumsum(sizes)
+    return StoredMessages(b"".join(data), end - sizes, end, np.array(time_ns), np.array(channel))
+
+
+def join_in_blocks(messages: Iterable[tuple[int, int, bytes]]) -> Iterator[StoredMessages]:
+    """Put single messages together in blocks of at least `BLOCK_BYTES`; the last may be smaller.
+
+    Args:
+        messages: Channel, time of recording in ns, and serialised bytes of each message.
+    """
+    waiting: list[tuple[int, int, bytes]] = []
+    size = 0
+    for message in messages:
+        waiting.append(message)
+        size += len(message[2])
+        if size >= BLOCK_BYTES:
+            yield join(waiting)
+            waiting, size = [], 0
+    if waiting:
+        yield join(waiting)
