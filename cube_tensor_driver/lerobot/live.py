@@ -54,12 +54,17 @@ MIN_HEIGHT = 4 * MIN_SQUARE
 """Smallest height of a picture, in pixels, so that the frame number, which is two rows of squares
 (`NUMBER_GRID`), covers at most half of it."""
 
-HANDOVER_S = 1e-3
-"""Time, in s, for which `next_picture` sleeps before it takes the samples that have arrived.
+MAX_AGE_NS = 5_000_000
+"""Age, in ns, from which on a sample must be in the frame that is read; but at least one sampling
+period, within which there need not be a new sample."""
 
-Only one thread of Python runs at a time. While the thread of the recorder computes, the threads
-that read the links wait up to 5 ms each (`sys.getswitchinterval`) for their turn. While it sleeps,
-they process the bytes that have arrived; otherwise these samples would be missing in the frame.
+CATCH_UP_S = 0.02
+"""Longest time, in s, for which `next_picture` waits for samples that are older than `MAX_AGE_NS`.
+
+Only one thread of Python runs at a time. While the recorder or its writers of images compute, each
+of the two threads that a sample passes waits up to 5 ms (`sys.getswitchinterval`) for its turn, and
+on a busy computer longer. They run while `next_picture` waits, for which half a frame of a data set
+of 30 frames per second is left.
 """
 
 UNKNOWN_GREY = 90
@@ -116,6 +121,9 @@ class LiveWindows:
         self._writer: pyarrow.ipc.RecordBatchStreamWriter | None = None
         self._file: pyarrow.NativeFile | None = None
         self._rows: list[StressRows] = []
+        self._newest_ns = 0
+        rate = source.skin.rate
+        self._max_age_ns = max(MAX_AGE_NS, round(1e9 / rate) if rate else 0)
         self._failure: CubeError | None = None
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._collect, daemon=True)
@@ -135,8 +143,11 @@ class LiveWindows:
             TimeoutError: No sample arrived.
             CubeError: The thread that reads the links has failed.
         """
-        time.sleep(HANDOVER_S)
+        wanted_ns = time.time_ns() - self._max_age_ns
         with self._changed:
+            self._changed.wait_for(
+                lambda: self._newest_ns >= wanted_ns or self._failure, min(CATCH_UP_S, timeout_s)
+            )
             self._changed.wait_for(lambda: self._rows or self._failure, timeout_s)
             parts, self._rows = self._rows, []
         if not parts:
@@ -173,6 +184,7 @@ class LiveWindows:
                 stress = reconstruct(rows)
                 with self._changed:
                     self._rows.append(stress)
+                    self._newest_ns = int(stress.stamp_ns.max(initial=0))
                     self._changed.notify()
         except CubeError as error:
             with self._changed:

@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import sys
 import threading
+import time
 from itertools import pairwise
 from pathlib import Path
 
@@ -151,7 +152,7 @@ def test_live_windows_have_the_bits_of_the_export_of_the_same_run(tmp_path):
 
 def test_a_frame_has_what_arrived_while_the_recorder_computed(tmp_path, monkeypatch):
     """No other thread runs between the arrival of a scan and the reading of the frame."""
-    monkeypatch.setattr(live_module, "HANDOVER_S", 0.3)
+    monkeypatch.setattr(live_module, "CATCH_UP_S", 0.3)
     skin = read_skin(package_data() / "config" / "skin_demo.yaml")
     cubes = len(skin.cubes)
     with ctd.simulate(skin, duration=0.02, rate=RATE) as simulated:
@@ -179,6 +180,34 @@ def test_a_frame_has_what_arrived_while_the_recorder_computed(tmp_path, monkeypa
     live.close()
     window = RecordedWindows(tmp_path / "touch").of(picture)
     np.testing.assert_array_equal(window[f"{TACTILE}.count"], [2] * cubes)
+
+
+def test_a_frame_waits_for_samples_that_are_older_than_5_ms_only(tmp_path, monkeypatch):
+    """The newest sample is 50 ms old, so the one that arrives 0.1 s later is waited for; a sample
+    of now is not waited for."""
+    monkeypatch.setattr(live_module, "CATCH_UP_S", 10.0)
+    skin = read_skin(package_data() / "config" / "skin_demo.yaml")
+    cubes = len(skin.cubes)
+    source = HeldSource(skin)
+    live = LiveWindows(source, tmp_path / "touch", **SIZE)
+
+    def give(age_ns: int) -> None:
+        rest = [cube.calibration.rest_frequency for cube in skin.cubes]
+        rows = FrequencyRows.of(range(cubes), rest, stamp_ns=time.time_ns() - age_ns)
+        source.give(rows)
+
+    give(50_000_000)
+    thread = threading.Timer(0.1, give, [-10_000_000_000])
+    thread.start()
+    pictures = [live.next_picture(20.0)]
+    thread.join()
+    give(-10_000_000_000)
+    begin = time.monotonic()
+    pictures.append(live.next_picture(20.0))
+    assert time.monotonic() - begin < 9
+    live.close()
+    recorded = RecordedWindows(tmp_path / "touch")
+    assert [len(recorded.of(picture)[TACTILE]) for picture in pictures] == [2, 1]
 
 
 def assert_picture_shows(picture: np.ndarray, last: StressRows) -> None:
