@@ -8,6 +8,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from ..core.arguments import join_names
 from ..core.arrays import Array
 from .skin import Skin
 
@@ -70,9 +71,7 @@ def _find_shared_positions(skin: Skin, positions: Array) -> Iterator[str]:
     group = group.reshape(-1)  # numpy 2.0, but no other version, returns shape (cubes, 1)
     for number in np.flatnonzero(count > 1).tolist():
         members = [skin.cubes[member] for member in np.flatnonzero(group == number)]
-        names = ", ".join(repr(cube.name) for cube in members[:MAX_NAMES])
-        if len(members) > MAX_NAMES:
-            names += f" and {len(members) - MAX_NAMES} more"
+        names = join_names([repr(cube.name) for cube in members], MAX_NAMES)
         yield f"cubes: {names} are at one place, [{_format(members[0].xyz)}] m; correct xyz"
 
 

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from numbers import Real
 
 import numpy as np
@@ -81,3 +81,15 @@ def read_numbers(
         raise error(f"{name} holds NaN or Inf; every value must be finite")
     array.flags.writeable = False
     return array
+
+
+def join_names(names: Sequence[str], limit: int) -> str:
+    """Return a text with the first names, such as "a, b and 3 more", for an error message.
+
+    Args:
+        names: The names.
+        limit: Maximum number of names that are listed; of further names the number is stated.
+    """
+    listed = ", ".join(names[:limit])
+    n_hidden = len(names) - limit
+    return f"{listed} and {n_hidden} more" if n_hidden > 0 else listed

@@ -10,10 +10,11 @@ Source: Kiyota & Shinoda, eq. 1.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
+from .arguments import join_names
 from .arrays import Array
 from .errors import CalibrationError, LayoutError
 from .layout import LAYOUTS
@@ -121,13 +122,14 @@ def response(structure: Structure, coefficients: Mapping[str, float]) -> Array:
     Raises:
         CalibrationError: Coefficients are missing or unknown.
     """
-    missing = set(structure.names) - set(coefficients)
-    unknown = set(coefficients) - set(structure.names)
+    missing = sorted(set(structure.names) - set(coefficients))
+    unknown = sorted(set(coefficients) - set(structure.names))
     if missing or unknown:
         raise CalibrationError(
             f"layout {structure.layout.name!r} with symmetry {structure.symmetry!r} has "
-            f"{structure.n_coefficients} coefficients; missing {_list_names(missing)}, "
-            f"unknown {_list_names(unknown)}"
+            f"{structure.n_coefficients} coefficients; "
+            f"missing {join_names(missing, MAX_LISTED_NAMES) or 'none'}, "
+            f"unknown {join_names(unknown, MAX_LISTED_NAMES) or 'none'}"
         )
     values = [coefficients[name] for name in structure.names]
     return np.tensordot(values, structure.basis, axes=1)
@@ -163,16 +165,3 @@ def project(structure: Structure, matrix: Array) -> tuple[dict[str, float], floa
     size = np.linalg.norm(matrix)
     relative = float(remainder / size) if size else 0.0
     return coefficients, relative
-
-
-def _list_names(names: Iterable[str]) -> str:
-    """Return a text with the first `MAX_LISTED_NAMES` names in alphabetical order.
-
-    If there are more, it ends with their number.
-    """
-    ordered = sorted(names)
-    if not ordered:
-        return "none"
-    hidden = len(ordered) - MAX_LISTED_NAMES
-    more = f" and {hidden} more" if hidden > 0 else ""
-    return ", ".join(ordered[:MAX_LISTED_NAMES]) + more

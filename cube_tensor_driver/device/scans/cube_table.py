@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.arguments import join_names
 from ..wire.protocol import Hello, Sample
 from .row_counts import RowCounts
 
@@ -235,7 +236,8 @@ class CubeTable:
             names.setdefault(("the hub's cube", problem), []).append(f"{index} (uid {uid:#x})")
         problems = []
         for (noun, text), group in names.items():
-            problems.append(_join_names(noun, group, text))
+            plural = "s" if len(group) > 1 else ""
+            problems.append(f"{noun}{plural} {join_names(group, MAX_NAMES)} {text}")
         return cubes, problems
 
 
@@ -277,17 +279,3 @@ def _locate(
             "correct the layout and calibration in the skin file"
         )
     return index, ""
-
-
-def _join_names(what: str, names: Sequence[str], text: str) -> str:
-    """Return one line about several cubes, which lists the first `MAX_NAMES` names.
-
-    Args:
-        what: Noun of the cubes, in the singular.
-        names: Names of the cubes.
-        text: Statement about all of these cubes, such as "not in the skin file: add it there".
-    """
-    plural = "s" if len(names) > 1 else ""
-    listed = ", ".join(names[:MAX_NAMES])
-    more = f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else ""
-    return f"{what}{plural} {listed}{more} {text}"
