@@ -48,6 +48,27 @@ class Section:
         slopes = np.stack([shape[0].grad for shape in self.basis.basis])
         self._gradient = sample_matrix(self.basis, slopes)
         self._linear_tangent: sp.csr_matrix | None = None
+        self._set_up_tangent(slopes)
+
+    def _set_up_tangent(self, slopes: Array) -> None:
+        """Prepare what all tangents share.
+
+        Args:
+            slopes: Gradients (n, 2, 2, E, Q) of the n shape functions of each element.
+
+        This sets `_slopes` (E, Q, 4, n), these gradients by quadrature point; `_rows` and
+        `_columns`, which of the unknowns each entry of the sparse tangent belongs to; and `_entry`
+        (E x n x n,), the entry to which a pair of unknowns of an element contributes.
+        """
+        n = len(slopes)
+        by_point = np.moveaxis(slopes.reshape(n, 4, *slopes.shape[3:]), (0, 1), (3, 2))
+        self._slopes = np.ascontiguousarray(by_point)
+        dofs = self.basis.element_dofs.T.astype(np.int64)
+        rows = np.repeat(dofs, n, axis=1)
+        columns = np.tile(dofs, (1, n))
+        pairs = rows.ravel() * self.basis.N + columns.ravel()
+        entries, self._entry = np.unique(pairs, return_inverse=True)
+        self._rows, self._columns = np.divmod(entries, self.basis.N)
 
     def node(self, x: float, z: float) -> int:
         """Return the number of the corner of an element that is nearest to this point."""
@@ -90,12 +111,19 @@ class Section:
         if self._linear_tangent is not None:
             return self._linear_tangent
         moduli = self.material.moduli(self.deformation(u)) * self.basis.dx
-        # Components ij and kl of the gradient at the same point depend on each other.
-        by_component = moduli.reshape(4, 4, -1)
-        blocks = [[sp.diags(entries) for entries in row] for row in by_component]
-        stress_change = sp.bmat(blocks, format="csr")
-        weighted = stress_change @ self._gradient
-        matrix = (self._gradient.T @ weighted).tocsr()
+        n_elements, n_points = self.basis.dx.shape
+        by_component = moduli.reshape(4, 4, n_elements, n_points)
+        by_point = np.moveaxis(by_component, (0, 1), (2, 3))
+
+        # In each element, all quadrature points and components are summed by one product.
+        n = self._slopes.shape[-1]
+        slopes = self._slopes.reshape(n_elements, -1, n)
+        stress_change = (by_point @ self._slopes).reshape(slopes.shape)
+        by_element = slopes.swapaxes(1, 2) @ stress_change
+
+        values = np.bincount(self._entry, by_element.ravel())
+        size = self.basis.N
+        matrix = sp.csr_matrix((values, (self._rows, self._columns)), (size, size))
         if not self.material.finite:
             self._linear_tangent = matrix
         return matrix
