@@ -9,7 +9,6 @@ stresses. So the motion comes from elsewhere.
 from __future__ import annotations
 
 import math
-from collections import deque
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -29,9 +28,9 @@ from .messages import CheckedSubscription, to_ns
 from .node import CubeNode
 from .qos import NEWEST
 
-MAX_SAMPLES = 2048
-"""Number of newest samples of an IMU that are kept. A message of frequencies covers up to 1 s, in
-which an IMU with 1 kHz sends half as many."""
+MAX_SAMPLES = 4096
+"""Maximum number of samples of an IMU that are kept; then the older half is dropped. A message of
+frequencies covers up to 1 s, in which an IMU with 1 kHz sends half as many as are left."""
 
 MAX_TRANSFORM_AGE_NS = SECOND
 """Maximum difference, in ns, between the time of a transform and the time of the newest row (sample
@@ -205,7 +204,9 @@ class ImuMotion:
         self._topic = topic
         self._parent_frame = parent_frame
         self._transforms = Transforms(node)
-        self._samples: deque[_Sample] = deque(maxlen=MAX_SAMPLES)
+        # `motion` may read the list in another thread. So samples are only ever appended to it, and
+        # it is replaced by another list to drop some.
+        self._samples: list[_Sample] = []
         self._imu_frame = parent_frame
         self._problem = f"no message on {topic}: start the IMU, or set imu to its topic"
         subscription = CheckedSubscription(node, Imu, topic, self.on_imu, NEWEST)
@@ -231,7 +232,7 @@ class ImuMotion:
         if interval_ns <= 0:
             # Time went back, because a replay has jumped or a clock was set. Older samples cannot
             # be compared with new ones any more.
-            self._samples.clear()
+            self._samples = []
         elif interval_ns <= MAX_INTERVAL_NS:
             changes = zip(velocity, before.angular_velocity, strict=True)
             mean = tuple((now - then) * SECOND / interval_ns for now, then in changes)
@@ -241,12 +242,13 @@ class ImuMotion:
             acceleration = tuple(1.5 * now - 0.5 * then for now, then in means)
             sample = sample._replace(angular_acceleration=acceleration, mean_acceleration=mean)
         self._imu_frame = message.header.frame_id
+        if len(self._samples) == MAX_SAMPLES:
+            self._samples = self._samples[MAX_SAMPLES // 2 :]
         self._samples.append(sample)
 
     def motion(self, first_ns: int, last_ns: int) -> Motion:
         """Return the motion at the samples around a span of time; see `MotionSource.motion`."""
-        # The samples are copied, because `on_imu` may change them in another thread meanwhile.
-        samples = tuple(self._samples)
+        samples = self._samples
         if len(samples) < 2:
             raise MissingMotion(self._problem)
         # The chosen samples enclose the span of time if possible. At least two are chosen, so that

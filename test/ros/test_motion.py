@@ -383,11 +383,14 @@ def test_gravity_comes_from_tf_alone(start, monkeypatch):
 
 
 def test_what_nobody_records_is_not_sent_but_compensated(start, monkeypatch):
+    """Also while samples of the IMU are dropped, because they are too many."""
     fake_tf(monkeypatch, imu=IMU_FRAME)
+    monkeypatch.setattr("cube_tensor_driver.ros.motion.MAX_SAMPLES", 8)
     node = start(imu="/imu")
     node._compensation.listeners = 0
     played(node, MovingSkin(), 0.1)
     assert not node.sent["compensation"]
+    assert len(node._motion._samples) <= 8
     stress = [stress_codec.decode(one).rows for one in node.sent["stress"]]
     assert all((rows.status & WEIGHT).all() for rows in stress)
 
