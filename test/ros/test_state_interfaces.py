@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 import sys
+import time
 from types import SimpleNamespace
 from xml.etree import ElementTree
 
@@ -161,6 +162,35 @@ def test_the_example_names_what_is_published():
     for broadcaster in controllers.values():
         values = broadcaster["ros__parameters"]
         assert values["sensor_name"] in sensors and values["frame_id"] in links | own
+
+
+def test_the_last_values_are_nan_for_longer_than_a_cycle_of_controllers(skin_file, monkeypatch):
+    """DDS discards a message that is not yet taken when its publisher is destroyed."""
+
+    class Publisher(list):
+        def publish(self, message):
+            self.append((time.monotonic(), np.array(message.values)))
+
+    values = {"hardware_name": "skin", "wrench_side": 0.0, "publish_period": 0.0}
+    publishers, cleanup = {}, []
+    node = SimpleNamespace(
+        value=values.get,
+        create_publisher=lambda kind, topic, quality: publishers.setdefault(topic, Publisher()),
+        create_timer=lambda period, function: None,
+        own=lambda entity: entity,
+        call_at_cleanup=cleanup.append,
+    )
+    messages = SimpleNamespace(StatisticsNames=SimpleNamespace, StatisticsValues=SimpleNamespace)
+    monkeypatch.setitem(sys.modules, "pal_statistics_msgs.msg", messages)
+    interfaces = make_state_interfaces(node, read_skin(skin_file))
+    interfaces.publish(stress_rows(range(4), np.ones((4, 6)), np.zeros((4, 9))), 0)
+    (forget,) = cleanup
+    forget()
+    (_, known), *last = publishers["skin/values"]
+    assert np.isfinite(known).all() and all(np.isnan(unknown).all() for _, unknown in last)
+    stamps = [at for at, _ in last]
+    # A controller manager at 100 Hz that misses ten cycles still takes one of them.
+    assert stamps[-1] - stamps[0] > 0.1 and len(stamps) > 2
 
 
 class Component:

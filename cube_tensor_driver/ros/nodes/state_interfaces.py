@@ -44,6 +44,14 @@ CHECK_PERIOD_S = 0.1
 """Time, in s, between two checks for cubes whose last row (sample) is too old, and for new
 subscribers."""
 
+LAST_VALUES_S = 0.2
+"""Time, in s, for which NaN is repeated before the publisher of the values is destroyed. DDS
+discards what a subscriber has not yet taken when the publisher ends, so that a controller manager
+that is late by a few milliseconds would miss a single message."""
+
+LAST_VALUES_PERIOD_S = 0.02
+"""Time, in s, between two of these messages."""
+
 
 class SkinWrenches:
     """The latest wrench of each cube of a skin and of the whole skin; NaN where it is not known.
@@ -222,9 +230,12 @@ class StateInterfaces:
     def _forget_all(self) -> None:
         """Publish NaN for all wrenches, because the hardware component would otherwise return the
         last values for ever."""
+        end = time.monotonic() + LAST_VALUES_S
         with self._lock:
             self._wrenches.forget_stale(np.inf)
-            self._send(time.time_ns())
+            while time.monotonic() < end:
+                self._send(time.time_ns())
+                time.sleep(LAST_VALUES_PERIOD_S)
 
     def _send(self, stamp_ns: int) -> None:
         stamp = to_time(stamp_ns)
