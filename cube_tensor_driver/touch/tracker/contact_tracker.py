@@ -30,7 +30,13 @@ from .hertz_fit import HertzFit, linearise
 from .local_values import CubeNoise, rotations_about_normal
 from .node_fit import NodeFit
 from .pressure_regions import PressureRegions
-from .tracked_region import MAX_START_SIZE, TrackedRegion, Work, update_responses
+from .tracked_region import (
+    MAX_START_SIZE,
+    RESPONSE_ERROR,
+    TrackedRegion,
+    Work,
+    update_responses,
+)
 
 NEIGHBOUR_REACH_PITCHES = 3.0
 """Distance between two regions of contact, divided by the pitch (distance of neighbouring cubes),
@@ -278,26 +284,26 @@ class ContactTracker:
         The response of the cubes to the other regions is subtracted from their values before.
         """
         fitted = [region for region in self._regions if region.fit is not None]
+        if not fitted:
+            return
         if len(fitted) > 1:
             update_responses(self._inverse, fitted, self._fitted_cubes)
-        total, deviation = self._sum_responses(slice(None), None)
+        responses = np.array([region.response for region in self._regions])
+        total, magnitude = responses.sum(axis=0), np.abs(responses).sum(axis=0)
         for region in fitted:
             if region.fit is not None:
                 values = region.fit.values
                 cubes = values.cubes
                 own = region.response[cubes]
-                own_deviation = region.relative_error * np.abs(own)
                 region.others = total[cubes] - own
-                values.disturbance = deviation[cubes] - own_deviation
+                values.disturbance = RESPONSE_ERROR * (magnitude[cubes] - np.abs(own))
                 region.fit.step(values.whiten(self._scaled, region.others))
                 if region.near:
                     explained = region.fit.explained
                     total[cubes] += explained - own
                     region.response[cubes] = explained
 
-    def _update_and_sum_responses(
-        self, cubes: Index, excluded: TrackedRegion
-    ) -> tuple[Array, Array]:
+    def _respond_to_others(self, cubes: Index, excluded: TrackedRegion) -> tuple[Array, Array]:
         """Return the response of some cubes to all regions of contact but one.
 
         The stored responses to regions whose contacts have changed are computed again before.
@@ -312,30 +318,10 @@ class ContactTracker:
         """
         others = [region for region in self._regions if region is not excluded]
         update_responses(self._inverse, others, cubes)
-        return self._sum_responses(cubes, excluded)
-
-    def _sum_responses(
-        self, cubes: Index | slice, excluded: TrackedRegion | None
-    ) -> tuple[Array, Array]:
-        """Return the sum of the stored responses of some cubes to all regions of contact but one.
-
-        Args:
-            cubes: Indices (n,) of the cubes.
-            excluded: Region whose contacts are left out; None: no region is left out.
-
-        Returns:
-            Change (n, C), in Pa, of the C measured components of each cube by the other regions,
-            and its standard deviation (n, C), in Pa.
-        """
-        total = np.zeros_like(self._scaled[cubes])
-        deviation = np.zeros_like(total)
-        for region in self._regions:
-            if region is not excluded:
-                response = region.response[cubes]
-                total += response
-                # Deviations add linearly, because the same errors of the elastomer cause them.
-                deviation += region.relative_error * np.abs(response)
-        return total, deviation
+        nothing = np.zeros_like(self._scaled[cubes])
+        responses = np.array([nothing, *(region.response[cubes] for region in others)])
+        # Deviations add linearly, because the same errors of the elastomer cause them.
+        return responses.sum(axis=0), RESPONSE_ERROR * np.abs(responses).sum(axis=0)
 
     def _start_of_fit(self, contact: TrackedContact) -> tuple[int, Discs]:
         """Return the start of the fit of a contact.
@@ -379,7 +365,7 @@ class ContactTracker:
             if spent >= max_work or order[number][0] == Work.NONE:
                 break
             region = regions[number]
-            respond_to_others = partial(self._update_and_sum_responses, excluded=region)
+            respond_to_others = partial(self._respond_to_others, excluded=region)
             spent += region.improve(self._scaled, respond_to_others)
         return spent > 0
 

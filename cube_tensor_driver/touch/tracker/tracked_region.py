@@ -88,13 +88,8 @@ The change is the larger one of two ratios: shift to distance of the nearest oth
 contact, and change of the force to force.
 """
 
-START_ERROR = 0.15
-"""Relative standard deviation of the stress that a contact without a fit causes in the cubes around
-other contacts. Its force is only the integral of the traction that the linear inverse problem of
-elasticity yields from the values of all cubes."""
-
-FIT_ERROR = 0.05
-"""Relative standard deviation of the stress that a fitted contact causes in the cubes around other
+RESPONSE_ERROR = 0.05
+"""Relative standard deviation of the stress that a contact causes in the cubes around other
 contacts. It is computed for the stated depth, thickness and Poisson's ratio, whose errors change it
 by 3 % each (sensitivity.py). With 0.5 %, forces of twenty contacts were off by three stated
 deviations."""
@@ -245,12 +240,6 @@ class TrackedRegion:
     def has_fitted_neighbours(self) -> bool:
         """Whether all near regions have a fit, whose response this fit can subtract."""
         return all(other.fit is not None for other in self.near)
-
-    @property
-    def relative_error(self) -> float:
-        """Relative standard deviation of the stress that the contacts of this region cause in the
-        cubes around other regions."""
-        return START_ERROR if self.fit is None else FIT_ERROR
 
     @property
     def discs(self) -> tuple[int, Discs]:
