@@ -90,18 +90,22 @@ Row vectors are multiplied from the left: ``parts @ FIELD_FROM_CIRCULAR``.
 """
 
 
-def rotation_phases(angle: Array, order: Orders) -> Complex:
+def rotation_phases(rotation: Complex, order: Orders) -> Complex:
     """Return the phases exp(i m angle) by which rotations multiply circular components of order m.
 
+    They are powers of exp(i angle), which takes a third of the time of exponential functions.
+
     Args:
-        angle: Angles (N,) in rad.
+        rotation: Angles (...) of the rotations as the complex numbers exp(i angle).
         order: Orders m (n,) of the circular components.
 
     Returns:
-        Phases (N, n).
+        Phases (..., n).
     """
-    phases: Complex = np.exp(1j * angle[:, None] * order)
-    return phases
+    powers = [np.ones_like(rotation)]
+    for _ in range(int(order.max())):
+        powers.append(powers[-1] * rotation)
+    return np.stack(powers, axis=-1)[..., order]
 
 
 def rotate_loads(
@@ -134,7 +138,7 @@ def rotate_loads(
     along_y = sine * radial + cosine * across
     loads = np.stack([along_x, along_y, normal], axis=1)
 
-    rotated = rotation_phases(angle, order)[:, None] * loads
+    rotated = rotation_phases(np.exp(1j * angle), order)[:, None] * loads
     return np.concatenate([rotated.real, rotated.imag], axis=2)
 
 
@@ -150,17 +154,7 @@ def sum_rotated(
     Returns:
         Stress (N, 6) and gradient (N, 6, 3) in the frame of each cube, summed over the L fields.
     """
-    # exp(i m angle) is computed as a power of exp(i angle), which is much faster than np.exp.
-    powers = np.stack(
-        [
-            np.ones_like(rotation),
-            rotation,
-            rotation**2,
-            rotation**3,
-        ],
-        axis=-1,
-    )
-    phases = powers.astype(np.complex64)[..., ORDERS]
+    phases = rotation_phases(rotation.astype(np.complex64), ORDERS)
     total = (circular * phases).sum(axis=1)
 
     parts = np.concatenate([total.real, total.imag], axis=1)

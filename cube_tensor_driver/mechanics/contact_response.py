@@ -18,7 +18,7 @@ import numpy as np
 
 from ..core.arrays import Array, Complex, Index, Single
 from .cache import Arrays, load_or_compute
-from .circular import FIELD_FROM_CIRCULAR, ORDERS, Orders, rotate_loads
+from .circular import FIELD_FROM_CIRCULAR, ORDERS, Orders, rotate_loads, rotation_phases
 from .distance_table import DistanceTable, cubic_weights, to_polar
 from .load_response import disc_spectrum
 from .measurement_model import CubeMeasurement
@@ -183,7 +183,8 @@ class ContactResponse:
         circular[:, 5] = by_log
         circular[:, 6] = by_log_twice
         circular[:, 7] = moment
-        phases = _fast_phases(direction - angle, self._order)
+        in_cube = np.exp(1j * (direction - angle)).astype(np.complex64)
+        phases = rotation_phases(in_cube, self._order)
         circular *= phases[:, None]
         return self._cubes.measure(_split(circular), variant)
 
@@ -324,7 +325,8 @@ class ContactResponse:
         circular = np.empty((n, parts.shape[1], n_orders), np.complex64)
         circular.real = by_radial + by_normal
         circular.imag = in_plane.imag * parts[:, :, 2]
-        phases = _fast_phases(direction - angle, order)
+        in_cube = np.exp(1j * (direction - angle)).astype(np.complex64)
+        phases = rotation_phases(in_cube, order)
         circular *= phases[:, None]
         return circular
 
@@ -394,20 +396,6 @@ class ContactResponse:
         start = int(first) - 1
         neighbours = discs[start : start + 4, :n_distances]
         return np.asarray(np.tensordot(weights, neighbours, axes=1))
-
-
-def _fast_phases(angle: Array, order: Orders) -> Complex:
-    """Return exp(i m angle) (N, n) as powers of exp(i angle), which takes a third of the time.
-
-    Args:
-        angle: Angles (N,) in rad.
-        order: Orders m (n,).
-    """
-    one = np.exp(1j * angle).astype(np.complex64)
-    powers = [np.ones_like(one)]
-    for _ in range(int(order.max())):
-        powers.append(powers[-1] * one)
-    return np.stack(powers, axis=1)[:, order]
 
 
 def _size_index(size: Array | float, depth: float) -> Array:

@@ -24,16 +24,14 @@ cubes' centres below the surface. Responses and covariances at larger distances 
 one times the inverse square of the distance, as the stress by a tangential force on a half space
 falls."""
 
-_CUBIC_LAGRANGE = (
-    np.array(
-        [
-            [[0, -2, 3, -1], [6, -3, -6, 3], [0, 6, 3, -3], [0, -1, 0, 1]],
-            [[-2, 6, -3, 0], [-3, -12, 9, 0], [6, 6, -9, 0], [-1, 0, 3, 0]],
-            [[6, -6, 0, 0], [-12, 18, 0, 0], [6, -18, 0, 0], [0, 6, 0, 0]],
-        ]
-    )
-    / 6
-)
+_VALUE = np.round(6 * np.linalg.inv(np.vander([-1, 0, 1, 2], increasing=True)).T) / 6
+"""Coefficients (4 table entries, 4 powers) of the cubic polynomials in t that are 1 at one of the
+entries t = -1, 0, 1, 2 and 0 at the others. They are multiples of 1/6."""
+
+_DERIVATIVE = np.diag([1.0, 2.0, 3.0], -1)
+"""Matrix (4, 4) from the coefficients of a cubic polynomial to those of its derivative."""
+
+_CUBIC_LAGRANGE = np.stack([_VALUE, _VALUE @ _DERIVATIVE, _VALUE @ _DERIVATIVE @ _DERIVATIVE])
 """Coefficients (3, 4 table entries, 4 powers) of the weights of cubic Lagrange interpolation, and
 of their first and second derivative: with the fraction t of the index between the second and the
 third entry, the weight of an entry is the sum of its coefficients times 1, t, t^2, t^3."""

@@ -172,7 +172,7 @@ class CubeMeasurement:
             Two matrices (N, 15, n): for the real parts of the circular components, and for their
             imaginary parts.
         """
-        phases = rotation_phases(angle, self.spectra.order)[:, None]
+        phases = rotation_phases(np.exp(1j * angle), self.spectra.order)[:, None]
         real, imaginary = np.split(
             self.matrices.swapaxes(1, 2),
             2,

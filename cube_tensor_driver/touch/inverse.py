@@ -26,7 +26,7 @@ from ..mechanics.layer import Layer
 from ..mechanics.measurement_model import CubeMeasurement, MeasurementModel
 from ..mechanics.traction_prior import TractionPrior
 from .pad_measurement import model_pads
-from .pad_noise import GAIN_ERROR, noise_of_all_pads, pad_stresses
+from .pad_noise import GAIN_ERROR, noise_of_all_pads, stress_matrices
 from .posterior import ObservationModel, WindowPosteriors
 from .prediction import MissingValuePrediction
 from .surface import patches
@@ -328,7 +328,8 @@ class SurfaceInverse:
         y = self._fill(residual)
         # Variance of each pad's error, divided by the variance of its noise: 1 for the noise itself
         # plus the gain error.
-        stresses = pad_stresses(self.by_pad, self._known, scaled)
+        known_values = np.where(self._known, scaled, 0.0)[:, :, None]
+        stresses = (stress_matrices(self.by_pad, self._known) @ known_values)[:, :, 0]
         has_values = self._known.any(axis=1)[:, None]
         gain_variance = (GAIN_ERROR * stresses) ** 2
         # A cube without known values contributes no noise to the field.

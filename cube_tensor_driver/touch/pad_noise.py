@@ -74,28 +74,32 @@ def noise_of_all_pads(calibrations: Sequence[Calibration]) -> Array:
     return noise_by_pad(Pipeline(calibrations), np.arange(n), no_pads)
 
 
-def pad_stresses(
-    by_pad: Array,
-    known: Mask,
-    values: Array,
-) -> Array:
-    """Estimate the stresses u of P pads from C components, for each of n cubes.
+def stress_matrices(by_pad: Array, known: Mask) -> Array:
+    """Return the matrices (n, P, C) with which C components of n cubes give the stresses of P pads.
+
+    The stresses are the smallest ones that explain the components, each divided by the standard
+    deviation of the noise of its pad.
 
     Args:
         by_pad: Noise matrices B (n, C, P): change of each component for one standard deviation of
             the noise of each pad.
         known: Whether each component (n, C) is known; the others are ignored.
-        values: Components (n, C), in the units of `by_pad`.
-
-    Returns:
-        Stresses u (n, P), each divided by the standard deviation of the noise of its pad.
     """
     by_pad = np.where(known[:, :, None], by_pad, 0.0)
-    transposed = by_pad.swapaxes(1, 2)
+    covariance = regularise(by_pad @ by_pad.swapaxes(1, 2), known)
+    return np.asarray(np.linalg.solve(covariance, by_pad).swapaxes(1, 2))
 
-    # The rows of unknown components in the noise matrix B are zero. A 1 on the diagonal keeps B B'
-    # invertible.
-    unknown = np.eye(known.shape[1]) * ~known[:, None, :]
-    right = np.where(known, values, 0.0)[..., None]
-    weights = np.linalg.solve(by_pad @ transposed + unknown, right)
-    return np.asarray((transposed @ weights)[..., 0])
+
+def regularise(covariance: Array, known: Mask) -> Array:
+    """Add to the diagonal of covariances (n, C, C) what makes them invertible, and return them.
+
+    Rows of unknown components are 0, and components may be almost linearly dependent.
+
+    Args:
+        covariance: Covariances of C components of n cubes.
+        known: Whether each component (n, C) is known.
+    """
+    diagonal = np.einsum("ncc->nc", covariance)
+    diagonal *= 1 + 1e-9
+    diagonal += ~known
+    return covariance

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...core.arrays import Array, Index, Mask
 from ..inverse import SurfaceInverse
-from ..pad_noise import GAIN_ERROR
+from ..pad_noise import GAIN_ERROR, regularise, stress_matrices
 
 MIN_FACING = 0.5
 """Smallest cosine of the angle between the outward normals of two cubes at which one of them
@@ -78,10 +78,9 @@ class CubeNoise:
         if is_outdated.any():
             outdated, known_there = cubes[is_outdated], known[is_outdated]
             self.known[outdated] = known_there
-            by_pad = np.where(known_there[:, :, None], inverse.by_pad[outdated], 0.0)
-            self._by_pad[outdated] = by_pad
-            covariance = _regularise(by_pad @ by_pad.swapaxes(1, 2), known_there)
-            self._to_pads[outdated] = np.linalg.solve(covariance, by_pad).swapaxes(1, 2)
+            by_pad = inverse.by_pad[outdated]
+            self._by_pad[outdated] = np.where(known_there[:, :, None], by_pad, 0.0)
+            self._to_pads[outdated] = stress_matrices(by_pad, known_there)
             self._variance[outdated] = 0.0
         values = np.where(known, scaled[cubes], 0.0)
         stresses = (self._to_pads[cubes] @ values[:, :, None])[:, :, 0]
@@ -110,22 +109,11 @@ class CubeNoise:
         by_pad = self._by_pad[cubes]
         covariance = (by_pad * variance[:, None]) @ by_pad.swapaxes(1, 2)
         is_known = self.known[cubes]
-        covariance = _regularise(covariance, is_known)
+        covariance = regularise(covariance, is_known)
         inverse_factor = np.linalg.inv(np.linalg.cholesky(covariance))
         self.whitening[cubes] = inverse_factor * is_known[:, None]
         self._variance[cubes] = variance
         self.version[cubes] += 1
-
-
-def _regularise(covariance: Array, known: Mask) -> Array:
-    """Add to the diagonal of covariances (n, C, C) what makes them invertible, and return them.
-
-    Rows of unknown values are 0, and components may be almost linearly dependent.
-    """
-    diagonal = np.einsum("ncc->nc", covariance)
-    diagonal *= 1 + 1e-9
-    diagonal += ~known
-    return covariance
 
 
 class LocalValues:
