@@ -8,8 +8,9 @@ def run(start: int, n_residuals: int, *arrays: Any) -> tuple[int, int]:
     Args:
         start: Number of the first row.
         n_residuals: Number of outputs that are residuals.
-        arrays: Fields of Tables, HealthState (or None for each), Columns and Results;
-            real numbers are float32.
+        arrays: Fields of Tables, HealthState and Offsets (or None for each) and Columns, then the
+            columns of StressRows in the order of run.py, and what is subtracted or None; real
+            numbers are float32.
 
     Raises:
         ValueError: An array has another type or shape, or is not contiguous.

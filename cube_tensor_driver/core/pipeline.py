@@ -34,7 +34,6 @@ from .kernel.contract import (
     UNKNOWN_CUBE,
     Columns,
     Numbers,
-    Results,
     Tables,
 )
 from .kernel.rows import (
@@ -221,7 +220,12 @@ class Pipeline:
         stiffness: Array = self._stiffness[self._tables.calibration]
         return stiffness
 
-    def unloaded_factor(self, cube: Index, temperature: Real, offset: Real | None = None) -> Array:
+    def unloaded_factor(
+        self,
+        cube: Index,
+        temperature: Real,
+        offset: Real | None = None,
+    ) -> Array:
         """Return the ratio of the frequencies without load to the rest frequencies (N, P).
 
         The ratio is the product of two factors. One is that of temperature. The other is the ratio
@@ -298,15 +302,6 @@ class Pipeline:
             out = self.make_rows(rows)
         if watch is None or known is not None:
             out.left_out[:] = rows.pad_fault if left_out is None else left_out
-        results = Results(
-            stress=out.stress,
-            gradient=out.gradient,
-            residual=out.residual,
-            status=out.status,
-            observed=out.observed,
-            left_out=out.left_out,
-            offset=offset,
-        )
         sums = watch.sums if watch else None
         offsets = effects.offsets if effects else None
         row = 0
@@ -318,7 +313,8 @@ class Pipeline:
                 sums,
                 offsets,
                 columns,
-                results,
+                out,
+                offset,
             )
             if request == UNKNOWN_CUBE:
                 if watch:

@@ -114,7 +114,12 @@ class DriftTracker:
         self._tracked_rest = self._tracked_rest + change
         self._update_when_due()
 
-    def _follow_others(self, change: Array, follows: Mask, follows_others: Mask) -> None:
+    def _follow_others(
+        self,
+        change: Array,
+        follows: Mask,
+        follows_others: Mask,
+    ) -> None:
         """Correct the drift of loaded cubes by the median of unloaded ones, and set `deviation`.
 
         The drift of a loaded cube is assumed to differ from the median by the standard deviation of

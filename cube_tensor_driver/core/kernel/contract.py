@@ -237,8 +237,8 @@ class Columns(NamedTuple):
         pad_fault: Bit masks of the pads that the device reports as broken (N,).
         stamp_ns: Time stamps (N,), in ns.
         doubt: Status bits (N,) of which STAMP (doubtful time stamp) is used.
-        known: Whether `left_out` and `status` of `Results` hold the health of a row before the call
-            (N,); None stands for False in all rows.
+        known: Whether `left_out` and `status` of the rows to write hold the health of a row before
+            the call (N,); None stands for False in all rows.
         force: Specific force (N, 3), in m/s²; None: weight is not compensated.
     """
 
@@ -264,27 +264,3 @@ class Columns(NamedTuple):
         """Return the columns of some successive rows, as views."""
         columns = (None if column is None else column[rows] for column in self)
         return Columns(*columns)  # type: ignore[arg-type]
-
-
-class Results(NamedTuple):
-    """Columns of N rows (samples of one cube) that the kernel writes; `StressRows` defines them.
-
-    Before a call, `left_out` and `status` must hold the mask of the pads that are not used and the
-    conditions of the pads, for all rows whose health is not judged in this call.
-
-    Attributes:
-        offset: What is subtracted (N, P), see `Offsets`; None: not wanted.
-    """
-
-    stress: Real
-    gradient: Real
-    residual: Real
-    status: StatusBits
-    observed: NDArray[np.uint16]
-    left_out: PadMasks
-    offset: Real | None = None
-
-    def select(self, rows: slice) -> Results:
-        """Return the columns of some successive rows, as views."""
-        columns = (None if column is None else column[rows] for column in self)
-        return Results(*columns)  # type: ignore[arg-type]

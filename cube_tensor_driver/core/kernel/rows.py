@@ -16,6 +16,7 @@ from ..arrays import Array, Index, Mask, PadMasks, Real, Single, StatusBits, Tim
 from ..health.statistics import GAP_NS, MAX_JITTER_RATIO
 from ..modes import COMPONENTS, STRESS
 from ..oscillator import rest_ratio
+from ..rows import StressRows
 from ..status import COMPENSATION, INVALID, PAD_FAULT, RESIDUAL, STAMP, TEMPERATURE
 from .contract import (
     DONE,
@@ -30,7 +31,6 @@ from .contract import (
     HealthState,
     Numbers,
     Offsets,
-    Results,
     Tables,
 )
 
@@ -52,7 +52,8 @@ def run(
     health: HealthState | None,
     offsets: Offsets | None,
     columns: Columns,
-    results: Results,
+    results: StressRows,
+    offset: Real | None,
 ) -> tuple[int, int]:
     """Process rows of frequencies until the caller has to do something.
 
@@ -76,7 +77,9 @@ def run(
         if due != DONE:
             return start, due
         with np.errstate(all="ignore"):
-            start, request = _process(scan, n_residuals, tables, health, offsets, columns, results)
+            start, request = _process(
+                scan, n_residuals, tables, health, offsets, columns, results, offset
+            )
         if request != DONE:
             return start, request
     if len(unknown):
@@ -84,7 +87,12 @@ def run(
     return start, DONE
 
 
-def apply_law(tables: Tables, cube: Index, frequency: Real, temperature: Real) -> tuple[Real, Mask]:
+def apply_law(
+    tables: Tables,
+    cube: Index,
+    frequency: Real,
+    temperature: Real,
+) -> tuple[Real, Mask]:
     """Apply the pad law v = (f - f0) / (f_highest - f), with f0 and f_highest at a temperature.
 
     Args:
@@ -107,7 +115,11 @@ def apply_law(tables: Tables, cube: Index, frequency: Real, temperature: Real) -
     return v, is_good
 
 
-def temperature_factor(tables: Tables, calibration: Numbers, temperature: Real) -> Array:
+def temperature_factor(
+    tables: Tables,
+    calibration: Numbers,
+    temperature: Real,
+) -> Array:
     """Return the ratio of rest frequencies at temperatures to those at the reference (N, P).
 
     It is 1 without a temperature model, and for an unknown temperature.
@@ -185,7 +197,8 @@ def _process(
     health: HealthState | None,
     offsets: Offsets | None,
     columns: Columns,
-    results: Results,
+    results: StressRows,
+    offset: Real | None,
 ) -> tuple[int, int]:
     """Process the rows of one scan, up to the first for which the caller has to do something.
 
@@ -197,6 +210,7 @@ def _process(
         offsets: What is subtracted and its state, which is changed; None: nothing is.
         columns: All rows of frequencies.
         results: All rows of stress to write.
+        offset: Array for what is subtracted from all rows (N, P); None: not wanted.
 
     Returns:
         Number of the first row that is not processed, and what the caller has to do: `DONE`,
@@ -221,10 +235,10 @@ def _process(
     is_bad = is_lacking | mask_bits(tables, calibration, out.left_out)
     bad = pack_bits(is_bad)
     if offsets is not None:
-        offset = _find_offsets(offsets, rows, cube, v, is_bad, out.status)
-        v -= offset
-        if out.offset is not None:
-            out.offset[:] = offset
+        subtracted = _find_offsets(offsets, rows, cube, v, is_bad, out.status)
+        v -= subtracted
+        if offset is not None:
+            offset[scan] = subtracted
     v[is_bad] = 0
     table, key = _find_tables(tables, calibration, bad)
     stops = np.flatnonzero(has_new_condition | (key != DONE))
@@ -304,7 +318,11 @@ def _find_offsets(
     return total
 
 
-def _find_tables(tables: Tables, calibration: Numbers, bad: PadMasks) -> tuple[Numbers, Times]:
+def _find_tables(
+    tables: Tables,
+    calibration: Numbers,
+    bad: PadMasks,
+) -> tuple[Numbers, Times]:
     """Find the matrices of rows, by their calibrations and bad pads.
 
     Args:
@@ -324,7 +342,12 @@ def _find_tables(tables: Tables, calibration: Numbers, bad: PadMasks) -> tuple[N
     return table, np.where(is_missing, key, DONE)
 
 
-def find_impossible(tables: Tables, health: HealthState, rows: Columns, cube: Index) -> Mask:
+def find_impossible(
+    tables: Tables,
+    health: HealthState,
+    rows: Columns,
+    cube: Index,
+) -> Mask:
     """Return whether a pad has an impossible frequency or a fault that the device reports (N, P).
 
     Args:
@@ -344,7 +367,12 @@ def find_impossible(tables: Tables, health: HealthState, rows: Columns, cube: In
     return is_impossible | is_reported
 
 
-def _add_to_window(health: HealthState, rows: Columns, cube: Index, is_over_limit: Mask) -> None:
+def _add_to_window(
+    health: HealthState,
+    rows: Columns,
+    cube: Index,
+    is_over_limit: Mask,
+) -> None:
     """Add rows of one scan to the sums of the present window; `statistics.py` has the equations.
 
     Args:
@@ -374,7 +402,11 @@ def _add_to_window(health: HealthState, rows: Columns, cube: Index, is_over_limi
     health.cubes["over_limit"][cube] += is_over_limit
 
 
-def _measure_pace(health: HealthState, rows: Columns, cube: Index) -> tuple[Single, Single]:
+def _measure_pace(
+    health: HealthState,
+    rows: Columns,
+    cube: Index,
+) -> tuple[Single, Single]:
     """Compute ratios and weights for second differences from the intervals between rows.
 
     The ratio r of two successive intervals makes the second difference of a linear drift vanish,

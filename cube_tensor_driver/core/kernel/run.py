@@ -6,8 +6,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..arrays import Real
+from ..rows import StressRows
 from . import rows
-from .contract import Columns, HealthState, Offsets, Results, Tables
+from .contract import Columns, HealthState, Offsets, Tables
 
 __all__ = ["native", "run"]
 
@@ -32,7 +34,8 @@ def run(
     health: HealthState | None,
     offsets: Offsets | None,
     columns: Columns,
-    results: Results,
+    out: StressRows,
+    offset: Real | None,
 ) -> tuple[int, int]:
     """Process rows of frequencies, from one row on, until the caller has to do something.
 
@@ -43,7 +46,10 @@ def run(
         health: State of the health, which is changed; None: health is not judged.
         offsets: What is subtracted and its state, which is changed; None: nothing is.
         columns: Rows to process.
-        results: Rows to write.
+        out: Rows to write; its arrays are contiguous. Before the call, `left_out` and `status` hold
+            the pads that are not used and the conditions of the pads, for all rows whose health is
+            not judged in this call.
+        offset: Array for what is subtracted (N, P), stress / stiffness; None: not wanted.
 
     Returns:
         Number of the first row that is not processed, and what the caller has to do: `DONE`,
@@ -52,7 +58,9 @@ def run(
     """
     # The kernel in C computes in float32, the precision of messages.
     if native is None or columns.frequency.dtype != np.float32:
-        return rows.run(start, n_residuals, tables, health, offsets, columns, results)
+        return rows.run(start, n_residuals, tables, health, offsets, columns, out, offset)
     state = health or _NO_HEALTH
     subtracted = offsets or _NO_OFFSETS
-    return native.run(start, n_residuals, *tables, *state, *subtracted, *columns, *results)
+    written = out.stress, out.gradient, out.residual, out.status, out.observed, out.left_out
+    arrays = *tables, *state, *subtracted, *columns, *written, offset
+    return native.run(start, n_residuals, *arrays)
