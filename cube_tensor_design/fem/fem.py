@@ -28,8 +28,9 @@ from cube_tensor_driver.core.defaults import (
     REST_FREQUENCY,
 )
 from cube_tensor_driver.core.errors import ElasticError
-from cube_tensor_driver.core.estimator import make_estimator
+from cube_tensor_driver.core.estimator import Estimator, make_estimator
 from cube_tensor_driver.core.layout import Layout
+from cube_tensor_driver.core.modes import Modes
 from cube_tensor_driver.core.response import project
 from cube_tensor_driver.core.symmetry import (
     Structure,
@@ -141,12 +142,7 @@ def compute_response(
     matrix = results[-1].pads
     coefficients, residual = project(structure, matrix)
     modes = structure.modes
-    estimator = make_estimator(
-        matrix,
-        noise=np.ones(layout.n_pads),
-        modes=modes,
-        targets=np.eye(modes.n_modes),
-    )
+    estimator = estimate_modes(matrix, modes)
     unobservable = np.array(modes.names)[~estimator.observed]
     return Response(
         body=body,
@@ -161,6 +157,27 @@ def compute_response(
         unobservable=tuple(unobservable.tolist()),
         convergence=tuple(rows),
         seconds=sum(result.seconds for result in results),
+    )
+
+
+def estimate_modes(
+    response: Array,
+    modes: Modes,
+    neglect: Sequence[str] = (),
+) -> Estimator:
+    """Return the estimator of the amplitudes of all modes (linear stress fields).
+
+    Args:
+        response: Response matrix (pads, modes) of pads that have equal noise.
+        modes: The modes.
+        neglect: Names of modes that are assumed to be zero.
+    """
+    return make_estimator(
+        response,
+        noise=np.ones(len(response)),
+        modes=modes,
+        neglect=neglect,
+        targets=np.eye(modes.n_modes),
     )
 
 

@@ -19,13 +19,12 @@ import numpy as np
 
 from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.defaults import BETA, REST_FREQUENCY
-from cube_tensor_driver.core.estimator import make_estimator
 from cube_tensor_driver.core.layout import LAYOUTS, Layout
 from cube_tensor_driver.core.modes import PLANE
 from cube_tensor_driver.core.oscillator import pad_frequency
 
 from ..fem.body import Body
-from ..fem.fem import Progress, Response, compute_response, count_steps
+from ..fem.fem import Progress, Response, compute_response, count_steps, estimate_modes
 from .rod import Rod
 from .virtual_bench import Deformation, LoadStep, VirtualBench
 
@@ -163,22 +162,10 @@ def _run_experiment(
         pads=with_cube.pads,
         prototype=prototype(frequency[:, ON_LOWER]),
         upper=prototype(frequency[:, ON_UPPER]),
-        recovered=with_cube.pads @ plane_estimator(calibration.matrix).T,
+        recovered=with_cube.pads @ estimate_modes(calibration.matrix, PLANE).matrix.T,
         truth=without.state,
         rotation=with_cube.rotation,
     )
-
-
-def plane_estimator(response: Array) -> Array:
-    """Return the matrix (7, 8) from the stresses of eight pads of equal noise to the amplitudes of
-    all plane modes (linear stress fields).
-
-    Args:
-        response: Response matrix (8, 7) of the pads.
-    """
-    noise = np.ones(8)
-    estimator = make_estimator(response, noise, PLANE, targets=np.eye(7))
-    return estimator.matrix
 
 
 def foam_frequency(pads: Array) -> Array:

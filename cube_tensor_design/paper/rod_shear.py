@@ -28,10 +28,10 @@ from cube_tensor_driver.mechanics.traction_prior import PRIOR_LENGTHS, SHEAR_RAT
 from cube_tensor_driver.touch.posterior import MODEL_ERROR
 
 from ..fem.body import Body
-from ..fem.fem import Progress, compute_response, count_steps
+from ..fem.fem import Progress, compute_response, count_steps, estimate_modes
 from ..fem.line_load import line_load
 from ..fem.reciprocity import compute_influence
-from .experiments import SHEAR_SIGNS, dent, plane_estimator
+from .experiments import SHEAR_SIGNS, dent
 from .rod import ROD_DEPTH, Rod
 from .virtual_bench import VirtualBench
 
@@ -87,7 +87,7 @@ def rod_shear(
     with_cube = VirtualBench(body)
     without = VirtualBench(body, cube=False)
     response = compute_response(body, layout, "slab", meshes=1).matrix
-    estimator = plane_estimator(response)
+    estimator = estimate_modes(response, PLANE).matrix
     zx = PLANE.names.index("zx")
     influence = compute_influence(replace(body, ground=True), layout)
 

@@ -25,7 +25,6 @@ import numpy as np
 
 from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.errors import ElasticError
-from cube_tensor_driver.core.estimator import make_estimator
 from cube_tensor_driver.core.layout import Layout
 from cube_tensor_driver.core.modes import PLANE
 from cube_tensor_driver.core.symmetry import default_modes, largest_symmetry
@@ -35,7 +34,7 @@ from cube_tensor_driver.mechanics.layer import FIELD, Layer
 from cube_tensor_driver.mechanics.measurement_model import CubeMeasurement
 
 from ..fem.body import Body
-from ..fem.fem import Progress, compute_response, count_steps
+from ..fem.fem import Progress, compute_response, count_steps, estimate_modes
 from ..fem.line_load import line_load
 from ..fem.reciprocity import compute_influence
 
@@ -155,13 +154,7 @@ def _inverse_rows(
     pseudo-inverse of the response matrix: from pad stresses to the component."""
     response = compute_response(body, layout, largest_symmetry(layout), meshes)
     modes = default_modes(layout)
-    estimator = make_estimator(
-        response.matrix,
-        noise=np.ones(layout.n_pads),
-        modes=modes,
-        neglect=neglect,
-        targets=np.eye(modes.n_modes),
-    )
+    estimator = estimate_modes(response.matrix, modes, neglect)
     rows = {
         name: estimator.matrix[modes.names.index(name)]
         for name in COMPONENTS
