@@ -34,6 +34,7 @@ from cube_tensor_driver.bags import summary
 from cube_tensor_driver.bags.metadata import typestore
 from cube_tensor_driver.bags.read import Bag, report_damage
 from cube_tensor_driver.bags.repair import repair
+from cube_tensor_driver.bags.reprocess import job as job_module
 from cube_tensor_driver.bags.reprocess.job import Overrides, ReprocessJob, reconstruct, reprocess
 from cube_tensor_driver.bags.source import open_bag
 from cube_tensor_driver.bags.write import BagWriter
@@ -163,6 +164,20 @@ def test_threads_take_turns(tmp_path, storage):
         assert [
             (connection.topic, time_ns) for connection, time_ns, _ in reader.messages()
         ] == written
+
+
+def test_a_job_that_ends_leaves_what_another_one_is_about_to_write(bag, tmp_path, monkeypatch):
+    """The first job ends before the second one, in another process, creates its output."""
+    write = job_module._reprocess
+
+    def write_after_another(opened, job, output):
+        monkeypatch.setattr(job_module, "_reprocess", write)
+        reprocess(ReprocessJob(bag, tmp_path / "first.parquet", "parquet"))
+        return write(opened, job, output)
+
+    monkeypatch.setattr(job_module, "_reprocess", write_after_another)
+    reprocess(ReprocessJob(bag, tmp_path / "second.parquet", "parquet"))
+    assert {path.name for path in tmp_path.iterdir()} == {"first.parquet", "second.parquet"}
 
 
 def test_messages_come_in_the_order_in_which_rosbags_reads_them(tmp_path):
@@ -381,12 +396,12 @@ def test_reprocess_goes_on_where_it_ended(bag, tmp_path, capsys):
     other = shutil.copytree(bag, tmp_path / "other")
     out = tmp_path / "out"
     assert main(["reprocess", str(bag), "-o", str(out), "--jobs", "1"]) == 0
-    (out / ".partial" / "other").mkdir(parents=True)  # as left behind by a killed run
+    (out / ".partial-other" / "other").mkdir(parents=True)  # as left behind by a killed run
     stamp = (out / "bag" / "metadata.yaml").stat().st_mtime_ns
     assert main(["reprocess", str(bag), str(other), "-o", str(out), "--jobs", "2"]) == 0
     assert (out / "bag" / "metadata.yaml").stat().st_mtime_ns == stamp
     assert all_differing_bits(stress(bag), stress(out / "other")) == 0
-    assert not (out / ".partial").exists()
+    assert not (out / ".partial-other").exists()
     assert main(["reprocess", str(bag), "-o", str(out), "--tare-from", "0", "1"]) == 1
     assert "other options" in capsys.readouterr().err
 

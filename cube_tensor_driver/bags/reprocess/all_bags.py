@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...config.yaml import read_yaml, write_yaml
 from ...core.errors import BagError, CubeError
-from .job import PARTIAL_FOLDER, Overrides, ReprocessJob, ReprocessResult, reprocess
+from .job import PARTIAL_PREFIX, Overrides, ReprocessJob, ReprocessResult, reprocess
 
 if TYPE_CHECKING:
     from .contacts import ContactOptions
@@ -115,8 +115,8 @@ def write_recipe(
 
 def has_results(folder: Path) -> bool:
     """Return whether a folder contains at least one complete result."""
-    names = {path.name for path in folder.iterdir()}
-    return bool(names - {RECIPE_NAME, PARTIAL_FOLDER})
+    others = (RECIPE_NAME, PARTIAL_PREFIX)
+    return any(not path.name.startswith(others) for path in folder.iterdir())
 
 
 def remove_without_results(folder: Path) -> None:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -39,9 +38,9 @@ if TYPE_CHECKING:
     from ..zarr_table import ZarrWriter
     from .contacts import ContactOptions
 
-PARTIAL_FOLDER = ".partial"
-"""Name of the folder, beside the results, for incomplete results. After an interruption, incomplete
-results are computed again from the start."""
+PARTIAL_PREFIX = ".partial-"
+"""Begin of the name of the folder, beside the results, in which one job writes its result. After an
+interruption, an incomplete result is computed again from the start."""
 
 MAX_NAMED_CUBES = 5
 """Largest number of cubes that one error message names."""
@@ -119,19 +118,17 @@ def reprocess(job: ReprocessJob) -> ReprocessResult:
         BagError: The bag is damaged, the overrides do not fit its cubes, or the output cannot be
             written.
     """
-    # Renaming the complete output requires that both names are in the same file system.
-    partial = job.output.parent / PARTIAL_FOLDER / job.output.name
+    # Renaming the complete output requires that both names are in the same file system. Each job
+    # has a folder of its own, because jobs in other processes create and remove theirs meanwhile.
+    folder = job.output.parent / f"{PARTIAL_PREFIX}{job.output.name}"
+    partial = folder / job.output.name
     try:
-        partial.parent.mkdir(parents=True, exist_ok=True)
-        if partial.is_dir():
-            shutil.rmtree(partial)
-        else:
-            partial.unlink(missing_ok=True)
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
         with Bag(job.bag) as bag:
             result = _reprocess(bag, job, partial)
         partial.replace(job.output)
-        with suppress(OSError):  # the folder is not empty while other jobs are running
-            partial.parent.rmdir()
+        folder.rmdir()
     except OSError as error:
         raise BagError(
             f"{job.output}: {error.strerror}; name a folder that can be written"
