@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -86,18 +85,19 @@ class ServiceCalls:
 
         A call times out after `MAX_ANSWER_S`. Later updates do not mention these calls again.
         """
-        # Other threads may append a call meanwhile, so the list is changed in place.
-        for call in self._open.copy():
+        still_open = []
+        for call in self._open:
             if call.future.done():
-                self._open.remove(call)
                 answer = call.future.result()
                 if call.notes_success or not answer.success:
                     self._report(call.what, answer)
             elif time.monotonic() - call.asked_s > MAX_ANSWER_S:
-                self._open.remove(call)
                 text = f"{call.what}: no answer within {MAX_ANSWER_S:g} s"
                 self._say(f"{call.what} had no answer", text, "red")
                 call.future.cancel()
+            else:
+                still_open.append(call)
+        self._open = still_open
 
     def _report(self, what: str, answer: Any) -> None:
         if answer.success:
@@ -136,9 +136,7 @@ class ReplayClient:
             1,
         )
         self._received_s = -np.inf
-        # The thread of the page appends the position of a jump, and `update` takes it out in one
-        # step, so that a position that comes meanwhile is not lost.
-        self._wanted_positions: deque[float] = deque(maxlen=1)
+        self._wanted_position: float | None = None
         self._wanted_s = -np.inf
 
     @property
@@ -152,15 +150,14 @@ class ReplayClient:
 
         Until then the position in `state` is not the one that the user has chosen.
         """
-        is_wanted = bool(self._wanted_positions) or self._services.awaits(JUMP)
+        is_wanted = self._wanted_position is not None or self._services.awaits(JUMP)
         return self.state is not None and is_wanted
 
     def toggle_hold(self) -> None:
         """Pause the replay if it runs, or let it continue if it is paused."""
-        state = self.state
-        if state is None:
+        if self.state is None:
             return
-        request = SteerReplay.Request(position=np.nan, paused=not state.paused)
+        request = SteerReplay.Request(position=np.nan, paused=not self.state.paused)
         # The page shows whether the replay is paused, so an action that succeeds needs no note.
         self._services.ask("replay", self._client, request, notes_success=False)
 
@@ -169,8 +166,8 @@ class ReplayClient:
 
         A position that is stored before that replaces this one.
         """
+        self._wanted_position = position
         self._wanted_s = time.monotonic()
-        self._wanted_positions.append(position)
 
     def update(self) -> bool:
         """Process the answers of services, then send the jump that `jump_to` stored, if any.
@@ -183,11 +180,11 @@ class ReplayClient:
             Whether a jump was sent in this call.
         """
         self._services.update()
-        if not self._wanted_positions or self._services.awaits(JUMP):
+        if self._wanted_position is None or self._services.awaits(JUMP):
             return False
         if self.state is None or not self._client.service_is_ready():
             if time.monotonic() > self._wanted_s + MAX_ANSWER_S:
-                self._wanted_positions.clear()
+                self._wanted_position = None
                 self._say(
                     "No jump is possible",
                     "jump: no replay is running",
@@ -196,8 +193,9 @@ class ReplayClient:
             return False
 
         # The slider may still have the length of the bag that was replayed before this one.
-        position = min(self._wanted_positions.pop(), self.state.length)
+        position = min(self._wanted_position, self.state.length)
         request = SteerReplay.Request(position=position, paused=self.state.paused)
+        self._wanted_position = None
         # The page shows the new position, so a jump that succeeds needs no note.
         self._services.ask(JUMP, self._client, request, notes_success=False)
         # Without this assignment, the slider would jump back to the old position until the next

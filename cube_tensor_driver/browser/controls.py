@@ -86,15 +86,19 @@ class ReplayControls:
     """A slider for the time within a replay, and a button to stop it; hidden without a replay."""
 
     def __init__(
-        self, gui: viser.GuiApi, hold: Callable[[], None], jump: Callable[[float], None]
+        self,
+        gui: viser.GuiApi,
+        hold: Callable[[], None],
+        jump: Callable[[Callable[[], float]], None],
     ) -> None:
         """Add the controls.
 
         Args:
             gui: The controls of one browser.
             hold: Function that stops the replay, or lets it continue if it is stopped.
-            jump: Function that is called with the position that the user has set, in s after the
-                start of the bag.
+            jump: Function that is called, in a thread of viser, when the user has set a position.
+                Its argument is a function that returns the position, in s after the start of the
+                bag; it must be called in the thread that calls `show`.
         """
         self.is_held = False
         with gui.add_folder("replay", visible=False) as self._folder:
@@ -110,20 +114,19 @@ class ReplayControls:
         self._drawn = 0.0
         self._button.on_click(lambda _: hold())
 
-        # viser runs a coroutine at once and in order. A plain function would run later in a thread,
-        # where a newer event may overtake it.
         @self._slider.on_update
-        async def _(event: viser.GuiEvent[Any]) -> None:
+        def _(event: viser.GuiEvent[Any]) -> None:
             # `_move_slider` triggers this function, too; such an event has no client (browser).
             if event.client is None:
                 return
-            position = self._slider.value
-            # A browser may send any number, also NaN or infinity.
-            if not math.isfinite(position):
-                self._slider.value = self._drawn  # type: ignore[misc]
-                return
-            jump(position)
-            self._drawn = position
+            jump(self._take_position)
+
+    def _take_position(self) -> float:
+        # A browser may send any number, also NaN or infinity.
+        if not math.isfinite(self._slider.value):
+            self._slider.value = self._drawn  # type: ignore[misc]
+        self._drawn = float(self._slider.value)
+        return self._drawn
 
     def show(self, replay: ReplayPosition | None) -> None:
         """Show position, length and state of a replay.
@@ -143,8 +146,8 @@ class ReplayControls:
         self._button.label = "go on with the replay" if replay.paused else "stop the replay"
 
     def _move_slider(self, position: float) -> None:
-        # If the slider is not where this object has put it, the user has moved it, and another
-        # thread will call `on_update`. Until then the position that the user set must stay.
+        # If the slider is not where this object has put it, the user has moved it, and the position
+        # is not yet taken. Until then it must stay: viser would take the same value for no event.
         if self._slider.value == self._drawn and position != self._drawn:
             self._drawn = position
             self._slider.value = position  # type: ignore[misc]

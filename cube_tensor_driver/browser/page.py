@@ -102,7 +102,8 @@ Act = Callable[..., None]
 """Function that a page calls, in threads of viser, when its user wants something.
 
 Its arguments are the action, `TARE`, `CLEAR_TARE`, `RECORD`, `STOP`, `HOLD` or `JUMP`, and for the
-latter a time in the replay, in s after the start of the bag. It returns at once.
+latter a function that returns a time in the replay, in s after the start of the bag. It returns at
+once; the action is done later, in the thread that shows the page.
 """
 
 NOTE_S = 8.0

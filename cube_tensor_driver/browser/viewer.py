@@ -51,7 +51,7 @@ from .clients import BagRecorder, ReplayClient, ServiceCalls
 from .gate import LOCAL_HOSTS, check_host, guarded_server
 from .history import History
 from .markup import PageStatus
-from .page import CLEAR_TARE, HOLD, JUMP, TARE, Layout, Page, clear, show_waiting
+from .page import CLEAR_TARE, HOLD, TARE, Layout, Page, clear, show_waiting
 from .scan import Links, Scan, ScanSynchronizer
 from .update import ShownSkin
 
@@ -240,7 +240,7 @@ class Viewer:
         self._pages.pop(client_id, None)
         self._layouts.pop(client_id, None)
 
-    def _act(self, action: str, position: float = 0.0) -> None:
+    def _act(self, action: str, take_position: Callable[[], float] | None = None) -> None:
         """Do what the user of a page wants; the arguments are those of `Act`."""
         if action == TARE:
             self._services.ask("tare", self._tare, Tare.Request())
@@ -252,8 +252,8 @@ class Viewer:
             )
         elif action == HOLD:
             self._replay.toggle_hold()
-        elif action == JUMP:
-            self._replay.jump_to(position)
+        elif take_position is not None:
+            self._replay.jump_to(take_position())
         else:
             self._toggle_recording()
 
