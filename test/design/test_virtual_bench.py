@@ -343,7 +343,7 @@ def test_study_error_falls_with_the_square_of_the_side(monkeypatch):
     """The pads see the second derivative of the stress: the error of a stress goes as (d0 /
     depth)^2."""
     monkeypatch.setattr(bodies, "BRICK_SIZES", (bodies.BrickSizes(1.0, 0.3, 6.0),) * 3)
-    result = layout_study(sides=(1e-3, 0.5e-3), widths=(5e-3,), offsets=(-8e-3, -2e-3, 2e-3, 8e-3))
+    result = layout_study(sides=(1e-3, 0.5e-3), widths=(5e-3,), offsets=(-2e-3, 8e-3))
     zz, slope = COMPONENTS.index("zz"), COMPONENTS.index("zz_x")
     for error in result.error.values():
         assert error[0, 0, zz] < 0.06 and error[0, 0, slope] < 0.06
