@@ -16,6 +16,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 # On every processor there is a worker, or a node: threads of a matrix product only get in the way.
@@ -118,6 +119,13 @@ def _turns(config: pytest.Config) -> _Turns:
 def effort(request: pytest.FixtureRequest) -> int:
     """How long a test marked `campaign` tries: in the suite once, under -m campaign 20 times."""
     return 20 if request.config.option.markexpr == "campaign" else 1
+
+
+@pytest.fixture
+def one_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`./cube reprocess` without worker processes, each of which takes half a second to start."""
+    name = "cube_tensor_driver.bags.reprocess.all_bags.workers"
+    monkeypatch.setattr(name, lambda *_: ThreadPoolExecutor(1))
 
 
 @contextlib.contextmanager

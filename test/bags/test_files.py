@@ -321,13 +321,6 @@ def test_tables_hold_the_same_numbers_with_units(bag, tmp_path):
     assert parquet["stamp_ns"].to_pylist()[1] == START_NS + 100
 
 
-@pytest.fixture
-def one_process(monkeypatch):
-    """`./cube reprocess` without worker processes, each of which takes half a second to start."""
-    name = "cube_tensor_driver.bags.reprocess.all_bags.workers"
-    monkeypatch.setattr(name, lambda *_: ThreadPoolExecutor(1))
-
-
 def test_another_calibration_and_tare(bag, tmp_path, capsys, one_process):
     """Twice the modulus is twice the stress; after a tare over one instant that instant has
     none."""

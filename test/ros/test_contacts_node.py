@@ -119,7 +119,7 @@ def test_what_reprocess_cannot_use_is_one_line(tmp_path, capsys, given, words):
     assert words in " ".join(error.split()) and "Traceback" not in error and not out.exists()
 
 
-def test_pads_in_a_thin_layer_out_of_a_bag(tmp_path):
+def test_pads_in_a_thin_layer_out_of_a_bag(tmp_path, one_process):
     """The force, by influence functions; cubes that count as points in this layer say 4 % more."""
     pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
     from rclpy.serialization import deserialize_message, serialize_message
