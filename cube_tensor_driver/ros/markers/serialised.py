@@ -188,8 +188,12 @@ class SerialisedMarkers:
         marks = [_mark(marker, number) for number, marker in enumerate(copies)]
         marked = serialize_message(MarkerArray(markers=copies))
         self._arrays = {}
+        start = 0
         for marker, begins in zip(markers, marks, strict=True):
-            points, colours, text, position, colour = map(marked.index, begins)
+            offsets = [marked.index(begin, start) for begin in begins]
+            points, colours, text, position, colour = offsets
+            # The position is the first of these fields in the bytes of a marker.
+            start = position
             n_points, n_colours = len(marker.points), len(marker.colors)
             n_characters = len(marker.text)
             self._arrays[marker.ns] = MarkerArrays(
