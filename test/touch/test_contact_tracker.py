@@ -304,10 +304,10 @@ def test_many_contacts_in_a_row(count):
         assert np.linalg.norm(one.position[:2] - place) < 0.1e-3
 
 
-@pytest.mark.parametrize("seed", [3, 4])
+@pytest.mark.parametrize("seed", [1, 4])
 def test_ten_balls_on_planar_cubes_have_their_forces(seed):
-    """With stress of contacts that are not fitted yet counted as 15 % uncertain and not as 5 %, the
-    rms error was 2 and 8 %, or 2 and 8 stated deviations. Ten balls leave 0.55 to 1.45 open."""
+    """Each fit subtracts the stress by nine other balls, which it takes for uncertain. Ten balls
+    leave 0.55 to 1.45 of the calibration ratio open."""
     bench = TractionBench(Setting(cubes=CUBES[1], side=96e-3), side=2)
     random, places = np.random.default_rng(seed), []
     while len(places) < 10:
@@ -317,13 +317,24 @@ def test_ten_balls_on_planar_cubes_have_their_forces(seed):
     shapes = [ellipse(6e-3, 6e-3, order=6) + np.array([*place, 0]) for place in places]
     load = np.concatenate(shapes), np.zeros(2), np.array([0, 0.9, -3.0])
     values, tracker = values_under(bench, *load, random), ContactTracker(bench.inverse, LEAST)
-    for _ in range(12):
+    for _ in range(36):
         found = tracker.update(values)
     assert len(found) == len(places)
     error = np.array([one.normal_force - 3 for one in found])
     stated = np.array([one.force_uncertainty for one in found])
     assert np.sqrt(np.mean(error**2)) < 0.005 * 3
     assert 0.5 < np.sqrt(np.mean((error / stated) ** 2)) < 1.5
+
+
+@pytest.mark.parametrize(("factor", "is_kept"), [(1.0, True), (20.0, False)])
+def test_a_fit_with_more_force_than_its_pressure_is_dropped(inverse, factor, is_kept):
+    """As when fits of neighbouring regions, which subtract each other's response, diverge."""
+    tracker = ContactTracker(inverse, LEAST)
+    tracker.update(ball(inverse, 8e-3, np.array([2e-3, 1e-3]), (0, 0, -3.0)), max_work=np.inf)
+    (region,) = tracker._regions
+    region.fit.found = region.fit.found._replace(forces=factor * region.fit.found.forces)
+    region.begin_scan(region.points, region.peak)
+    assert (region.fit is not None) == is_kept
 
 
 def test_two_contacts_one_and_a_half_pitches_apart_are_told_apart_and_keep_their_ids(inverse):

@@ -30,13 +30,7 @@ from .hertz_fit import HertzFit, linearise
 from .local_values import CubeNoise, rotations_about_normal
 from .node_fit import NodeFit
 from .pressure_regions import PressureRegions
-from .tracked_region import (
-    MAX_START_SIZE,
-    RESPONSE_ERROR,
-    TrackedRegion,
-    Work,
-    update_responses,
-)
+from .tracked_region import MAX_START_SIZE, TrackedRegion, Work, update_responses
 
 NEIGHBOUR_REACH_PITCHES = 3.0
 """Distance between two regions of contact, divided by the pitch (distance of neighbouring cubes),
@@ -289,14 +283,17 @@ class ContactTracker:
         if len(fitted) > 1:
             update_responses(self._inverse, fitted, self._fitted_cubes)
         responses = np.array([region.response for region in self._regions])
-        total, magnitude = responses.sum(axis=0), np.abs(responses).sum(axis=0)
+        errors = np.array([region.relative_error for region in self._regions])
+        # Deviations add linearly, because the same errors of the elastomer cause them.
+        deviation = np.tensordot(errors, np.abs(responses), 1)
+        total = responses.sum(axis=0)
         for region in fitted:
             if region.fit is not None:
                 values = region.fit.values
                 cubes = values.cubes
                 own = region.response[cubes]
                 region.others = total[cubes] - own
-                values.disturbance = RESPONSE_ERROR * (magnitude[cubes] - np.abs(own))
+                values.disturbance = deviation[cubes] - region.relative_error * np.abs(own)
                 region.fit.step(values.whiten(self._scaled, region.others))
                 if region.near:
                     explained = region.fit.explained
@@ -318,10 +315,12 @@ class ContactTracker:
         """
         others = [region for region in self._regions if region is not excluded]
         update_responses(self._inverse, others, cubes)
-        nothing = np.zeros_like(self._scaled[cubes])
-        responses = np.array([nothing, *(region.response[cubes] for region in others)])
-        # Deviations add linearly, because the same errors of the elastomer cause them.
-        return responses.sum(axis=0), RESPONSE_ERROR * np.abs(responses).sum(axis=0)
+        total = np.zeros((len(cubes), len(self._inverse.columns)))
+        deviation = np.zeros_like(total)
+        for region in others:
+            total += region.response[cubes]
+            deviation += region.relative_error * np.abs(region.response[cubes])
+        return total, deviation
 
     def _start_of_fit(self, contact: TrackedContact) -> tuple[int, Discs]:
         """Return the start of the fit of a contact.

@@ -237,6 +237,11 @@ class HertzFit:
         return self.found
 
     @property
+    def normal_force(self) -> float:
+        """Sum of the normal forces of the contacts in N, positive for bodies that press."""
+        return -float(self.found.forces[:, 2].sum())
+
+    @property
     def explained(self) -> Array:
         """Values (n, C), in Pa, of the cubes around the region under the contacts `found`."""
         found, base = self.found, self.linear.contacts
