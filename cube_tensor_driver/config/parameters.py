@@ -197,7 +197,7 @@ RECONSTRUCTION = (
         "publish_period",
         0.0,
         "Value of the driver's parameter publish_period, in s. The node computes the depths of its "
-        "queues from it.",
+        "queues and the limit for the size of a message from it.",
         span=(0.0, 1.0),
     ),
     RELIABILITY,

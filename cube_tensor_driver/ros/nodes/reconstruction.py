@@ -8,12 +8,13 @@ import threading
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from ...config.parameters import RECONSTRUCTION
 from ...core.arrays import Array
 from ...core.compensation.motion import UNKNOWN_MOTION, ForcesAtCubes, Motion
-from ...core.errors import BagError, CubeError
+from ...core.errors import BagError, CubeError, MessageError
 from ...core.reconstructor import Reconstructor
 from ...core.rows import FrequencyRows
 from ...messages.codec import SECOND, frequency_codec
@@ -35,13 +36,21 @@ from ..messages import (
 )
 from ..motion import MissingMotion, make_motion_source
 from ..node import CubeNode, run
-from ..qos import LATCHED
+from ..qos import LATCHED, scans_per_message
 from .state_interfaces import make_state_interfaces
 from .stress_publisher import StressPublisher
 from .taring import Taring, tare_folder
 
 if TYPE_CHECKING:
     from ...bags.reprocess.recorded_reconstruction import RecordedReconstruction
+
+MAX_SCANS = 1000
+"""Maximum number of scans in a message of `frequencies`; a scan has one sample of every cube. A
+message with more is refused, unless the parameter publish_period requires more.
+
+The limit keeps a single message from blocking the node for long: the computation of one scan of
+1280 cubes takes up to 0.3 ms.
+"""
 
 STATES_PERIOD_NS = 10 * SECOND
 """Time, in ns, between two messages with the states of the compensation of creep and temperature.
@@ -81,6 +90,11 @@ class Reconstruction(CubeNode):
         skin = self._skin = recorded.skin if recorded else self.read_skin()
         self._reconstructor = Reconstructor(skin)
         self._reconstructor.drift_time = float(self.value("drift_time"))
+        # The driver may put one scan more into a message than the number that belongs to
+        # publish_period. The factor 2 allows hubs to send faster than the rate in the skin file.
+        scans = scans_per_message(self.value("publish_period"), skin.rate)
+        self._max_scans = max(MAX_SCANS, 2 * (scans + 1))
+
         profile = self.batch_profile(skin.rate, len(skin.cubes))
         self._publisher = StressPublisher(
             self,
@@ -181,6 +195,7 @@ class Reconstruction(CubeNode):
         if not self.is_active:
             return
         try:
+            self._check_scans(rows)
             with self._lock:
                 recorded = self._recorded
                 health = recorded.health_at(rows, self._reconstructor) if recorded else None
@@ -244,6 +259,27 @@ class Reconstruction(CubeNode):
     def _refuse(self, error: CubeError) -> None:
         self._diagnostics.refused_messages += 1
         log_refused_message(self, "frequencies", error)
+
+    def _check_scans(self, rows: FrequencyRows) -> None:
+        """Check that a message does not have too many scans, see `MAX_SCANS`.
+
+        Args:
+            rows: Rows of frequencies, one sample of one cube each.
+
+        Raises:
+            MessageError: The message has more than the allowed number of rows of one cube.
+        """
+        # Counting the rows of each cube takes time. Almost all messages have so few rows in total
+        # that no cube can have too many.
+        if len(rows) <= self._max_scans:
+            return
+        counts = np.bincount(rows.cube)
+        n_scans = counts.max()
+        if n_scans > self._max_scans:
+            raise MessageError(
+                f"a message has {n_scans} rows of cube {counts.argmax()}, the limit is "
+                f"{self._max_scans}: set parameter publish_period to the driver's"
+            )
 
     def _publish_info(self) -> SkinInfo:
         # The stamp of `info` is the time from which on its rest frequencies are valid: 1 ns after
