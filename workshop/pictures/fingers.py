@@ -59,7 +59,7 @@ def draw_fingers(
     values_kpa = np.concatenate(list(pressures.values()))
     lowest, highest = np.nanmin(values_kpa), np.nanmax(values_kpa)
 
-    figure = Figure(figsize=(9, 4))
+    figure = Figure(figsize=(9, 4.4))
     robot, *axes = figure.subplots(1, 1 + len(fingers), width_ratios=[1.9] + [1.0] * len(fingers))
     robot.imshow(pixels)
     robot.set_axis_off()
@@ -78,6 +78,8 @@ def draw_fingers(
         _draw_shear(axis, parts[name], 1e-3 * values[cubes])
         axis.set(title=f"{name} finger\n\n", xlabel="$x$ / mm", aspect="equal")
         axis.grid(False)
+        # Room for the arrows at the edges.
+        axis.margins(0.22, 0.1)
     axes[0].set_ylabel("$z$ / mm")
     figure.colorbar(image, ax=axes, label="pressure in the cubes' plane / kPa")
     return figure
@@ -104,9 +106,6 @@ def _draw_shear(
         scale_units="xy",
         scale=ARROW_KPA / ARROW_MM,
         width=0.012,
-        clip_on=False,
     )
-    # Arrows may end outside of the axes, but must not change their size.
-    arrows.set_in_layout(False)
     label = f"shear {ARROW_KPA:g} kPa"
     axis.quiverkey(arrows, 0.5, 1.04, ARROW_KPA, label, color="black", labelpos="N")
