@@ -284,7 +284,9 @@ def fit_thermal(data: Warming) -> ThermalFit:
     unweighted = _search(data, 1, 1, 0.0)
     slope = root_mean_square(unweighted.values[1])
     best = _search(data, 1, 1, slope)
-    # If the weights of the blocks change the result much, the data do not determine it.
+    # In `best`, the weight of a block depends on the difference between its temperatures before and
+    # after the low-pass filter. If these weights change the slope much, the data do not determine
+    # it, and `_check` raises an error.
     change = abs(root_mean_square(best.values[1]) / slope - 1)
 
     two = _search(data, 2, 1, slope)

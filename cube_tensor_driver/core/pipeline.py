@@ -365,7 +365,7 @@ class Pipeline:
         return np.where(is_used, stress, np.nan)
 
     def suspects(self, rows: FrequencyRows, left_out: PadMasks | None = None) -> Mask:
-        """Find the pads that explain a high residual if just this one pad is broken.
+        """Find each pad that, as the only broken pad of a cube, would explain a high residual.
 
         Args:
             rows: N rows of frequencies.

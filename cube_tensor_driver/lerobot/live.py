@@ -36,8 +36,8 @@ of all recordings have different numbers.
 """
 
 NUMBER_BYTES = 6
-"""Size of a frame number (time of reading in ms since the Unix epoch), which reaches beyond the
-year 10000."""
+"""Size, in bytes, of a frame number (time in ms since the Unix epoch). Its 48 bits suffice beyond
+the year 10000."""
 
 NUMBER_GRID = (2, 24)
 """Rows and columns of black and white squares at the top of a picture, which show the 48 bits of
@@ -59,12 +59,13 @@ MAX_AGE_NS = 5_000_000
 period, within which there need not be a new sample."""
 
 CATCH_UP_S = 0.02
-"""Longest time, in s, for which `next_picture` waits for samples that are older than `MAX_AGE_NS`.
+"""Longest time, in s, for which `next_picture` waits until no unread sample is older than
+`MAX_AGE_NS`.
 
-Only one thread of Python runs at a time. While the recorder or its writers of images compute, each
-of the two threads that a sample passes waits up to 5 ms (`sys.getswitchinterval`) for its turn, and
-on a busy computer longer. They run while `next_picture` waits, for which half a frame of a data set
-of 30 frames per second is left.
+A sample passes through two threads, and Python runs only one thread at a time. While the recorder
+or its writers of images compute, each of the two waits up to 5 ms for its turn
+(`sys.getswitchinterval`), and on a busy computer longer. At 30 frames per second, the limit leaves
+13 of the 33 ms of a frame to the recorder.
 """
 
 UNKNOWN_GREY = 90

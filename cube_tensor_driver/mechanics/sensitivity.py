@@ -33,15 +33,18 @@ the thickness."""
 
 
 def sensitivities(layer: Layer, depth: float) -> list[Spectra]:
-    """Return the changes of a layer's spectra by errors of depth, thickness and Poisson's ratio.
+    """Compute how errors of depth, Poisson's ratio and thickness change the spectra of a layer.
+
+    The spectra are the responses of stress and gradient at a depth to waves of traction on the
+    surface, as functions of the wavenumber (`layer_spectra`).
 
     Args:
         layer: Elastic layer.
         depth: Distance from the cubes' centres to the surface, in m.
 
     Returns:
-        Changes of the spectra from `layer_spectra` for one standard deviation of the depth, of
-        Poisson's ratio and, in a layer of finite thickness, of the thickness.
+        Changes of the spectra for one standard deviation of the depth, of Poisson's ratio and, in a
+        layer of finite thickness, of the thickness.
     """
     base = layer_spectra(layer, depth)
     # The finite differences are one-sided, and their steps do not leave the allowed ranges: the

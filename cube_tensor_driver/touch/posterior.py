@@ -223,14 +223,15 @@ class WindowPosteriors:
         return _number_distinct(np.concatenate(features, axis=1))
 
     def product(self, y: Single) -> Single:
-        """Compute the posterior mean G y of the traction on the patches of all cubes.
+        """Compute the posterior mean G y (head of this file) of the traction around all cubes.
 
         Args:
-            y: Values (cubes, C) in Pa, 0 where unknown.
+            y: Components (cubes, C) that the cubes measure, in Pa; 0 where unknown.
 
         Returns:
-            Posterior mean (cubes, points x ROWS_PER_POINT) in Pa. Each point of the patch of a cube
-            has `ROWS_PER_POINT` results: traction along x, y, z, and pressure at the cubes' depth.
+            Posterior mean (cubes, points x ROWS_PER_POINT) in Pa, at the surface points around each
+            cube. Each point has `ROWS_PER_POINT` results: traction along x, y and z, and pressure
+            at the cubes' depth.
         """
         # The values of all cubes of a window are joined to one row, in the order of the columns of
         # the gain matrix G.
@@ -300,7 +301,11 @@ class WindowPosteriors:
 
 
 class _Window(NamedTuple):
-    """Matrices of one kind of window; see the attributes of `WindowPosteriors`."""
+    """Matrices for the traction around a cube from the values of its window (the nearest cubes).
+
+    All windows of one kind (same relative poses and noise) use them. `WindowPosteriors` describes
+    them; its attribute `prior` holds each `variance`.
+    """
 
     gain: Single
     precision: Single

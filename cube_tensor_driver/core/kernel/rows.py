@@ -432,8 +432,9 @@ def _measure_pace(
     state["interval_ns"][cube] = now
     state["is_doubtful"][cube] = is_doubtful
 
-    # Time that went back counts as a gap, too. The interval between the last row of a window and
-    # the first row of the next one is the gap before the next window, not within it.
+    # `gap_before` is the gap between the last row of the previous window and the first row of this
+    # one; `gap_within` is the longest gap between two rows of this window. A negative interval
+    # (time went back) is a gap, too.
     is_gap = (between < 0) | (between >= GAP_NS)
     is_first = state["rows"][cube] == 0
     within = state["gap_within"][cube]

@@ -243,7 +243,8 @@ class HertzFit:
 
     @property
     def explained(self) -> Array:
-        """Values (n, C), in Pa, of the cubes around the region under the contacts `found`."""
+        """Components (n, C), in Pa, that the contacts `found` cause in the n cubes around the
+        region, by the linearised response `linear`."""
         found, base = self.found, self.linear.contacts
         change = np.empty((len(found.forces), _N_PARAMETERS))
         change[:, :3] = found.forces - base.forces

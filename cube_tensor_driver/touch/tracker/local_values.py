@@ -231,17 +231,20 @@ class LocalValues:
         return values, whitened.reshape(-1, 3 * count)
 
     def sensitivity(self, centres: Array, size: float, forces: Array) -> Array:
-        """Compute how the values change by errors of the elastomer's depth, thickness and Poisson's
-        ratio (sensitivity.py).
+        """Compute how errors of the elastomer's properties change the response to Hertz contacts.
+
+        The properties are the S quantities of mechanics/sensitivity.py: depth of the cubes,
+        Poisson's ratio and, if it is finite, the thickness.
 
         Args:
-            centres: Centres (K, 2) of Hertz contacts in m, in the frame of the home cube.
+            centres: Centres (K, 2) of the contacts in m, in the frame of the home cube (the cube
+                around which the skin is laid flat).
             size: Radius of the contacts in m.
             forces: Forces (3, K) of the contacts in N.
 
         Returns:
-            Changes (n, C, S) in Pa of the C components of n cubes by one standard deviation of each
-            of S quantities.
+            Changes (n, C, S) in Pa of the C components of n cubes, if the error of a property is
+            one standard deviation.
         """
         n, count = len(self.cubes), len(centres)
         inverse = self._inverse

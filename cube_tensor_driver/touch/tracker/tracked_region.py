@@ -357,12 +357,15 @@ class TrackedRegion:
         return self._fit_nodes(scaled, respond_to_others)
 
     def _iterate(self, fit: HertzFit, scaled: Array, steps: int) -> int:
-        """Make Gauss-Newton steps until the fit has converged, and return their work.
+        """Make Gauss-Newton steps until the fit has converged.
 
         Args:
             fit: Fit that is improved.
             scaled: Values (cubes, C), in Pa, of all cubes.
             steps: Largest number of steps.
+
+        Returns:
+            Work (computing time) of the steps, in the unit of `MAX_WORK_PER_SCAN`.
         """
         white = fit.values.whiten(scaled, self.others)
         work = 0
