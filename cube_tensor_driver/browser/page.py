@@ -60,8 +60,8 @@ CAMERA_DIRECTIONS = {
     # Exactly from above, it would not be known which side of the skin is up in the picture.
     "from above": np.array([0.0, -0.01, 1.4]) * SPAN,
 }
-"""Name of a direction from which the camera looks -> vector in the scene from the point at which it
-looks to the camera."""
+"""Name of a direction of view -> vector to the camera from its target, the point at which it looks,
+in the coordinates of the scene."""
 
 PHONE_TARGET = np.array([0.0, -0.45, -0.3]) * SPAN
 """Point of the scene at which the camera looks on a phone.

@@ -102,9 +102,11 @@ LINES: dict[str, tuple[Colour, float]] = {
     "contacts": ((200, 40, 160), 0.02),
     **{f"fault {state}": (colour, 0.06) for state, colour in FAULT_COLOURS.items()},
 }
-"""Name of an object of lines that depend on the measured values -> its colour, and the thickness
-of its lines relative to the unit length of arrows (about the pitch, which is the distance of
-neighbouring cubes)."""
+"""Name of a group of lines that are redrawn in each update -> colour and thickness of its lines.
+
+The thickness is relative to the unit length of arrows, which is about the pitch (distance of
+neighbouring cubes).
+"""
 
 NO_LINES = np.zeros((1, 2, 3))
 """An invisible line without length, because the browser cannot draw an object without lines."""

@@ -122,8 +122,9 @@ class Pipeline:
         calibrations: Calibration of each cube.
         n_pads: Largest number of pads of a cube, P.
         dtype: Precision of the computation.
-        newest_offset: What was subtracted from the newest rows (cubes, P), stress / stiffness, as
-            weight, creep or temperature; None: nothing is compensated.
+        newest_offset: Sum of the effects of weight, creep and temperature that was subtracted from
+            the newest row of each cube (cubes, P), as stress divided by the stiffness of the pad;
+            None: nothing is compensated.
         rest_changes: Number of changes of the rest frequencies so far, by tare or drift.
     """
 

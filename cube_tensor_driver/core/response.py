@@ -58,9 +58,10 @@ ILLUSTRATIVE_CUBE = {
 }
 """Illustrative coefficients of the response matrix of the layout cube, in Pa per Pa.
 
-They are the responses of the first pad, +z-x, to the modes after the colon. Those to modes of the
-plane z-x are chosen so that the pads in this plane respond as `ILLUSTRATIVE` states; the others
-(yy, yy_x, yy_z and the two shear gradients) are chosen freely.
+Each key names a pad, always the first one, +z-x, and after the colon the mode to which it responds.
+The responses to yy, yy_x, yy_z and the two shear gradients are chosen freely. The others are chosen
+so that the pads in the plane z-x respond to the modes of this plane with the coefficients
+`ILLUSTRATIVE`, like the pads of the layouts quad and planar.
 """
 
 MAX_LISTED_NAMES = 6

@@ -350,9 +350,9 @@ class PolygonTables(_ContactTables):
         edge = second - first
         edge /= np.maximum(np.abs(edge), _MIN_EDGE_LENGTH)
 
-        # The ends are rotated into axes along and across the edge. There, the real parts are their
-        # positions t along the edge, and the imaginary part of both is -d, with the signed distance
-        # d of the edge's line from the origin.
+        # The two ends of each edge are rotated into axes along and across the edge. The real part
+        # of an end is then its position t along the edge. The imaginary part is the same for both
+        # ends: it is minus the signed distance of the edge's line from the origin.
         ends = np.stack([first, second], axis=-1)
         local = ends * edge.conj()[..., None]
         signed_distance = -local[..., 0].imag

@@ -40,7 +40,8 @@ PER_PAD = -1
 """Value of `_Field.width` for a field with one value per pad in each row (sample of a cube)."""
 
 PER_MESSAGE = 0
-"""Value of `_Field.width` for a field with a single value in a message, which is no sequence."""
+"""Value of `_Field.width` (number of values per row) for a field that is not a sequence, but holds
+one value for the whole message."""
 
 _SECONDS_AT = len(LITTLE_ENDIAN)
 _NANOSECONDS_AT = _SECONDS_AT + 4

@@ -380,7 +380,11 @@ class SlipEstimator:
         return values.reshape(len(self._contacts), -1)
 
     def _follow(self, scaled: Array) -> Array:
-        """Return force in N and position in m (n, 6) of each contact in a scan."""
+        """Return force in N and position in m (n, 6) of each contact in a scan.
+
+        Args:
+            scaled: Components (cubes, C) in Pa of the scan, as from `SurfaceInverse.scaled`.
+        """
         contacts = self._contacts
         # A value that is missing counts as unchanged.
         change = np.nan_to_num(self._gather(scaled) - contacts["values"])

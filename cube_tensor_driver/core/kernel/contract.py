@@ -32,10 +32,11 @@ DONE = -1
 """Result of the kernel (the loop over rows of frequencies): all rows are processed."""
 
 NEEDS_WINDOW = -2
-"""Result of the kernel (the loop over rows of frequencies) that stops before a scan whose newest
-time stamp lies outside the present window of 0.5 s over which the health of pads is judged.
+"""Result of the kernel (the loop over rows of frequencies): it has stopped before a scan.
 
-The caller ends this window, opens another, and calls the kernel again from that scan on.
+The newest time stamp of the scan lies outside the present window of 0.5 s, over which the health of
+pads is judged. The caller ends this window, opens another, and calls the kernel again from that
+scan on.
 """
 
 NEEDS_CONDITION = -3

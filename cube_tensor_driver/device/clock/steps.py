@@ -43,9 +43,12 @@ MIN_DECISION_READS = 8
 """Number of reads after a suspected step of the hub's clock before the smallest delay decides. The
 samples of a few reads may all be delayed."""
 UNLIKELY_DELAY = 8.0
-"""Factor by which hardly any delay of a sample (arrival minus sampling) exceeds the mean delay; the
-smallest delay is subtracted from both. A step of the hub's clock that exceeds the mean delay by
-this factor cannot be confused with a delayed sample."""
+"""Smallest ratio of a step of the hub's clock to the mean delay of samples, at which a single delay
+can decide whether the clock was set.
+
+A delay is the time from the sampling to the arrival of a sample, minus the smallest such time.
+Hardly any delay exceeds the mean by this factor, so the step cannot be confused with a delay.
+"""
 MIN_HOST_STEP_NS = 1_000_000
 """Smallest step of the host's clock, in ns, that is detected. The host's and the monotonic clock
 are read one after the other, so that smaller differences of the two are not certain."""

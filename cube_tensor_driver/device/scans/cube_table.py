@@ -31,7 +31,7 @@ HubIndex = NDArray[np.int32]
 """Array (n_cubes,) with the index in the skin of each cube of a hub; `ABSENT` for a cube that is
 not in the skin file."""
 RowIndex = NDArray[np.uint16]
-"""Array (n_cubes,) with the index in the skin of the cube that each row of a sample belongs to."""
+"""Array (n_cubes,) that states, for each row of a sample, the index of its cube in the skin."""
 
 
 @dataclass(frozen=True)

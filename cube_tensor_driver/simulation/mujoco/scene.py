@@ -31,7 +31,10 @@ KEPT_S = 2.0
 of a skin need the contacts at slightly different times, and a scene is only computed forwards."""
 
 UNBOUNDED_PERIOD_S = 10.0
-"""Value, in s, of the attribute `period` of a scene that never repeats."""
+"""Value, in s, of the attribute `period` of a scene that never repeats.
+
+If the load is computed in advance (option `--instants`), it is computed for this time and repeated.
+"""
 
 
 def read_scene(path: Path) -> MjModel:

@@ -144,7 +144,9 @@ class HertzFit:
     linear: Linearisation
 
     def __init__(self, inverse: SurfaceInverse, values: LocalValues, starts: Discs) -> None:
-        """Start without a step; `linearise` and `step` have to follow.
+        """Prepare a fit that begins at `starts`.
+
+        To improve these contacts, call `linearise`, then `step` (a Gauss-Newton step).
 
         Args:
             inverse: Depth and responses of the skin.

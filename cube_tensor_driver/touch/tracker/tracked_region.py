@@ -81,11 +81,11 @@ which the skin is laid flat for the fit, in pitches (distances of neighbouring c
 distance, the cube nearest to the contacts becomes the home cube."""
 
 MAX_STALE_CHANGE = 0.003
-"""Largest relative change of a contact at which the stress of distant cubes under this contact is
-not computed again.
+"""Largest relative change of a region's contacts up to which the stress that they cause in distant
+cubes is not computed again.
 
-The change is the larger one of two ratios: shift to distance of the nearest other region of
-contact, and change of the force to force.
+The relative change is the larger one of two ratios: the shift of the contacts divided by the
+distance of the nearest other region, and the change of force divided by the largest force.
 """
 
 START_ERROR = 0.15
