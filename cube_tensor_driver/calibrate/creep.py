@@ -152,8 +152,8 @@ class _Solution(NamedTuple):
     Attributes:
         amplitude: Amplitudes of each pad (P, K).
         error: Measured minus computed averages of the readings (N, P), in Pa.
-        deviation: Error of the amplitudes (P, K) that changes the predicted creep under a long load
-            by one standard deviation of this prediction.
+        deviation: Change of the amplitudes (P, K) that stands for their uncertainty. It changes the
+            creep predicted under a long load by the standard deviation of this prediction.
     """
 
     amplitude: Array

@@ -289,8 +289,9 @@ class SkinWatcher:
         from .usage import Usage
 
         spin = self._observer.spin
-        # The measurement begins when DDS (the middleware of ROS 2) has found all nodes, because
-        # otherwise it could count tensors of another skin that is found later.
+        # Another skin in the same DDS domain would add its tensors to the counts. DDS (the
+        # middleware of ROS 2) finds it within `ANNOUNCE_S`; the measurement begins after this time,
+        # so that `_check_alone` finds such a skin.
         spin(self._made_s + ANNOUNCE_S - time.monotonic())
         start_ns = time.time_ns()
         usage = Usage(self._children, MEASURED_NODES)

@@ -296,13 +296,17 @@ def _airy(
     ) -> Array:
         """Return the second derivative g_ij of the Airy function g, or the derivative of g_ij by Z.
 
+        g contains one potential h for tangential forces and one for normal forces. The arguments
+        are h1 = h'/r, h2 = h1'/r and h3 = h2'/r of these, where ' is the derivative by the distance
+        r in a plane Z = const.
+
         Args:
             i: First axis of the derivative, 0 (x) or 1 (y).
             j: Second axis of the derivative.
-            t2: Function h2 of the potential of the tangential force: chi, or chi_Z for d/dZ.
-            t3: Function h3 of this potential.
-            n1: Function h1 of the potential of the normal force: chi_Z, or chi_ZZ for d/dZ.
-            n2: Function h2 of this potential.
+            t2: h2 for tangential forces, of h = chi; for the derivative by Z, of h = chi_Z.
+            t3: h3 of the same h.
+            n1: h1 for normal forces, of h = chi_Z; for the derivative by Z, of h = chi_ZZ.
+            n2: h2 of the same h.
         """
         mixed = force[i] * position[j] + force[j] * position[i]
         by_distance = f_dot_d * t3 - fz * n2

@@ -478,10 +478,11 @@ class MessageCodec(Generic[AnyRows]):
         return shape
 
     def _read_stamp(self, layout: _Layout, message: bytes) -> int:
-        """Return the time stamp of a message's header, in ns since the Unix epoch.
+        """Check the sequences of a message, and return its time stamp in ns since the Unix epoch.
 
         Raises:
-            MessageError: A sequence has another number of values than the number of rows requires.
+            MessageError: The number of values of a sequence does not fit the message's numbers of
+                rows and pads.
         """
         seconds, nanoseconds, *counts = layout.numbers.unpack_from(message)
         for name, found, needed in zip(layout.sequences, counts, layout.counts, strict=True):

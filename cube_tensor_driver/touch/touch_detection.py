@@ -64,9 +64,9 @@ NEIGHBOURS = 9
 cube of the touch and those nearest to it."""
 
 SPREAD = 0.25
-"""Largest ratio of the pressures that a load causes at two neighbouring cubes far from it, of which
-one is farther away by one pitch. From it follows an upper limit of the pressure that a load causes
-at other cubes, which a touch there must exceed."""
+"""Largest ratio of the pressures that a distant load causes at two neighbouring cubes: the pressure
+of the farther cube divided by that of the nearer one. This ratio limits the pressure that a load
+can cause at other cubes. A touch at such a cube must exceed this limit."""
 
 FAR = 1e-4
 """Largest ratio of the pressure of a cube at least seven pitches away from a load to the largest

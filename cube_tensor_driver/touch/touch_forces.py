@@ -45,8 +45,8 @@ MAX_PITCHES = 1.0
 neighbouring cubes). Half a pitch would be enough for small loads; wide ones reach farther."""
 
 MIN_OTHER_PITCHES = 2.0
-"""Smallest distance of other loads from the cube along x or along y, in pitches (distances of
-neighbouring cubes)."""
+"""Distance from the cube of the nearest other loads for which the estimate is computed, in pitches
+(distances of neighbouring cubes). It is the larger one of the distances along x and along y."""
 
 
 class ForceEstimate(NamedTuple):

@@ -161,10 +161,12 @@ class Thermal:
         self.is_known = self.has_model & is_accurate
 
     def deviation(self, cube: int) -> Array:
-        """Return the errors (P, k) of the effect on a cube by k independent causes, in Pa.
+        """Return the errors (P, k) of the thermal stress on the P pads of a cube, in Pa.
 
-        Each column has the size of one standard deviation. An unknown temperature is taken as the
-        reference temperature, with a standard deviation of 5 K.
+        Each of the k columns is the error, of one standard deviation, by one of k independent
+        causes: the unknown temperature of the elastomer, its lag behind the thermometer, and the
+        coefficients of the calibration. If no temperature has been measured yet, the reference
+        temperature is assumed, with a standard deviation of 5 K.
         """
         model = self._models[cube]
         _, n_pads = self.offset.shape

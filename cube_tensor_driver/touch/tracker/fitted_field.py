@@ -23,9 +23,10 @@ _MIN_RINGS = 4
 its force is distributed over the points of the surface."""
 
 _RINGS_PER_SPACING = 16
-"""Distance of neighbouring points of the surface, divided by the width of a ring of point forces.
-Each point force is added to the nearest point of the surface. With rings this narrow, the rounding
-error of the pressure is below the standard deviation of the pressure."""
+"""Number of concentric rings of point forces, by which a Hertz contact is represented, within the
+distance of neighbouring points of the surface. Each point force is moved to the nearest of these
+points. With rings this narrow, the error of the pressure due to the moves is below the standard
+deviation of the pressure."""
 
 
 def add_fits(

@@ -199,9 +199,9 @@ class HertzFit:
     def needs_linearisation(self) -> bool:
         """Whether the response of the cubes must be linearised again before the next step.
 
-        It must if the cubes or their noise have changed, if the `displacement` exceeds
-        `SETTLED_STEP`, or if the misfit has fallen so far that the prior is too narrow
-        (`MAX_PRECISION_RATIO`).
+        It must if the cubes or their noise have changed, if the `displacement` of the contacts is
+        at least `SETTLED_STEP`, or if the prior precision of the elastomer's errors exceeds
+        `MAX_PRECISION_RATIO` times the misfit.
         """
         if self.linear.cubes is not self.values or self.displacement >= SETTLED_STEP:
             return True

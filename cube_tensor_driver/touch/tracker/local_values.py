@@ -27,9 +27,9 @@ MODEL_ERROR = 1e-4
 divided by the largest stress on any pad of the surrounding cubes."""
 
 _MIN_DISTURBANCE = 1e-3
-"""Change, in Pa, of the disturbance by other contacts (sum of the standard deviations of the stress
-that they cause in the cubes of a fit) that is ignored. It is far below the noise of a pad and far
-above rounding errors."""
+"""Change of the total disturbance, in Pa, that is ignored even if the relative change is large. The
+total disturbance is the sum of the standard deviations of the stress that other contacts cause in
+the cubes of a fit. The limit is far below the noise of a pad and far above rounding errors."""
 
 
 class CubeNoise:

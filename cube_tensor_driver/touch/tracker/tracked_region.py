@@ -453,8 +453,11 @@ class TrackedRegion:
         return work
 
     def _accept(self, fit: HertzFit | NodeFit) -> None:
-        """Make `fit` the fit of this region, and store the points, the largest pressure and the
-        misfit with which later scans are compared."""
+        """Make `fit` the fit of this region, and store the state of the region at this fit: its
+        points of the surface, its largest pressure and the misfit.
+
+        If later scans differ from it too much, the region is fitted again.
+        """
         self.fit = fit
         self._fitted_points, self._fitted_peak = self.points, self.peak
         self._first_misfit = max(fit.shape_misfit, MAX_HERTZ_MISFIT / MAX_MISFIT_GROWTH)
