@@ -326,17 +326,6 @@ def test_ten_balls_on_planar_cubes_have_their_forces(seed):
     assert 0.5 < np.sqrt(np.mean((error / stated) ** 2)) < 1.5
 
 
-@pytest.mark.parametrize(("factor", "is_kept"), [(1.0, True), (20.0, False)])
-def test_a_fit_with_more_force_than_its_pressure_is_dropped(inverse, factor, is_kept):
-    """As when fits of neighbouring regions, which subtract each other's response, diverge."""
-    tracker = ContactTracker(inverse, LEAST)
-    tracker.update(ball(inverse, 8e-3, np.array([2e-3, 1e-3]), (0, 0, -3.0)), max_work=np.inf)
-    (region,) = tracker._regions
-    region.fit.found = region.fit.found._replace(forces=factor * region.fit.found.forces)
-    region.begin_scan(region.points, region.peak)
-    assert (region.fit is not None) == is_kept
-
-
 def test_two_contacts_one_and_a_half_pitches_apart_are_told_apart_and_keep_their_ids(inverse):
     random, tracker = np.random.default_rng(3), ContactTracker(inverse, LEAST)
     first, second = np.array([-4e-3, 1e-3]), np.array([14e-3, 1e-3])

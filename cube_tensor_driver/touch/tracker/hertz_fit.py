@@ -239,11 +239,6 @@ class HertzFit:
         return self.found
 
     @property
-    def normal_force(self) -> float:
-        """Sum of the normal forces of the contacts in N, positive for bodies that press."""
-        return -float(self.found.forces[:, 2].sum())
-
-    @property
     def explained(self) -> Array:
         """Components (n, C), in Pa, that the contacts `found` cause in the n cubes around the
         region, by the linearised response `linear`."""

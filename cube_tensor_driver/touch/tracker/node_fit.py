@@ -262,11 +262,6 @@ class NodeFit:
         self.labels = split_peaks(pressure, root, is_neighbour)
 
     @property
-    def normal_force(self) -> float:
-        """Sum of the normal forces of the nodes in N, positive for bodies that press."""
-        return -float(self.posterior.forces[2].sum())
-
-    @property
     def explained(self) -> Array:
         """Values (n, C) in Pa of the cubes around the region under the traction on the nodes."""
         by_forces = self.response @ self.posterior.forces.ravel()

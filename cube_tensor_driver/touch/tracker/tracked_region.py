@@ -100,15 +100,6 @@ contacts. It is computed for the stated depth, thickness and Poisson's ratio, wh
 by 3 % each (sensitivity.py). With 1 %, and Poisson's ratio off by 0.02, forces of fourteen contacts
 were off by 2.2 stated deviations."""
 
-MAX_FORCE_RATIO = 3.0
-"""Largest ratio of the normal force of a fit to the force that the pressure at the depth of the
-cubes' centres shows, above which the fit is dropped.
-
-The latter is the largest pressure times the area of the region, enlarged by 2 pi / 3 squared
-depths: below a point force F, the largest pressure at the depth z is 3 F / (2 pi z^2). A larger
-force means that the fits of neighbouring regions, which subtract each other's response, diverge.
-"""
-
 MAX_STEPS = 10
 """Largest number of Gauss-Newton steps in the first fit of a Hertz contact."""
 
@@ -196,10 +187,6 @@ class TrackedRegion:
         self.waited += 1
         self._is_tried = False
         fit = self.fit
-        inverse = self._inverse
-        area = len(points) * inverse.area + 2 * np.pi / 3 * inverse.depth**2
-        if fit is not None and fit.normal_force > MAX_FORCE_RATIO * peak * area:
-            fit = self.fit = None
         is_bad = self._is_misfit_larger and self.has_fitted_neighbours
         self._bad_scans = self._bad_scans + 1 if is_bad else 0
         if isinstance(fit, HertzFit):
