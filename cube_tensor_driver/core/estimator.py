@@ -94,7 +94,7 @@ class Estimator:
         return len(self.null)
 
     def suspects(self, pad_stress: Array) -> Mask:
-        """Find the pads that explain a high chi-square if just this one pad is broken.
+        """Find each pad that, as the only broken pad of a cube, would explain a high chi-square.
 
         Leaving out pad p lowers chi-square by (u_p . z)^2 / |u_p|^2. Here z = `null` v are the
         residuals, whose squares add up to chi-square, v the stresses on the pads, and u_p column p

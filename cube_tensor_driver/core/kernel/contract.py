@@ -40,9 +40,9 @@ scan on.
 """
 
 NEEDS_CONDITION = -3
-"""Result of the kernel (the loop over rows of frequencies) that stops before a row with a pad whose
-frequency is impossible, or which the device reports as broken.
+"""Result of the kernel (the loop over rows of frequencies): it has stopped before a row.
 
+A pad of this row has an impossible frequency, or the device reports it as broken.
 The health of pads is judged over windows of 0.5 s, so the kernel stops at the first such row of a
 cube in a window only.
 
@@ -51,17 +51,17 @@ kernel again from that row on.
 """
 
 UNKNOWN_CUBE = -4
-"""Result of the kernel (the loop over rows of frequencies) that stops before a row with the number
-of a cube that the skin does not have.
+"""Result of the kernel (the loop over rows of frequencies): it has stopped before a row.
 
+The row has the number of a cube that the skin does not have.
 If the health of pads is updated, the kernel stops before the first row, and no row is processed.
 """
 
 NEEDS_STEP = -5
-"""Result of the kernel (the loop over rows of frequencies) that stops before a scan whose newest
-time stamp lies outside the present step of the compensation, `Offsets.step_ns`.
+"""Result of the kernel (the loop over rows of frequencies): it has stopped before a scan.
 
-The caller advances creep and temperature, and calls the kernel again from that scan on.
+The newest time stamp of the scan lies outside the present step of the compensation,
+`Offsets.step_ns`. The caller advances creep and temperature, and calls the kernel again from that scan on.
 """
 
 MAX_GAP_NS = 5_000_000_000

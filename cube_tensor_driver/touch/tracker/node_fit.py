@@ -263,7 +263,8 @@ class NodeFit:
 
     @property
     def explained(self) -> Array:
-        """Values (n, C) in Pa of the cubes around the region under the traction on the nodes."""
+        """Components (n, C), in Pa, that the traction on the nodes causes in the n cubes around the
+        region."""
         by_forces = self.response @ self.posterior.forces.ravel()
         by_errors = self._sensitivity[:, :, 1:] @ self._elastomer_errors
         return np.asarray(by_forces + by_errors)
