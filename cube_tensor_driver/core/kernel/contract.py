@@ -42,9 +42,9 @@ scan on.
 NEEDS_CONDITION = -3
 """Result of the kernel (the loop over rows of frequencies): it has stopped before a row.
 
-A pad of this row has an impossible frequency, or the device reports it as broken.
-The health of pads is judged over windows of 0.5 s, so the kernel stops at the first such row of a
-cube in a window only.
+A pad of this row has an impossible frequency, or the device reports it as broken. The health of
+pads is judged over windows of 0.5 s, so the kernel stops at the first such row of a cube in a
+window only.
 
 The caller finds the condition of the pad (open, short, out of range or reported), and calls the
 kernel again from that row on.
@@ -53,15 +53,16 @@ kernel again from that row on.
 UNKNOWN_CUBE = -4
 """Result of the kernel (the loop over rows of frequencies): it has stopped before a row.
 
-The row has the number of a cube that the skin does not have.
-If the health of pads is updated, the kernel stops before the first row, and no row is processed.
+The row has the number of a cube that the skin does not have. If the health of pads is updated, the
+kernel stops before the first row, and no row is processed.
 """
 
 NEEDS_STEP = -5
 """Result of the kernel (the loop over rows of frequencies): it has stopped before a scan.
 
 The newest time stamp of the scan lies outside the present step of the compensation,
-`Offsets.step_ns`. The caller advances creep and temperature, and calls the kernel again from that scan on.
+`Offsets.step_ns`. The caller advances creep and temperature, and calls the kernel again from that
+scan on.
 """
 
 MAX_GAP_NS = 5_000_000_000
