@@ -161,7 +161,8 @@ class HertzFit:
         self.misfit = 1.0
         self.shape_misfit = 1.0
         self.last_step = np.inf
-        self._previous = self.found
+        # In its first scan a fit comes from a start that is no earlier place of the contacts.
+        self._previous: Discs | None = None
         self._flatness = self._moments = np.zeros(len(starts.forces))
         flatness_deviation = 1.0
         moment_deviation = FORCE_DEVIATION * depth
@@ -261,7 +262,7 @@ class HertzFit:
         """
         found, previous = self.found, self._previous
         self._previous = found
-        if extrapolates:
+        if extrapolates and previous is not None:
             limit = _MAX_STEP * self._depth
             shift = np.clip(found.centres - previous.centres, -limit, limit)
             forces = 2 * found.forces - previous.forces
@@ -286,7 +287,8 @@ class HertzFit:
             return discs._replace(forces=discs.forces @ to_home.T, centres=centres)
 
         self.found = transform(self.found)
-        self._previous = transform(self._previous)
+        if self._previous is not None:
+            self._previous = transform(self._previous)
         self.values = values
 
     def step(self, white: Array) -> None:
