@@ -193,28 +193,6 @@ def test_what_no_surface_is(depth, side):
         Surface(flat(2, 2, 0.01), depth, side)
 
 
-def test_the_view_s_image_of_the_field_has_each_point_s_colour_where_the_point_is():
-    from cube_tensor_driver.views.raster import Raster
-
-    place = np.array([0.2, -0.1, 0.4])
-    skin = flat(5, 3, 0.01)
-    keep = np.delete(np.arange(15), 7)  # a hole in the middle
-    skin = CubePoses((skin.position + place)[keep], skin.rotation[keep], skin.half_side[keep])
-    surface = Surface(skin, DEPTH, 2)
-    colours = np.random.default_rng(2).random((len(surface.points), 3))
-    raster = Raster(surface.points, surface.spacing / 4, 0.75 * surface.spacing)
-    image = raster.image(colours)
-    np.testing.assert_allclose((raster.low + raster.high) / 2, place[:2], atol=1e-12)
-    assert (image[image.shape[0] // 2, image.shape[1] // 2] == 0).all()
-    size = (raster.high - raster.low) / image.shape[1::-1]
-    for point, colour in zip(surface.points, colours, strict=True):
-        column = (point[0] - raster.low[0]) / size[0]
-        row = (raster.high[1] - point[1]) / size[1]
-        shown = image[int(row), int(column)]
-        np.testing.assert_array_equal(shown[:3], np.round(255 * colour))
-        assert shown[3] == 255
-
-
 def test_the_view_s_squares_have_the_colour_of_their_value():
     from cube_tensor_driver.views import scene
     from cube_tensor_driver.views.meshes import COLOUR_STEPS, colour_steps, step_colours
