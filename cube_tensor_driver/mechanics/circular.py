@@ -49,12 +49,15 @@ def _define_components() -> tuple[Complex, Orders]:
         Returns:
             For each of the four components, its order m and its coefficients (24,) of `FIELD`.
         """
-        s = {name: unit[name + suffix].astype(complex) for name in STRESS}
+        vectors = [unit[name + suffix].astype(complex) for name in STRESS]
+        xx, yy, zz, yz, zx, xy = vectors
+        mean = (xx + yy) / 2
+        half_difference = (xx - yy) / 2
         return [
-            (0, (s["xx"] + s["yy"]) / 2),
-            (0, s["zz"]),
-            (1, s["zx"] + 1j * s["yz"]),
-            (2, (s["xx"] - s["yy"]) / 2 + 1j * s["xy"]),
+            (0, mean),
+            (0, zz),
+            (1, zx + 1j * yz),
+            (2, half_difference + 1j * xy),
         ]
 
     components = combine_stresses("") + combine_stresses("_z")
@@ -65,14 +68,16 @@ def _define_components() -> tuple[Complex, Orders]:
     by_y = combine_stresses("_y")
     pairs = zip(by_x, by_y, strict=True)
     for (order, along_x), (_, along_y) in pairs:
-        components.append((order + 1, along_x + 1j * along_y))
+        raised = along_x + 1j * along_y
+        components.append((order + 1, raised))
         # If the order is 0, the component is real. Its two combinations are then complex conjugates
         # of each other, and one of them is enough.
         if order > 0:
-            components.append((order - 1, along_x - 1j * along_y))
+            lowered = along_x - 1j * along_y
+            components.append((order - 1, lowered))
 
-    orders = np.array([order for order, _ in components])
-    return np.stack([component for _, component in components]), orders
+    orders, coefficients = zip(*components, strict=True)
+    return np.stack(coefficients), np.array(orders)
 
 
 CIRCULAR_FROM_FIELD, ORDERS = _define_components()
@@ -80,9 +85,11 @@ CIRCULAR_FROM_FIELD, ORDERS = _define_components()
 m (14,) of each one. A circular component is a combination of stresses and gradients that a rotation
 of the frame about z by an angle multiplies by exp(-i m angle)."""
 
-FIELD_FROM_CIRCULAR = np.linalg.pinv(
-    np.concatenate([CIRCULAR_FROM_FIELD.real, CIRCULAR_FROM_FIELD.imag])
-).T
+_PARTS_FROM_FIELD = np.concatenate([CIRCULAR_FROM_FIELD.real, CIRCULAR_FROM_FIELD.imag])
+"""Matrix (28, 24) from the stresses and gradients `FIELD` to the real and then the imaginary parts
+of the circular components."""
+
+FIELD_FROM_CIRCULAR = np.linalg.pinv(_PARTS_FROM_FIELD).T
 """Matrix (28, 24) from the real and then the imaginary parts of the circular components back to the
 stresses and gradients `FIELD`.
 
@@ -103,9 +110,11 @@ def rotation_phases(rotation: Complex, order: Orders) -> Complex:
         Phases (..., n).
     """
     powers = [np.ones_like(rotation)]
-    for _ in range(int(order.max())):
+    highest_order = int(order.max())
+    for _ in range(highest_order):
         powers.append(powers[-1] * rotation)
-    return np.stack(powers, axis=-1)[..., order]
+    phases = np.stack(powers, axis=-1)
+    return phases[..., order]
 
 
 def rotate_loads(
@@ -138,7 +147,8 @@ def rotate_loads(
     along_y = sine * radial + cosine * across
     loads = np.stack([along_x, along_y, normal], axis=1)
 
-    rotated = rotation_phases(np.exp(1j * angle), order)[:, None] * loads
+    phases = rotation_phases(np.exp(1j * angle), order)
+    rotated = phases[:, None] * loads
     return np.concatenate([rotated.real, rotated.imag], axis=2)
 
 

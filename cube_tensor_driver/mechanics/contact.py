@@ -83,7 +83,9 @@ def field(
     _check(points, sources, forces, poisson)
 
     # d has one row per point and one column per force.
-    d = points[..., :, None, :] - sources[..., None, :, :]
+    rows = points[..., :, None, :]
+    columns = sources[..., None, :, :]
+    d = rows - columns
     forces = forces[..., None, :, :]
     distance = np.sqrt(np.einsum("...i,...i->...", d, d))
     if not np.all(distance > 0.0):
@@ -145,7 +147,8 @@ def hertz(
     # The Gauss points are placed in t = sqrt(1 - r^2) instead of r. The integrand p r dr = t^2 dt
     # is then smooth at the rim, where the pressure p as a function of r has a vertical slope.
     radii = np.sqrt(1.0 - nodes**2)
-    return _place_rings(radius, radii, 3.0 * weights * nodes**2, force, centre)
+    fractions = 3.0 * weights * nodes**2
+    return _place_rings(radius, radii, fractions, force, centre)
 
 
 def hertz_order(radius: float, depth: float) -> int:
@@ -168,7 +171,8 @@ def hertz_order(radius: float, depth: float) -> int:
             f"radius is {radius} m and depth {depth} m; a contact has a radius above 0, and its "
             "stress is asked for below the surface"
         )
-    return max(_MIN_HERTZ_ORDER, math.ceil(_HERTZ_ORDER_PER_RADIUS * radius / depth))
+    order = math.ceil(_HERTZ_ORDER_PER_RADIUS * radius / depth)
+    return max(_MIN_HERTZ_ORDER, order)
 
 
 def _check(
@@ -231,12 +235,14 @@ def _radial(
     constant = -3.0 / (2.0 * np.pi)
     pairs = [d[..., i] * d[..., j] for i, j in _STRESS_AXES]
     products = np.stack(pairs, axis=-2)
-    w = constant * np.einsum("...i,...i->...", d, forces) / distance**5
+    f_dot_d = np.einsum("...i,...i->...", d, forces)
+    w = constant * f_dot_d / distance**5
     stress = np.einsum("...cl,...l->...c", products, w)
 
     # dw/dk = constant F_k / R^5 - 5 w d_k / R^2
     by_force = constant * forces / distance[..., None] ** 5
-    by_distance = 5.0 * (w / distance**2)[..., None] * d
+    w_by_square = w / distance**2
+    by_distance = 5.0 * w_by_square[..., None] * d
     gradient = products @ (by_force - by_distance)
     weighted_d = np.einsum("...l,...li->...i", w, d)
     for component, (i, j) in enumerate(_STRESS_AXES):
@@ -266,7 +272,8 @@ def _airy(
         Field C (..., N, 6) and its gradient (..., N, 6, 3), without the factor of Poisson's ratio.
     """
     x, y, z = np.moveaxis(d, -1, 0)
-    fx, fy, fz = np.moveaxis(np.broadcast_to(forces, d.shape), -1, 0)
+    forces_at_points = np.broadcast_to(forces, d.shape)
+    fx, fy, fz = np.moveaxis(forces_at_points, -1, 0)
     position = (x, y)
     force = (fx, fy)
     f_dot_d = fx * x + fy * y
@@ -336,17 +343,13 @@ def _airy(
 
     # C_xx = g_yy, C_yy = g_xx, C_xy = -g_xy. The depth Z is -d_z, so a derivative by z is the
     # negative of the derivative by Z.
+    *points, _ = distance.shape
     n_components = len(_STRESS_AXES)
-    stress = np.zeros((*distance.shape[:-1], n_components))
-    gradient = np.zeros(
-        (
-            *distance.shape[:-1],
-            n_components,
-            3,
-        )
-    )
+    stress = np.zeros((*points, n_components))
+    gradient = np.zeros((*points, n_components, 3))
     for component, i, j, sign in _AIRY_COMPONENTS:
-        stress[..., component] = sign * second(i, j, chi2, chi3, log1, log2)
+        in_plane = second(i, j, chi2, chi3, log1, log2)
+        stress[..., component] = sign * in_plane
         for axis in (0, 1):
             i1, i2, i3 = sorted((i, j, axis))
             derivative = third_derivatives[i1, i2, i3]
@@ -396,13 +399,8 @@ def _place_rings(
     angle = 2.0 * np.pi * (np.arange(n) + 0.5) / n
     x = radius * np.outer(rings, np.cos(angle))
     y = radius * np.outer(rings, np.sin(angle))
-    return _place_forces(
-        x.ravel(),
-        y.ravel(),
-        np.repeat(fractions / n, n),
-        force,
-        centre,
-    )
+    per_force = np.repeat(fractions / n, n)
+    return _place_forces(x.ravel(), y.ravel(), per_force, force, centre)
 
 
 def _place_forces(
@@ -427,5 +425,6 @@ def _place_forces(
     cx, cy = np.asarray(centre, dtype=np.float64)[:2]
     z = np.zeros_like(x)
     sources = np.stack([cx + x, cy + y, z], axis=-1)
-    forces = fractions[:, None] * np.asarray(force, dtype=np.float64)
+    total = np.asarray(force, dtype=np.float64)
+    forces = fractions[:, None] * total
     return sources, forces

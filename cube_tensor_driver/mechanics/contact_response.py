@@ -71,10 +71,10 @@ class ContactResponse:
         rows = self._response.reshape(-1, width)
         self._rows = rows.astype(np.float32)
         self._point_matrix = cubes.point_matrix.astype(np.float32)
-        changes = [
-            self._tabulate_discs(spectra, bessel)
-            for spectra in sensitivities(cubes.layer, cubes.depth)
-        ]
+        changes = []
+        for spectra in sensitivities(cubes.layer, cubes.depth):
+            change = self._tabulate_discs(spectra, bessel)
+            changes.append(change)
         by_quantity = np.stack(changes, axis=2).astype(np.float32)
         self._sensitivity_rows = by_quantity.reshape(len(self._rows), -1)
 
@@ -92,8 +92,8 @@ class ContactResponse:
 
         def compute() -> Arrays:
             radii = DISC_SIZES * self._depth
-            loads = np.stack([disc_spectrum(spectra.k * radius) for radius in radii])
-            return {"discs": spectra.radial(bessel, loads)}
+            loads = [disc_spectrum(spectra.k * radius) for radius in radii]
+            return {"discs": spectra.radial(bessel, np.stack(loads))}
 
         return load_or_compute("discs", inputs, compute)["discs"]
 
@@ -117,7 +117,8 @@ class ContactResponse:
         """
         table = self._interpolate_size(self._response, size, place)
         circular = self._rotate_loads(table, place, angle, self._order)
-        return np.asarray(self._cubes.measure(circular, variant).swapaxes(1, 2))
+        measured = self._cubes.measure(circular, variant)
+        return np.asarray(measured.swapaxes(1, 2))
 
     def response_slopes(
         self,
@@ -151,7 +152,8 @@ class ContactResponse:
         # functions R, Z and T (circular.py). `loads` are c / exp(i m phi) and its derivatives.
         cosine = np.cos(direction).astype(np.float32)[:, None]
         sine = np.sin(direction).astype(np.float32)[:, None]
-        force_x, force_y, force_z = force.astype(np.float32).T[..., None]
+        force = force[..., None].astype(np.float32)
+        force_x, force_y, force_z = force.swapaxes(0, 1)
         radial = cosine * force_x + sine * force_y
         tangential = cosine * force_y - sine * force_x
         n, n_orders = len(place), len(self._order)
@@ -165,8 +167,10 @@ class ContactResponse:
         inverse = (1 / distance).astype(np.float32)[:, None]
         r, z, t = parts[:, 0].swapaxes(0, 1)
         r_slope, z_slope, t_slope = parts[:, 1].swapaxes(0, 1)
-        by_phi = 1j * (order * value - radial * t) + tangential * r
-        moment = 0.5j * (inverse * (order * r - t) - t_slope)
+        by_phase = order * value - radial * t
+        by_phi = 1j * by_phase + tangential * r
+        twisting = inverse * (order * r - t)
+        moment = 0.5j * (twisting - t_slope)
         # R, Z and T were interpolated at `_MIN_DISTANCE` if the contact is nearer. Their values at
         # the true distance are extrapolated linearly from there.
         below = (true_distance - distance).astype(np.float32)[:, None]
@@ -183,8 +187,8 @@ class ContactResponse:
         circular[:, 5] = by_log
         circular[:, 6] = by_log_twice
         circular[:, 7] = moment
-        in_cube = np.exp(1j * (direction - angle)).astype(np.complex64)
-        phases = rotation_phases(in_cube, self._order)
+        in_cube = np.exp(1j * (direction - angle))
+        phases = rotation_phases(in_cube.astype(np.complex64), self._order)
         circular *= phases[:, None]
         return self._cubes.measure(_split(circular), variant)
 
@@ -200,7 +204,8 @@ class ContactResponse:
             second derivative by the logarithm of the radius.
         """
         first, by_distance, distance_slope = self._table.weights(distance, 2)
-        size_row, *by_size = cubic_weights(_size_index(size, self._depth), 3)
+        size_index = _size_index(size, self._depth)
+        size_row, *by_size = cubic_weights(size_index, 3)
 
         # Bicubic interpolation uses 16 rows of the table: four radii times four distances.
         columns = self._response.shape[1]
@@ -219,7 +224,8 @@ class ContactResponse:
         weights = over_size[:, :, None] * over_distance[:, None]
         by_row = weights.reshape(-1, 16, 4).swapaxes(1, 2)
         functions = by_row.astype(np.float32) @ neighbours
-        return np.asarray(functions).reshape(len(distance), 4, 3, -1)
+        shape = len(distance), 4, 3, -1
+        return np.asarray(functions.reshape(shape))
 
     def response_to_forces(
         self,
@@ -308,25 +314,30 @@ class ContactResponse:
         farther = index - below
         wider = size_index - narrower
         by_distance = np.stack([1 - farther, farther]) * decay
-        weights = np.concatenate([(1 - wider) * by_distance, wider * by_distance])
-        weights = weights.T.astype(np.float32)[:, None]
+        of_narrower = (1 - wider) * by_distance
+        of_wider = wider * by_distance
+        weights = np.concatenate([of_narrower, of_wider])
+        weights = weights.T.astype(np.float32)
         n, n_orders = len(place), len(order)
-        parts = (weights @ neighbours).reshape(n, -1, 3, n_orders)
+        interpolated = weights[:, None] @ neighbours
+        parts = interpolated.reshape(n, -1, 3, n_orders)
 
         # The radial and the tangential force are the real and the imaginary part of the tangential
         # vector F_x + i F_y, rotated into the direction from the contact to the cube.
         force_x, force_y, force_z = force.T
         towards = np.exp(1j * direction).astype(np.complex64)
         tangential = (force_x + 1j * force_y).astype(np.complex64)
-        in_plane = (tangential * towards.conj())[:, None, None]
-        along_z = force_z.astype(np.float32)[:, None, None]
-        by_radial = in_plane.real * parts[:, :, 0]
-        by_normal = along_z * parts[:, :, 1]
-        circular = np.empty((n, parts.shape[1], n_orders), np.complex64)
+        in_plane = tangential * towards.conj()
+        in_plane = in_plane[:, None, None]
+        along_z = force_z.astype(np.float32)
+        r, z, t = np.moveaxis(parts, 2, 0)
+        by_radial = in_plane.real * r
+        by_normal = along_z[:, None, None] * z
+        circular = np.empty(r.shape, np.complex64)
         circular.real = by_radial + by_normal
-        circular.imag = in_plane.imag * parts[:, :, 2]
-        in_cube = np.exp(1j * (direction - angle)).astype(np.complex64)
-        phases = rotation_phases(in_cube, order)
+        circular.imag = in_plane.imag * t
+        in_cube = np.exp(1j * (direction - angle))
+        phases = rotation_phases(in_cube.astype(np.complex64), order)
         circular *= phases[:, None]
         return circular
 
@@ -344,7 +355,8 @@ class ContactResponse:
         table = self._interpolate_size(self._field, size, place)
         no_rotation = np.zeros(len(place))
         circular = self._rotate_loads(table, place, no_rotation, ORDERS)
-        return np.asarray((circular @ FIELD_FROM_CIRCULAR).swapaxes(1, 2))
+        field = circular @ FIELD_FROM_CIRCULAR
+        return np.asarray(field.swapaxes(1, 2))
 
     def _rotate_loads(
         self,
@@ -392,7 +404,8 @@ class ContactResponse:
         farthest = distance.max(initial=0.0) / self._table.step
         n_distances = int(min(farthest, self._table.last)) + 4
 
-        first, weights = cubic_weights(_size_index(size, self._depth))
+        size_index = _size_index(size, self._depth)
+        first, weights = cubic_weights(size_index)
         start = int(first) - 1
         neighbours = discs[start : start + 4, :n_distances]
         return np.asarray(np.tensordot(weights, neighbours, axes=1))
@@ -406,8 +419,10 @@ def _size_index(size: Array | float, depth: float) -> Array:
         depth: Depth of the cubes' centres below the surface, in m.
     """
     # The tabulated radii are a geometric series, so their logarithms are equally spaced.
-    index = np.log(size / depth / DISC_SIZES[0]) / _SIZE_LOG_STEP
-    return np.asarray(np.clip(index, 1.0, len(DISC_SIZES) - 2.001))
+    ratio = size / depth / DISC_SIZES[0]
+    index = np.log(ratio) / _SIZE_LOG_STEP
+    last = len(DISC_SIZES) - 2.001
+    return np.asarray(np.clip(index, 1.0, last))
 
 
 def _split(circular: Complex) -> Array:

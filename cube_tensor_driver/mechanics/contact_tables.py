@@ -30,6 +30,8 @@ about O, with alpha from the first leg on, the hypotenuse is at r = d / cos(alph
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
@@ -62,7 +64,7 @@ away hardly causes any stress at the cube."""
 _LAST_DISTANCE = REACH_DEPTHS * POINTS_PER_DEPTH
 """Index of the largest tabulated distance between a round contact and a cube."""
 
-_GRID_ROWS = int(np.ceil(np.arcsinh(REACH_DEPTHS) / GRID_STEP)) + 2
+_GRID_ROWS = math.ceil(np.arcsinh(REACH_DEPTHS) / GRID_STEP) + 2
 """Number of rows of the tables of stress at a cube under polygons of traction on the surface.
 
 Row k is for d = sinh(k `GRID_STEP`) from 0 to `REACH_DEPTHS`, where d is the distance of the line
@@ -71,7 +73,7 @@ cubes' centres. There are two rows more than steps: the one for d = 0, and one b
 the interpolation between neighbouring rows needs.
 """
 
-_CENTRE_COLUMN = int(np.ceil(np.arcsinh(MAX_LEG_RATIO) / GRID_STEP))
+_CENTRE_COLUMN = math.ceil(np.arcsinh(MAX_LEG_RATIO) / GRID_STEP)
 """Index of the column of the polygon tables for t = 0, where t is the length along the line through
 a polygon's edge, from the point of this line that is nearest to the cube."""
 
@@ -107,7 +109,8 @@ class _ContactTables:
         # Complex numbers are stored as pairs of real ones, one row per grid point, so that a
         # product of real matrices interpolates.
         n_loads = table.shape[-2]
-        self._rows = table.reshape(-1, n_loads * len(ORDERS)).view(np.float32)
+        width = n_loads * len(ORDERS)
+        self._rows = table.reshape(-1, width).view(np.float32)
 
     def _compute(self) -> Arrays:
         """Compute the table of circular components under unit loads; subclasses implement it.
@@ -137,11 +140,12 @@ class _ContactTables:
             Stress (N, 6) in Pa and gradient (N, 6, 3) in Pa/m.
         """
         neighbours = self._rows.take(rows, axis=0)
-        interpolated = (weights[..., None, :] @ neighbours).view(np.complex64)
-        unit_fields = interpolated.reshape(*loads.shape, len(ORDERS))
+        interpolated = weights[..., None, :] @ neighbours
+        unit_fields = interpolated.view(np.complex64)
+        unit_fields = unit_fields.reshape(*loads.shape, len(ORDERS))
 
-        amplitudes = loads[..., None, :].astype(np.complex64)
-        circular = amplitudes @ unit_fields
+        amplitudes = loads.astype(np.complex64)
+        circular = amplitudes[..., None, :] @ unit_fields
         return sum_rotated(circular[..., 0, :], rotation)
 
 
@@ -156,14 +160,14 @@ class DiscTables(_ContactTables):
     def _compute(self) -> Arrays:
         spectra = layer_spectra(self.layer, self.depth)
         radii = CONTACT_SIZES * self.depth
-        disc_spectra = np.stack([disc_spectrum(spectra.k * radius) for radius in radii])
+        disc_spectra = [disc_spectrum(spectra.k * radius) for radius in radii]
 
         distance = np.arange(_LAST_DISTANCE + 2) * self.depth / POINTS_PER_DEPTH
         bessel = tabulate_bessel(spectra.k, distance)
         # The table has the axes radius, distance, force (radial, normal, tangential) and component.
         # The equations in circular.py contain the tangential force multiplied by i.
         factors = np.array([1, 1, 1j])[:, None]
-        table = spectra.radial(bessel, disc_spectra) * factors
+        table = spectra.radial(bessel, np.stack(disc_spectra)) * factors
         return {"table": table.astype(np.complex64)}
 
     def field(
@@ -191,11 +195,8 @@ class DiscTables(_ContactTables):
         forces = np.asarray(force, float)
         distance = np.abs(offset)
         is_centred = distance == 0
-        direction = np.where(
-            is_centred,
-            1.0,
-            offset / np.where(is_centred, 1.0, distance),
-        )
+        distance_safe = np.where(is_centred, 1.0, distance)
+        direction = np.where(is_centred, 1.0, offset / distance_safe)
 
         # The real part is the force along the direction from contact to cube, the imaginary part
         # the force across it.
@@ -221,9 +222,10 @@ class DiscTables(_ContactTables):
         )
         weights *= is_near[..., None]
 
-        first_row = self._nearest_size(radius) * (_LAST_DISTANCE + 2) + below
-        rows = first_row[..., None] + np.array([0, 1])
-        return self._sum_loads(weights, rows, loads.astype(complex), direction)
+        n_distances = _LAST_DISTANCE + 2
+        first_row = self._nearest_size(radius) * n_distances + below
+        neighbours = np.stack([first_row, first_row + 1], axis=-1)
+        return self._sum_loads(weights, neighbours, loads.astype(complex), direction)
 
     def _nearest_size(self, radius: ArrayLike) -> Index:
         """Return the index (L,) in `CONTACT_SIZES` of the tabulated radius nearest to each radius.
@@ -231,13 +233,11 @@ class DiscTables(_ContactTables):
         Args:
             radius: Radii (L,) in m, which are compared with the table on a logarithmic scale.
         """
-        size = np.clip(
-            np.asarray(radius, float) / self.depth,
-            CONTACT_SIZES[0],
-            CONTACT_SIZES[-1],
-        )
-        log_step = np.log(CONTACT_SIZES[1] / CONTACT_SIZES[0])
-        steps = np.log(size / CONTACT_SIZES[0]) / log_step
+        smallest, second, *_, largest = CONTACT_SIZES
+        size = np.asarray(radius, float) / self.depth
+        size = np.clip(size, smallest, largest)
+        log_step = np.log(second / smallest)
+        steps = np.log(size / smallest) / log_step
         nearest: Index = np.rint(steps).astype(np.intp)
         return nearest
 
@@ -264,9 +264,12 @@ class PolygonTables(_ContactTables):
 
         # The rows of the grid are for the leg d of the triangle, the columns for the leg t, both
         # divided by the depth; r is the length of the hypotenuse.
-        eta = np.arange(-_CENTRE_COLUMN, _CENTRE_COLUMN + 1) * GRID_STEP
-        d = np.sinh(np.arange(_GRID_ROWS) * GRID_STEP)[:, None]
-        t = np.hypot(1.0, d) * np.sinh(eta)
+        column = np.arange(-_CENTRE_COLUMN, _CENTRE_COLUMN + 1)
+        row = np.arange(_GRID_ROWS)[:, None]
+        eta = column * GRID_STEP
+        d = np.sinh(row * GRID_STEP)
+        t_scale = np.hypot(1.0, d)
+        t = t_scale * np.sinh(eta)
         r = np.hypot(d, t)
         is_origin = r == 0
         r_safe = np.where(is_origin, 1.0, r)
@@ -275,29 +278,25 @@ class PolygonTables(_ContactTables):
 
         # The integral over the angle alpha = atan(t / d) is computed as an integral over the grid
         # variable eta, with t = sqrt(1 + d^2) sinh(eta).
-        t_slope = np.hypot(1.0, d) * np.cosh(eta)
+        t_slope = t_scale * np.cosh(eta)
         alpha_slope = d * t_slope / r_safe**2
-        exponents = np.stack(
-            [
-                ORDERS - 1,
-                ORDERS + 1,
-                ORDERS,
-                ORDERS,
-            ]
-        )
+        exponents = ORDERS + np.array([-1, 1, 0, 0])[:, None]
+        phases = direction[..., None, None] ** exponents
         integrand = over_distance(np.minimum(r, REACH_DEPTHS))
-        integrand = integrand * direction[..., None, None] ** exponents
+        integrand = integrand * phases
         integrand *= alpha_slope[..., None, None]
-        table = CubicSpline(eta, integrand, axis=1).antiderivative()(eta)
-        table -= table[:, _CENTRE_COLUMN : _CENTRE_COLUMN + 1]  # the integral begins at t = 0
+        integral = CubicSpline(eta, integrand, axis=1).antiderivative()
+        table = integral(eta)
+        table -= integral(0.0)[:, None]  # the integral begins at t = 0
 
-        load_sign = np.array([-1.0, -1.0, 1.0, -1j])[:, None]
-        sign = (-1.0) ** ORDERS * load_sign
+        load_sign = np.array([-1.0, -1.0, 1.0, -1j])
+        sign = (-1.0) ** ORDERS * load_sign[:, None]
         # Lengths in the integrals were divided by the depth. So the integrals A, B and Z over an
         # area are multiplied by depth^2, and W, which contains one more length, by depth^3.
-        dimension = np.array([2.0, 2.0, 2.0, 3.0])[:, None]
-        unit = self.depth**dimension
-        return {"table": (table * sign * unit).astype(np.complex64)}
+        dimension = np.array([2.0, 2.0, 2.0, 3.0])
+        unit = self.depth ** dimension[:, None]
+        signed = table * sign * unit
+        return {"table": signed.astype(np.complex64)}
 
     def _integrate_distance(self) -> CubicSpline:
         """Integrate the response to a point force over the distance r (for A, B, Z and W).
@@ -365,7 +364,7 @@ class PolygonTables(_ContactTables):
         # Beyond the largest tabulated distance, traction has no effect. The integral over the
         # triangle of a more distant edge therefore depends only on the angle under which the edge
         # appears from the cube, and the edge can be moved to the largest distance.
-        shrink = np.minimum(1.0, REACH_DEPTHS / np.maximum(d, REACH_DEPTHS))
+        shrink = REACH_DEPTHS / np.maximum(d, REACH_DEPTHS)
         weights, rows = _triangle_neighbours(d * shrink, t * shrink[..., None])
 
         tractions = np.asarray(traction, float)
@@ -400,18 +399,25 @@ def _triangle_neighbours(d: Array, t: Array) -> tuple[Single, Index]:
         belong. The first four are for the triangle up to the start of the edge, which is subtracted
         and so has negative weights, the others for the triangle up to its end.
     """
-    ratio = t / np.hypot(1.0, d)[..., None]
-    column = np.arcsinh(ratio) / GRID_STEP + _CENTRE_COLUMN
-    column = np.clip(column, 0, _GRID_COLUMNS - 1 - 1e-6)
+    t_scale = np.hypot(1.0, d)
+    eta = np.arcsinh(t / t_scale[..., None])
+    last_column = _GRID_COLUMNS - 1 - 1e-6
+    column = eta / GRID_STEP + _CENTRE_COLUMN
+    column = np.clip(column, 0, last_column)
     row = np.arcsinh(d) / GRID_STEP
     above = row.astype(np.intp)
     left = column.astype(np.intp)
 
     down = (row - above)[..., None]
     right = column - left
-    upper = [(1 - down) * (1 - right), (1 - down) * right]
-    lower = [down * (1 - right), down * right]
-    weights = np.stack(upper + lower, axis=-1, dtype=np.float32)
+    up = 1 - down
+    corner_weights = [
+        up * (1 - right),
+        up * right,
+        down * (1 - right),
+        down * right,
+    ]
+    weights = np.stack(corner_weights, axis=-1, dtype=np.float32)
     weights[..., 0, :] *= -1
 
     corners = np.array([0, 1, _GRID_COLUMNS, _GRID_COLUMNS + 1])

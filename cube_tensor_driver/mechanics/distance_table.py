@@ -24,14 +24,23 @@ cubes' centres below the surface. Responses and covariances at larger distances 
 one times the inverse square of the distance, as the stress by a tangential force on a half space
 falls."""
 
-_VALUE = np.round(6 * np.linalg.inv(np.vander([-1, 0, 1, 2], increasing=True)).T) / 6
+_POWERS = np.vander([-1, 0, 1, 2], increasing=True)
+"""Powers 1, t, t^2, t^3 (4 table entries, 4 powers) at the entries t = -1, 0, 1, 2."""
+
+_VALUE = np.round(6 * np.linalg.inv(_POWERS).T) / 6
 """Coefficients (4 table entries, 4 powers) of the cubic polynomials in t that are 1 at one of the
 entries t = -1, 0, 1, 2 and 0 at the others. They are multiples of 1/6."""
 
 _DERIVATIVE = np.diag([1.0, 2.0, 3.0], -1)
 """Matrix (4, 4) from the coefficients of a cubic polynomial to those of its derivative."""
 
-_CUBIC_LAGRANGE = np.stack([_VALUE, _VALUE @ _DERIVATIVE, _VALUE @ _DERIVATIVE @ _DERIVATIVE])
+_SLOPE = _VALUE @ _DERIVATIVE
+"""Coefficients (4 table entries, 4 powers) of the first derivatives of these polynomials."""
+
+_CURVATURE = _SLOPE @ _DERIVATIVE
+"""Coefficients (4 table entries, 4 powers) of their second derivatives."""
+
+_CUBIC_LAGRANGE = np.stack([_VALUE, _SLOPE, _CURVATURE])
 """Coefficients (3, 4 table entries, 4 powers) of the weights of cubic Lagrange interpolation, and
 of their first and second derivative: with the fraction t of the index between the second and the
 third entry, the weight of an entry is the sum of its coefficients times 1, t, t^2, t^3."""
@@ -57,7 +66,8 @@ class DistanceTable:
         """
         self.step = depth / POINTS_PER_DEPTH
         self.last = REACH_DEPTHS * POINTS_PER_DEPTH
-        self.distances = np.arange(-1.0, self.last + 3) * self.step
+        index = np.arange(-1.0, self.last + 3)
+        self.distances = index * self.step
 
     def weights(self, distance: Array, count: int = 1) -> tuple[Array, ...]:
         """Return the rows and weights of the interpolation of a table over the distance.
@@ -84,7 +94,8 @@ class DistanceTable:
             distance: Distances (N,) in m.
         """
         index = distance / self.step
-        decay = (self.last / np.maximum(index, self.last)) ** 2
+        ratio = self.last / np.maximum(index, self.last)
+        decay = ratio**2
         return np.minimum(index, self.last), decay
 
     def interpolate(self, table: Array, distance: Array) -> Array:
@@ -98,9 +109,12 @@ class DistanceTable:
             Values (N, ...).
         """
         first, weights = self.weights(distance)
-        shape = (len(distance),) + (1,) * (table.ndim - 1)
-        weights = weights.reshape(4, *shape)
-        terms = [weights[j] * table[first + j] for j in range(4)]
+        value_axes = (1,) * (table.ndim - 1)
+        weights = weights.reshape(4, len(distance), *value_axes)
+        terms = []
+        for j, weight in enumerate(weights):
+            row = table[first + j]
+            terms.append(weight * row)
         return np.asarray(sum(terms))
 
 
@@ -116,8 +130,11 @@ def cubic_weights(index: Array | float, count: int = 1) -> tuple[Array, ...]:
     """
     first = np.floor(index).astype(np.intp)
     t = index - first
-    powers = np.stack([np.ones_like(t), t, t * t, t * t * t])
-    return first, *(_CUBIC_LAGRANGE[:count] @ powers)
+    square = t * t
+    cube = square * t
+    powers = np.stack([np.ones_like(t), t, square, cube])
+    weights = _CUBIC_LAGRANGE[:count] @ powers
+    return first, *weights
 
 
 def to_polar(place: Array) -> tuple[Array, Array]:

@@ -67,7 +67,8 @@ class Influence:
         # The grid contains all combinations of its x and y coordinates, sorted by x, then by y.
         axes = [np.unique(column) for column in self.place.T]
         nodes = np.moveaxis(self.pads, 1, 0)
-        grid = nodes.reshape(*map(len, axes), *nodes.shape[1:])
+        grid_shape = [len(axis) for axis in axes]
+        grid = nodes.reshape(*grid_shape, *nodes.shape[1:])
         return RegularGridInterpolator(
             tuple(axes), grid, "cubic", bounds_error=False, fill_value=0.0
         )

@@ -155,14 +155,13 @@ def _check(influence: Influence) -> None:
     shape = (influence.layout.n_pads, len(place), 3)
     if influence.pads.shape != shape:
         raise ConfigError(f"pads have shape {influence.pads.shape}, needed is {shape}")
-    is_finite = np.isfinite(place).all() and np.isfinite(influence.pads).all()
-    if not is_finite:
+    has_places = np.isfinite(place).all()
+    has_stresses = np.isfinite(influence.pads).all()
+    if not (has_places and has_stresses):
         raise ConfigError("a position or a stress is not finite")
 
-    x, y = np.meshgrid(
-        *(np.unique(column) for column in place.T),
-        indexing="ij",
-    )
+    axes = [np.unique(column) for column in place.T]
+    x, y = np.meshgrid(*axes, indexing="ij")
     grid = np.column_stack([x.ravel(), y.ravel()])
     is_grid = np.array_equal(place, grid)
     # Cubic interpolation needs four nodes per axis.

@@ -148,18 +148,19 @@ class Layer:
         # zeta = k z. The last axis is for the boundary conditions at the surface: psi = 1 and
         # psi' = 0 (normal traction), then psi = 0 and psi' = 1 (shear traction).
         psi = self._airy(k, -k * depth)
-        by_load = {"L": 1j * psi[..., 1], "z": -psi[..., 0]}
+        by_normal, by_shear = np.moveaxis(psi, -1, 0)
+        by_load = {"L": 1j * by_shear, "z": -by_normal}
 
         nu = self.poisson
         waves: _WaveStress = {}
-        for load, p in by_load.items():
+        for load, (p, p1, p2, p3) in by_load.items():
             # Each pair is a stress component, from the formulas at the head of this file, and its
             # derivative by zeta = k z.
             parts = {
-                "zz": (-p[0], -p[1]),
-                "Lz": (-1j * p[1], -1j * p[2]),
-                "LL": (p[2], p[3]),
-                "TT": (nu * (p[2] - p[0]), nu * (p[3] - p[1])),
+                "zz": (-p, -p1),
+                "Lz": (-1j * p1, -1j * p2),
+                "LL": (p2, p3),
+                "TT": (nu * (p2 - p), nu * (p3 - p1)),
             }
             for name, (value, slope) in parts.items():
                 waves[name + load] = (value, k * slope)
@@ -210,9 +211,11 @@ class Layer:
         ]
         matrix = np.stack(conditions, axis=-2)
         constants = np.linalg.inv(matrix)[..., :2]
-        derivatives = [
-            np.einsum("...c,...cl->...l", differentiate(n, zeta), constants) for n in range(4)
-        ]
+        derivatives = []
+        for n in range(4):
+            solutions = differentiate(n, zeta)
+            derivative = np.einsum("...c,...cl->...l", solutions, constants)
+            derivatives.append(derivative)
         return np.stack(derivatives)
 
     @staticmethod
@@ -225,7 +228,10 @@ class Layer:
         a = np.array([1.0, 0.0])
         b = np.array([-1.0, 1.0])  # because psi'(0) = a + b
         depth_factor = zeta[..., None]
-        derivatives = [(a + (n + depth_factor) * b) * decay for n in range(4)]
+        derivatives = []
+        for n in range(4):
+            factor = a + (n + depth_factor) * b
+            derivatives.append(factor * decay)
         return np.stack(derivatives)
 
     def _twist(self, k: Array, depth: float) -> _WaveStress:
@@ -244,7 +250,8 @@ class Layer:
             # sinh(k (t - depth)) / cosh(k t). They are written with exponentials of negative
             # numbers, which cannot overflow for large k.
             reflected = np.exp(-2 * k * (self.thickness - depth))
-            base = decay / (1 + np.exp(-2 * k * self.thickness))
+            bottom = np.exp(-2 * k * self.thickness)
+            base = decay / (1 + bottom)
             cosh = base * (1 + reflected)
             sinh = base * (1 - reflected)
         return {
@@ -287,16 +294,15 @@ def _add_rotated(
         value: Amplitude (...) of the component in Pa.
     """
     c, s = cosine, sine
+    cc = c * c
+    ss = s * s
+    cs = c * s
     # `stress_rows` has the factors with which a stress component in the wave's axes contributes to
     # the stresses xx, yy, zz, yz, zx and xy (indices 0 to 5).
     stress_rows: dict[str, dict[int, Any]] = {
-        "LL": {0: c * c, 1: s * s, 5: c * s},
-        "TT": {0: s * s, 1: c * c, 5: -c * s},
-        "LT": {
-            0: -2 * c * s,
-            1: 2 * c * s,
-            5: c * c - s * s,
-        },
+        "LL": {0: cc, 1: ss, 5: cs},
+        "TT": {0: ss, 1: cc, 5: -cs},
+        "LT": {0: -2 * cs, 1: 2 * cs, 5: cc - ss},
         "zz": {2: 1.0},
         "Lz": {4: c, 3: s},
         "Tz": {4: -s, 3: c},

@@ -70,11 +70,13 @@ class LoadResponse:
             wavenumber = np.hypot(kx, k)
             load = disc_spectrum(wavenumber * width / 2) * cell
             transfer = layer.transfer(kx, k, depth)
-            amplitude = (load[:, None, None] * transfer).sum(axis=0)
+            response = load[:, None, None] * transfer
+            amplitude = response.sum(axis=0)
 
             n_waves = 2 if kx else 1
             waves = np.exp(1j * kx * distance) * n_waves
-            field += np.multiply.outer(waves, amplitude).real
+            along_x = np.multiply.outer(waves, amplitude)
+            field += along_x.real
 
         circular = CIRCULAR_FROM_FIELD @ field
         # All distances are along x. So a force along x is the radial force F_r of circular.py, and

@@ -156,7 +156,9 @@ class CubeMeasurement:
             return np.asarray(circular @ matrices[variant])
         # With only one variant, a single matrix product for all cubes is faster than one per cube.
         n, loads, width = circular.shape
-        return np.asarray((circular.reshape(-1, width) @ matrices[0]).reshape(n, loads, -1))
+        flat = circular.reshape(-1, width)
+        measured = flat @ matrices[0]
+        return np.asarray(measured.reshape(n, loads, -1))
 
     def matrices_towards(self, angle: Array, variant: Index) -> tuple[Array, Array]:
         """Return the matrices from circular components to measured components of N cubes.
@@ -172,13 +174,11 @@ class CubeMeasurement:
             Two matrices (N, 15, n): for the real parts of the circular components, and for their
             imaginary parts.
         """
-        phases = rotation_phases(np.exp(1j * angle), self.spectra.order)[:, None]
-        real, imaginary = np.split(
-            self.matrices.swapaxes(1, 2),
-            2,
-            axis=2,
-        )
+        phases = rotation_phases(np.exp(1j * angle), self.spectra.order)
+        transposed = self.matrices.swapaxes(1, 2)
+        real, imaginary = np.split(transposed, 2, axis=2)
         # A rotation of the frame multiplies each circular component by a phase. Multiplying its
         # column of the matrices by this phase has the same effect on the measured components.
-        matrices = (real - 1j * imaginary)[variant] * phases
+        unrotated = real - 1j * imaginary
+        matrices = unrotated[variant] * phases[:, None]
         return matrices.real, -matrices.imag

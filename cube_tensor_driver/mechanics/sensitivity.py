@@ -51,14 +51,17 @@ def sensitivities(layer: Layer, depth: float) -> list[Spectra]:
     # depth is reduced, and Poisson's ratio (0 to 0.5) is changed towards 0.25.
     poisson_step = _STEP if layer.poisson < 0.25 else -_STEP
     softer = replace(layer, poisson=layer.poisson + poisson_step)
-    other = [
-        (layer_spectra(layer, (1 - _STEP) * depth, depth), -DEPTH_DEVIATION / _STEP),
-        (layer_spectra(softer, depth), POISSON_DEVIATION / poisson_step),
+    of_softer = layer_spectra(softer, depth)
+    shallower = layer_spectra(layer, (1 - _STEP) * depth, depth)
+    changes = [
+        _subtract(shallower, base, -DEPTH_DEVIATION / _STEP),
+        _subtract(of_softer, base, POISSON_DEVIATION / poisson_step),
     ]
     if np.isfinite(layer.thickness):
         thicker = replace(layer, thickness=(1 + _STEP) * layer.thickness)
-        other.append((layer_spectra(thicker, depth), THICKNESS_DEVIATION / _STEP))
-    return [_subtract(spectra, base, factor) for spectra, factor in other]
+        of_thicker = layer_spectra(thicker, depth)
+        changes.append(_subtract(of_thicker, base, THICKNESS_DEVIATION / _STEP))
+    return changes
 
 
 def _subtract(spectra: Spectra, base: Spectra, factor: float) -> Spectra:

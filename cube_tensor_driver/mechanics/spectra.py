@@ -139,22 +139,22 @@ class Spectra:
             positions along x, real parts are independent of imaginary parts.
         """
         normal = _outer(self.normal, other.normal)
-        same = _outer(self.plus, other.plus) + _outer(self.minus, other.minus)
-        crossed = _outer(self.plus, other.minus) + _outer(self.minus, other.plus)
+        plus_plus = _outer(self.plus, other.plus)
+        minus_minus = _outer(self.minus, other.minus)
+        plus_minus = _outer(self.plus, other.minus)
+        minus_plus = _outer(self.minus, other.plus)
+        same = plus_plus + minus_minus
+        crossed = plus_minus + minus_plus
         half = shear**2 / 2
 
         # These are the covariances <c d*> and <c d> of two complex components c and d (formulas at
         # the head of this file), for the direction phi = 0 from one position to the other.
-        order_difference = self.order[:, None] - other.order
-        order_sum = self.order[:, None] + other.order
+        order = self.order[:, None]
         sign = (-1.0) ** other.order
-        conjugate = self._integrate(normal + half * same, order_difference, bessel, prior)
-        direct = self._integrate(
-            sign * (normal - half * crossed),
-            order_sum,
-            bessel,
-            prior,
-        )
+        of_conjugate = normal + half * same
+        of_direct = sign * (normal - half * crossed)
+        conjugate = self._integrate(of_conjugate, order - other.order, bessel, prior)
+        direct = self._integrate(of_direct, order + other.order, bessel, prior)
 
         # The covariances of real and imaginary parts follow from those of the complex components:
         # Re c Re d = Re(c d* + c d) / 2 and Im c Im d = Re(c d* - c d) / 2.
@@ -178,7 +178,8 @@ class Spectra:
         Returns:
             Integrals (distances, n, n').
         """
-        result = np.zeros((len(bessel(0)), *order.shape))
+        n_distances = len(bessel(0))
+        result = np.zeros((n_distances, *order.shape))
         for one in np.unique(order):
             chosen = order == one
             wave = bessel(int(one)) * (self.weight * prior)

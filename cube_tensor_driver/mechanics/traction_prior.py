@@ -100,8 +100,9 @@ class TractionPrior:
         bessel = tabulate_bessel(spectra.k, self._table.distances)
         prior = _prior_spectrum(spectra.k * depth) * depth**2
         shear, normal = SHEAR_RATIO**2, 1.0
-        axis_variance = np.array([shear, normal, shear])[:, None]
-        cross = spectra.radial(bessel, prior[None])[0] * axis_variance
+        axis_variance = np.array([shear, normal, shear])
+        radial = spectra.radial(bessel, prior[None])[0]
+        cross = radial * axis_variance[:, None]
 
         real, imaginary = spectra.covariance(spectra, bessel, prior, SHEAR_RATIO)
         with_points, _ = spectra.covariance(points, bessel, prior, SHEAR_RATIO)
@@ -135,7 +136,8 @@ class TractionPrior:
         parts = self._table.interpolate(self._cross, distance)
         order = self._cubes.spectra.order
         circular = rotate_loads(parts, direction, direction - angle, order)
-        return np.asarray(self._cubes.measure(circular, variant).swapaxes(1, 2))
+        measured = self._cubes.measure(circular, variant)
+        return np.asarray(measured.swapaxes(1, 2))
 
     def covariance(
         self,
@@ -161,19 +163,10 @@ class TractionPrior:
         first = self._cubes.matrices_towards(direction - angle, variant)
         second = self._cubes.matrices_towards(direction - other_angle, other_variant)
 
-        total = np.zeros(
-            (
-                len(place),
-                len(COMPONENTS),
-                len(COMPONENTS),
-            )
-        )
-        for left, table, right in zip(
-            first,
-            (self._real, self._imaginary),
-            second,
-            strict=True,
-        ):
+        n_components = len(COMPONENTS)
+        total = np.zeros((len(place), n_components, n_components))
+        tables = (self._real, self._imaginary)
+        for left, table, right in zip(first, tables, second, strict=True):
             circular = self._table.interpolate(table, distance)
             total += left @ circular @ right.swapaxes(1, 2)
         return total
