@@ -54,8 +54,9 @@ def add_fits(
         points, share, below, rotation = _distribute(inverse, fit, contacts)
         point_forces = contacts.forces @ share.T
         local_forces = np.einsum("mab,bm->ma", rotation, point_forces)
+        all_forces = contacts.forces.ravel()
         traction[points] += local_forces / inverse.area
-        pressure[points] += below @ contacts.forces.ravel()
+        pressure[points] += below @ all_forces
     return TractionField(traction, pressure)
 
 
@@ -70,10 +71,12 @@ def fit_variances(inverse: SurfaceInverse, fits: list[HertzFit | NodeFit]) -> Ar
     for fit in fits:
         contacts = fit.to_contacts(inverse.spacing)
         points, share, below, _ = _distribute(inverse, fit, contacts)
-        on_surface = share @ contacts.root[2] / inverse.area
-        at_depth = below @ contacts.root.reshape(-1, contacts.root.shape[2])
-        total[points, 0] += (on_surface**2).sum(axis=1)
-        total[points, 1] += (at_depth**2).sum(axis=1)
+        normal_force_root = contacts.root[2]
+        force_root = np.concatenate(contacts.root)
+        surface_root = share @ normal_force_root / inverse.area
+        depth_root = below @ force_root
+        total[points, 0] += (surface_root**2).sum(axis=1)
+        total[points, 1] += (depth_root**2).sum(axis=1)
     return total
 
 
@@ -88,31 +91,45 @@ def _distribute(
         all contacts, then y, then z; and rotations (m, 3, 3) from the frame of the home cube
         (around which the skin is laid flat) to that of the cube below each point.
     """
-    points = np.flatnonzero(np.isin(inverse.cube, fit.values.cubes))
-    place = unroll_points(inverse, fit.values.home, points)
-    count = len(contacts.places)
-    rings = math.ceil(_RINGS_PER_SPACING * contacts.sizes.max() / inverse.spacing)
-    offsets, weights = hertz(1.0, (0, 0, 1), order=max(_MIN_RINGS, rings))
-    shifts = contacts.sizes[:, None, None] * offsets[:, :2]
-    samples = (contacts.places[:, None] + shifts).reshape(-1, 2)
+    home = fit.values.home
+    is_around = np.isin(inverse.cube, fit.values.cubes)
+    points = np.flatnonzero(is_around)
+    n_points = len(points)
+    place = unroll_points(inverse, home, points)
+
+    sizes = contacts.sizes
+    count = len(sizes)
+    rings = math.ceil(_RINGS_PER_SPACING * sizes.max() / inverse.spacing)
+    order = max(_MIN_RINGS, rings)
+    offsets, weights = hertz(1.0, (0, 0, 1), order=order)
+    in_plane = offsets[:, :2]
+    shifts = sizes[:, None, None] * in_plane
+    samples = contacts.places[:, None] + shifts
+    samples = samples.reshape(-1, 2)
+    tree = cKDTree(place)
+    distance, nearest = tree.query(samples, distance_upper_bound=inverse.spacing)
+
     # Point forces beyond the border of the skin (at an infinite distance) act on no point.
-    distance, nearest = cKDTree(place).query(samples, distance_upper_bound=inverse.spacing)
-    contact = np.repeat(np.arange(count), len(offsets))
-    weight = np.tile(weights[:, 2], count)
     is_on_skin = np.isfinite(distance)
+    contact = np.repeat(np.arange(count), len(offsets))
+    normal_weight = weights[:, 2]
+    weight = np.tile(normal_weight, count)
     entries = nearest[is_on_skin], contact[is_on_skin]
-    share = np.zeros((len(points), count))
+    share = np.zeros((n_points, count))
     np.add.at(share, entries, weight[is_on_skin])
 
-    below = np.zeros((len(points), 3, count))
-    for size in np.unique(contacts.sizes):
-        of_this_size = np.flatnonzero(contacts.sizes == size)
+    below = np.zeros((n_points, 3, count))
+    zz = FIELD.index("zz")
+    for size in np.unique(sizes):
+        of_this_size = np.flatnonzero(sizes == size)
         from_contacts = place[:, None] - contacts.places[of_this_size]
-        stress = inverse.contact_response.field(from_contacts.reshape(-1, 2), size)
-        pressure = -stress[:, FIELD.index("zz")]
-        by_contact = pressure.reshape(len(points), -1, 3)
+        from_contacts = from_contacts.reshape(-1, 2)
+        stress = inverse.contact_response.field(from_contacts, size)
+        pressure = -stress[:, zz]
+        by_contact = pressure.reshape(n_points, -1, 3)
         below[:, :, of_this_size] = by_contact.swapaxes(1, 2)
+    below_by_force = below.reshape(n_points, -1)
 
-    _, angle = inverse.unroll(fit.values.home, inverse.cube[points])
+    _, angle = inverse.unroll(home, inverse.cube[points])
     rotation = rotations_about_normal(angle)
-    return points, share, below.reshape(len(points), -1), rotation
+    return points, share, below_by_force, rotation

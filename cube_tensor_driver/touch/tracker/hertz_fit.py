@@ -154,16 +154,21 @@ class HertzFit:
             starts: Contacts at which the fit begins.
         """
         self.values = values
-        self._depth = depth = inverse.depth
+        depth = inverse.depth
+        self._depth = depth
         # Cubic interpolation of responses needs one tabulated radius below and two above.
-        self._log_range = np.log(DISC_SIZES[[1, -3]] * depth)
-        self.found = starts._replace(log_sizes=np.clip(starts.log_sizes, *self._log_range))
+        size_range = DISC_SIZES[[1, -3]] * depth
+        self._log_range = np.log(size_range)
+        log_sizes = np.clip(starts.log_sizes, *self._log_range)
+        self.found = starts._replace(log_sizes=log_sizes)
         self.misfit = 1.0
         self.shape_misfit = 1.0
         self.last_step = np.inf
         # In its first scan a fit comes from a start that is no earlier place of the contacts.
         self._previous: Discs | None = None
-        self._flatness = self._moments = np.zeros(len(starts.forces))
+        n_contacts = len(starts.forces)
+        self._flatness = np.zeros(n_contacts)
+        self._moments = np.zeros(n_contacts)
         flatness_deviation = 1.0
         moment_deviation = FORCE_DEVIATION * depth
         deviations = [
@@ -174,7 +179,7 @@ class HertzFit:
             moment_deviation,
         ]
         precision = np.array(deviations) ** -2
-        self._contact_precision = np.tile(precision, len(starts.forces))
+        self._contact_precision = np.tile(precision, n_contacts)
         self._elastomer_errors = np.zeros(0)
 
     def prior_precision(self, quantities: int) -> Array:
@@ -184,17 +189,20 @@ class HertzFit:
             quantities: Number S of quantities of the elastomer.
         """
         is_first = not np.isfinite(self.last_step)
-        elastomer_precision = START_ELASTOMER_PRECISION if is_first else self.misfit
-        return np.append(self._contact_precision, np.full(quantities, elastomer_precision))
+        precision = START_ELASTOMER_PRECISION if is_first else self.misfit
+        elastomer_precision = np.full(quantities, precision)
+        return np.append(self._contact_precision, elastomer_precision)
 
     @property
     def displacement(self) -> float:
         """Distance of the contacts from those at which the response was linearised, measured as the
         step in `SETTLED_STEP`."""
-        base = self.linear.contacts
-        shift = np.abs(self.found.centres - base.centres).max() / self._depth
-        growth = np.abs(self.found.log_sizes - base.log_sizes).max()
-        return float(max(shift, growth))
+        found, base = self.found, self.linear.contacts
+        shift = found.centres - base.centres
+        growth = found.log_sizes - base.log_sizes
+        largest_shift = np.abs(shift).max() / self._depth
+        largest_growth = np.abs(growth).max()
+        return float(max(largest_shift, largest_growth))
 
     @property
     def needs_linearisation(self) -> bool:
@@ -204,10 +212,14 @@ class HertzFit:
         at least `SETTLED_STEP`, or if the prior precision of the elastomer's errors exceeds
         `MAX_PRECISION_RATIO` times the misfit.
         """
-        if self.linear.cubes is not self.values or self.displacement >= SETTLED_STEP:
+        if self.linear.cubes is not self.values:
             return True
-        is_prior_narrow = self.linear.precision[-1] > MAX_PRECISION_RATIO * self.misfit
-        return bool(is_prior_narrow) or self.values.is_stale
+        if self.displacement >= SETTLED_STEP:
+            return True
+        elastomer_precision = self.linear.precision[-1]
+        if elastomer_precision > MAX_PRECISION_RATIO * self.misfit:
+            return True
+        return self.values.is_stale
 
     @property
     def is_unsettled(self) -> bool:
@@ -231,8 +243,10 @@ class HertzFit:
         _, log_posterior_precision = np.linalg.slogdet(self.linear.information)
         log_prior_precision = np.log(self.linear.precision).sum()
         occam_term = log_posterior_precision - log_prior_precision
-        noise_term = max(self.values.count, 1) * np.log(self.misfit)
-        return float(self._chi_squared / self.misfit + noise_term + occam_term)
+        count = max(self.values.count, 1)
+        noise_term = count * np.log(self.misfit)
+        residual_term = self._chi_squared / self.misfit
+        return float(residual_term + noise_term + occam_term)
 
     @property
     def discs(self) -> Discs:
@@ -243,7 +257,9 @@ class HertzFit:
     def explained(self) -> Array:
         """Components (n, C), in Pa, that the contacts `found` cause in the n cubes around the
         region, by the linearised response `linear`."""
-        found, base = self.found, self.linear.contacts
+        found = self.found
+        linear = self.linear
+        base = linear.contacts
         change = np.empty((len(found.forces), _N_PARAMETERS))
         change[:, :3] = found.forces - base.forces
         change[:, 3:5] = found.centres - base.centres
@@ -251,7 +267,8 @@ class HertzFit:
         change[:, 6] = self._flatness
         change[:, 7] = self._moments
         all_changes = np.append(change, self._elastomer_errors)
-        return np.asarray(self.linear.values + self.linear.derivatives @ all_changes)
+        value_changes = linear.derivatives @ all_changes
+        return np.asarray(linear.values + value_changes)
 
     def predict(self, extrapolates: bool) -> None:
         """Set the contacts at which the fit of a new scan (set of values of all cubes) begins.
@@ -264,9 +281,11 @@ class HertzFit:
         self._previous = found
         if extrapolates and previous is not None:
             limit = _MAX_STEP * self._depth
-            shift = np.clip(found.centres - previous.centres, -limit, limit)
+            shift = found.centres - previous.centres
+            shift = np.clip(shift, -limit, limit)
+            centres = found.centres + shift
             forces = 2 * found.forces - previous.forces
-            self.found = found._replace(centres=found.centres + shift, forces=forces)
+            self.found = found._replace(centres=centres, forces=forces)
 
     def move_home(self, values: LocalValues) -> None:
         """Continue the fit around another home cube, and rotate the contacts into its frame.
@@ -278,13 +297,16 @@ class HertzFit:
             values: Source of the measured stress and gradient of the cubes around the new home
                 cube. The new home cube is one of the cubes of the present fit.
         """
-        (number,) = np.flatnonzero(self.values.cubes == values.home)
-        place, angle = self.values.place[number], self.values.angle[number]
-        to_home = rotations_about_normal(angle)
+        is_home = self.values.cubes == values.home
+        (number,) = np.flatnonzero(is_home)
+        place = self.values.place[number]
+        to_home = rotations_about_normal(self.values.angle[number])
+        to_home_in_plane = to_home[:2, :2]
 
         def transform(discs: Discs) -> Discs:
-            centres = (discs.centres - place) @ to_home[:2, :2].T
-            return discs._replace(forces=discs.forces @ to_home.T, centres=centres)
+            centres = (discs.centres - place) @ to_home_in_plane.T
+            forces = discs.forces @ to_home.T
+            return discs._replace(forces=forces, centres=centres)
 
         self.found = transform(self.found)
         if self._previous is not None:
@@ -298,21 +320,28 @@ class HertzFit:
             white: Whitened values (n C,), C components of each of n cubes, transformed by
                 `LocalValues.whiten` so that their noise has variance 1 and no correlation.
         """
-        linear, known = self.linear, self.values.known
+        linear = self.linear
         residual = white - linear.white_values
         prior_gradient = linear.precision * linear.offset
         gradient = residual @ linear.jacobian - prior_gradient
         change = linear.covariance @ gradient
         penalty = linear.offset @ prior_gradient
         self._chi_squared = float(residual @ residual + penalty - gradient @ change)
-        self.misfit = max(self._chi_squared / max(self.values.count, 1), 1.0)
+        count = max(self.values.count, 1)
+        self.misfit = max(self._chi_squared / count, 1.0)
 
-        new_residual = (residual - linear.jacobian @ change).reshape(known.shape)[linear.nearest]
-        n_near = max(int(known[linear.nearest].sum()), 1)
-        self.shape_misfit = float((new_residual**2).sum()) / n_near
+        known = self.values.known
+        new_residual = residual - linear.jacobian @ change
+        new_residual = new_residual.reshape(known.shape)
+        near_residual = new_residual[linear.nearest]
+        near_square = float((near_residual**2).sum())
+        near_count = int(known[linear.nearest].sum())
+        self.shape_misfit = near_square / max(near_count, 1)
+
         n_parameters = len(self._contact_precision)
         self._elastomer_errors = change[n_parameters:]
-        self._move_contacts(change[:n_parameters].reshape(-1, _N_PARAMETERS))
+        contact_change = change[:n_parameters]
+        self._move_contacts(contact_change.reshape(-1, _N_PARAMETERS))
 
     def _move_contacts(self, change: Array) -> None:
         """Change the contacts from those at which the response is linearised.
@@ -325,11 +354,14 @@ class HertzFit:
         limit = _MAX_STEP * self._depth
         shift = change[:, 3:5].clip(-limit, limit)
         growth = change[:, 5].clip(-_MAX_STEP, _MAX_STEP)
-        self.last_step = float(max(np.abs(shift).max() / self._depth, np.abs(growth).max()))
+        largest_shift = np.abs(shift).max() / self._depth
+        largest_growth = np.abs(growth).max()
+        self.last_step = float(max(largest_shift, largest_growth))
+        log_sizes = base.log_sizes + growth
         self.found = Discs(
             forces=base.forces + change[:, :3],
             centres=base.centres + shift,
-            log_sizes=(base.log_sizes + growth).clip(*self._log_range),
+            log_sizes=log_sizes.clip(*self._log_range),
         )
         self._flatness = change[:, 6]
         self._moments = change[:, 7]
@@ -346,64 +378,74 @@ class HertzFit:
                 evaluated, because contacts shifted by less have the same traction there.
         """
         count = len(self.found.forces)
-        shifts = np.concatenate([step * _STENCIL, np.zeros((2, 2))])
+        no_shift = np.zeros((2, 2))
+        shifts = np.concatenate([step * _STENCIL, no_shift])
         places = self.found.centres[:, None] + shifts
         log_growth = FLATNESS_STEP * np.array([0, 0, 0, 0, 0, 1, -1])
+        growth = np.exp(log_growth)
         radii = np.exp(self.found.log_sizes)
-        sizes = radii[:, None] * np.exp(log_growth)
+        sizes = radii[:, None] * growth
 
         # Derivatives (3 axes, J, 7, J, 8) of the forces of all Hertz contacts of the sum by the 8
         # parameters of each of the J fitted contacts.
         slopes = np.zeros((3, count, 7, count, _N_PARAMETERS))
         wider_share = 1 / (1 + np.exp(2 * FLATNESS_STEP))
         narrower_share = 1 - wider_share
+        x_shifted, y_shifted, resized = [1, 2], [3, 4], [5, 6]
         # Four forces of 1 / (4 step) at this arm have a moment of 1 N m.
         unit_moment_force = np.array([1, -1]) / (4 * step)
         for j, force in enumerate(self.found.forces[:, :, None]):
             own = slopes[:, j, :, j]
-            by_shift = force * [1, -1] / (2 * step)
+            difference = force * [1, -1]
+            by_shift = difference / (2 * step)
             own[:, 0, :3] = np.eye(3)
-            own[:, [1, 2], 3] = by_shift
-            own[:, [3, 4], 4] = by_shift
-            own[:, [5, 6], 5] = force * [1, -1] / (2 * FLATNESS_STEP)
-            own[:, [0, 5, 6], 6] = force * [1, -wider_share, -narrower_share]
-            own[1, [1, 2], 7] = unit_moment_force
-            own[0, [3, 4], 7] = -unit_moment_force
-        by_flatness, by_moment = slopes[..., 6], slopes[..., 7]
+            own[:, x_shifted, 3] = by_shift
+            own[:, y_shifted, 4] = by_shift
+            own[:, resized, 5] = difference / (2 * FLATNESS_STEP)
+            own[:, [0, *resized], 6] = force * [1, -wider_share, -narrower_share]
+            own[1, x_shifted, 7] = unit_moment_force
+            own[0, y_shifted, 7] = -unit_moment_force
+        by_flatness = slopes[..., 6]
+        by_moment = slopes[..., 7]
         forces = np.einsum("ajkj,j->ajk", by_flatness, self._flatness)
         forces += np.einsum("ajkj,j->ajk", by_moment, self._moments)
         forces[:, :, 0] += self.found.forces.T
 
         n_parameters = _N_PARAMETERS * count
-        covariance = self.inflation * self.linear.covariance[:n_parameters, :n_parameters]
+        covariance = self.linear.covariance[:n_parameters, :n_parameters]
+        covariance = self.inflation * covariance
         cholesky_factor = np.linalg.cholesky(covariance)
+        all_slopes = slopes.reshape(3, -1, n_parameters)
         return ContactSum(
             places=places.reshape(-1, 2),
             sizes=sizes.ravel(),
             forces=forces.reshape(3, -1),
-            root=slopes.reshape(3, -1, n_parameters) @ cholesky_factor,
+            root=all_slopes @ cholesky_factor,
         )
 
     def estimate_contacts(self) -> list[ContactEstimate]:
         """Return force, position, moment and area of each contact."""
         estimates = []
         for j, log_size in enumerate(self.found.log_sizes.tolist()):
-            own = slice(_N_PARAMETERS * j, _N_PARAMETERS * (j + 1))
+            first = _N_PARAMETERS * j
+            own = slice(first, first + _N_PARAMETERS)
             covariance = self.inflation * self.linear.covariance[own, own]
+            variances = np.diag(covariance)
             area = float(np.pi * np.exp(2 * log_size))
-            estimates.append(
-                ContactEstimate(
-                    force=self.found.forces[j],
-                    force_covariance=covariance[:3, :3],
-                    place=self.found.centres[j],
-                    place_variance=np.diag(covariance)[3:5],
-                    moment=float(self._moments[j]),
-                    moment_variance=float(covariance[7, 7]),
-                    area=area,
-                    area_variance=float((2 * area) ** 2 * covariance[5, 5]),
-                    aspect=1.0,
-                )
+            # The area is proportional to exp(2 ln a), so its derivative by ln a is 2 area.
+            area_variance = (2 * area) ** 2 * variances[5]
+            estimate = ContactEstimate(
+                force=self.found.forces[j],
+                force_covariance=covariance[:3, :3],
+                place=self.found.centres[j],
+                place_variance=variances[3:5],
+                moment=float(self._moments[j]),
+                moment_variance=float(variances[7]),
+                area=area,
+                area_variance=float(area_variance),
+                aspect=1.0,
             )
+            estimates.append(estimate)
         return estimates
 
 
@@ -446,37 +488,56 @@ def _linearise_alike(
     offset = place[:, None] - centres[:, :, None]
 
     # The responses are computed for all fits, contacts and cubes in one call.
+    response = inverse.contact_response
     positions = offset.reshape(-1, 2)
     angles = np.broadcast_to(angle[:, None], shape).ravel()
     variants = np.broadcast_to(variant[:, None], shape).ravel()
-    load = np.repeat(np.exp(log_sizes), cubes), np.repeat(forces.reshape(-1, 3), cubes, axis=0)
-    response, observed = inverse.contact_response, inverse.columns
-    slopes = response.response_slopes(positions, angles, variants, *load)[:, :, observed]
-    sensitivity = response.sensitivity(positions, angles, *load)[:, :, observed]
+    all_sizes = np.repeat(np.exp(log_sizes), cubes)
+    all_forces = forces.reshape(-1, 3)
+    all_forces = np.repeat(all_forces, cubes, axis=0)
+    slopes = response.response_slopes(positions, angles, variants, all_sizes, all_forces)
+    slopes = slopes[:, :, inverse.columns]
+    sensitivity = response.sensitivity(positions, angles, all_sizes, all_forces)
+    sensitivity = sensitivity[:, :, inverse.columns]
 
-    by_contact = slopes.reshape(*shape, *slopes.shape[1:]).astype(float)
-    values = np.einsum("kjnac,kja->knc", by_contact[:, :, :, :3], forces)
+    by_contact = slopes.reshape(*shape, *slopes.shape[1:])
+    by_contact = by_contact.astype(float)
+    by_force = by_contact[:, :, :, :3]
+    values = np.einsum("kjnac,kja->knc", by_force, forces)
     # With h = FLATNESS_STEP and the derivatives by the logarithm of the radius, the response to the
     # difference of contact and mixture is h^2 (first - second / 2), to order h^2.
-    first, second = by_contact[:, :, :, 5], by_contact[:, :, :, 6]
+    first = by_contact[:, :, :, 5]
+    second = by_contact[:, :, :, 6]
     by_contact[:, :, :, 6] = FLATNESS_STEP**2 * (first - second / 2)
-    by_contacts = by_contact.transpose(0, 2, 4, 1, 3).reshape(*values.shape, -1)
-    by_elastomer = sensitivity.reshape(*shape, *sensitivity.shape[1:]).sum(axis=1)
-    derivatives = np.concatenate([by_contacts, by_elastomer.swapaxes(2, 3)], axis=3)
+    by_contacts = by_contact.transpose(0, 2, 4, 1, 3)
+    by_contacts = by_contacts.reshape(*values.shape, -1)
+    by_elastomer = sensitivity.reshape(*shape, *sensitivity.shape[1:])
+    by_elastomer = by_elastomer.sum(axis=1)
+    by_elastomer = by_elastomer.swapaxes(2, 3)
+    derivatives = np.concatenate([by_contacts, by_elastomer], axis=3)
 
+    n_fits = len(fits)
+    n_parameters = derivatives.shape[3]
     whitening = np.stack([fit.values.whitening for fit in fits])
-    jacobian = (whitening @ derivatives).reshape(len(fits), -1, derivatives.shape[3])
-    white_values = (whitening @ values[..., None]).reshape(len(fits), -1)
-    precision = np.stack([fit.prior_precision(sensitivity.shape[1]) for fit in fits])
+    jacobian = whitening @ derivatives
+    jacobian = jacobian.reshape(n_fits, -1, n_parameters)
+    white_values = whitening @ values[..., None]
+    white_values = white_values.reshape(n_fits, -1)
+
+    quantities = sensitivity.shape[1]
+    precision = np.stack([fit.prior_precision(quantities) for fit in fits])
     prior_offset = np.zeros_like(precision)
-    of_contacts = prior_offset[:, : _N_PARAMETERS * contacts].reshape(*shape[:2], _N_PARAMETERS)
+    of_contacts = prior_offset[:, : _N_PARAMETERS * contacts]
+    of_contacts = of_contacts.reshape(n_fits, contacts, _N_PARAMETERS)
     of_contacts[:, :, :3] = forces
     of_contacts[:, :, 5] = log_sizes - np.log(USUAL_SIZE * inverse.depth)
     information = jacobian.swapaxes(1, 2) @ jacobian
-    information += precision[:, None] * np.eye(precision.shape[1])
+    information += precision[:, None] * np.eye(n_parameters)
     covariance = np.linalg.inv(information)
-    distance = np.linalg.norm(offset, axis=3).min(axis=1)
-    nearest = np.argsort(distance, axis=1, kind="stable")[:, :SHAPE_CUBES]
+    distance = np.linalg.norm(offset, axis=3)
+    distance = distance.min(axis=1)
+    by_distance = np.argsort(distance, axis=1, kind="stable")
+    nearest = by_distance[:, :SHAPE_CUBES]
     results = zip(
         values,
         derivatives,

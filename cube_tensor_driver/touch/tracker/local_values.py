@@ -72,31 +72,46 @@ class CubeNoise:
             # The set of pads in use has changed, so all stored variances are invalid (0).
             self._revision = inverse.revision
             self._variance[:] = 0.0
-        known = np.isfinite(scaled[cubes]) & inverse.observed[cubes]
-        has_other_values = (known != self.known[cubes]).any(axis=1)
-        is_outdated = has_other_values | (self._variance[cubes, 0] == 0)
+        values = scaled[cubes]
+        known = np.isfinite(values) & inverse.observed[cubes]
+        values = np.where(known, values, 0.0)
+        is_other_value = known != self.known[cubes]
+        has_no_variance = self._variance[cubes, 0] == 0
+        is_outdated = is_other_value.any(axis=1) | has_no_variance
         if is_outdated.any():
-            outdated, known_there = cubes[is_outdated], known[is_outdated]
-            self.known[outdated] = known_there
-            by_pad = inverse.by_pad[outdated]
-            self._by_pad[outdated] = np.where(known_there[:, :, None], by_pad, 0.0)
-            self._to_pads[outdated] = stress_matrices(by_pad, known_there)
-            self._variance[outdated] = 0.0
-        values = np.where(known, scaled[cubes], 0.0)
-        stresses = (self._to_pads[cubes] @ values[:, :, None])[:, :, 0]
+            self._replace_pads(cubes[is_outdated], known[is_outdated])
+        stresses = self._to_pads[cubes] @ values[:, :, None]
+        stresses = stresses[:, :, 0]
 
         # The predicted stress of a pad is wrong by interpolation errors of the tabulated response
         # and by contacts that are not found yet. Both grow with the stress in the cubes around.
         self._peak[cubes] = np.abs(stresses).max(axis=1)
-        largest_around = self._peak[inverse.near[cubes]].max(axis=1)
+        around = inverse.near[cubes]
+        largest_around = self._peak[around].max(axis=1)
         model_deviation = MODEL_ERROR * largest_around[:, None]
-        variance = 1 + (GAIN_ERROR * stresses) ** 2 + model_deviation**2
+        gain_deviation = GAIN_ERROR * stresses
+        variance = 1 + gain_deviation**2 + model_deviation**2
 
         before = self._variance[cubes]
-        larger, smaller = np.maximum(variance, before), np.minimum(variance, before)
-        is_changed = (larger > MAX_NOISE_CHANGE * smaller).any(axis=1)
+        larger = np.maximum(variance, before)
+        smaller = np.minimum(variance, before)
+        is_pad_changed = larger > MAX_NOISE_CHANGE * smaller
+        is_changed = is_pad_changed.any(axis=1)
         if is_changed.any():
             self._whiten(cubes[is_changed], variance[is_changed])
+
+    def _replace_pads(self, cubes: Index, known: Mask) -> None:
+        """Store the noise matrices of n cubes for other known components or pads in use.
+
+        Args:
+            cubes: Indices (n,) of the cubes.
+            known: Whether each of the C components is known (n, C).
+        """
+        by_pad = self._inverse.by_pad[cubes]
+        self.known[cubes] = known
+        self._by_pad[cubes] = np.where(known[:, :, None], by_pad, 0.0)
+        self._to_pads[cubes] = stress_matrices(by_pad, known)
+        self._variance[cubes] = 0.0
 
     def _whiten(self, cubes: Index, variance: Array) -> None:
         """Compute the whitening matrices of n cubes, which make their noise uncorrelated.
@@ -107,11 +122,13 @@ class CubeNoise:
                 variance of the pad's noise without load.
         """
         by_pad = self._by_pad[cubes]
-        covariance = (by_pad * variance[:, None]) @ by_pad.swapaxes(1, 2)
+        weighted = by_pad * variance[:, None]
+        covariance = weighted @ by_pad.swapaxes(1, 2)
         is_known = self.known[cubes]
         covariance = regularise(covariance, is_known)
-        inverse_factor = np.linalg.inv(np.linalg.cholesky(covariance))
-        self.whitening[cubes] = inverse_factor * is_known[:, None]
+        cholesky_factor = np.linalg.cholesky(covariance)
+        whitening = np.linalg.inv(cholesky_factor)
+        self.whitening[cubes] = whitening * is_known[:, None]
         self._variance[cubes] = variance
         self.version[cubes] += 1
 
@@ -153,8 +170,9 @@ class LocalValues:
         self.cubes = cubes
         self._inverse = inverse
         self._noise = noise
-        self.place, self.angle = inverse.unroll(home, self.cubes)
-        self.disturbance = np.zeros((len(self.cubes), len(inverse.columns)))
+        self.place, self.angle = inverse.unroll(home, cubes)
+        shape = len(cubes), len(inverse.columns)
+        self.disturbance = np.zeros(shape)
         self.refresh()
 
     def refresh(self) -> None:
@@ -163,36 +181,46 @@ class LocalValues:
         Cubes in which other contacts cause stress that is not exactly known (`disturbance`) get a
         smaller weight.
         """
-        self._versions = self._noise.version[self.cubes]
-        self.variant = self._inverse.variant[self.cubes]
-        whitening = self._noise.whitening[self.cubes]
+        cubes, noise = self.cubes, self._noise
+        self._versions = noise.version[cubes]
+        self.variant = self._inverse.variant[cubes]
+        self.known = noise.known[cubes]
+        self.count = int(self.known.sum())
         self._total_disturbance = float(self.disturbance.sum())
+
         # The noise has variance 1 after whitening, to which the disturbance adds its own variance.
+        whitening = noise.whitening[cubes]
         white_disturbance = whitening @ self.disturbance[:, :, None]
-        disturbance_variance = (white_disturbance[:, :, 0] ** 2).mean(axis=1)
+        white_disturbance = white_disturbance[:, :, 0]
+        disturbance_variance = (white_disturbance**2).mean(axis=1)
         total_variance = 1 + disturbance_variance
         weight = 1 / np.sqrt(total_variance)
         self.whitening = whitening * weight[:, None, None]
-        self.known = self._noise.known[self.cubes]
-        self.count = int(self.known.sum())
 
     def nearest_cubes(self, places: Array) -> Index:
         """Return the indices (J,) of the cubes nearest to places (J, 2) on the skin laid flat."""
-        squared_distance = ((places[:, None] - self.place) ** 2).sum(axis=2)
-        return np.asarray(self.cubes[squared_distance.argmin(axis=1)])
+        offset = places[:, None] - self.place
+        squared_distance = (offset**2).sum(axis=2)
+        nearest = squared_distance.argmin(axis=1)
+        return np.asarray(self.cubes[nearest])
 
     @property
     def is_stale(self) -> bool:
         """Whether the noise of the cubes or the disturbance has changed since `refresh`."""
-        totals = self._total_disturbance, float(self.disturbance.sum())
-        is_disturbance_new = max(totals) > MAX_NOISE_CHANGE * min(totals) + _MIN_DISTURBANCE
-        is_noise_new = not np.array_equal(self._versions, self._noise.version[self.cubes])
-        return is_disturbance_new or is_noise_new
+        total = float(self.disturbance.sum())
+        larger = max(self._total_disturbance, total)
+        smaller = min(self._total_disturbance, total)
+        limit = MAX_NOISE_CHANGE * smaller + _MIN_DISTURBANCE
+        if larger > limit:
+            return True
+        versions = self._noise.version[self.cubes]
+        return not np.array_equal(self._versions, versions)
 
     @property
     def has_same_values(self) -> bool:
         """Whether the known components of the cubes are the same as at the last `refresh`."""
-        return np.array_equal(self.known, self._noise.known[self.cubes])
+        known = self._noise.known[self.cubes]
+        return np.array_equal(self.known, known)
 
     def whiten(self, scaled: Array, others: Array | float) -> Array:
         """Return the values (n C,) of these cubes, transformed so that their noise has variance 1.
@@ -202,7 +230,8 @@ class LocalValues:
             others: Response (n, C) in Pa to other contacts, which is subtracted.
         """
         values = np.where(self.known, scaled[self.cubes] - others, 0.0)
-        return np.asarray((self.whitening @ values[:, :, None]).ravel())
+        white = self.whitening @ values[:, :, None]
+        return np.asarray(white.ravel())
 
     def respond(self, centres: Array, size: float) -> tuple[Array, Array]:
         """Compute the response of the cubes to Hertz contacts with a force of 1 N.
@@ -216,15 +245,14 @@ class LocalValues:
             (n C, 3 K), in 1/N. The last axis holds forces along x of all contacts, then along y,
             then along z.
         """
-        count = len(centres)
-        offset = (self.place[:, None] - centres).reshape(-1, 2)
+        n, count = len(self.cubes), len(centres)
+        offset = self.place[:, None] - centres
+        offset = offset.reshape(-1, 2)
         angle = np.repeat(self.angle, count)
         variant = np.repeat(self.variant, count)
-        inverse = self._inverse
-        response = inverse.contact_response.response(offset, angle, variant, size)[
-            :, inverse.columns
-        ]
-        by_contact = response.reshape(len(self.place), count, -1, 3)
+        response = self._inverse.contact_response.response(offset, angle, variant, size)
+        response = response[:, self._inverse.columns]
+        by_contact = response.reshape(n, count, -1, 3)
         by_axis = by_contact.transpose(0, 2, 3, 1)
         values = by_axis.reshape(*self.known.shape, -1)
         whitened = self.whitening @ values
@@ -247,15 +275,17 @@ class LocalValues:
             one standard deviation.
         """
         n, count = len(self.cubes), len(centres)
-        inverse = self._inverse
-        offset = (self.place[:, None] - centres).reshape(-1, 2)
+        response = self._inverse.contact_response
+        offset = self.place[:, None] - centres
+        offset = offset.reshape(-1, 2)
         angle = np.repeat(self.angle, count)
         sizes = np.full(n * count, size)
         all_forces = np.tile(forces.T, (n, 1))
-        changes = inverse.contact_response.sensitivity(offset, angle, sizes, all_forces)
-        changes = changes[:, :, inverse.columns]
+        changes = response.sensitivity(offset, angle, sizes, all_forces)
+        changes = changes[:, :, self._inverse.columns]
         by_contact = changes.reshape(n, count, *changes.shape[1:])
-        return np.asarray(by_contact.sum(axis=1).swapaxes(1, 2), float)
+        total = by_contact.sum(axis=1)
+        return np.asarray(total.swapaxes(1, 2), float)
 
 
 def rotations_about_normal(angle: Array) -> Array:
@@ -264,7 +294,8 @@ def rotations_about_normal(angle: Array) -> Array:
     Args:
         angle: Angles (...) in rad by which the second frame is rotated in the first one.
     """
-    cosine, sine = np.cos(angle), np.sin(angle)
+    cosine = np.cos(angle)
+    sine = np.sin(angle)
     rotation = np.zeros((*np.shape(angle), 3, 3))
     rotation[..., 0, 0] = cosine
     rotation[..., 0, 1] = sine
@@ -284,10 +315,13 @@ def unroll_points(inverse: SurfaceInverse, home: int, points: Index) -> Array:
     """
     cubes = inverse.cube[points]
     place, angle = inverse.unroll(home, cubes)
+    rotation = inverse.poses.rotation[cubes]
     from_cube = inverse.points[points] - inverse.poses.position[cubes]
-    local = np.einsum("nji,nj->ni", inverse.poses.rotation[cubes], from_cube)
-    x, y = local[:, 0], local[:, 1]
-    cosine, sine = np.cos(angle), np.sin(angle)
+    local = np.einsum("nji,nj->ni", rotation, from_cube)
+    x, y, _ = local.T
+    cosine = np.cos(angle)
+    sine = np.sin(angle)
     rotated_x = cosine * x - sine * y
     rotated_y = sine * x + cosine * y
-    return np.asarray(place + np.stack([rotated_x, rotated_y], axis=1))
+    rotated = np.stack([rotated_x, rotated_y], axis=1)
+    return np.asarray(place + rotated)

@@ -141,7 +141,8 @@ class NodeFit:
             values: Values of the cubes around the region.
         """
         self.values = values
-        around = np.flatnonzero(np.isin(inverse.cube, values.cubes))
+        is_around = np.isin(inverse.cube, values.cubes)
+        around = np.flatnonzero(is_around)
         region_points = unroll_points(inverse, values.home, points)
         points_around = unroll_points(inverse, values.home, around)
         self.places, self.spacing = _place_nodes(region_points, points_around, inverse)
@@ -151,11 +152,13 @@ class NodeFit:
         self._squared_distances = cdist(self.places, self.places, "sqeuclidean")
         lengths = _CORRELATION_LENGTHS[:, None, None] * inverse.depth
         exponents = self._squared_distances / (2 * lengths**2)
-        pressure_covariance = np.tensordot(_VARIANCE_SHARES, np.exp(-exponents), 1)
+        correlations = np.exp(-exponents)
+        pressure_covariance = np.tensordot(_VARIANCE_SHARES, correlations, 1)
         self._covariance = self.spacing**4 * pressure_covariance
 
         self.response, white = values.respond(self.places, self.size)
-        self._white_response = white.reshape(len(white), 3, -1)
+        n_values = len(white)
+        self._white_response = white.reshape(n_values, 3, -1)
         self._peak_width = _PEAK_WIDTH * inverse.depth
         self.is_sharp = False
         # The sensitivity (n, C, S) holds the changes of the values, in Pa, by one standard
@@ -163,8 +166,9 @@ class NodeFit:
         # first step; until then one column of zeros stands for the depth.
         self._elastomer_errors = np.zeros(0)
         self._sensitivity = np.zeros((*values.known.shape, 1))
-        self._white_sensitivity = np.zeros((len(white), 1))
-        self._decomposition = self._decompose(np.ones(len(self.places)))
+        self._white_sensitivity = np.zeros((n_values, 1))
+        equal_envelope = np.ones(len(self.places))
+        self._decomposition = self._decompose(equal_envelope)
 
     def step(self, white: Array) -> None:
         """Compute `posterior` (forces of the nodes) and `misfit` for new values of the same cubes.
@@ -177,40 +181,52 @@ class NodeFit:
         # Column 0 holds the values, column 1 their sensitivity to the depth, and the others the
         # sensitivities to further quantities of the elastomer.
         columns = np.column_stack([white, self._white_sensitivity])
-        projected = vectors.T @ (design.T @ columns)
+        projected = design.T @ columns
+        projected = vectors.T @ projected
         prior_variances = _SCALES[:, None] ** 2
 
         # By the Woodbury identity, columns' W columns is columns' columns minus the part that the
         # prior of the forces explains, for every scale s and W = (1 + s^2 B K B')^-1.
-        weights = prior_variances / (1 + prior_variances * eigenvalues)
+        signal_to_noise = prior_variances * eigenvalues
+        weights = prior_variances / (1 + signal_to_noise)
         explained_by_forces = np.einsum("se,ea,eb->sab", weights, projected, projected)
         products = columns.T @ columns - explained_by_forces
 
         # The errors of all quantities but the depth are estimated together with the forces. The
         # depth only adds to the covariance.
-        information = products[:, 2:, 2:] + np.eye(columns.shape[1] - 2)
+        n_errors = columns.shape[1] - 2
+        information = products[:, 2:, 2:] + np.eye(n_errors)
         gradients = products[:, 2:, :2]
         errors = np.linalg.solve(information, gradients)
         by_error = errors[:, :, 0] * gradients[:, :, 0]
-        chi_squared = np.maximum(products[:, 0, 0] - by_error.sum(axis=1), 0)
+        explained_by_errors = by_error.sum(axis=1)
+        chi_squared = products[:, 0, 0] - explained_by_errors
+        chi_squared = np.maximum(chi_squared, 0)
         count = self.values.count
         misfit = np.maximum(chi_squared / count, 1.0)
 
-        scores = np.log1p(prior_variances * eigenvalues).sum(axis=1)
-        scores += np.linalg.slogdet(information)[1]
+        scores = np.log1p(signal_to_noise).sum(axis=1)
+        _, log_information = np.linalg.slogdet(information)
+        scores += log_information
         scores += chi_squared / misfit + count * np.log(misfit)
         best = int(np.argmin(scores))
+        best_errors = errors[best]
         self.misfit = float(misfit[best])
-        self._elastomer_errors = errors[best, :, 0]
+        self._elastomer_errors = best_errors[:, 0]
 
-        variances = 1 / (eigenvalues + _SCALES[best] ** -2)
-        means = basis @ (variances[:, None] * projected)
+        precisions = eigenvalues + _SCALES[best] ** -2
+        variances = 1 / precisions
+        amplitudes = variances[:, None] * projected
+        means = basis @ amplitudes
         by_errors = means[:, 2:]
-        forces, by_depth = (means[:, :2] - by_errors @ errors[best]).T
+        corrected = means[:, :2] - by_errors @ best_errors
+        forces, by_depth = corrected.T
         # The covariance is the sum of three parts: for an exactly known elastomer, by its estimated
         # errors, and by the error of the depth. Its square root has the columns of all three.
-        errors_root = np.linalg.inv(np.linalg.cholesky(information[best])).T
-        parts = [basis * np.sqrt(variances), by_errors @ errors_root, by_depth[:, None]]
+        cholesky_factor = np.linalg.cholesky(information[best])
+        errors_root = np.linalg.inv(cholesky_factor).T
+        exact_root = basis * np.sqrt(variances)
+        parts = [exact_root, by_errors @ errors_root, by_depth[:, None]]
         root = np.sqrt(self.misfit) * np.hstack(parts)
         self.posterior = Posterior(
             forces=forces.reshape(3, -1),
@@ -237,26 +253,36 @@ class NodeFit:
         """
         self.update_sensitivity()
         self.step(white)
-        present_score = self.posterior.score
-        present = self.posterior, self.misfit, self._elastomer_errors, self._decomposition
-        normal_variance = (self.posterior.root[2] ** 2).sum(axis=1)
-        mean_square = self.posterior.forces[2] ** 2 + normal_variance
+        posterior = self.posterior
+        misfit = self.misfit
+        elastomer_errors = self._elastomer_errors
+        decomposition = self._decomposition
+
+        normal_root = posterior.root[2]
+        normal_variance = (normal_root**2).sum(axis=1)
+        mean_square = posterior.forces[2] ** 2 + normal_variance
         smoothing = np.exp(-self._squared_distances / (2 * self.spacing**2))
-        envelope = np.sqrt(smoothing @ mean_square / smoothing.sum(axis=1))
-        relative_envelope = np.maximum(envelope / envelope.max(), ENVELOPE_FLOOR)
+        smooth_square = smoothing @ mean_square / smoothing.sum(axis=1)
+        envelope = np.sqrt(smooth_square)
+        relative_envelope = envelope / envelope.max()
+        relative_envelope = np.maximum(relative_envelope, ENVELOPE_FLOOR)
         self._decomposition = self._decompose(relative_envelope)
         self.step(white)
-        if self.posterior.score > present_score - MIN_SCORE_GAIN:
-            self.posterior, self.misfit, self._elastomer_errors, self._decomposition = present
+        if self.posterior.score > posterior.score - MIN_SCORE_GAIN:
+            self.posterior = posterior
+            self.misfit = misfit
+            self._elastomer_errors = elastomer_errors
+            self._decomposition = decomposition
             self.is_sharp = True
         self.label_peaks()
 
     def label_peaks(self) -> None:
         """Set `labels`: assign each node to one of the peaks of the pressure, which are
         contacts."""
+        forces, force_root, _ = self.posterior
         smoothing = np.exp(-self._squared_distances / (2 * self._peak_width**2))
-        pressure = -smoothing @ self.posterior.forces[2]
-        root = smoothing @ self.posterior.root[2]
+        pressure = -smoothing @ forces[2]
+        root = smoothing @ force_root[2]
         # Diagonal neighbours on the grid are 1.41 spacings apart.
         is_neighbour = self._squared_distances < (1.5 * self.spacing) ** 2
         self.labels = split_peaks(pressure, root, is_neighbour)
@@ -265,8 +291,11 @@ class NodeFit:
     def explained(self) -> Array:
         """Components (n, C), in Pa, that the traction on the nodes causes in the n cubes around the
         region."""
-        by_forces = self.response @ self.posterior.forces.ravel()
-        by_errors = self._sensitivity[:, :, 1:] @ self._elastomer_errors
+        forces = self.posterior.forces.ravel()
+        by_forces = self.response @ forces
+        # The depth is the first quantity; its error only adds to the covariance.
+        sensitivity = self._sensitivity[:, :, 1:]
+        by_errors = sensitivity @ self._elastomer_errors
         return np.asarray(by_forces + by_errors)
 
     @property
@@ -277,10 +306,14 @@ class NodeFit:
     def estimate_contacts(self) -> list[ContactEstimate]:
         """Return force, centre, moment and area of each contact of the region, by integration."""
         estimates = []
-        for label in range(self.labels.max() + 1):
+        n_contacts = self.labels.max() + 1
+        for label in range(n_contacts):
             own = self.labels == label
-            forces, root = self.posterior.forces[:, own], self.posterior.root[:, own]
-            estimates.append(estimate_contact(self.places[own], forces, root, self.size))
+            places = self.places[own]
+            forces = self.posterior.forces[:, own]
+            root = self.posterior.root[:, own]
+            estimate = estimate_contact(places, forces, root, self.size)
+            estimates.append(estimate)
         return estimates
 
     @property
@@ -298,8 +331,9 @@ class NodeFit:
         Args:
             step: Not used here; `HertzFit.to_contacts` needs it.
         """
+        forces, root, _ = self.posterior
         sizes = np.full(len(self.places), self.size)
-        return ContactSum(self.places, sizes, self.posterior.forces, self.posterior.root)
+        return ContactSum(self.places, sizes, forces, root)
 
     def _decompose(self, envelope: Array) -> tuple[Array, Array, Array, Array]:
         """Compute the eigenvalues and eigenvectors from which every posterior follows.
@@ -317,20 +351,24 @@ class NodeFit:
         covariance = self._covariance * np.outer(envelope, envelope)
         # Rounding errors could give the covariance a negative eigenvalue, and this tiny increase of
         # its diagonal prevents that.
-        covariance[np.diag_indices(len(covariance))] *= 1 + 1e-8
+        n_nodes = len(covariance)
+        covariance[np.diag_indices(n_nodes)] *= 1 + 1e-8
         cholesky_factor = np.linalg.cholesky(covariance)
-        design = np.concatenate(
-            [
-                self._white_response[:, axis] @ (cholesky_factor * deviation)
-                for axis, deviation in enumerate(_RELATIVE_DEVIATIONS)
-            ],
-            axis=1,
-        )
-        eigenvalues, vectors = np.linalg.eigh(design.T @ design)
+        columns = []
+        for axis, deviation in enumerate(_RELATIVE_DEVIATIONS):
+            white_response = self._white_response[:, axis]
+            force_root = cholesky_factor * deviation
+            columns.append(white_response @ force_root)
+        design = np.concatenate(columns, axis=1)
+        gram_matrix = design.T @ design
+        eigenvalues, vectors = np.linalg.eigh(gram_matrix)
+        # Rounding errors may make the smallest eigenvalues negative.
         eigenvalues = np.maximum(eigenvalues, 0)
-        vectors_by_axis = vectors.reshape(3, len(cholesky_factor), -1)
-        basis = (cholesky_factor @ vectors_by_axis) * _RELATIVE_DEVIATIONS[:, None, None]
-        return design, eigenvalues, vectors, basis.reshape(len(vectors), -1)
+        vectors_by_axis = vectors.reshape(3, n_nodes, -1)
+        basis = cholesky_factor @ vectors_by_axis
+        basis = basis * _RELATIVE_DEVIATIONS[:, None, None]
+        basis = basis.reshape(3 * n_nodes, -1)
+        return design, eigenvalues, vectors, basis
 
 
 def _place_nodes(region: Array, around: Array, inverse: SurfaceInverse) -> tuple[Array, float]:
@@ -347,15 +385,19 @@ def _place_nodes(region: Array, around: Array, inverse: SurfaceInverse) -> tuple
     reach = BORDER_REACH_PITCHES * inverse.pitch
     margin = _POINT_MARGIN * inverse.spacing
     centre = region.mean(axis=0)
-    extent = np.abs(region - centre).max() + reach
+    radius = np.abs(region - centre).max()
+    extent = radius + reach
     step = NODE_STEP * inverse.depth
     while True:
         steps_each_way = int(np.ceil(extent / step))
-        nodes = centre + square_points(step, 2 * steps_each_way + 1)
+        side = 2 * steps_each_way + 1
+        nodes = centre + square_points(step, side)
         to_region = cdist(nodes, region).min(axis=1)
         is_within_reach = to_region < reach
-        nodes, to_region = nodes[is_within_reach], to_region[is_within_reach]
-        is_beyond_border = cdist(nodes, around).min(axis=1) > margin
+        nodes = nodes[is_within_reach]
+        to_region = to_region[is_within_reach]
+        to_skin = cdist(nodes, around).min(axis=1)
+        is_beyond_border = to_skin > margin
         is_in_region = to_region < margin
         nodes = nodes[is_in_region | is_beyond_border]
         if len(nodes) <= MAX_NODES:
