@@ -61,9 +61,11 @@ def index_cubes(cube: AnyArray, n_cubes: int) -> Index | slice:
     A scan of all cubes, the usual case, gets a slice, with which numpy copies nothing. Numbers that
     the skin does not have are replaced by the nearest that it has.
     """
-    if len(cube) == n_cubes and np.array_equal(cube, np.arange(n_cubes)):
+    all_cubes = np.arange(n_cubes)
+    if np.array_equal(cube, all_cubes):
         return slice(None)
-    return np.minimum(np.maximum(cube, 0), n_cubes - 1).astype(np.intp)
+    nearest = np.clip(cube, 0, n_cubes - 1)
+    return nearest.astype(np.intp)
 
 
 def multiply(left: AnyArray, right: AnyArray) -> AnyArray:
@@ -73,8 +75,10 @@ def multiply(left: AnyArray, right: AnyArray) -> AnyArray:
     The terms are added in their order. The `@` of numpy (BLAS) adds them in an order that depends
     on the processor.
     """
-    shape = np.broadcast_shapes(left.shape[:-1], right.shape[:-2] or (1,))
-    product: AnyArray = np.zeros((*shape, right.shape[-1]), right.dtype)
-    for term in range(left.shape[-1]):
+    *left_axes, n_terms = left.shape
+    *right_axes, _, n_columns = right.shape
+    shape = np.broadcast_shapes(tuple(left_axes), tuple(right_axes) or (1,))
+    product: AnyArray = np.zeros((*shape, n_columns), right.dtype)
+    for term in range(n_terms):
         product += left[..., term, None] * right[..., term, :]
     return product

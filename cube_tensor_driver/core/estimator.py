@@ -134,7 +134,8 @@ class Estimator:
         limit_without = chi2_limit(self.dof - 1, FALSE_ALARM)
         is_explained = (chi2 > self.limit) & (chi2 - best < limit_without)
         is_specific = is_similar.sum(axis=1) < is_checked.sum()
-        suspects: Mask = is_similar & (is_explained & is_specific)[:, None]
+        has_suspects = is_explained & is_specific
+        suspects: Mask = is_similar & has_suspects[:, None]
         return suspects
 
 
@@ -169,7 +170,8 @@ def make_estimator(
 
     # Dividing by the noise (standard deviation) of each pad gives all pads the standard deviation
     # 1, so that the sum of the squared residuals is chi-square.
-    whitened = response[np.ix_(present, kept)] / noise[present, None]
+    used_response = response[np.ix_(present, kept)]
+    whitened = used_response / noise[present, None]
     seen = _orthonormalise(whitened, len(present), RANK_TOLERANCE)
     rank = seen.shape[1]
     # The response divided by the noise is Q R, with orthonormal columns Q. The rows of R are
@@ -204,9 +206,11 @@ def make_estimator(
     covariance[:, ~observed] = np.nan
     # Only noise and faults have a part along combinations of pads that are orthogonal to the
     # response of every mode (linear stress field): the residual.
-    unexplained = np.eye(len(present)) - multiply(seen, seen.T)
-    null = np.zeros((len(present) - rank, n_pads))
-    residual = _orthonormalise(unexplained, len(present), count=len(null))
+    n_present = len(present)
+    explained = multiply(seen, seen.T)
+    unexplained = np.eye(n_present) - explained
+    null = np.zeros((n_present - rank, n_pads))
+    residual = _orthonormalise(unexplained, n_present, count=len(null))
     null[:, present] = residual.T / noise[present]
     return Estimator(
         matrix=matrix,
@@ -247,7 +251,8 @@ def _orthonormalise(
     if count is None:
         count = min(length, remainder.shape[1])
     for _ in range(count):
-        sizes = np.sqrt((remainder[:length] ** 2).sum(axis=0))
+        squares = remainder[:length] ** 2
+        sizes = np.sqrt(squares.sum(axis=0))
         longest = int(np.argmax(sizes))
         limit = limit or tolerance * sizes[longest]
         if sizes[longest] <= limit:
@@ -257,7 +262,8 @@ def _orthonormalise(
         # subtracted here.
         overlap = (result[:length] * chosen[:length, None]).sum(axis=0)
         chosen = chosen - (result * overlap).sum(axis=1)
-        chosen = chosen / np.sqrt((chosen[:length] ** 2).sum())
+        square = (chosen[:length] ** 2).sum()
+        chosen = chosen / np.sqrt(square)
         overlap = (remainder[:length] * chosen[:length, None]).sum(axis=0)
         remainder = remainder - chosen[:, None] * overlap
         result = np.column_stack([result, chosen])
@@ -309,7 +315,8 @@ def summarize_response(
         "gradient": np.any(modes.gradient, axis=(1, 2, 3)),
     }
     for part, columns in parts.items():
-        s = np.linalg.svd(response[:, columns & is_kept], compute_uv=False)
+        kept_response = response[:, columns & is_kept]
+        s = np.linalg.svd(kept_response, compute_uv=False)
         if s.size:
             s = s[s > RANK_TOLERANCE * s[0]]
         result[f"rank_{part}"] = len(s)

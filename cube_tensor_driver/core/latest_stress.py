@@ -76,8 +76,9 @@ class LatestStress:
         if not is_known.all():
             rows = rows.select(is_known)
         cube = rows.cube
-        self.values[cube, : len(STRESS)] = rows.stress
-        self.values[cube, len(STRESS) :] = rows.gradient
+        n_stress = len(STRESS)
+        self.values[cube, :n_stress] = rows.stress
+        self.values[cube, n_stress:] = rows.gradient
         self.residual[cube] = rows.residual
         self.status[cube] = rows.status
         self.left_out[cube] = rows.left_out
@@ -106,8 +107,10 @@ class LatestStress:
         other_bits = self.status & ~np.uint16(RESIDUAL)
         is_doubtful = self.high_residual | (other_bits != 0)
         health = np.where(is_doubtful, DOUBTFUL, FINE)
-        health[self.status & INVALID != 0] = FAULTY
-        health[now - self.arrived > stale_after] = STALE
+        is_faulty = self.status & INVALID != 0
+        is_stale = now - self.arrived > stale_after
+        health[is_faulty] = FAULTY
+        health[is_stale] = STALE
         return health
 
     def usable_values(self, health: Index) -> Array:
@@ -128,7 +131,8 @@ class LatestStress:
         Args:
             now: Present time, in s. A time before the start of the counts also ends them.
         """
-        if 0 <= now - self._window_start < WINDOW_S:
+        elapsed_s = now - self._window_start
+        if 0 <= elapsed_s < WINDOW_S:
             return
         rows = self.count - self._count_at_start
         self.high_residual = has_high_residual(self.high_residual, self._over_limit, rows)

@@ -79,11 +79,14 @@ def match_rows(known: SampleRows, wanted: SampleRows) -> Index:
     found = np.full(len(wanted_keys), NO_MATCH, np.intp)
     found[has_match] = order[begin[has_match]]
     # More than one known row has the same key only if a hub restarted and counted from 0 again.
-    for repeat in range(1, int((end - begin).max(initial=0))):
-        rows = np.flatnonzero(begin + repeat < end)
+    n_candidates = end - begin
+    max_candidates = int(n_candidates.max(initial=0))
+    for repeat in range(1, max_candidates):
+        rows = np.flatnonzero(repeat < n_candidates)
         candidate = order[begin[rows] + repeat]
-        distance_ns = np.abs(known.stamp_ns[candidate] - wanted.stamp_ns[rows])
-        best_ns = np.abs(known.stamp_ns[found[rows]] - wanted.stamp_ns[rows])
+        stamp_ns = wanted.stamp_ns[rows]
+        distance_ns = np.abs(known.stamp_ns[candidate] - stamp_ns)
+        best_ns = np.abs(known.stamp_ns[found[rows]] - stamp_ns)
         nearer = distance_ns < best_ns
         found[rows[nearer]] = candidate[nearer]
     return found

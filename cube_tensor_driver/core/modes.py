@@ -148,9 +148,9 @@ class Modes:
             s = to_matrix(s)
         s = s.reshape(-1, 9)
         if gradient is None:
-            g = np.zeros((len(s), 27))
-        else:
-            g = np.asarray(gradient, dtype=float).reshape(-1, 27)
+            gradient = np.zeros((len(s), 3, 3, 3))
+        g = np.asarray(gradient, dtype=float)
+        g = g.reshape(-1, 27)
         fields = np.concatenate([s, g], axis=1)
         state: Array = fields @ self.reading.T
         return state
@@ -166,8 +166,8 @@ class Modes:
             the side of the cube) (N, 3, 3, 3), both in Pa.
         """
         amplitudes = np.asarray(state, dtype=float)
-        flat = amplitudes.reshape(-1, self.n_modes) @ self.fields.T
-        return _split_fields(flat)
+        amplitudes = amplitudes.reshape(-1, self.n_modes)
+        return _split_fields(amplitudes @ self.fields.T)
 
     def action(self, rotation: Array) -> Array:
         """Compute the matrix that transforms states when the field is rotated or mirrored.

@@ -140,9 +140,10 @@ def rest_ratio(coefficients: Array, change: Array) -> Array:
         coefficients: Coefficients c_d (..., D, P), in 1/K^d, the linear term first.
         change: Difference t of the temperatures (...), in K.
     """
+    *_, n_degrees, n_pads = coefficients.shape
     t = change[..., None]
-    total = np.zeros((*change.shape, coefficients.shape[-1]))
-    for d in reversed(range(coefficients.shape[-2])):
+    total = np.zeros((*change.shape, n_pads))
+    for d in reversed(range(n_degrees)):
         total = (total + coefficients[..., d, :]) * t
     return 1 + total
 

@@ -39,6 +39,7 @@ from .kernel.contract import (
 from .kernel.rows import (
     N_COMPONENTS,
     apply_law,
+    find_existing,
     mask_bits,
     pack_bits,
     temperature_factor,
@@ -94,12 +95,13 @@ def _find_estimator(calibration: Calibration, mask: int) -> Estimator:
     Returns:
         Estimator of stresses, in Pa, and gradients, in Pa/m. Its arrays must not be changed.
     """
-    missing = [pad for pad in range(calibration.layout.n_pads) if mask >> pad & 1]
+    pads = np.arange(calibration.layout.n_pads)
+    is_missing = mask >> pads & 1 > 0
     estimator = make_estimator(
         calibration.response,
         calibration.noise,
         calibration.modes,
-        missing,
+        pads[is_missing],
         calibration.neglect,
     )
     # So far, the estimator gives gradients times d0 (half the side of the cube), in Pa.
@@ -193,7 +195,7 @@ class Pipeline:
     def rest_frequency(self, value: Array) -> None:
         rest = np.array(value, dtype=float)
         group = self._tables.calibration
-        exists = np.arange(self.n_pads) < self._tables.pads[group][:, None]
+        exists = find_existing(self._tables, group)
         if rest.shape != exists.shape:
             raise LayoutError(
                 f"rest_frequency has shape {rest.shape}; this skin needs {exists.shape}"
@@ -385,7 +387,8 @@ class Pipeline:
             calibration = self._groups[key >> 32]
             n_pads = calibration.layout.n_pads
             estimator = _find_estimator(calibration, key & 0xFFFFFFFF)
-            result[chosen, :n_pads] = estimator.suspects(stress[chosen, :n_pads])
+            suspects = estimator.suspects(stress[chosen, :n_pads])
+            result[chosen, :n_pads] = suspects
         return result
 
     def matrix(self, cube: int, left_out: int = 0) -> Array:
@@ -477,7 +480,8 @@ class Pipeline:
         masks = columns.pad_fault if left_out is None else np.asarray(left_out)
         with np.errstate(all="ignore"):
             v, is_good = apply_law(self._tables, cube, columns.frequency, columns.temperature)
-        is_used = is_good & ~mask_bits(self._tables, group, masks) & is_known[:, None]
+        is_left_out = mask_bits(self._tables, group, masks)
+        is_used = is_good & ~is_left_out & is_known[:, None]
         stress = np.where(is_used, v * self._stiffness[group], 0)
         return group, is_used, stress
 
@@ -488,23 +492,27 @@ class Pipeline:
             group: Number of the calibration of each cube.
         """
         n_groups = len(self._groups)
+        pads = [calibration.layout.n_pads for calibration in self._groups]
         models = [calibration.temperature for calibration in self._groups]
         n_degrees = max(model.coefficients.shape[1] if model else 0 for model in models)
         coefficients = np.zeros((n_groups, n_degrees, self.n_pads))
+        reference = np.full(n_groups, np.nan)
         for number, model in enumerate(models):
             if model:
-                pads, degrees = model.coefficients.shape
-                coefficients[number, :degrees, :pads] = model.coefficients.T
+                of_pads = model.coefficients.T
+                degrees, model_pads = of_pads.shape
+                coefficients[number, :degrees, :model_pads] = of_pads
+                reference[number] = model.reference
         n_outputs = N_COMPONENTS + self._n_residuals
         n_outputs += -n_outputs % BLOCK
         n_tables = n_groups + MAX_CACHED_ESTIMATORS
         shape = len(self.calibrations), self.n_pads
         return Tables(
             calibration=group,
-            pads=np.array([c.layout.n_pads for c in self._groups], np.int32),
+            pads=np.array(pads, np.int32),
             rest=np.empty(shape, self.dtype),
             highest=np.empty(shape, self.dtype),
-            reference=np.array([model.reference if model else np.nan for model in models]),
+            reference=reference,
             coefficients=coefficients,
             # The system provides memory only for the tables that are written.
             matrix=np.zeros((n_tables, self.n_pads, n_outputs), self.dtype),
@@ -530,7 +538,8 @@ class Pipeline:
         number = len(self._groups) + self._n_extra
         group = key >> 32
         mask = key & 0xFFFFFFFF
-        self._store_table(number, group, _find_estimator(self._groups[group], mask))
+        estimator = _find_estimator(self._groups[group], mask)
+        self._store_table(number, group, estimator)
         self._n_extra += 1
         place = int(np.searchsorted(keys, key))
         keys[place + 1 :] = keys[place:-1].copy()
@@ -564,7 +573,8 @@ class Pipeline:
             limit = np.sqrt(chi2_limit(dof, FALSE_ALARM) / dof)
         # The matrix will be applied to pad stresses divided by the stiffness, so the stiffness is
         # included in it.
-        self._tables.matrix[number] = matrix * self._stiffness[group][:, None]
+        stiffness = self._stiffness[group]
+        self._tables.matrix[number] = matrix * stiffness[:, None]
         self._tables.limit[number] = limit
         self._tables.observed[number] = pack_bits(estimator.observed)
 

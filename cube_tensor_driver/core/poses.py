@@ -42,7 +42,9 @@ class CubePoses(NamedTuple):
         square_distance = square[:, None] + square - 2 * products
         np.fill_diagonal(square_distance, np.inf)
         nearest = np.median(square_distance.min(axis=1))
-        return max(side, float(np.sqrt(max(0.0, nearest))))
+        # Rounding may make the difference of the squares negative.
+        distance = np.sqrt(max(0.0, nearest))
+        return max(side, float(distance))
 
 
 def quaternions(rotation: Array) -> Array:
@@ -52,4 +54,5 @@ def quaternions(rotation: Array) -> Array:
     for every picture.
     """
     in_ros_order = [quaternion_from_rotation(matrix) for matrix in rotation]
-    return np.roll(np.array(in_ros_order).reshape(-1, 4), 1, axis=1)
+    xyzw = np.reshape(in_ros_order, (-1, 4))
+    return np.roll(xyzw, 1, axis=1)

@@ -159,7 +159,8 @@ def project(structure: Structure, matrix: Array) -> tuple[dict[str, float], floa
             f"with its modes needs {basis.shape[1:]}"
         )
     orbit_sizes = np.einsum("kpm,kpm->k", basis, basis)
-    values = np.einsum("kpm,pm->k", basis, matrix) / orbit_sizes
+    orbit_sums = np.einsum("kpm,pm->k", basis, matrix)
+    values = orbit_sums / orbit_sizes
     coefficients = dict(zip(structure.names, values.tolist(), strict=True))
     nearest = np.tensordot(values, basis, axes=1)
     remainder = np.linalg.norm(matrix - nearest)

@@ -227,9 +227,8 @@ def find_structure(
     modes = modes or default_modes(layout)
     elements = find_layout_group(layout, symmetry)
     pad_images = np.array([map_pads(layout, element) for element in elements])
-    mode_images, mode_signs = _read_signed_permutations(
-        np.array([modes.action(element) for element in elements])
-    )
+    actions = [modes.action(element) for element in elements]
+    mode_images, mode_signs = _read_signed_permutations(np.array(actions))
 
     letters: dict[str, tuple[str, int]] = {}
     images_of_first = set(pad_images[:, 0])
@@ -249,7 +248,8 @@ def find_structure(
         signs = mode_signs[:, mode]
         is_assigned[rows, columns] = True
         is_same_entry = (rows == pad) & (columns == mode)
-        if np.any(is_same_entry & (signs < 0)):
+        is_reversed = signs < 0
+        if np.any(is_same_entry & is_reversed):
             # An element of the symmetry group maps the pad onto itself and reverses the sign of the
             # mode (linear stress field). So the entry equals its own negative and must be zero.
             continue
@@ -287,8 +287,9 @@ def _read_signed_permutations(matrices: Array) -> tuple[Index, Index]:
     largest = magnitude.max(axis=1)
     if not (np.allclose(sums, 1) and np.allclose(largest, 1)):
         raise SymmetryError("the group does not act on these modes as signed permutations")
-    signs = np.sign(matrices.sum(axis=1)).astype(int)
-    return magnitude.argmax(axis=1), signs
+    nonzero = matrices.sum(axis=1)
+    signs = np.sign(nonzero)
+    return magnitude.argmax(axis=1), signs.astype(int)
 
 
 def coefficient_counts(layout: Layout) -> Iterator[tuple[str, int | None]]:

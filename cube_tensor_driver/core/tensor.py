@@ -38,8 +38,8 @@ def principal_stresses(stress: Real) -> tuple[Array, Array]:
         Principal stresses (..., 3), the largest first, and their directions as the rows of
         matrices (..., 3, 3). The sign of a direction is arbitrary. A stress with a NaN gives NaN.
     """
+    is_known = np.isfinite(stress).all(axis=-1)
     matrices = to_matrix(stress).astype(float)
-    is_known = np.isfinite(matrices).all(axis=(-2, -1))
     # LAPACK raises an error for NaN, so unknown rows are computed as zero and replaced below.
     matrices[~is_known] = 0
     ascending, vectors = np.linalg.eigh(matrices)
@@ -98,8 +98,9 @@ def traction(stress: Real, normal: ArrayLike) -> Array:
         raise CubeError(
             f"traction: normal {n.tolist()} has length 0; give the direction of the plane's normal"
         )
+    unit_normal = n / length
     matrices: AnyArray = to_matrix(stress)
-    result: Array = np.einsum("...ij,...j->...i", matrices, n / length)
+    result: Array = np.einsum("...ij,...j->...i", matrices, unit_normal)
     return result
 
 
@@ -184,7 +185,8 @@ def rotation_from_quaternion(quaternion: ArrayLike) -> Array:
         CubeError: The quaternion is zero or not finite.
     """
     x, y, z, w = np.asarray(quaternion, dtype=float)
-    length = np.sqrt(x * x + y * y + z * z + w * w)
+    square = x * x + y * y + z * z + w * w
+    length = np.sqrt(square)
     if not (np.isfinite(length) and length > 0):
         raise CubeError(
             f"quaternion {[x, y, z, w]} has length {length}; it must be finite and above 0"

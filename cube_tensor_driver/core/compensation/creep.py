@@ -77,13 +77,17 @@ class Creep:
         self._models = [calibration.creep for calibration in pipeline.calibrations]
         self.has_model = np.array([model is not None for model in self._models])
         n_cubes, n_pads = offsets.reading.shape
-        present = {cube: model for cube, model in enumerate(self._models) if model is not None}
-        times = {time for model in present.values() for time in model.time.tolist()}
+        times: set[float] = set()
+        for model in self._models:
+            if model is not None:
+                times.update(model.time.tolist())
         self._times = np.array(sorted(times))
         time = np.repeat(self._times[:, None], n_cubes, axis=1)
         self._memories = LowPass(time, n_pads)
         self._amplitude = np.zeros_like(self._memories.lag)
-        for cube, model in present.items():
+        for cube, model in enumerate(self._models):
+            if model is None:
+                continue
             places = np.searchsorted(self._times, model.time)
             self._amplitude[places, cube, : model.n_pads] = model.amplitude.T
         self._total = self._amplitude.sum(axis=0)
@@ -211,7 +215,9 @@ class Creep:
             amplitude = model.deviation.swapaxes(1, 2)
             products = amplitude * memory[:, pads]
             known = products.sum(axis=1) * stiffness[pads]
-            errors += list(np.pad(known, [(0, 0), (0, len(reading) - model.n_pads)]))
+            n_missing = len(reading) - model.n_pads
+            padded = np.pad(known, [(0, 0), (0, n_missing)])
+            errors.extend(padded)
         return np.stack(errors, axis=1)
 
     def _update_certainty(self) -> None:

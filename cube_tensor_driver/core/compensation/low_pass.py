@@ -84,7 +84,8 @@ class LowPass:
         """
         self._time = time
         # Whether a cube has other time constants than the one before.
-        self._is_other = (time[:, 1:] != time[:, :-1]).any(axis=0)
+        is_different = time[:, 1:] != time[:, :-1]
+        self._is_other = is_different.any(axis=0)
         self.lag = np.zeros((*time.shape, n_signals))
 
     def advance(self, elapsed_s: Real, change: Real) -> Array:
@@ -113,7 +114,8 @@ class LowPass:
         # The cubes of one hub follow each other and have equal intervals, so one computation serves
         # them all.
         is_other = self._is_other | (elapsed_s[1:] != elapsed_s[:-1])
-        begins = np.flatnonzero(np.append(True, is_other))
+        begins_run = np.append(True, is_other)
+        begins = np.flatnonzero(begins_run)
         ratio = elapsed_s[begins] / self._time[:, begins]
         share = relaxed_share(ratio)
         # The quotient share / ratio tends to 1 as the length of the interval tends to 0.

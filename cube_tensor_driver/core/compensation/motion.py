@@ -107,8 +107,8 @@ class ForcesAtCubes:
         """
         n_cubes = len(self._position)
         cube = rows.cube.clip(0, n_cubes - 1).astype(np.intp)
-        state = _interpolate(time_ns, known, rows.stamp_ns).astype(np.float32)
-        in_parent = multiply(self._position[cube], state)
+        state = _interpolate(time_ns, known, rows.stamp_ns)
+        in_parent = multiply(self._position[cube], state.astype(np.float32))
         # A vector in the parent frame is transformed to the frame of a cube by the transpose of the
         # rotation of the cube.
         in_cube: Single = multiply(in_parent, self._rotation[cube])
@@ -132,14 +132,17 @@ def _interpolate(time_ns: Times, known: Array, stamp_ns: Times) -> Array:
         state[:] = known if len(known) else np.nan
         return state
     # Number of the instant before the interval that each time lies in, or is nearest to.
-    first = np.searchsorted(time_ns[1:-1], stamp_ns, side="right")
+    inner_ns = time_ns[1:-1]
+    first = np.searchsorted(inner_ns, stamp_ns, side="right")
     length_ns = np.diff(time_ns)[first]
     elapsed_ns = stamp_ns - time_ns[first]
     limit_ns = np.maximum(MAX_EXTRAPOLATION_NS, 2 * length_ns)
-    is_near = (elapsed_ns >= -limit_ns) & (elapsed_ns <= length_ns + limit_ns)
+    latest_ns = length_ns + limit_ns
+    is_near = (elapsed_ns >= -limit_ns) & (elapsed_ns <= latest_ns)
     # A damaged recording may state equal instants.
     is_usual = (length_ns > 0) & (length_ns <= MAX_INTERVAL_NS)
-    share = elapsed_ns / np.where(is_near & is_usual, length_ns, np.nan)
+    usable_length_ns = np.where(is_near & is_usual, length_ns, np.nan)
+    share = elapsed_ns / usable_length_ns
     change = np.diff(known, axis=0)[first]
     interpolated: Array = known[first] + change * share[:, None, None]
     return interpolated

@@ -63,8 +63,10 @@ class Thermal:
         self._models = [calibration.thermal for calibration in pipeline.calibrations]
         self.has_model = np.array([model is not None for model in self._models])
         present = [model for model in self._models if model is not None]
-        n_lags = max((len(model.lag) for model in present), default=0)
-        n_degrees = max((model.coefficient.shape[1] for model in present), default=0)
+        lag_counts = [len(model.lag) for model in present]
+        degrees_by_model = [model.coefficient.shape[1] for model in present]
+        n_lags = max(lag_counts, default=0)
+        n_degrees = max(degrees_by_model, default=0)
         stiffness = np.where(pipeline.stiffness > 0, pipeline.stiffness, np.inf)
         n = len(self._models)
         times = np.full((n_lags, n), MIN_LAG_S)
@@ -180,9 +182,11 @@ class Thermal:
         if model.deviation is not None:
             n_degrees = model.deviation.shape[1]
             powers = 1 + np.arange(n_degrees)
-            errors.append(model.deviation * self._level[cube] ** powers)
+            level_powers = self._level[cube] ** powers
+            errors.append(model.deviation * level_powers)
         found = np.hstack(errors)
-        return np.pad(found, [(0, n_pads - len(found)), (0, 0)])
+        n_missing = n_pads - len(found)
+        return np.pad(found, [(0, n_missing), (0, 0)])
 
     def parts(self) -> list[Array]:
         """Return the arrays of the state. To restore a recorded state, write into them."""
@@ -196,7 +200,8 @@ class Thermal:
 
 def _typical_size(values: Array) -> float:
     """Return the root sum of squares of the K values of a pad, as rms over the pads (P, K)."""
-    return float(np.sqrt((values**2).sum() / len(values)))
+    mean_square = (values**2).sum() / len(values)
+    return float(np.sqrt(mean_square))
 
 
 def filter_weights(lag: Array) -> Array:

@@ -35,11 +35,14 @@ class Weight:
         has_model = [calibration.weight is not None for calibration in calibrations]
         self.has_model = np.array(has_model)
         for number, calibration in enumerate(calibrations):
-            gain, pads = calibration.gain, slice(len(calibration.gain))
-            if calibration.weight is not None:
-                self.response[number, :, pads] = gain * calibration.weight.response.T
-                if calibration.weight.deviation is not None:
-                    self._deviation[number, :, pads] = gain * calibration.weight.deviation.T
+            model = calibration.weight
+            if model is None:
+                continue
+            gain = calibration.gain
+            pads = slice(len(gain))
+            self.response[number, :, pads] = gain * model.response.T
+            if model.deviation is not None:
+                self._deviation[number, :, pads] = gain * model.deviation.T
 
     def deviation(self, cube: int, force: Array) -> Array:
         """Return the errors (P, 3) of the compensation of weight by independent causes, in Pa.

@@ -234,7 +234,8 @@ class PadDiagnosis:
         usual = np.fmax(self.noise, _lower_median(window.noise))
         self.bound = _squared_bound(usual)
         was_noisy = state & NOISY > 0
-        limit = np.where(was_noisy, NOISY_LEAVE, NOISY_ENTER) * usual
+        ratio = np.where(was_noisy, NOISY_LEAVE, NOISY_ENTER)
+        limit = ratio * usual
         # A moving load raises the computed noise, too, but the frequency is then smooth, not rough.
         # A pad that was noisy before stays noisy even if the load now makes its frequency smooth.
         is_noise = window.rough | was_noisy
@@ -247,7 +248,8 @@ class PadDiagnosis:
             span: Highest minus lowest frequency in the window (cubes, P), in Hz.
             state: Conditions known before the window ended (cubes, P).
         """
-        others_moved = _lower_median(span / self.noise) > STUCK_MIN_SPAN
+        usual_span = _lower_median(span / self.noise)
+        others_moved = usual_span > STUCK_MIN_SPAN
         # A pad with a loose wire may show a single frequency for a window. It is not stuck, and has
         # the condition open, short or range already.
         is_intermittent = state & (OPEN | SHORT | RANGE) > 0
@@ -274,7 +276,8 @@ class PadDiagnosis:
         jumped = np.abs(window.mean - self._mean_before) > limit
         is_unmoved = (span < limit) & ~jumped
         is_unused = (state & LEFT_OUT > 0) | ~self._exists
-        self.still = has_enough_rows & (is_unmoved | is_unused).all(axis=1)
+        all_unmoved = (is_unmoved | is_unused).all(axis=1)
+        self.still = has_enough_rows & all_unmoved
         has_mean = ~np.isnan(window.mean)
         self._mean_before = np.where(has_mean, window.mean, self._mean_before)
 
@@ -298,7 +301,8 @@ class PadDiagnosis:
         still_span = STILL_MAX_SPAN * self.noise / self._rest
         limit = np.maximum(DRIFT_LIMIT, still_span)
         # A shift that all pads share is caused by temperature or a slow load, not by a fault.
-        drifting: Mask = np.abs(shift - _lower_median(shift)) > limit
+        own_shift = shift - _lower_median(shift)
+        drifting: Mask = np.abs(own_shift) > limit
         return drifting
 
 
@@ -322,7 +326,8 @@ def has_high_residual(
         Whether the residual of a cube is high now (cubes,).
     """
     share = np.where(was_high, RESIDUAL_LEAVE, RESIDUAL_ENTER)
-    return np.where(rows > 0, over_limit > share * rows, was_high)
+    is_high = over_limit > share * rows
+    return np.where(rows > 0, is_high, was_high)
 
 
 def _squared_bound(noise: Array) -> Array:

@@ -104,12 +104,16 @@ class DriftTracker:
         is_left_out = self._health.state & LEFT_OUT > 0
         usable = ~is_left_out & ~np.isnan(self._tracked_rest)
 
-        self._count_unloaded_windows(self._is_at_rest(measured, usable), has_rows)
+        at_rest = self._is_at_rest(measured, usable)
+        self._count_unloaded_windows(at_rest, has_rows)
         is_settled = self._unloaded_windows * WINDOW_S > RELEASE_S
-        follows = (is_settled & has_rows)[:, np.newaxis] & usable
+        is_unloaded = is_settled & has_rows
+        is_loaded = ~is_settled & has_rows
+        follows = is_unloaded[:, np.newaxis] & usable
+        follows_others = is_loaded[:, np.newaxis] & usable
         gain = min(1.0, WINDOW_S / time_constant)
-        change = np.where(follows, (measured - self._tracked_rest) * gain, 0.0)
-        follows_others = (~is_settled & has_rows)[:, np.newaxis] & usable
+        distance = measured - self._tracked_rest
+        change = np.where(follows, distance * gain, 0.0)
         self._follow_others(change, follows, follows_others)
         self._tracked_rest = self._tracked_rest + change
         self._update_when_due()
@@ -135,16 +139,18 @@ class DriftTracker:
         is_unloaded: Mask = np.asarray(follows.any(axis=1))
         self._followed_windows += is_unloaded
         self._loaded_windows = np.where(is_unloaded, 0, self._loaded_windows + 1)
-        drift = np.nanmean(self._tracked_rest / self._tared_rest - 1, axis=1)
+        change_since_tare = self._tracked_rest / self._tared_rest - 1
+        drift = np.nanmean(change_since_tare, axis=1)
         for cubes in self._layouts:
             unloaded = cubes[is_unloaded[cubes]]
             rate = drift / np.maximum(self._followed_windows, 1)
-            spread = float(np.sqrt(np.mean(rate[cubes] ** 2)))
+            mean_square = np.mean(rate[cubes] ** 2)
+            spread = float(np.sqrt(mean_square))
             if len(unloaded) >= MIN_UNLOADED_CUBES:
                 ratio = change[unloaded] / self._tracked_rest[unloaded]
                 common = np.median(np.nan_to_num(ratio), axis=0)
-                others = np.where(follows_others[cubes], common * self._tracked_rest[cubes], 0.0)
-                change[cubes] += others
+                common_change = common * self._tracked_rest[cubes]
+                change[cubes] += np.where(follows_others[cubes], common_change, 0.0)
                 spread = float(np.std(rate[unloaded]))
             self.deviation[cubes] = spread * self._loaded_windows[cubes]
 
@@ -167,7 +173,8 @@ class DriftTracker:
             The answer for each cube (cubes,); False for a cube without usable pads.
         """
         with np.errstate(invalid="ignore"):  # NaN where a cube has no such pad
-            is_close = np.abs(measured / self._tracked_rest - 1) < CONTACT_THRESHOLD
+            shift = np.abs(measured / self._tracked_rest - 1)
+            is_close = shift < CONTACT_THRESHOLD
         all_close = (is_close | ~usable).all(axis=1)
         return all_close & usable.any(axis=1) & self._health.diagnosis.still
 

@@ -123,13 +123,19 @@ class Health:
         """
         calibrations = self.pipeline.calibrations
         n_pads = self.pipeline.n_pads
-        beta = pad_table([c.beta for c in calibrations], n_pads, fill=1.0)
-        modulus = pad_table([c.modulus for c in calibrations], n_pads, fill=1.0)
-        noise = pad_table([c.noise for c in calibrations], n_pads, fill=1.0)
+        betas = [calibration.beta for calibration in calibrations]
+        moduli = [calibration.modulus for calibration in calibrations]
+        noises = [calibration.noise for calibration in calibrations]
+        beta = pad_table(betas, n_pads, fill=1.0)
+        modulus = pad_table(moduli, n_pads, fill=1.0)
+        noise = pad_table(noises, n_pads, fill=1.0)
         rest = self.pipeline.rest_frequency
-        for name, strain in {"low": MIN_STRAIN, "high": MAX_STRAIN}.items():
-            self.sums.pads(name)[:] = pad_frequency(strain * modulus, rest, beta, modulus)
-        self._open = pad_frequency(OPEN_STRAIN * modulus, rest, beta, modulus).astype(np.float32)
+        low = pad_frequency(MIN_STRAIN * modulus, rest, beta, modulus)
+        high = pad_frequency(MAX_STRAIN * modulus, rest, beta, modulus)
+        disconnected = pad_frequency(OPEN_STRAIN * modulus, rest, beta, modulus)
+        self.sums.pads("low")[:] = low
+        self.sums.pads("high")[:] = high
+        self._open = disconnected.astype(np.float32)
         slope = stress_slope(rest, rest, beta, modulus)
         self.diagnosis.set_reference(rest, noise / slope)
 
@@ -154,18 +160,22 @@ class Health:
             columns: Rows of frequencies.
             row: Number of the first row to check; all rows of its scan after it are checked, too.
         """
-        rows = columns.select(columns.find_scan(row))
+        scan = columns.find_scan(row)
+        rows = columns.select(scan)
         cube = rows.cube.astype(np.intp)
+        calibration = tables.calibration[cube]
         f = rows.frequency.astype(np.float32)
-        reported = mask_bits(tables, tables.calibration[cube], rows.pad_fault)
+        reported = mask_bits(tables, calibration, rows.pad_fault)
         bits = np.where(f >= self._open[cube], OPEN, RANGE)
         # The comparison is also false for NaN, which stands for a pad without a frequency.
         bits = np.where(f > 0, bits, SHORT)
         low = self.sums.pads("low")[cube]
         high = self.sums.pads("high")[cube]
-        bits[(f > low) & (f < high)] = 0
+        is_possible = (f > low) & (f < high)
+        bits[is_possible] = 0
         bits |= reported * REPORTED
-        bits[~find_impossible(tables, self.sums, rows, cube)] = 0
+        has_condition = find_impossible(tables, self.sums, rows, cube)
+        bits[~has_condition] = 0
         self._conditions.add(cube, bits.astype(np.uint16))
 
     def collect(self) -> tuple[StatusBits, Mask, Index]:

@@ -101,8 +101,9 @@ def make_state(rest_frequency: Array) -> HealthState:
     """
     n_cubes, n_pads = rest_frequency.shape
     shape = len(PAD_QUANTITIES), n_cubes, n_pads
+    n_words = CUBE_STATE.itemsize // 8
     state = HealthState(
-        words=np.zeros((n_cubes, CUBE_STATE.itemsize // 8), np.int64),
+        words=np.zeros((n_cubes, n_words), np.int64),
         quantities=np.full(shape, np.nan, np.float32),
         window_ns=np.array([1, 0, 0]),  # holds no time, so that the first row opens a window
     )
@@ -126,10 +127,14 @@ def make_window(state: HealthState) -> Window:
     """Compute the statistics of the rows that the present window has so far."""
     rows = state.cubes["rows"]
     count = np.maximum(rows, 1)[:, None]
-    base, lowest, highest = (state.pads(name) for name in ("base", "lowest", "highest"))
+    base = state.pads("base")
+    lowest = state.pads("lowest")
+    highest = state.pads("highest")
     is_measured = (rows[:, None] > 0) & ~np.isnan(base)
     mean = base + state.pads("sum") / count
     noise = np.sqrt(state.pads("bounded_squares") / count / 6)
+    # The minimum is above the maximum where no frequency was measured in the window.
+    has_span = is_measured & (lowest <= highest)
     first_squares = state.pads("first_squares")
     second_squares = state.pads("second_squares")
     with np.errstate(invalid="ignore"):  # NaN where a frequency was not measured
@@ -137,8 +142,8 @@ def make_window(state: HealthState) -> Window:
     return Window(
         rows=rows.copy(),
         mean=np.where(is_measured, mean, np.nan),
-        lowest=np.where(is_measured & (lowest <= highest), lowest, np.nan),
-        highest=np.where(is_measured & (lowest <= highest), highest, np.nan),
+        lowest=np.where(has_span, lowest, np.nan),
+        highest=np.where(has_span, highest, np.nan),
         noise=np.where(is_measured, noise, np.nan),
         rough=rough,
         gap_before=state.cubes["gap_before"].copy(),

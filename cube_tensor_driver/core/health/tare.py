@@ -225,8 +225,8 @@ def _average(windows: Sequence[Window], chosen: Index) -> _Means:
     mean = np.array([window.mean[chosen] for window in windows])
     noise = np.array([window.noise[chosen] for window in windows])
     variance = noise**2
-    highest = np.fmax.reduce([window.highest[chosen] for window in windows])
-    lowest = np.fmin.reduce([window.lowest[chosen] for window in windows])
+    highest = [window.highest[chosen] for window in windows]
+    lowest = [window.lowest[chosen] for window in windows]
 
     # The mean frequency of a window without rows is NaN. It is replaced, because NaN times the
     # weight 0 of this window would still be NaN.
@@ -235,11 +235,12 @@ def _average(windows: Sequence[Window], chosen: Index) -> _Means:
     # The noise of a window is NaN if it holds the first rows of a cube ever, because these have no
     # differences to rows before.
     rows_with_noise = rows * np.isfinite(variance)
-    total_variance = (np.nan_to_num(variance) * rows_with_noise).sum(axis=0)
+    known_variance = np.nan_to_num(variance)
+    total_variance = (known_variance * rows_with_noise).sum(axis=0)
     n_with_noise = np.maximum(rows_with_noise.sum(axis=0), 1)
     return _Means(
         frequency=total / rows.sum(axis=0),
-        span=highest - lowest,
+        span=np.fmax.reduce(highest) - np.fmin.reduce(lowest),
         noise=np.sqrt(total_variance / n_with_noise),
     )
 
@@ -299,7 +300,8 @@ def _check_pads(
         exceeds = used & ~(values <= limit)
         if not exceeds.any():
             continue
-        excess = np.where(exceeds, np.nan_to_num(values, nan=np.inf), -1)
+        comparable = np.nan_to_num(values, nan=np.inf)
+        excess = np.where(exceeds, comparable, -1)
         row, pad = np.unravel_index(np.argmax(excess), excess.shape)
         pad_name = calibrations[row].layout.pads[pad]
         value = values[row, pad]

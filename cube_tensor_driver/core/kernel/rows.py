@@ -59,7 +59,8 @@ def run(
 
     Arguments and results are those of the function `run` in `kernel/run.py`.
     """
-    unknown = np.flatnonzero(columns.cube[start:] >= len(tables.calibration))
+    is_unknown = columns.cube[start:] >= len(tables.calibration)
+    unknown = np.flatnonzero(is_unknown)
     if health is not None and len(unknown):
         return start, UNKNOWN_CUBE
     n_rows = len(columns.cube)
@@ -71,11 +72,13 @@ def run(
     while start < n_rows:
         end = start + MAX_ROWS
         if health is not None or offsets is not None:
-            end = start + 1 + int(np.argmax(begins_scan[start + 1 :]))
+            later_begins = begins_scan[start + 1 :]
+            end = start + 1 + int(np.argmax(later_begins))
         scan = slice(start, min(end, n_rows))
-        due = _find_due(health, offsets, columns, scan) if begins_scan[start] else DONE
-        if due != DONE:
-            return start, due
+        if begins_scan[start]:
+            due = _find_due(health, offsets, columns, scan)
+            if due != DONE:
+                return start, due
         with np.errstate(all="ignore"):
             start, request = _process(
                 scan, n_residuals, tables, health, offsets, columns, results, offset
@@ -158,8 +161,9 @@ def pack_bits(bits: Mask) -> PadMasks:
 
     Value p becomes bit p of a mask.
     """
-    weights = np.uint32(1) << np.arange(bits.shape[-1], dtype=np.uint32)
-    masks: PadMasks = (bits * weights).sum(axis=-1, dtype=np.uint32)
+    places = np.arange(bits.shape[-1], dtype=np.uint32)
+    weighted = bits * (np.uint32(1) << places)
+    masks: PadMasks = weighted.sum(axis=-1, dtype=np.uint32)
     return masks
 
 
@@ -183,10 +187,13 @@ def _find_due(
     newest_ns = int(columns.stamp_ns[scan].max())
     if health is not None:
         health.window_ns[2] = newest_ns
-        if not health.window_ns[0] <= newest_ns < health.window_ns[1]:
+        begin_ns, end_ns, _ = health.window_ns
+        if not begin_ns <= newest_ns < end_ns:
             return NEEDS_WINDOW
-    if offsets is not None and not offsets.step_ns[0] <= newest_ns < offsets.step_ns[1]:
-        return NEEDS_STEP
+    if offsets is not None:
+        begin_ns, end_ns = offsets.step_ns
+        if not begin_ns <= newest_ns < end_ns:
+            return NEEDS_STEP
     return DONE
 
 
@@ -223,16 +230,18 @@ def _process(
     has_new_condition = np.zeros(len(cube), bool)
     if health is not None:
         state = health.cubes[cube]
-        is_known = np.zeros(len(cube), bool) if rows.known is None else rows.known
+        is_judged = np.ones(len(cube), bool) if rows.known is None else ~rows.known
         left_out = rows.pad_fault | state["mask"]
-        out.left_out[:] = np.where(is_known, out.left_out, left_out)
-        out.status[:] = np.where(is_known, out.status, state["status"])
-        shown = pack_bits(find_impossible(tables, health, rows, cube))
-        has_new_condition = shown & ~state["found"] != 0
+        np.copyto(out.left_out, left_out, where=is_judged)
+        np.copyto(out.status, state["status"], where=is_judged)
+        is_impossible = find_impossible(tables, health, rows, cube)
+        new_conditions = pack_bits(is_impossible) & ~state["found"]
+        has_new_condition = new_conditions != 0
 
     v, is_good = apply_law(tables, cube, rows.frequency, rows.temperature)
     is_lacking = find_existing(tables, calibration) & ~is_good
-    is_bad = is_lacking | mask_bits(tables, calibration, out.left_out)
+    is_left_out = mask_bits(tables, calibration, out.left_out)
+    is_bad = is_lacking | is_left_out
     bad = pack_bits(is_bad)
     if offsets is not None:
         subtracted = _find_offsets(offsets, rows, cube, v, is_bad, out.status)
@@ -264,14 +273,15 @@ def _process(
     out.residual[:end] = residual
     out.observed[:end] = observed
     out.left_out[:end] |= bad[:end]
-    out.status[:end] |= rows.doubt[:end] & np.uint16(STAMP)
+    status = out.status[:end]
+    status |= rows.doubt[:end] & np.uint16(STAMP)
     for bit, condition in (
         (PAD_FAULT, bad[:end] != 0),
         (RESIDUAL, is_over_limit),
         (INVALID, observed == 0),
         (TEMPERATURE, is_cold[:end]),
     ):
-        out.status[:end] |= condition * np.uint16(bit)
+        status |= condition * np.uint16(bit)
     if health is not None:
         _add_to_window(health, rows, cube[:end], is_over_limit)
     return scan.start + end, request
@@ -306,12 +316,15 @@ def _find_offsets(
     status |= np.where(is_valid, lasting, np.uint16(COMPENSATION))
     if rows.force is not None:
         # NaN, which stands for an unknown force, fails the comparison.
-        is_known: Mask = np.abs(rows.force).max(axis=1) < MAX_SPECIFIC_FORCE
+        largest = np.abs(rows.force).max(axis=1)
+        is_known: Mask = largest < MAX_SPECIFIC_FORCE
         force = np.where(is_known[:, None], rows.force, 0)
         for axis in range(3):
             total += offsets.response[cube, axis] * force[:, axis, None]
-        status |= np.where(is_known, offsets.weighing[cube], np.uint16(COMPENSATION))
-        offsets.newest_force[cube] = np.where(is_known[:, None], force, np.nan)
+        weighing = offsets.weighing[cube]
+        status |= np.where(is_known, weighing, np.uint16(COMPENSATION))
+        force[~is_known] = np.nan
+        offsets.newest_force[cube] = force
     offsets.newest_ns[cube] = rows.stamp_ns
     offsets.reading[cube] = np.where(is_bad, np.nan, v)
     offsets.subtracted[cube] = total
@@ -382,22 +395,26 @@ def _add_to_window(
         is_over_limit: Whether the residual of a row is above its limit.
     """
     ratio, weight = _measure_pace(health, rows, cube)
-    f = rows.frequency[: len(cube)].astype(np.float32)
+    n = len(cube)
+    f = rows.frequency[:n].astype(np.float32)
     pads = {name: health.pads(name) for name in PAD_QUANTITIES}
     difference = f - pads["last"][cube]
     second = difference - ratio * pads["difference"][cube]
     squares = second * second * weight
     pads["second_squares"][cube] += squares
-    pads["bounded_squares"][cube] += np.minimum(squares, pads["bound"][cube])
+    bound = pads["bound"][cube]
+    pads["bounded_squares"][cube] += np.minimum(squares, bound)
     pads["first_squares"][cube] += difference * difference
     pads["sum"][cube] += f - pads["base"][cube]
     # fmin and fmax ignore NaN, which stands for a sample in which the pad had no frequency.
-    pads["lowest"][cube] = np.fmin(pads["lowest"][cube], f)
-    pads["highest"][cube] = np.fmax(pads["highest"][cube], f)
+    lowest = pads["lowest"][cube]
+    highest = pads["highest"][cube]
+    pads["lowest"][cube] = np.fmin(lowest, f)
+    pads["highest"][cube] = np.fmax(highest, f)
     pads["difference"][cube] = difference
     pads["last"][cube] = f
 
-    health.cubes["temperature"][cube] = rows.temperature[: len(cube)]
+    health.cubes["temperature"][cube] = rows.temperature[:n]
     health.cubes["rows"][cube] += 1
     health.cubes["over_limit"][cube] += is_over_limit
 
@@ -421,8 +438,9 @@ def _measure_pace(
         Ratios r and weights w (n, 1), to apply to all pads of a row.
     """
     state = health.cubes
-    stamp_ns = rows.stamp_ns[: len(cube)]
-    is_doubtful = rows.doubt[: len(cube)] & STAMP > 0
+    n = len(cube)
+    stamp_ns = rows.stamp_ns[:n]
+    is_doubtful = rows.doubt[:n] & STAMP > 0
     between = stamp_ns - state["time_ns"][cube]
     before = state["interval_ns"][cube]
     # An interval that begins or ends with a doubtful time stamp is unknown.
@@ -437,10 +455,12 @@ def _measure_pace(
     # (time went back) is a gap, too.
     is_gap = (between < 0) | (between >= GAP_NS)
     is_first = state["rows"][cube] == 0
-    within = state["gap_within"][cube]
-    is_longest = is_gap & ~is_first & (np.abs(between) > np.abs(within))
-    state["gap_before"][cube] = np.where(is_gap & is_first, between, state["gap_before"][cube])
-    state["gap_within"][cube] = np.where(is_longest, between, within)
+    gap_before = state["gap_before"][cube]
+    gap_within = state["gap_within"][cube]
+    is_longer = np.abs(between) > np.abs(gap_within)
+    is_longest = is_gap & ~is_first & is_longer
+    state["gap_before"][cube] = np.where(is_gap & is_first, between, gap_before)
+    state["gap_within"][cube] = np.where(is_longest, between, gap_within)
 
     shorter = np.minimum(now, before)
     longer = np.maximum(now, before)
@@ -448,7 +468,9 @@ def _measure_pace(
     is_even = longer < MAX_JITTER_RATIO * shorter
     safe_before = np.where(is_known, before, 1)
     ratio = np.where(is_known & ~is_even, now / safe_before, 1.0)
-    weight = is_known * 6 / (1 + (1 + ratio) * (1 + ratio) + ratio * ratio)
+    # Variance of the second difference as a multiple of the variance of the noise.
+    variance = 1 + (1 + ratio) * (1 + ratio) + ratio * ratio
+    weight = is_known * 6 / variance
     ratio = ratio.astype(np.float32)
     weight = weight.astype(np.float32)
     return ratio[:, None], weight[:, None]
