@@ -79,9 +79,11 @@ class Interpolation:
         # position are multiplied by c.
         scale = np.full(len(columns), self._length)
         scale[0] = 1.0
-        scaled = np.where(known, values, 0)[:, columns] * scale
+        known_values = np.where(known, values, 0)
+        scaled = known_values[:, columns] * scale
         result: Array = weights.matrix @ scaled.ravel()
-        result[np.repeat(weights.empty, n_points)] = np.nan
+        is_unknown = np.repeat(weights.empty, n_points)
+        result[is_unknown] = np.nan
         return result
 
     def uncertainty(self, values: Array, columns: list[int]) -> Array:
@@ -91,7 +93,9 @@ class Interpolation:
             Standard deviation (M,) of each interpolated value divided by the standard deviation of
             the quantity over the skin: 0 at a cube with a value, 1 far from all cubes.
         """
-        return self._solve_weights(np.isfinite(values), columns).uncertainty.ravel()
+        known = np.isfinite(values)
+        weights = self._solve_weights(known, columns)
+        return weights.uncertainty.ravel()
 
     def _solve_weights(self, known: Mask, columns: list[int]) -> _Weights:
         """Return the interpolation weights for some columns of the values.
@@ -114,10 +118,14 @@ class Interpolation:
         weights = self._weights[key]
         if not np.array_equal(wanted, weights.known):
             differs = wanted != weights.known
-            changed = np.flatnonzero(differs[self._near].any(axis=(1, 2)))
-            weights.data[changed], weights.uncertainty[changed] = self._solve(changed, wanted)
+            is_changed = differs[self._near].any(axis=(1, 2))
+            changed = np.flatnonzero(is_changed)
+            data, uncertainty = self._solve(changed, wanted)
+            weights.data[changed] = data
+            weights.uncertainty[changed] = uncertainty
             weights.known = wanted
-            weights.empty = ~wanted[self._near, 0].any(axis=1)
+            has_value = wanted[self._near, 0]
+            weights.empty = ~has_value.any(axis=1)
         return weights
 
     def _solve(self, chosen: Index, known: Mask) -> tuple[Array, Array]:
@@ -151,26 +159,29 @@ class Interpolation:
             axes[:, :, None],
             axes[:, None],
         )
-        matrix = np.moveaxis(matrix, 3, 2).reshape(n, size, size)
+        matrix = np.moveaxis(matrix, 3, 2)
+        matrix = matrix.reshape(n, size, size)
         # The covariances of unknown values with all others are set to 0, so that unknown values get
         # the weight 0.
-        matrix *= is_known[:, :, None] & is_known[:, None]
+        are_both_known = is_known[:, :, None] & is_known[:, None]
+        matrix *= are_both_known
         diagonal = np.arange(size)
-        matrix[:, diagonal, diagonal] += np.where(is_known, RIDGE, 1.0)
+        noise_variance = np.where(is_known, RIDGE, 1.0)
+        matrix[:, diagonal, diagonal] += noise_variance
 
         offset = points[:, :, None] - cubes[:, None]
         n_points = points.shape[1]
         no_axes = np.zeros((n, n_points, 1, 0, 3))
         to_points = _covariance(offset, no_axes, axes[:, None])
-        to_points = to_points.reshape(n, -1, size) * is_known[:, None]
+        to_points = to_points.reshape(n, -1, size)
+        to_points = to_points * is_known[:, None]
 
-        weights = np.swapaxes(
-            np.linalg.solve(matrix, np.swapaxes(to_points, 1, 2)),
-            1,
-            2,
-        )
+        from_points = np.swapaxes(to_points, 1, 2)
+        solution = np.linalg.solve(matrix, from_points)
+        weights = np.swapaxes(solution, 1, 2)
         explained = np.einsum("nqd,nqd->nq", weights, to_points)
-        return weights, np.sqrt(np.clip(1 - explained, 0, 1))
+        variance = np.clip(1 - explained, 0, 1)
+        return weights, np.sqrt(variance)
 
 
 class _Weights:
@@ -199,7 +210,8 @@ class _Weights:
             known: Initial value (cubes, width) of the attribute `known`.
         """
         n, width = known.shape
-        columns = near[:, :, None] * width + np.arange(width)
+        first_column = near[:, :, None] * width
+        columns = first_column + np.arange(width)
         columns = columns.reshape(n, -1)
         per_row = columns.shape[1]
         rows = n * points
@@ -232,14 +244,17 @@ def _nearest_cubes(poses: CubePoses) -> Index:
     # More cubes than needed are requested, because of several cubes at the same distance the tree
     # returns arbitrary ones.
     candidates = min(3 * count, n)
-    distance, near = cKDTree(poses.position).query(poses.position, candidates)
+    tree = cKDTree(poses.position)
+    distance, near = tree.query(poses.position, candidates)
     distance = distance.reshape(n, -1)
     near = near.reshape(n, -1)
 
     # Distances are rounded, because otherwise their rounding errors would decide the order of
     # equally distant cubes.
-    rounded = (distance / poses.pitch).round(6)
-    order = np.lexsort((near, rounded))[:, :count]
+    pitches = distance / poses.pitch
+    rounded = pitches.round(6)
+    order = np.lexsort((near, rounded))
+    order = order[:, :count]
     return np.asarray(np.take_along_axis(near, order, axis=1))
 
 
@@ -267,16 +282,13 @@ def _covariance(
     along_u = np.einsum("...i,...ai->...a", d, u)
     along_v = np.einsum("...i,...ai->...a", d, v)
 
-    result = np.empty(
-        (
-            *b.shape,
-            1 + u.shape[-2],
-            1 + v.shape[-2],
-        )
-    )
+    n_rows = 1 + u.shape[-2]
+    n_columns = 1 + v.shape[-2]
+    slope = 2 * phi1[..., None]
+    result = np.empty((*b.shape, n_rows, n_columns))
     result[..., 0, 0] = phi
-    result[..., 0, 1:] = -2 * phi1[..., None] * along_v
-    result[..., 1:, 0] = 2 * phi1[..., None] * along_u
+    result[..., 0, 1:] = -slope * along_v
+    result[..., 1:, 0] = slope * along_u
     u_dot_v = np.einsum("...ai,...bi->...ab", u, v)
     product = along_u[..., None] * along_v[..., None, :]
     first = -2 * phi1[..., None, None] * u_dot_v

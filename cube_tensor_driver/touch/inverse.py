@@ -249,8 +249,9 @@ class SurfaceInverse:
         # The whole skin is laid flat at once and kept, because contacts stay at few cubes.
         if centre not in self._unrolled:
             everything = np.arange(len(self.poses.position))
-            place, angle = unroll(self.poses, np.array([centre]), everything[None])
-            self._unrolled[centre] = place[0], angle[0]
+            centres = np.array([centre])
+            places, angles = unroll(self.poses, centres, everything[None])
+            self._unrolled[centre] = places[0], angles[0]
         place, angle = self._unrolled[centre]
         return place[cubes], angle[cubes]
 
@@ -302,8 +303,9 @@ class SurfaceInverse:
             Traction at all points, as from `field`.
         """
         # The results are sorted by cube and then by point of its patch, as `points` are.
-        result = self._windows.product(self._fill(scaled))
-        rows = result.reshape(len(self.points), -1).astype(np.float64)
+        y = self._fill(scaled)
+        result = self._windows.product(y).astype(np.float64)
+        rows = result.reshape(len(self.points), -1)
         return TractionField(rows[:, :3], rows[:, 3])
 
     def deviation(self, values: Array) -> FieldDeviation:
@@ -328,20 +330,26 @@ class SurfaceInverse:
         y = self._fill(residual)
         # Variance of each pad's error, divided by the variance of its noise: 1 for the noise itself
         # plus the gain error.
-        known_values = np.where(self._known, scaled, 0.0)[:, :, None]
-        stresses = (stress_matrices(self.by_pad, self._known) @ known_values)[:, :, 0]
-        has_values = self._known.any(axis=1)[:, None]
-        gain_variance = (GAIN_ERROR * stresses) ** 2
+        known = self._known
+        known_values = np.where(known, scaled, 0.0)
+        to_pads = stress_matrices(self.by_pad, known)
+        stresses = to_pads @ known_values[:, :, None]
+        gain_deviation = GAIN_ERROR * stresses[:, :, 0]
+        variance_with_values = gain_deviation**2 + 1
         # A cube without known values contributes no noise to the field.
-        pad_variance = np.where(has_values, gain_variance + 1, 0).astype(np.float32)
+        has_values = known.any(axis=1)
+        pad_variance = np.where(has_values[:, None], variance_with_values, 0)
+        pad_variance = pad_variance.astype(np.float32)
 
         windows = self._windows
-        scale = windows.scale(y, pad_variance, self._known)[:, None]
+        scale = windows.scale(y, pad_variance, known)
         prior = windows.prior[windows.kind] + self._prediction.variance
-        variance = scale * prior
+        variance = scale[:, None] * prior
         variance += windows.noise(pad_variance)
         variance += self._prediction.noise(pad_variance)
-        return FieldDeviation(*np.sqrt(variance).reshape(-1, 2).T)
+        deviation = np.sqrt(variance)
+        on_surface, at_depth = deviation.reshape(-1, 2).T
+        return FieldDeviation(on_surface, at_depth)
 
     def _fill(self, scaled: Array) -> Single:
         """Replace missing values by predictions from the neighbouring cubes.
@@ -359,5 +367,6 @@ class SurfaceInverse:
         if not np.array_equal(known, self._known):
             self._known = known
             self._prediction = MissingValuePrediction(self._windows, self.observed, known)
-        y = np.where(known, scaled, 0.0).astype(np.float32)
-        return self._prediction.fill(y)
+        y = np.where(known, scaled, 0.0)
+        single = y.astype(np.float32)
+        return self._prediction.fill(single)

@@ -182,8 +182,10 @@ class WindowPosteriors:
         self._rows = [(kind, np.flatnonzero(self.kind == kind)) for kind in kinds]
         self._shared_kinds = [(kind, rows) for kind, rows in self._rows if len(rows) > 1]
         counts = np.bincount(self.kind)
-        self._single = np.flatnonzero(counts[self.kind] == 1)
-        self._single_gain = self.gain[self.kind[self._single]]
+        is_single = counts[self.kind] == 1
+        self._single = np.flatnonzero(is_single)
+        single_kinds = self.kind[self._single]
+        self._single_gain = self.gain[single_kinds]
 
     def _find_kinds(
         self,
@@ -235,14 +237,17 @@ class WindowPosteriors:
         """
         # The values of all cubes of a window are joined to one row, in the order of the columns of
         # the gain matrix G.
-        gathered = y[self.near].reshape(len(self.near), -1)
+        n = len(self.near)
+        gathered = y[self.near].reshape(n, -1)
         n_rows = self.gain.shape[1]
-        result = np.empty((len(self.near), n_rows), np.float32)
+        result = np.empty((n, n_rows), np.float32)
         for kind, rows in self._shared_kinds:
-            result[rows] = gathered[rows] @ self.gain[kind].T
+            gain = self.gain[kind]
+            result[rows] = gathered[rows] @ gain.T
         if len(self._single):
-            single = gathered[self._single][:, :, None]
-            result[self._single] = (self._single_gain @ single)[:, :, 0]
+            single = gathered[self._single]
+            products = self._single_gain @ single[:, :, None]
+            result[self._single] = products[:, :, 0]
         return result
 
     def scale(
@@ -275,12 +280,11 @@ class WindowPosteriors:
             weighted = own @ self.precision[kind]
             excess[rows] = (weighted * own).sum(axis=1)
             excess[rows] -= pads[rows] @ self.trace[kind]
-        count = known.sum(axis=1)[inner].sum(axis=1)
-        return np.where(
-            count > 0,
-            np.maximum(excess, 0) / np.maximum(count, 1),
-            1.0,
-        )
+        excess = np.maximum(excess, 0)
+        count_by_cube = known.sum(axis=1)
+        count = count_by_cube[inner].sum(axis=1)
+        mean_excess = excess / np.maximum(count, 1)
+        return np.where(count > 0, mean_excess, 1.0)
 
     def noise(self, pad_variance: Single) -> Array:
         """Compute the variances of the pressures that the errors of the pads cause.
@@ -293,10 +297,13 @@ class WindowPosteriors:
             Variances (cubes, points x 2) in Pa^2 of the pressure on the surface and of the pressure
             at the cubes' depth.
         """
-        gathered = pad_variance[self.near].reshape(len(self.near), -1)
-        noise = np.empty((len(gathered), self.by_pad.shape[1]))
+        n = len(self.near)
+        gathered = pad_variance[self.near].reshape(n, -1)
+        n_pressures = self.by_pad.shape[1]
+        noise = np.empty((n, n_pressures))
         for kind, rows in self._rows:
-            noise[rows] = gathered[rows] @ self.by_pad[kind].T
+            by_pad = self.by_pad[kind]
+            noise[rows] = gathered[rows] @ by_pad.T
         return noise
 
 
@@ -338,29 +345,36 @@ def _solve_window(
     known = model.known.ravel()
     pads = np.nan_to_num(model.by_pad)
 
-    prior = AMPLITUDE**2 * covariance_matrix(traction_prior, columns, place, angle, model.variant)
+    unit_prior = covariance_matrix(traction_prior, columns, place, angle, model.variant)
+    prior = AMPLITUDE**2 * unit_prior
     total = prior.copy()  # becomes the covariance K_yy + N of the measured values
     for cube, own in enumerate(pads):
-        part = slice(cube * width, (cube + 1) * width)
+        first = cube * width
+        part = slice(first, first + width)
         total[part, part] += own @ own.T
-    total[np.diag_indices(n * width)] += MODEL_ERROR**2 * np.diag(prior)
+    model_variance = MODEL_ERROR**2 * np.diag(prior)
+    total[np.diag_indices(n * width)] += model_variance
 
     # `known_gain` is the gain matrix G = K_ty (K_yy + N)^-1 for the known values, and `variance`
     # the posterior variance diag(K_tt - G K_yt) of the traction.
-    cross = _cross_covariance(traction_prior, model, place, angle, points)[:, known]
+    cross = _cross_covariance(traction_prior, model, place, angle, points)
+    cross = cross[:, known]
+    known_block = np.ix_(known, known)
     # Cholesky takes a quarter of the time of numpy's general solver.
-    factor = cho_factor(total[np.ix_(known, known)])
+    factor = cho_factor(total[known_block])
     known_gain = cho_solve(factor, cross.T).T
     per_point = np.array([*traction_prior.variance, traction_prior.pressure_variance])
     prior_variance = AMPLITUDE**2 * np.tile(per_point, len(points))
-    variance = prior_variance - (known_gain * cross).sum(axis=1)
+    explained = (known_gain * cross).sum(axis=1)
+    variance = prior_variance - explained
     gain = np.zeros((len(cross), n * width), np.float32)
     gain[:, known] = known_gain
 
     # With the noise matrix B of the pads, diag(G M G') is a sum of (G B)^2 over the pads.
     by_point = gain.reshape(-1, ROWS_PER_POINT, n, width)
     pressure_gain = by_point[:, 2:].reshape(-1, n, width)
-    by_pad = np.einsum("rwc,wcp->rwp", pressure_gain, pads, optimize=True) ** 2
+    by_pad = np.einsum("rwc,wcp->rwp", pressure_gain, pads, optimize=True)
+    by_pad = by_pad**2
 
     inner = min(INNER_CUBES, n)
     size = inner * width
@@ -368,13 +382,15 @@ def _solve_window(
     cubes = np.arange(inner)
     # The noise covariance M has no entries between different cubes, so the trace of P M depends
     # only on the diagonal blocks of P.
-    diagonal = precision.reshape(inner, width, inner, width)[cubes, :, cubes]
+    blocks = precision.reshape(inner, width, inner, width)
+    diagonal = blocks[cubes, :, cubes]
     inner_pads = pads[:inner]
     trace = np.einsum("wcp,wcd,wdp->wp", inner_pads, diagonal, inner_pads, optimize=True)
+    pressure_variance = select_pressure(variance)
     return _Window(
         gain=gain,
         precision=precision.astype(np.float32),
-        variance=np.maximum(select_pressure(variance), 0),
+        variance=np.maximum(pressure_variance, 0),
         by_pad=by_pad.reshape(len(pressure_gain), -1).astype(np.float32),
         trace=trace.ravel().astype(np.float32),
     )
@@ -404,18 +420,20 @@ def _cross_covariance(
     columns = model.columns
     n = len(place)
     n_points = len(points)
-    offset = (place[:, None] - points).reshape(-1, 2)
+    width = len(columns)
+    offset = place[:, None] - points
+    offset = offset.reshape(-1, 2)
     angles = np.repeat(angle, n_points)
     variants = np.repeat(model.variant, n_points)
 
-    traction = traction_prior.cross(offset, angles, variants)[:, columns]
-    pressure = traction_prior.pressure(offset, angles, variants)[:, columns]
-    cross = np.empty((n_points, ROWS_PER_POINT, n, len(columns)))
-    traction = traction.reshape(n, n_points, -1, 3)
-    pressure = pressure.reshape(n, n_points, -1)
+    traction = traction_prior.cross(offset, angles, variants)
+    traction = traction[:, columns].reshape(n, n_points, width, 3)
+    pressure = traction_prior.pressure(offset, angles, variants)
+    pressure = pressure[:, columns].reshape(n, n_points, width)
+    cross = np.empty((n_points, ROWS_PER_POINT, n, width))
     cross[:, :3] = traction.transpose(1, 3, 0, 2)
     cross[:, 3] = pressure.transpose(1, 0, 2)
-    return AMPLITUDE**2 * cross.reshape(-1, n * len(columns))
+    return AMPLITUDE**2 * cross.reshape(-1, n * width)
 
 
 def _invert_known(matrix: Array, known: Mask) -> Array:
@@ -447,7 +465,8 @@ def select_pressure(rows: Array) -> Array:
         pressure on the surface, and the pressure at the cubes' depth.
     """
     leading = rows.shape[:-1]
-    chosen = rows.reshape(*leading, -1, ROWS_PER_POINT)[..., 2:]
+    by_point = rows.reshape(*leading, -1, ROWS_PER_POINT)
+    chosen = by_point[..., 2:]
     return chosen.reshape(*leading, -1)
 
 
@@ -463,21 +482,19 @@ def _nearest_cubes(poses: CubePoses) -> Index:
     # returns arbitrary ones.
     candidates = min(3 * count, n)
     tree = cKDTree(poses.position)
-    near = tree.query(poses.position, candidates)[1].reshape(n, -1)
+    _, near = tree.query(poses.position, candidates)
+    near = near.reshape(n, -1)
 
     offset = poses.position[near] - poses.position[:, None]
     local = np.einsum("nji,nkj->nki", poses.rotation, offset)
     # Positions are rounded, because otherwise rounding errors would decide the order of equally
     # distant cubes.
     local = np.round(local / poses.pitch, 4)
-    distance = np.round(np.linalg.norm(local, axis=2), 4)
-    order = np.lexsort(
-        (
-            local[..., 1],
-            local[..., 0],
-            distance,
-        )
-    )[:, :count]
+    distance = np.linalg.norm(local, axis=2)
+    distance = np.round(distance, 4)
+    x, y, _ = np.moveaxis(local, -1, 0)
+    order = np.lexsort((y, x, distance))
+    order = order[:, :count]
     return np.asarray(np.take_along_axis(near, order, axis=1))
 
 

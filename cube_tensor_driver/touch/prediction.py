@@ -101,14 +101,18 @@ class MissingValuePrediction:
         """
         width = missing.shape[1]
         near = windows.near[cube, : windows.inner]
-        precision = windows.precision[windows.kind[cube]].astype(float)
+        kind = windows.kind[cube]
+        precision = windows.precision[kind].astype(float)
         is_missing = missing[near].ravel()
         own = np.flatnonzero(missing[cube])
+        n_own = len(own)
 
         # A window lists its centre cube first, so the first missing values are those of this cube.
         missing_block = precision[np.ix_(is_missing, is_missing)]
-        selection = np.eye(is_missing.sum(), len(own))
+        n_missing = is_missing.sum()
+        selection = np.eye(n_missing, n_own)
         covariance = np.linalg.solve(missing_block, selection)
+        own_covariance = covariance[:n_own]
         weights = -covariance.T @ precision[is_missing]
         weights[:, is_missing] = 0.0
 
@@ -116,17 +120,20 @@ class MissingValuePrediction:
         # cubes of each of these windows.
         rows, place = np.nonzero(windows.near == cube)
         columns = place[:, None] * width + own
-        kinds = windows.kind[rows][:, None]
-        gain = select_pressure(windows.gain[kinds, :, columns].astype(float))
-        increase = np.einsum("ncr,cd,ndr->nr", gain, covariance[: len(own)], gain)
+        kinds = windows.kind[rows]
+        all_gain = windows.gain[kinds[:, None], :, columns]
+        gain = select_pressure(all_gain.astype(float))
+        increase = np.einsum("ncr,cd,ndr->nr", gain, own_covariance, gain)
         self.variance[rows] += np.maximum(increase, 0)
 
         if is_missing.all():
             return  # nothing is known nearby: the prediction is the mean of the prior, 0
-        by_cube = weights.reshape(len(own), len(near), -1)
-        by_pad = np.einsum("fwc,wcp->fwp", by_cube, windows.pads[near])
-        by_pad = by_pad.reshape(len(own), -1)
-        self._predictions.append(_Prediction(cube, own, near, weights, by_pad, rows, gain))
+        by_cube = weights.reshape(n_own, len(near), -1)
+        pads = windows.pads[near]
+        by_pad = np.einsum("fwc,wcp->fwp", by_cube, pads)
+        by_pad = by_pad.reshape(n_own, -1)
+        prediction = _Prediction(cube, own, near, weights, by_pad, rows, gain)
+        self._predictions.append(prediction)
 
     def fill(self, y: Single) -> Single:
         """Replace missing values by predictions from the neighbouring cubes.
@@ -157,6 +164,8 @@ class MissingValuePrediction:
         total = np.zeros_like(self.variance)
         for one in self._predictions:
             neighbours = pad_variance[one.near].ravel()
-            covariance = (one.by_pad * neighbours) @ one.by_pad.T
-            total[one.rows] += np.einsum("ncr,cd,ndr->nr", one.gain, covariance, one.gain)
+            weighted = one.by_pad * neighbours
+            covariance = weighted @ one.by_pad.T
+            variance = np.einsum("ncr,cd,ndr->nr", one.gain, covariance, one.gain)
+            total[one.rows] += variance
         return total

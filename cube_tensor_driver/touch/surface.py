@@ -190,20 +190,24 @@ class Surface:
         # Where neither a cube nor its neighbours have a value, the pressure is unknown (NaN) and
         # counts as zero.
         pressure = np.nan_to_num(self._pressure(values))
-        relative_threshold = RELATIVE_THRESHOLD * float(pressure.max())
+        largest = float(pressure.max())
+        relative_threshold = RELATIVE_THRESHOLD * largest
         inside = pressure > max(threshold, relative_threshold)
         if not inside.any():
             return []
 
         shear = np.nan_to_num(self._shear(values))
-        value_pressure = -self._interpolation.values(values, PRESSURE[:1])
         shear_by_patch = [self._by_patch(component) for component in shear.T]
+        moment_pressure = -self._interpolation.values(values, PRESSURE[:1])
+        moment_pressure = np.nan_to_num(moment_pressure)
+        uncertainty = self.uncertainty(values)
+        is_shear_known = np.isfinite(values[:, SHEAR])
         loaded = _LoadedSurface(
             pressure=self._by_patch(pressure),
             shear=np.stack(shear_by_patch),
-            moment_pressure=self._by_patch(np.nan_to_num(value_pressure)),
-            uncertainty=self._by_patch(self.uncertainty(values)),
-            sees_shear=bool(np.isfinite(values[:, SHEAR]).any()),
+            moment_pressure=self._by_patch(moment_pressure),
+            uncertainty=self._by_patch(uncertainty),
+            sees_shear=bool(is_shear_known.any()),
         )
         owner = self._assign_patches(inside)
         numbers = np.unique(owner)
@@ -243,16 +247,21 @@ class Surface:
         n = len(self._patches)
         first, second = self._pairs.T
         joined = inside[first] & inside[second]
-        patch_pairs = self.cube[self._pairs[joined]].T
+        joined_points = self._pairs[joined]
+        patch_pairs = self.cube[joined_points].T
         # Patches are the nodes of a graph; neighbouring points in contact are its edges.
-        links = coo_matrix((joined[joined], patch_pairs), shape=(n, n))
-        component = connected_components(links, directed=False)[1]
+        entries = np.ones(len(joined_points), bool)
+        links = coo_matrix((entries, patch_pairs), shape=(n, n))
+        _, component = connected_components(links, directed=False)
 
-        is_touched = inside.reshape(n, -1).any(axis=1)
+        inside_by_patch = inside.reshape(n, -1)
+        is_touched = inside_by_patch.any(axis=1)
         # A patch without a point in contact joins the contact of the nearest patch that has one.
-        touched = cKDTree(self.poses.position[is_touched])
-        nearest = touched.query(self.poses.position)[1]
-        return np.asarray(component[is_touched][nearest], np.intp)
+        position = self.poses.position
+        touched = cKDTree(position[is_touched])
+        _, nearest = touched.query(position)
+        touched_component = component[is_touched]
+        return np.asarray(touched_component[nearest], np.intp)
 
     def _contact(self, loaded: _LoadedSurface, chosen: Mask) -> Contact:
         """Compute force, position and uncertainty of a contact.
@@ -270,22 +279,28 @@ class Surface:
         normal_force = float(pressure.sum() * self.area)
         # The normal of the contact is the mean of its cubes' normals, weighted with the pressure.
         cube_normals = rotation[:, :, 2]
-        normal = _weighted_sum(pressure.sum(axis=1), cube_normals)
+        cube_weights = pressure.sum(axis=1)
+        normal = _weighted_sum(cube_weights, cube_normals)
         normal /= np.linalg.norm(normal)
 
         shear = self._shear_force(loaded.shear[:, chosen], rotation)
         shear -= normal * (shear @ normal)
         # The shear force acts on the surface, `depth` above the cubes' plane, and so shifts the
         # centre of pressure in this plane by depth × shear force / normal force.
-        centre = _weighted_sum(weight, points) / weight.sum()
-        position = centre + self.depth * (normal - shear / weight.sum())
+        total_weight = weight.sum()
+        centre = _weighted_sum(weight, points) / total_weight
+        force_direction = normal - shear / total_weight
+        position = centre + self.depth * force_direction
 
         # Interpolation errors are correlated over one pitch (distance of neighbouring cubes), so
         # the errors of the pitch / spacing points along each axis add up instead of averaging out.
         pressure_deviation = loaded.uncertainty[chosen] * pressure
         variance = (pressure_deviation * self.pitch * self.spacing) ** 2
-        squared_lever = ((points - centre) ** 2).sum(axis=2) / 2
+        lever = points - centre
+        # The lever lies in the surface. Along one axis, its mean square is half of its square.
+        squared_lever = (lever**2).sum(axis=2) / 2
         moment_variance = (variance * squared_lever).sum()
+        moment_deviation = np.sqrt(moment_variance)
         is_pressed = pressure > 0.5 * pressure.max()
         n_pressed = np.count_nonzero(is_pressed)
         shear_force = float(np.linalg.norm(shear)) if loaded.sees_shear else np.nan
@@ -296,7 +311,7 @@ class Surface:
             normal_force=normal_force,
             shear_force=shear_force,
             area=float(n_pressed * self.area),
-            position_uncertainty=float(np.sqrt(moment_variance) / normal_force),
+            position_uncertainty=float(moment_deviation / normal_force),
             force_uncertainty=float(np.sqrt(variance.sum())),
         )
 
@@ -347,7 +362,8 @@ def square_points(spacing: float, side: int) -> Array:
     Returns:
         Positions (side^2, 2) in m.
     """
-    line = (np.arange(side) - (side - 1) / 2) * spacing
+    steps = np.arange(side) - (side - 1) / 2
+    line = steps * spacing
     x, y = np.meshgrid(line, line)
     return np.stack([x.ravel(), y.ravel()], axis=1)
 
@@ -369,7 +385,8 @@ def patches(
         plane of its cube.
     """
     in_plane = poses.rotation[:, :, :2]
-    offset = np.einsum("nij,qj->nqi", in_plane, square_points(spacing, side))
+    grid = square_points(spacing, side)
+    offset = np.einsum("nij,qj->nqi", in_plane, grid)
     return np.asarray(poses.position[:, None] + offset)
 
 
@@ -379,5 +396,6 @@ def _weighted_sum(weights: Array, vectors: Array) -> Array:
     The function uses einsum, because a BLAS matrix product would start threads that occupy a second
     core.
     """
-    result: Array = np.einsum("n,ni->i", weights.ravel(), vectors.reshape(-1, 3))
+    rows = vectors.reshape(-1, 3)
+    result: Array = np.einsum("n,ni->i", weights.ravel(), rows)
     return result

@@ -32,19 +32,23 @@ def unroll(
     """
     to_centre = poses.rotation[centres]
     origin = poses.position[centres]
-    offset = poses.position[near] - origin[:, None]
+    positions = poses.position[near]
+    offset = positions - origin[:, None]
     local = np.einsum("nji,nkj->nki", to_centre, offset)
 
     # The direction in the x-y plane stays, the length becomes the distance in space.
     distance = np.linalg.norm(local, axis=2)
-    x, y, _ = np.moveaxis(local, -1, 0)
-    in_plane = np.hypot(x, y)
-    in_plane_safe = np.where(in_plane > 0, in_plane, 1.0)
-    stretch = distance / in_plane_safe
-    place = local[..., :2] * stretch[..., None]
+    in_plane = local[..., :2]
+    x, y = np.moveaxis(in_plane, -1, 0)
+    length = np.hypot(x, y)
+    positive_length = np.where(length > 0, length, 1.0)
+    stretch = distance / positive_length
+    place = in_plane * stretch[..., None]
 
     # A tilted neighbour gets the rotation about z that is closest to its rotation in space.
-    relative = np.einsum("nji,nkjl->nkil", to_centre, poses.rotation[near])
+    rotations = poses.rotation[near]
+    relative = np.einsum("nji,nkjl->nkil", to_centre, rotations)
     sine = relative[..., 1, 0] - relative[..., 0, 1]
     cosine = relative[..., 0, 0] + relative[..., 1, 1]
-    return place, np.arctan2(sine, cosine)
+    angle = np.arctan2(sine, cosine)
+    return place, angle

@@ -86,12 +86,11 @@ class Discs(NamedTuple):
 
 def discs_of(estimates: Sequence[ContactEstimate]) -> Discs:
     """Return round Hertz contacts with the force, position and area of the estimates."""
+    forces = np.array([one.force for one in estimates])
+    centres = np.array([one.place for one in estimates])
     areas = np.array([one.area for one in estimates])
-    return Discs(
-        np.array([one.force for one in estimates]),
-        np.array([one.place for one in estimates]),
-        np.log(areas / np.pi) / 2,
-    )
+    log_squares = np.log(areas / np.pi)
+    return Discs(forces, centres, log_squares / 2)
 
 
 def estimate_contact(nodes: Array, forces: Array, root: Array, size: float) -> ContactEstimate:
@@ -124,17 +123,22 @@ def estimate_contact(nodes: Array, forces: Array, root: Array, size: float) -> C
     # pressure of one node about its own centre. Its eigenvectors are the axes of the ellipse.
     node_moment = _HERTZ_MOMENT * size**2
     weighted_arm = arm * forces[2][:, None]
-    second_moment = weighted_arm.T @ arm / normal_force + node_moment * np.eye(2)
+    moment_of_forces = weighted_arm.T @ arm / normal_force
+    second_moment = moment_of_forces + node_moment * np.eye(2)
     principal_moments, axes = np.linalg.eigh(second_moment)
     principal_moments = np.maximum(principal_moments, node_moment)
-    area = np.pi / _HERTZ_MOMENT * float(np.sqrt(principal_moments.prod()))
-    excess = (arm @ axes) ** 2 + node_moment - principal_moments
+    mean_moment = float(np.sqrt(principal_moments.prod()))
+    area = np.pi / _HERTZ_MOMENT * mean_moment
+    principal_arm = arm @ axes
+    excess = principal_arm**2 + node_moment - principal_moments
     relative_excess = (excess / principal_moments).sum(axis=1)
     slopes[3, 2] = area * relative_excess / (2 * normal_force)
 
     propagated_root = np.einsum("kan,anm->km", slopes, root)
     variance = (propagated_root**2).sum(axis=1)
     force_root = root.sum(axis=1)
+    smaller_moment, larger_moment = principal_moments
+    aspect = np.sqrt(larger_moment / smaller_moment)
     return ContactEstimate(
         force=force,
         force_covariance=force_root @ force_root.T,
@@ -144,5 +148,5 @@ def estimate_contact(nodes: Array, forces: Array, root: Array, size: float) -> C
         moment_variance=float(variance[2]),
         area=area,
         area_variance=float(variance[3]),
-        aspect=float(np.sqrt(principal_moments[1] / principal_moments[0])),
+        aspect=float(aspect),
     )

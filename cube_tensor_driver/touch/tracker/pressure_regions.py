@@ -75,8 +75,10 @@ class PressureRegions:
         """
         largest = float(pressure.max(initial=0.0))
         threshold = max(self._min_pressure, DETECTION_FRACTION * largest)
+        release = RELEASE_FRACTION * threshold
         before = self._inside
-        self._inside = pressure > np.where(before, RELEASE_FRACTION * threshold, threshold)
+        limits = np.where(before, release, threshold)
+        self._inside = pressure > limits
         if not np.array_equal(self._inside, before):
             self._regions = self._connect_points()
         return sorted(self._regions, key=lambda region: -float(pressure[region].max()))
@@ -88,11 +90,13 @@ class PressureRegions:
         regions = []
         for label in np.unique(wide):
             own = inside[wide == label]
-            if len(np.unique(self._cube[own])) <= MAX_JOINED_CUBES:
+            cubes = np.unique(self._cube[own])
+            if len(cubes) <= MAX_JOINED_CUBES:
                 regions.append(own)
-            else:
-                narrow = self._label(own, self._neighbours)
-                regions += [own[narrow == one] for one in np.unique(narrow)]
+                continue
+            narrow = self._label(own, self._neighbours)
+            for narrow_label in np.unique(narrow):
+                regions.append(own[narrow == narrow_label])
         return regions
 
     def _label(self, points: Index, neighbours: Index) -> Index:
@@ -124,9 +128,12 @@ def _list_neighbours(tree: cKDTree, distance: float) -> Index:
     Missing neighbours have the index M.
     """
     found = tree.query_ball_point(tree.data, distance)
+    n = len(found)
     width = max(map(len, found))
-    rows = [one + [len(found)] * (width - len(one)) for one in found]
-    return np.array(rows, np.intp)
+    rows = np.full((n, width), n, np.intp)
+    for row, neighbours in zip(rows, found, strict=True):
+        row[: len(neighbours)] = neighbours
+    return rows
 
 
 def split_peaks(pressure: Array, root: Array, is_neighbour: Mask) -> Index:
@@ -161,7 +168,9 @@ def split_peaks(pressure: Array, root: Array, is_neighbour: Mask) -> Index:
             peak = peaks[other]
             fall = pressure[peak] - pressure[node]
             uncertainty = np.linalg.norm(root[peak] - root[node])
-            if fall < max((1 - VALLEY) * pressure[peak], MIN_FALL * uncertainty):
+            relative_limit = (1 - VALLEY) * pressure[peak]
+            significant_fall = MIN_FALL * uncertainty
+            if fall < max(relative_limit, significant_fall):
                 owner[owner == other] = first
     # Nodes that are left have too little pressure for a peak and no neighbour that belongs to one.
     # They are assigned to the highest peak.

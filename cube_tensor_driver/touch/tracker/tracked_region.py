@@ -159,8 +159,9 @@ class TrackedRegion:
         self.fit: HertzFit | NodeFit | None = None
         self.others: Array | float = 0.0
         self.gap = np.inf
-        self.response = np.zeros((len(inverse.variant), len(inverse.columns)))
-        self._responding = np.zeros(len(inverse.variant), bool)
+        n_cubes = len(inverse.variant)
+        self.response = np.zeros((n_cubes, len(inverse.columns)))
+        self._responding = np.zeros(n_cubes, bool)
         self.waited = 0
         self._inverse = inverse
         self._noise = noise
@@ -183,7 +184,8 @@ class TrackedRegion:
             points: Indices of the points of the surface that form the region in this scan.
             peak: Largest pressure in Pa at these points, at the depth of the cubes' centres.
         """
-        self.points, self.peak = points, peak
+        self.points = points
+        self.peak = peak
         self.waited += 1
         self._is_tried = False
         fit = self.fit
@@ -214,19 +216,27 @@ class TrackedRegion:
 
         A fit whose contacts have left the region, or pull at the surface, is dropped.
         """
-        inverse, values, found = self._inverse, fit.values, fit.found
+        inverse = self._inverse
+        values = fit.values
+        found = fit.found
         below = values.nearest_cubes(found.centres)
-        cubes_of_region = inverse.near[inverse.cube[self.points], : NEAREST_CUBES[-1]]
-        is_in_region = (cubes_of_region == below[:, None, None]).any(axis=(1, 2))
-        if not (is_in_region & (found.forces[:, 2] < 0)).all():
+        cubes_below_points = inverse.cube[self.points]
+        cubes_of_region = inverse.near[cubes_below_points, : NEAREST_CUBES[-1]]
+        is_below = cubes_of_region == below[:, None, None]
+        is_in_region = is_below.any(axis=(1, 2))
+        presses = found.forces[:, 2] < 0
+        if not (is_in_region & presses).all():
             self.fit = None
             return
         # The home cube is the origin of the frame of the contacts.
         mean_centre = found.centres.mean(axis=0)
-        if np.hypot(*mean_centre) > HOME_PITCHES * inverse.pitch:
-            home = int(values.nearest_cubes(mean_centre[None])[0])
+        from_home = np.hypot(*mean_centre)
+        if from_home > HOME_PITCHES * inverse.pitch:
+            (nearest,) = values.nearest_cubes(mean_centre[None])
+            home = int(nearest)
             if home != values.home:
-                cubes = np.unique(inverse.near[np.append(below, home)])
+                centre_cubes = np.append(below, home)
+                cubes = np.unique(inverse.near[centre_cubes])
                 fit.move_home(self._collect(home, cubes))
 
     def _collect(self, home: int, cubes: Index) -> LocalValues:
@@ -239,7 +249,8 @@ class TrackedRegion:
                 normals and that of the home cube have a cosine above `MIN_FACING`.
         """
         normals = self._inverse.poses.rotation[:, :, 2]
-        facing = cubes[normals[cubes] @ normals[home] > MIN_FACING]
+        cosines = normals[cubes] @ normals[home]
+        facing = cubes[cosines > MIN_FACING]
         return LocalValues(self._inverse, self._noise, home, facing)
 
     @property
@@ -273,10 +284,12 @@ class TrackedRegion:
         old_home, old = self._responded
         if home != old_home or len(old.forces) != len(discs.forces):
             return True
-        shift = np.abs(discs.centres - old.centres).max() / self.gap
+        shift = np.abs(discs.centres - old.centres)
+        relative_shift = shift.max() / self.gap
+        force_change = np.abs(discs.forces - old.forces)
         largest_force = np.abs(discs.forces).max()
-        change = np.abs(discs.forces - old.forces).max() / largest_force
-        return bool(max(shift, change) > MAX_STALE_CHANGE)
+        relative_change = force_change.max() / largest_force
+        return bool(max(relative_shift, relative_change) > MAX_STALE_CHANGE)
 
     def take_response(self, cubes: Index, response: Array) -> None:
         """Store the newest response of some cubes to this region.
@@ -300,9 +313,11 @@ class TrackedRegion:
         if isinstance(fit, HertzFit):
             if fit.is_unsettled or (is_worse and fit.needs_linearisation):
                 return Work.MOVE
+            if self._is_tried:
+                return Work.NONE
             is_lastingly_worse = is_worse and self._bad_scans >= MAX_BAD_SCANS
             is_given_up = is_lastingly_worse and self.has_fitted_neighbours
-            return Work.FIT if is_given_up and not self._is_tried else Work.NONE
+            return Work.FIT if is_given_up else Work.NONE
         if self._is_hertz_due:
             return Work.CHOOSE
         peak_change = abs(self.peak / self._fitted_peak - 1)
@@ -329,7 +344,8 @@ class TrackedRegion:
             Work of this step, in the unit of `MAX_WORK_PER_SCAN`.
         """
         self.waited = 0
-        work, fit = self.next_work, self.fit
+        work = self.next_work
+        fit = self.fit
         if fit is None and self._is_hertz_due:
             return self._fit_hertz_directly(scaled, respond_to_others)
         if isinstance(fit, HertzFit) and work == Work.MOVE:
@@ -337,7 +353,8 @@ class TrackedRegion:
         if isinstance(fit, NodeFit) and work == Work.CHOOSE:
             return self._replace_by_hertz(fit, scaled)
         if isinstance(fit, NodeFit) and work == Work.SHARPEN:
-            fit.sharpen(fit.values.whiten(scaled, self.others))
+            white = fit.values.whiten(scaled, self.others)
+            fit.sharpen(white)
             self._is_hertz_due = fit.is_sharp
             self._first_misfit = fit.shape_misfit
             return len(fit.places) // 2
@@ -400,10 +417,13 @@ class TrackedRegion:
         inverse = self._inverse
         points = inverse.points[self.points]
         below = inverse.cube[self.points]
-        to_centre = np.linalg.norm(points - points.mean(axis=0), axis=1)
-        home = int(below[to_centre.argmin()])
+        from_centre = points - points.mean(axis=0)
+        distance = np.linalg.norm(from_centre, axis=1)
+        central_point = distance.argmin()
+        home = int(below[central_point])
+        cubes_below = np.unique(below)
         for count in NEAREST_CUBES:
-            cubes = np.unique(inverse.near[np.unique(below), :count])
+            cubes = np.unique(inverse.near[cubes_below, :count])
             if len(cubes) <= MAX_CUBES:
                 break
         else:
@@ -429,11 +449,14 @@ class TrackedRegion:
         evidence of the values. Return the work of it."""
         self._is_hertz_due = False
         starts = nodes.estimate_contacts()
-        if max(one.aspect for one in starts) > MAX_HERTZ_ASPECT:
+        largest_aspect = max(one.aspect for one in starts)
+        if largest_aspect > MAX_HERTZ_ASPECT:
             return 1
         discs = discs_of(starts)
-        sizes = np.minimum(discs.log_sizes, np.log(MAX_START_SIZE * self._inverse.depth))
-        fit = HertzFit(self._inverse, nodes.values, discs._replace(log_sizes=sizes))
+        largest_size = MAX_START_SIZE * self._inverse.depth
+        log_sizes = np.minimum(discs.log_sizes, np.log(largest_size))
+        discs = discs._replace(log_sizes=log_sizes)
+        fit = HertzFit(self._inverse, nodes.values, discs)
         work = self._iterate(fit, scaled, MAX_STEPS)
         if not fit.is_unsettled and fit.score < nodes.posterior.score:
             self._accept(fit)
@@ -446,8 +469,10 @@ class TrackedRegion:
         If later scans differ from it too much, the region is fitted again.
         """
         self.fit = fit
-        self._fitted_points, self._fitted_peak = self.points, self.peak
-        self._first_misfit = max(fit.shape_misfit, MAX_HERTZ_MISFIT / MAX_MISFIT_GROWTH)
+        self._fitted_points = self.points
+        self._fitted_peak = self.peak
+        lowest_misfit = MAX_HERTZ_MISFIT / MAX_MISFIT_GROWTH
+        self._first_misfit = max(fit.shape_misfit, lowest_misfit)
 
 
 def update_responses(
@@ -466,35 +491,65 @@ def update_responses(
     """
     stale = [region for region in regions if region.is_response_stale(cubes)]
     if stale:
-        homes = np.array([region.discs[0] for region in stale])
-        discs = [region.discs[1] for region in stale]
-        counts = np.array([len(one.forces) for one in discs])
-        of_disc = np.repeat(np.arange(len(stale)), counts)
-        unrolled = [inverse.unroll(home, cubes) for home in homes.tolist()]
-        place, angle = (np.stack(one)[of_disc] for one in zip(*unrolled, strict=True))
-        forces, centres, log_sizes = map(np.concatenate, zip(*discs, strict=True))
-        # On a bent skin, cubes that face away from a contact do not respond to it.
-        normals = inverse.poses.rotation[:, :, 2]
-        is_facing = normals[homes] @ normals[cubes].T > MIN_FACING
-        forces = is_facing[of_disc][:, :, None] * forces[:, None]
-        response = inverse.contact_response.response_to_forces(
-            (place - centres[:, None]).reshape(-1, 2),
-            angle.ravel(),
-            np.tile(inverse.variant[cubes], len(of_disc)),
-            np.repeat(np.exp(log_sizes), len(cubes)),
-            forces.reshape(-1, 3),
-        )
-        measured = response[:, inverse.columns].reshape(len(of_disc), len(cubes), -1)
-        first = np.cumsum(counts) - counts
-        by_region = np.add.reduceat(measured, first, axis=0)
-        for region, own in zip(stale, by_region, strict=True):
-            region.take_response(cubes, own)
+        _update_stale_responses(inverse, stale, cubes)
     for region in regions:
-        if region.fit is not None:
-            region.response[region.fit.values.cubes] = region.fit.explained
+        fit = region.fit
+        if fit is not None:
+            region.response[fit.values.cubes] = fit.explained
+
+
+def _update_stale_responses(
+    inverse: SurfaceInverse, regions: Sequence[TrackedRegion], cubes: Index
+) -> None:
+    """Compute the response of cubes to the Hertz contacts of all regions in one call.
+
+    Args:
+        inverse: Poses and responses of the skin.
+        regions: Regions, at least one, whose response is computed.
+        cubes: Indices (n,) of the cubes.
+    """
+    homes = np.array([region.discs[0] for region in regions])
+    discs = [region.discs[1] for region in regions]
+    counts = np.array([len(one.forces) for one in discs])
+    forces = np.concatenate([one.forces for one in discs])
+    centres = np.concatenate([one.centres for one in discs])
+    log_sizes = np.concatenate([one.log_sizes for one in discs])
+    n_discs = len(forces)
+    n_cubes = len(cubes)
+    region_of_disc = np.repeat(np.arange(len(regions)), counts)
+
+    unrolled = [inverse.unroll(home, cubes) for home in homes.tolist()]
+    places, angles = (np.stack(one) for one in zip(*unrolled, strict=True))
+    place = places[region_of_disc]
+    angle = angles[region_of_disc]
+    offset = place - centres[:, None]
+    variant = np.tile(inverse.variant[cubes], n_discs)
+    sizes = np.repeat(np.exp(log_sizes), n_cubes)
+    # On a bent skin, cubes that face away from a contact do not respond to it.
+    normals = inverse.poses.rotation[:, :, 2]
+    cosines = normals[homes] @ normals[cubes].T
+    is_facing = cosines > MIN_FACING
+    acts_on_cube = is_facing[region_of_disc]
+    acting_forces = acts_on_cube[:, :, None] * forces[:, None]
+    response = inverse.contact_response.response_to_forces(
+        offset.reshape(-1, 2),
+        angle.ravel(),
+        variant,
+        sizes,
+        acting_forces.reshape(-1, 3),
+    )
+    measured = response[:, inverse.columns]
+    by_disc = measured.reshape(n_discs, n_cubes, -1)
+    first_disc = np.cumsum(counts) - counts
+    by_region = np.add.reduceat(by_disc, first_disc, axis=0)
+    for region, own in zip(regions, by_region, strict=True):
+        region.take_response(cubes, own)
 
 
 def _new_share(new: Index, old: Index) -> float:
     """Return the fraction (0 to 1) of the indices in `new` that are not in `old`; 0 if `new` is
     empty."""
-    return 1 - float(np.isin(new, old).mean()) if len(new) else 0.0
+    if not len(new):
+        return 0.0
+    is_old = np.isin(new, old)
+    return 1 - float(is_old.mean())
