@@ -44,17 +44,13 @@ def noise_by_pad(
         of each pad. It is NaN where a component is not observed, and 0 for a pad that is left out
         or that the cube does not have.
     """
-    by_pad = np.zeros(
-        (
-            len(cubes),
-            len(COMPONENTS),
-            pipeline.n_pads,
-        )
-    )
+    shape = len(cubes), len(COMPONENTS), pipeline.n_pads
+    by_pad = np.zeros(shape)
     # Cubes may have different numbers of pads; the columns of pads that a cube lacks stay 0.
     cube_masks = zip(cubes.tolist(), left_out.tolist(), strict=True)
     for row, (cube, mask) in enumerate(cube_masks):
-        own = pipeline.matrix(cube, mask) * pipeline.calibrations[cube].noise
+        calibration = pipeline.calibrations[cube]
+        own = pipeline.matrix(cube, mask) * calibration.noise
         by_pad[row, :, : own.shape[1]] = own
     return by_pad
 
@@ -86,8 +82,10 @@ def stress_matrices(by_pad: Array, known: Mask) -> Array:
         known: Whether each component (n, C) is known; the others are ignored.
     """
     by_pad = np.where(known[:, :, None], by_pad, 0.0)
-    covariance = regularise(by_pad @ by_pad.swapaxes(1, 2), known)
-    return np.asarray(np.linalg.solve(covariance, by_pad).swapaxes(1, 2))
+    covariance = by_pad @ by_pad.swapaxes(1, 2)
+    covariance = regularise(covariance, known)
+    matrices = np.linalg.solve(covariance, by_pad)
+    return np.asarray(matrices.swapaxes(1, 2))
 
 
 def regularise(covariance: Array, known: Mask) -> Array:

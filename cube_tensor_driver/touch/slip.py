@@ -218,26 +218,30 @@ class SlipEstimator:
         contacts["past"] = np.nan
         for number, one in enumerate(found):
             if one.id in ids:
-                contacts[number] = self._contacts[ids.index(one.id)]
+                old_number = ids.index(one.id)
+                contacts[number] = self._contacts[old_number]
             ratio = one.shear_force / one.normal_force
-            deviation = np.hypot(ratio * one.force_uncertainty, one.shear_uncertainty)
+            by_normal_force = ratio * one.force_uncertainty
+            shear_deviation = np.hypot(by_normal_force, one.shear_uncertainty)
+            ratio_deviation = shear_deviation / one.normal_force
+            certain_ratio = ratio - 3 * ratio_deviation
             row = contacts[number]
             row["id"] = one.id
             row["normal"] = one.normal
             row["radius"] = np.sqrt(one.area / np.pi)
-            row["ratio_deviation"] = deviation / one.normal_force
-            certain = ratio - 3 * row["ratio_deviation"]
-            row["largest_ratio"] = max(row["largest_ratio"], certain)
+            row["ratio_deviation"] = ratio_deviation
+            row["largest_ratio"] = max(row["largest_ratio"], certain_ratio)
         self._contacts = contacts
         if not found:
             self.slip = NO_CONTACTS
             return
 
+        normal = contacts["normal"]
         followed = self._follow(scaled)
-        before = _motion_state(followed, contacts["normal"])
+        before = _motion_state(followed, normal)
         contacts["load"] = [[*one.force, *one.position] for one in found]
         contacts["values"] = self._gather(scaled)
-        after = _motion_state(contacts["load"], contacts["normal"])
+        after = _motion_state(contacts["load"], normal)
         # The tracker has fitted the loads again, which corrects errors of the followed ones. The
         # past states get the same correction, so that it does not look like motion.
         correction = after - before
@@ -249,7 +253,8 @@ class SlipEstimator:
         is_new = slips & ~contacts["is_fitted"]
         contacts["sums"][is_new] = 0.0
         contacts["is_fitted"] |= slips
-        ratios = _lengths(after[:, 3:6])
+        shear_ratio = after[:, 3:6]
+        ratios = _lengths(shear_ratio)
         _add_ratio(contacts, slips, ratios, contacts["ratio_deviation"])
 
     def update(self, time_s: float, values: Array) -> bool:
@@ -280,13 +285,17 @@ class SlipEstimator:
         begins = slipped & ~contacts["slips"]
         contacts["slips"] = slipped
 
-        ratio = _lengths(newest[:, 3:6])
-        deviation = np.hypot(contacts["ratio_deviation"], FOLLOWED_DEVIATION * ratio)
+        shear_ratio = newest[:, 3:6]
+        ratio = _lengths(shear_ratio)
+        followed_deviation = FOLLOWED_DEVIATION * ratio
+        deviation = np.hypot(contacts["ratio_deviation"], followed_deviation)
         is_followed = slipped & ~contacts["is_fitted"]
         _add_ratio(contacts, is_followed, ratio, deviation)
 
-        is_strong = newest[:, 6] > np.log(MIN_FORCE_N)
-        is_known = np.isfinite(change[:, 0, 0]) & is_strong
+        log_force = newest[:, 6]
+        is_strong = log_force > np.log(MIN_FORCE_N)
+        has_past = np.isfinite(change[:, 0, 0])
+        is_known = has_past & is_strong
         sticks = is_known & ~moves.any(axis=1)
         state = np.where(sticks, STICK, UNKNOWN)
         state[slipped] = SLIP
@@ -336,21 +345,25 @@ class SlipEstimator:
         ratio = _lengths(shear_ratio)[:, None]
 
         divisor = np.maximum(distance, 1e-12)
-        growth = np.einsum("nlk,nlk->nl", moved, turned) / divisor
+        scalar_product = np.einsum("nlk,nlk->nl", moved, turned)
+        growth = scalar_product / divisor
         lever = LEVER_M / (1 + 2 * ratio)
         tilt = lever * np.maximum(growth, 0)
-        leak = LEAK_M * _lengths(change[..., 3:])
+        force_change = change[..., 3:]
+        leak = LEAK_M * _lengths(force_change)
         # A force that changes and returns within a long lag shows no change over it, but may have
         # left the contact shifted. So each lag is allowed the largest shift of all shorter ones.
         explained = np.maximum.accumulate(tilt + leak, axis=1)
         noise = SIGNIFICANCE * np.sqrt(2) * self._contacts["noise"]
-        threshold = np.maximum(noise, MIN_DISTANCE_M)[:, None]
-        moves = distance > threshold + explained
+        threshold = np.maximum(noise, MIN_DISTANCE_M)
+        min_distance = threshold[:, None] + explained
+        moves = distance > min_distance
         moves &= distance > MIN_SPEED * duration
         # A lag is twice the one before. The motion over the lag before is therefore the motion in
         # the second half of a lag; if it is small, the contact has stopped.
         late = distance[:, :-1]
-        moves[:, 1:] &= late > MIN_LATE_SHARE * distance[:, 1:]
+        min_late = MIN_LATE_SHARE * distance[:, 1:]
+        moves[:, 1:] &= late > min_late
 
         along = np.einsum("nlk,nk->nl", moved, shear_ratio)
         is_along = along > MIN_COSINE * distance * ratio
@@ -387,7 +400,8 @@ class SlipEstimator:
         """
         contacts = self._contacts
         # A value that is missing counts as unchanged.
-        change = np.nan_to_num(self._gather(scaled) - contacts["values"])
+        change = self._gather(scaled) - contacts["values"]
+        change = np.nan_to_num(change)
         load_change = np.einsum("nkm,nm->nk", contacts["weights"], change)
         loads: Array = contacts["load"] + load_change
         return loads
@@ -401,19 +415,23 @@ class SlipEstimator:
         """
         contacts = self._contacts
         change = loads - contacts["linearised"]
+        depth = self._inverse.depth
         force = _lengths(loads[:, :3])
         force = np.maximum(force, MIN_FORCE_N)
         force_change = _lengths(change[:, :3])
         shift = _lengths(change[:, 3:])
         has_changed = force_change > MAX_FORCE_CHANGE * force
-        has_changed |= shift > MAX_SHIFT_DEPTHS * self._inverse.depth
+        has_changed |= shift > MAX_SHIFT_DEPTHS * depth
 
         # After a sudden change, as of a body that bounces, linear extrapolation with the
         # derivatives gives no useful position. The contact then keeps the position of the last
         # linearisation, and its past counts as unknown.
-        is_lost = (force_change > MAX_JUMP * force) | (shift > self._inverse.depth)
-        is_lost &= contacts["noise"] > 0
-        loads[is_lost, 3:] = contacts["linearised"][is_lost, 3:]
+        has_jumped = force_change > MAX_JUMP * force
+        has_left = shift > depth
+        is_linearised = contacts["noise"] > 0
+        is_lost = (has_jumped | has_left) & is_linearised
+        last_position = contacts["linearised"][:, 3:]
+        loads[is_lost, 3:] = last_position[is_lost]
         contacts["past"][is_lost] = np.nan
 
         changed = np.flatnonzero(has_changed).tolist()
@@ -436,12 +454,17 @@ class SlipEstimator:
         inverse = self._inverse
         poses = inverse.poses
         contact = self._contacts[row]
-        place = loads[row, 3:]
-        distance = _lengths(self._above_cubes - place)
-        is_turned_away = poses.rotation[:, :, 2] @ contact["normal"] < MIN_FACING
+        positions = loads[:, 3:]
+        place = positions[row]
+        offset = self._above_cubes - place
+        distance = _lengths(offset)
+        normals = poses.rotation[:, :, 2]
+        cosines = normals @ contact["normal"]
+        is_turned_away = cosines < MIN_FACING
         distance[is_turned_away] = np.inf
         n_cubes = len(contact["cubes"])
-        cubes = np.argsort(distance)[:n_cubes]
+        by_distance = np.argsort(distance)
+        cubes = by_distance[:n_cubes]
         home = int(cubes[0])
         usable = np.where(is_turned_away[:, None], np.nan, scaled)
         self._noise.update(usable, cubes)
@@ -450,27 +473,32 @@ class SlipEstimator:
         # Derivatives are computed in the frame of `home`, the cube nearest to the contact. They are
         # sorted by distance, so that those of this contact come first.
         rotation = poses.rotation[home]
-        apart = _lengths(loads[:, 3:] - place)
-        n_near = np.sum(apart < NEIGHBOUR_PITCHES * inverse.pitch)
+        apart = _lengths(positions - place)
+        is_near = apart < NEIGHBOUR_PITCHES * inverse.pitch
+        n_near = np.sum(is_near)
         near = np.argsort(apart)[:n_near]
         forces = loads[near, :3] @ rotation
-        centres = (loads[near, 3:] - poses.position[home]) @ rotation
-        sizes = np.log(self._contacts["radius"][near])
-        discs = Discs(forces, centres[:, :2], sizes)
+        from_home = positions[near] - poses.position[home]
+        centres = from_home @ rotation
+        radii = self._contacts["radius"][near]
+        discs = Discs(forces, centres[:, :2], np.log(radii))
         fit = HertzFit(inverse, local, discs)
         linearise(inverse, [fit])
 
         # The first five parameters of the fit are force (3) and position (2) of this contact.
-        solved = fit.linear.covariance[:5] @ fit.linear.jacobian.T
+        linear = fit.linear
+        solved = linear.covariance[:5] @ linear.jacobian.T
         solved = solved.reshape(5, len(cubes), -1)
         weights = np.einsum("knc,ncd->knd", solved, local.whitening)
 
         by_pad = np.nan_to_num(inverse.by_pad[cubes])
-        noise = np.einsum("knc,ncp->knp", weights[3:], by_pad)
+        position_weights = weights[3:]
+        noise = np.einsum("knc,ncp->knp", position_weights, by_pad)
+        mean_variance = (noise**2).sum() / 2
         to_parent = np.zeros((6, 5))
         to_parent[:3, :3] = rotation
         to_parent[3:, 3:] = rotation[:, :2]
-        contact["noise"] = np.sqrt((noise**2).sum() / 2)
+        contact["noise"] = np.sqrt(mean_variance)
         contact["weights"] = to_parent @ weights.reshape(5, -1)
         contact["cubes"] = cubes
         contact["values"] = scaled[cubes].ravel()
@@ -495,12 +523,14 @@ def _motion_state(loads: Array, normal: Array) -> Array:
         normal: Normals (n, 3) out of the skin.
     """
     force = loads[:, :3]
-    outward = np.einsum("nk,nk->n", force, normal)[:, None]
+    outward = np.einsum("nk,nk->n", force, normal)
+    outward = outward[:, None]
     pressing = np.maximum(-outward, 1e-3 * MIN_FORCE_N)
     shear = force - outward * normal
     position = loads[:, 3:]
-    parts = [position, shear / pressing, np.log(pressing)]
-    return np.concatenate(parts, axis=1)
+    shear_ratio = shear / pressing
+    log_force = np.log(pressing)
+    return np.concatenate([position, shear_ratio, log_force], axis=1)
 
 
 def _add_ratio(

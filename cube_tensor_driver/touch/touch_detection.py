@@ -165,15 +165,17 @@ class Touch:
         n = len(skin.calibrations)
         rate_hz = skin.rate or DEFAULT_RATE_HZ
         tests_per_alarm = 3600 * rate_hz * n / false_alarms
-        limit = math.log(2 * REFERENCE**2 * tests_per_alarm) / (2 * REFERENCE)
+        log_ratio = math.log(2 * REFERENCE**2 * tests_per_alarm)
+        limit = log_ratio / (2 * REFERENCE)
         self.limit = max(0.0, limit - OVERSHOOT)
 
         self._pipeline = Pipeline(skin.calibrations)
         covariances = [self._pipeline.covariance(cube) for cube in range(n)]
         covariance = np.array(covariances)
         variance = np.diagonal(covariance, axis1=1, axis2=2)
+        pressure_variance = variance[:, PRESSURE]
         self._unobserved = np.isnan(variance)
-        self._deviation = np.sqrt(variance[:, PRESSURE])
+        self._deviation = np.sqrt(pressure_variance)
         poses = skin.poses
         self._place = poses.position / poses.pitch
         near = _find_neighbours(poses.position)
@@ -219,8 +221,11 @@ class Touch:
         is_first = rows.cube[1:] <= rows.cube[:-1]
         starts = np.flatnonzero(is_first) + 1
         bounds = sorted({0, *starts.tolist(), len(rows)})
-        scans = [slice(*pair) for pair in pairwise(bounds)]
-        return [self._update_scan(rows.select(scan)) for scan in scans]
+        touches = []
+        for start, end in pairwise(bounds):
+            scan = rows.select(slice(start, end))
+            touches.append(self._update_scan(scan))
+        return touches
 
     __call__ = update
 
@@ -258,7 +263,8 @@ class Touch:
         self._slow[cube] = slow + gain[:, None] * change
         self._count[cube] += 1
 
-        stale = self._stamp_ns < rows.stamp_ns.max() - STALE_NS
+        oldest_ns = rows.stamp_ns.max() - STALE_NS
+        stale = self._stamp_ns < oldest_ns
         if stale.any():
             self._slow[stale] = np.nan
             self._change[stale] = 0
@@ -299,7 +305,8 @@ class Touch:
             part; 0 where the slow part is held.
         """
         if not self._touched.any():
-            has_gone = pressure < -MIN_RELEASE * self._deviation[cube]
+            release = -MIN_RELEASE * self._deviation[cube]
+            has_gone = pressure < release
             self._count[cube] *= ~has_gone
         # With the gain 1 / n of the n-th sample, the slow part is the mean of the first samples.
         mean_gain = 1 / (self._count[cube] + 1)
@@ -333,12 +340,17 @@ class Touch:
         before = self._sum[cube]
         # The slow part of a pressure that drifts steadily lags behind by one time constant. The
         # largest difference that drift causes is subtracted.
-        excess = pressure - margin - MAX_DRIFT * TIME_CONSTANT_S
+        lag = MAX_DRIFT * TIME_CONSTANT_S
+        excess = pressure - margin - lag
         score = excess / self._deviation[cube]
         # The sum is limited from above, so that it falls to 0 within a few scans after any load.
-        after = (before + score - REFERENCE).clip(0, self.limit + REFERENCE)
-        after = np.where(self._count[cube] < SETTLING_ROWS, before, after)
-        self._sum[cube] = np.where(np.isnan(pressure), 0, after)
+        largest_sum = self.limit + REFERENCE
+        after = before + score - REFERENCE
+        after = after.clip(0, largest_sum)
+        is_settling = self._count[cube] < SETTLING_ROWS
+        after = np.where(is_settling, before, after)
+        is_unknown = np.isnan(pressure)
+        self._sum[cube] = np.where(is_unknown, 0, after)
 
         begins = self._sum > self.limit
         lasts = self._touched & (self._sum > 0)
@@ -363,8 +375,10 @@ class Touch:
         is_largest = self._touched & (strength >= neighbours)
         # In each scan, the upper limit of the pressure spreads to the neighbours of a cube. This is
         # fast enough: slow parts change little in the scans until the limit has reached all cubes.
-        spread = SPREAD * self._reach[self._near].max(axis=0)
-        felt = np.maximum(spread, FAR * strength.max())
+        reach_around = self._reach[self._near].max(axis=0)
+        spread = SPREAD * reach_around
+        far_pressure = FAR * strength.max()
+        felt = np.maximum(spread, far_pressure)
         is_own = strength > felt
         self._reach = np.maximum(strength, spread)
         self._held = self._reach > self._deviation / 2
@@ -374,9 +388,10 @@ class Touch:
         cube = cube[order]
         own = pressure[cube]
         margin = self._margin[cube]
+        gain_deviation = GAIN_ERROR * own
         variance = self._deviation[cube] ** 2
         variance += margin**2
-        variance += (GAIN_ERROR * own) ** 2
+        variance += gain_deviation**2
         share = margin / np.maximum(own, 1e-9)
         share = np.clip(share, 0, 1)
         force, force_deviation = self._estimate_forces(cube, share[:, None])
@@ -406,8 +421,10 @@ class Touch:
         values = np.nan_to_num(self._change[near])
         values = values.reshape(len(cube), n_values, 1)
         terms = values * estimate.weights[kind]
+        square_terms = terms**2
         force = terms.sum(axis=1)
         square = force**2
+        total_square = square.sum(axis=1, keepdims=True)
 
         place = self._place[cube]
         offset = place[:, None] - place
@@ -417,13 +434,16 @@ class Touch:
         # The errors due to other loads decrease with the distance^-3, their squares with ^-6.
         others = pitches**-6
 
+        squared_error = estimate.error[kind] ** 2
+        lasting_force = share * force
         variance = estimate.noise[kind] ** 2
-        variance += GAIN_ERROR**2 * (terms**2).sum(axis=1)
-        variance += np.einsum("mij,mj->mi", estimate.error[kind] ** 2, square)
-        variance += OTHER_LOADS**2 * others @ square.sum(axis=1, keepdims=True)
-        variance += (share * force) ** 2
+        variance += GAIN_ERROR**2 * square_terms.sum(axis=1)
+        variance += np.einsum("mij,mj->mi", squared_error, square)
+        variance += OTHER_LOADS**2 * others @ total_square
+        variance += lasting_force**2
 
-        is_complete = np.isnan(self._slow[near]) == self._unobserved[near]
+        is_missing = np.isnan(self._slow[near])
+        is_complete = is_missing == self._unobserved[near]
         is_unknown = ~is_complete.all(axis=(1, 2))
         force[is_unknown] = np.nan
         deviation = np.sqrt(variance)
@@ -441,7 +461,8 @@ def _find_neighbours(position: Array) -> Index:
     for one in position:
         # Distances are rounded, because otherwise their rounding errors would decide the order of
         # equally distant cubes.
-        distance = np.linalg.norm(position - one, axis=1).round(6)
+        distance = np.linalg.norm(position - one, axis=1)
+        distance = distance.round(6)
         order = np.argsort(distance, kind="stable")
         near.append(order[:NEIGHBOURS])
     return np.array(near)

@@ -158,7 +158,8 @@ def _solve(
     noise[each, :, each] = covariance
     noise = noise[observed][:, observed]
 
-    own, other = np.split(signal[observed], [n_own], axis=1)
+    observed_signal = signal[observed]
+    own, other = np.split(observed_signal, [n_own], axis=1)
     total = FORCE_DEVIATION**2 * _mean_square(own)
     total += OTHER_FORCE_DEVIATION**2 * _mean_square(other)
     total += noise
@@ -169,7 +170,8 @@ def _solve(
 
     estimate = np.einsum("cf,csl->sfl", solution, own)
     error = estimate - np.eye(3)
-    rms_error = np.sqrt((error**2).mean(axis=0))
+    squared_error = (error**2).mean(axis=0)
+    rms_error = np.sqrt(squared_error)
     noise_variance = np.einsum("if,ij,jf->f", solution, noise, solution)
     return weights.reshape(-1, 3), np.sqrt(noise_variance), rms_error
 
