@@ -12,11 +12,12 @@ import numpy as np
 
 from ..config.influence import find_influence
 from ..config.skin import Elastomer
-from ..core.arrays import Array, PadMasks
+from ..core.arrays import Array, PadMasks, StatusBits
 from ..core.calibration import Calibration
 from ..core.defaults import CONTACT_METHODS, CONTACT_PRESSURE, SURFACE_DEPTH
 from ..core.pipeline import Pipeline
 from ..core.poses import CubePoses
+from ..core.status import COMPENSATION
 from ..mechanics.influence_file import read_influence
 from ..mechanics.layer import Layer
 from .inverse import SurfaceInverse
@@ -98,7 +99,7 @@ class ContactFinder(Protocol):
     def slip(self) -> Slip:
         """Newest state and friction of these contacts; empty if the method is interpolation."""
 
-    def update(self, time_s: float, values: Array, left_out: PadMasks) -> None:
+    def update(self, time_s: float, values: Array, left_out: PadMasks, status: StatusBits) -> None:
         """Find the contacts in the newest values.
 
         Args:
@@ -106,6 +107,8 @@ class ContactFinder(Protocol):
             values: Components (cubes, 15) in Pa and Pa/m, NaN where unknown.
             left_out: Bit masks (cubes,), in which bit k is set if pad k (sensing element) of a cube
                 was not used for `values`.
+            status: Status bits (cubes,) of `values`. Where COMPENSATION is set, the method inverse
+                finds a new contact only from `UNCERTAIN_PRESSURE` on.
         """
 
     def follow(self, time_s: float, values: Array) -> bool:
@@ -166,7 +169,7 @@ class _InterpolationFinder:
         self.contacts: list[Contact] = []
         self.slip = NO_CONTACTS
 
-    def update(self, time_s: float, values: Array, left_out: PadMasks) -> None:
+    def update(self, time_s: float, values: Array, left_out: PadMasks, status: StatusBits) -> None:
         self.contacts = self._surface.contacts(values, self._threshold)
 
     def follow(self, time_s: float, values: Array) -> bool:
@@ -207,7 +210,7 @@ class _InverseFinder:
     def slip(self) -> Slip:
         return self._slip.slip
 
-    def update(self, time_s: float, values: Array, left_out: PadMasks) -> None:
+    def update(self, time_s: float, values: Array, left_out: PadMasks, status: StatusBits) -> None:
         # The noise of a cube's components depends on the pads in use. So the noise matrices are
         # computed again for cubes whose pads in use have changed since the last scan.
         changed = np.flatnonzero(left_out != self._left_out)
@@ -215,7 +218,7 @@ class _InverseFinder:
             by_pad = noise_by_pad(self._pipeline, changed, left_out[changed])
             self._inverse.leave_out(changed, by_pad)
             self._left_out = left_out.copy()
-        self.contacts = self._tracker.update(values)
+        self.contacts = self._tracker.update(values, status & COMPENSATION != 0)
         self._slip.adopt(self.contacts, values)
         self._slip.update(time_s, values)
 

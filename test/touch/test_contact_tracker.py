@@ -458,3 +458,20 @@ def counted(function, calls):
         return function(*args)
 
     return call
+
+
+def test_a_new_contact_above_uncertain_cubes_needs_more_pressure(inverse):
+    """At the depth of the cubes, the field has 0.4 kPa under 0.1 N, and 0.8 kPa under 0.2 N."""
+    light, firm = (ball(inverse, 4e-3, (0, 0), (0, 0, -force)) for force in (0.1, 0.2))
+    uncertain = np.ones(COUNT**2, bool)
+    tracker = ContactTracker(inverse, LEAST)
+    assert not tracker.update(light, uncertain)
+    (begun,) = tracker.update(light)
+    (kept,) = tracker.update(light, uncertain)
+    assert kept.id == begun.id
+    assert not tracker.update(0 * light, uncertain) and not tracker.update(light, uncertain)
+    (found,) = tracker.update(firm, uncertain)
+    assert found.normal_force == pytest.approx(0.2, rel=0.05)
+    uncertain[COUNT**2 // 2] = False
+    (above_certain,) = ContactTracker(inverse, LEAST).update(light, uncertain)
+    assert above_certain.normal_force == pytest.approx(0.1, rel=0.05)

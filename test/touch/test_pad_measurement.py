@@ -142,7 +142,7 @@ def test_pads_that_are_left_out_change_what_a_cube_says_and_the_contact_stays(
     for bits in (0, [1, 2, 4, 8], [3, 0, 8, 0], 0):
         left_out[near] = bits
         values = bench.measured(pads, random, left_out)
-        finder.update(0.0, values, left_out)
+        finder.update(0.0, values, left_out, np.zeros(n, np.uint16))
         (touch,) = finder.contacts
         assert abs(touch.normal_force - 3) < min(0.05, 4 * touch.force_uncertainty)
         assert np.linalg.norm(touch.position[:2] - centre) < 1e-4

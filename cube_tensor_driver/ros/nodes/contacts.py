@@ -78,9 +78,10 @@ class Contacts(SkinSubscriberNode):
         if finder is None or skin.messages == self._processed_messages:
             return None
         self._processed_messages = skin.messages
-        values = skin.newest.usable_values(health)
+        newest = skin.newest
+        values = newest.usable_values(health)
         frame_id = skin.info.header.frame_id
-        finder.update(1e-9 * skin.stamp_ns, values, skin.newest.left_out)
+        finder.update(1e-9 * skin.stamp_ns, values, newest.left_out, newest.status)
         # Computing the point cloud takes time, so it is done only while somebody subscribes.
         if self._has_traction_listeners():
             cloud = finder.cloud(values)

@@ -22,7 +22,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from ...core.arrays import Array, Index
+from ...core.arrays import Array, Index, Mask
 from ..inverse import FieldDeviation, SurfaceInverse, TractionField
 from .contact_estimate import ContactEstimate, Discs
 from .fitted_field import add_fits, fit_variances
@@ -126,11 +126,19 @@ class ContactTracker:
         n_values = (len(inverse.poses.position), len(inverse.columns))
         self._scaled = np.full(n_values, np.nan)
 
-    def update(self, values: Array, max_work: float = MAX_WORK_PER_SCAN) -> list[TrackedContact]:
+    def update(
+        self,
+        values: Array,
+        uncertain: Mask | None = None,
+        *,
+        max_work: float = MAX_WORK_PER_SCAN,
+    ) -> list[TrackedContact]:
         """Find the contacts in the newest values.
 
         Args:
             values: Components (cubes, 15) in Pa and Pa/m, NaN where unknown.
+            uncertain: Whether the compensation of each cube is uncertain, so that a new contact
+                needs `UNCERTAIN_PRESSURE`; None: of no cube.
             max_work: Work, in the unit of `MAX_WORK_PER_SCAN`, after which no further fit is made
                 or improved in this scan. Infinite: all fits are improved as far as possible.
 
@@ -141,7 +149,7 @@ class ContactTracker:
         scaled = inverse.scaled(values)
         self._scaled = scaled
         field = inverse.field_of_scaled(scaled)
-        self._follow_regions(field.depth_pressure)
+        self._follow_regions(field.depth_pressure, uncertain)
         regions = self._regions
         self._noise.update(scaled, self._fitted_cubes)
         for region in regions:
@@ -222,7 +230,7 @@ class ContactTracker:
             total = total + region.response
         return np.asarray(total)
 
-    def _follow_regions(self, pressure: Array) -> None:
+    def _follow_regions(self, pressure: Array, uncertain: Mask | None) -> None:
         """Find the regions of the newest scan, and match them with those of the previous scan.
 
         A matched region keeps its fit.
@@ -230,8 +238,9 @@ class ContactTracker:
         Args:
             pressure: Pressure (M,) in Pa at the depth of the cubes' centres, below each of the M
                 points of the surface.
+            uncertain: Whether the compensation of each cube is uncertain; None: of no cube.
         """
-        found = self._pressure_regions.find(pressure)[:MAX_REGIONS]
+        found = self._pressure_regions.find(pressure, uncertain)[:MAX_REGIONS]
         owner = np.full(len(pressure), len(self._regions))
         for number, region in enumerate(self._regions):
             owner[region.points] = number
