@@ -40,10 +40,12 @@ def line_load(
         (7, m, 2) amplitudes of the modes `PLANE` (linear stress fields), in Pa under 1 N/m.
     """
     # The midpoints of equal intervals leave out k = 0, where the transfer function is a limit.
-    k = (np.arange(WAVES) + 0.5) * MAX_WAVENUMBER / depth / WAVES
+    midpoints = np.arange(WAVES) + 0.5
+    k = midpoints * MAX_WAVENUMBER / depth / WAVES
     transfer = layer.transfer(k, 0 * k, depth)
     transfer = transfer[:, :, [0, 2]]  # The columns of forces along x and z.
-    rows = transfer[:, [FIELD.index(name) for name in PLANE.names]]
+    modes_in_field = [FIELD.index(name) for name in PLANE.names]
+    rows = transfer[:, modes_in_field]
     is_gradient = ["_" in name for name in PLANE.names]
     rows[:, is_gradient] *= scale
 
@@ -52,5 +54,5 @@ def line_load(
     step = k[1] - k[0]
     phase = np.outer(x, k)
     wave = np.exp(-1j * phase) * (step / np.pi)
-    modes = np.tensordot(wave, rows, axes=1).real  # (m, 7, 2)
-    return np.moveaxis(modes, 0, 1)
+    modes = np.tensordot(wave, rows, axes=1)  # (m, 7, 2)
+    return np.moveaxis(modes.real, 0, 1)

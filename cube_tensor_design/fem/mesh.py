@@ -143,11 +143,13 @@ def _merge_points(points: Array, triangles: Index) -> skfem.MeshTri:
     """Return a mesh of triangles (3, m, numbers of points) in which equal points (2, n) are one."""
     # The points are complex numbers here, because np.unique of rows (axis=0) swallows Ctrl-C.
     # Adding 0.0 turns -0.0 into 0.0.
-    corners = (points + 0.0).T[triangles.T.ravel()] @ [1, 1j]
+    x, y = points + 0.0
+    corners = (x + 1j * y)[triangles.T.ravel()]
     unique, inverse = np.unique(corners, return_inverse=True)
     merged = np.array([unique.real, unique.imag])
     # skfem (the finite element library) wants contiguous arrays.
-    return skfem.MeshTri(merged, inverse.reshape(-1, 3).T.copy())
+    by_triangle = inverse.reshape(-1, 3)
+    return skfem.MeshTri(merged, by_triangle.T.copy())
 
 
 def mesh_box(
@@ -192,7 +194,8 @@ def mesh_box(
     for below, above in zip(lower, upper, strict=True):
         line = half_line(above)
         if below > 0:
-            line = np.concatenate([-half_line(below)[:0:-1], line])
+            negative = -half_line(below)[:0:-1]
+            line = np.concatenate([negative, line])
         lines.append(line)
     return skfem.MeshHex.init_tensor(*lines)
 
@@ -206,7 +209,8 @@ def _split(
     stops = sorted({*stops, end})
     points = [np.array([stops[0]])]
     for a, b in pairwise(stops):
-        count = int(np.ceil((b - a) / size - 1e-9))
+        exact = (b - a) / size
+        count = int(np.ceil(exact - 1e-9))
         points.append(np.linspace(a, b, count + 1)[1:])
     return np.concatenate(points)
 
@@ -257,7 +261,8 @@ def _rings(
     `smallest` times that."""
     n = int(np.ceil(np.log(smallest) / np.log(ratio)))
     radii = rho * ratio ** np.arange(n + 1)
-    around = 1.0 + np.multiply.outer(radii, _RING_POINTS).reshape(-1, 2)
+    from_corner = np.multiply.outer(radii, _RING_POINTS)
+    around = 1.0 + from_corner.reshape(-1, 2)
     # The corner of the cube is the last point.
     points = np.concatenate([around, [[1.0, 1.0]]])
     triangles = []
@@ -265,13 +270,16 @@ def _rings(
         inner = outer + 8
         # `side` is a point in the middle of a side, between two corners.
         for side in range(0, 8, 2):
+            outer_side = outer + side
             for corner in ((side + 1) % 8, (side - 1) % 8):
+                inner_corner = inner + corner
                 # Cut the trapezoid along its shorter diagonal.
-                triangles.append((outer + side, outer + corner, inner + corner))
-                triangles.append((outer + side, inner + corner, inner + side))
+                triangles.append((outer_side, outer + corner, inner_corner))
+                triangles.append((outer_side, inner_corner, inner + side))
     # The last ring is closed by triangles to the corner of the cube itself.
     last = 8 * n
     corner = len(points) - 1
     for j in range(8):
-        triangles.append((last + j, last + (j + 1) % 8, corner))
+        following = (j + 1) % 8
+        triangles.append((last + j, last + following, corner))
     return points, np.array(triangles)

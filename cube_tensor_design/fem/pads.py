@@ -59,10 +59,10 @@ def pad_weights(
             rotated.
     """
     axes = list(field_axes(layout))
-    dim = len(axes)
+    dim, n_dofs = positions.shape
     half = layout.pad_size / 2
-    component = np.arange(positions.shape[1]) % dim
-    weights = np.zeros((layout.n_pads, positions.shape[1]))
+    component = np.arange(n_dofs) % dim
+    weights = np.zeros((layout.n_pads, n_dofs))
     centres = layout.positions[:, axes]
     normals = layout.normals[:, axes]
     pads = zip(centres, normals, strict=True)
@@ -129,18 +129,21 @@ def interval_weights(
     for first in range(0, n - 1, order):
         own = slice(first, first + order + 1)
         begin, end = nodes[[first, first + order]]
-        mass[own, own] += (end - begin) * element_mass
-        if start <= (begin + end) / 2 <= stop:
-            integral[own] += (end - begin) * element_integral
+        length = end - begin
+        middle = (begin + end) / 2
+        mass[own, own] += length * element_mass
+        if start <= middle <= stop:
+            integral[own] += length * element_integral
 
     # The corner has no trial function of its own. The polynomials of the element beside it continue
     # up to the corner.
     trial = np.eye(n)[:, 1:-1]
     trial[-1, -order:] = _continuation(order)
     trial[0, :order] = _continuation(order)[::-1]
-    matrix = (mass @ trial)[1:-1].T
+    matrix = mass @ trial
+    right = trial.T @ integral
     weights = np.zeros(n)
-    weights[1:-1] = np.linalg.solve(matrix, trial.T @ integral)
+    weights[1:-1] = np.linalg.solve(matrix[1:-1].T, right)
     return weights
 
 
@@ -151,8 +154,10 @@ def _line_element(order: int) -> tuple[Array, Array]:
     points = (points + 1) / 2
     weight = weight / 2
     nodes = np.arange(order + 1) / order
-    to_nodal = np.linalg.inv(np.vander(nodes, increasing=True))
-    phi = np.vander(points, order + 1, increasing=True) @ to_nodal
+    powers_at_nodes = np.vander(nodes, increasing=True)
+    powers_at_points = np.vander(points, order + 1, increasing=True)
+    to_nodal = np.linalg.inv(powers_at_nodes)
+    phi = powers_at_points @ to_nodal
     weighted = phi * weight[:, None]
     return weighted.T @ phi, weight @ phi
 
@@ -160,6 +165,8 @@ def _line_element(order: int) -> tuple[Array, Array]:
 def _continuation(order: int) -> Array:
     """Return the values (order,) at the end 1 of an element [0, 1] of the polynomials that are 1 at
     one of its other nodes and 0 at the rest: binomial coefficients of alternating sign."""
-    signs = [(-1) ** (order - 1 - k) for k in range(order)]
-    coefficients = [comb(order, k) for k in range(order)]
-    return np.multiply(signs, coefficients, dtype=float)
+    values = []
+    for k in range(order):
+        sign = (-1) ** (order - 1 - k)
+        values.append(sign * comb(order, k))
+    return np.array(values, dtype=float)

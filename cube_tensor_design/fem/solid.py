@@ -81,7 +81,8 @@ def stiffness(scalar: skfem.Basis, moduli: tuple[float, float]) -> sp.csr_matrix
         # Components a of the test function and b of the displacement are coupled by this block.
         place = np.zeros((dim, dim))
         place[a, b] = 1.0
-        total = total + sp.kron(lam * slopes + mu * slopes.T, place)
+        coupling = lam * slopes + mu * slopes.T
+        total = total + sp.kron(coupling, place)
         if a == b:
             # The part of mu grad u : grad w couples equal components only.
             total = total + sp.kron(mu * slopes, np.eye(dim))
@@ -96,13 +97,15 @@ def sample_matrix(basis: skfem.Basis, values: Array) -> sp.csr_matrix:
         values: (n, ..., E, Q) samples of each of the n shape functions of an element; they make
             S = ... x E x Q rows of the matrix, row-major.
     """
-    samples = np.arange(values[0].size).reshape(values.shape[1:])
+    n_samples = values[0].size
+    samples = np.arange(n_samples).reshape(values.shape[1:])
     rows = np.broadcast_to(samples, values.shape)
-    inner_axes = range(1, values.ndim - 2)
-    dofs = np.expand_dims(basis.element_dofs, (*inner_axes, values.ndim - 1))
+    point_axis = values.ndim - 1
+    inner_axes = range(1, point_axis - 1)
+    dofs = np.expand_dims(basis.element_dofs, (*inner_axes, point_axis))
     columns = np.broadcast_to(dofs, values.shape)
-    entries = (values.ravel(), (rows.ravel(), columns.ravel()))
-    matrix = sp.csr_matrix(entries, (values[0].size, basis.N))
+    places = (rows.ravel(), columns.ravel())
+    matrix = sp.csr_matrix((values.ravel(), places), (n_samples, basis.N))
     matrix.eliminate_zeros()
     return matrix
 
@@ -192,7 +195,8 @@ class Solid:
         """
         mesh = self.basis.mesh
         edges = mesh.boundary_facets()
-        centres = mesh.p[:, mesh.facets[:, edges]].mean(axis=1)
+        corners = mesh.p[:, mesh.facets[:, edges]]
+        centres = corners.mean(axis=1)
         total: Any = 0.0
         for axis, sign in itertools.product(range(self.dim), (1, -1)):
             end = (sign * mesh.p[axis]).max()
@@ -206,11 +210,12 @@ class Solid:
             traction = sign * stress[..., axis]  # (q, n, dim)
             by_point = traction.reshape(face.dx.size, -1)
             # A quadrature point loads the nodes whose functions are not zero there.
-            values = np.stack([np.asarray(shape[0]) for shape in face.basis])
-            samples = sample_matrix(face, values * face.dx)
+            values = [np.asarray(shape[0]) for shape in face.basis]
+            samples = sample_matrix(face, np.stack(values) * face.dx)
             forces = samples.T @ by_point
-            by_node = forces.reshape(face.N, -1, self.dim).swapaxes(1, 2)
-            total = total + by_node.reshape(len(self.component), -1)
+            by_node = forces.reshape(face.N, -1, self.dim)
+            by_dof = by_node.swapaxes(1, 2).reshape(len(self.component), -1)
+            total = total + by_dof
         return total
 
     def solve(self, parity: Parity, forces: Array) -> Array:
@@ -219,9 +224,10 @@ class Solid:
         if self._last_solve is None or self._last_solve.parity != sorted_parity:
             self._last_solve = None  # frees its memory before the next factorisation
             self._last_solve = self._factorise(sorted_parity)
-        rows = swap[self._last_solve.free]
+        _, free, factors = self._last_solve
+        rows = swap[free]
         u = np.zeros_like(forces)
-        u[rows] = self._last_solve.factors.solve(forces[rows])
+        u[rows] = factors.solve(forces[rows])
         return u
 
     def _factorise(self, parity: Parity) -> _Factors:
@@ -263,8 +269,9 @@ class Solid:
 
         # Component k at x is, before the exchange, component axes[k] at y with y[axes[k]] = x[k].
         n_coordinates = self._grid.max(axis=1) + 1
+        _, n_nodes = self._grid.shape
         node_at = np.empty(n_coordinates, dtype=int)
-        node_at[tuple(self._grid)] = np.arange(self._grid.shape[1])
+        node_at[tuple(self._grid)] = np.arange(n_nodes)
         exchanged = self._grid[np.argsort(axes)]
         before = node_at[tuple(exchanged)]
         swap = self.dim * before[:, None] + axes
@@ -277,7 +284,8 @@ class Solid:
         mesh = self.basis.mesh
         centres = mesh.p[:, mesh.t].mean(axis=1)
         is_cube = np.all(np.abs(centres) < 1.0, axis=0)
-        return self.basis.with_elements(np.flatnonzero(is_cube == in_cube))
+        elements = np.flatnonzero(is_cube == in_cube)
+        return self.basis.with_elements(elements)
 
     def pad_weights(self, layout: Layout, parity: Parity) -> Array:
         """Return weights (P, dofs) from nodal forces on the body to the mean stresses of the pads.
@@ -299,7 +307,8 @@ class Solid:
             if sign != 0:
                 # Even: the normal component is zero on the mirror; odd: the other ones.
                 is_normal = component == k
-                held |= _is_at(x[k], 0.0) & (is_normal == (sign > 0))
+                is_even = sign > 0
+                held |= _is_at(x[k], 0.0) & (is_normal == is_even)
         if self._confined:
             for k in range(self.dim - 1):
                 at_end = _is_at(x[k], x[k].max())
@@ -340,10 +349,12 @@ def _parity_part(
     This part is the mean of the field over all mirrored points, with the signs of the parity.
     """
     part = np.zeros(())
-    for image, weight in zip(*mirror_images(parity), strict=True):
+    images, weights = mirror_images(parity)
+    for image, weight in zip(images, weights, strict=True):
         # A component sigma_ij changes its sign with each of its axes that is mirrored.
         signs = np.outer(image, image)
-        part = part + weight * signs * field(x * image)
+        mirrored = field(x * image)
+        part = part + weight * signs * mirrored
     return part
 
 
@@ -357,7 +368,8 @@ def mirror_images(parity: Parity) -> tuple[Array, Array]:
     """
     # Along an axis without a mirror the body is meshed as a whole.
     signs = [(1.0, -1.0) if sign else (1.0,) for sign in parity]
-    images = np.array(list(itertools.product(*signs)))
+    combinations = list(itertools.product(*signs))
+    images = np.array(combinations)
     signs_by_axis = np.where(images < 0, parity, 1)
     weights = signs_by_axis.prod(axis=1) / len(images)
     return images, weights
@@ -379,12 +391,15 @@ def nested_dissection(grid: Index) -> Index:
         axis = int(np.argmax(extent))
         along = grid[axis, part]
         # Even lines are planes between elements.
-        planes = np.unique(along[along % 2 == 0])[1:-1]
+        is_plane = along % 2 == 0
+        planes = np.unique(along[is_plane])[1:-1]
         if len(part) < SMALLEST_DISSECTED or len(planes) == 0:
             return part
         cut = planes[len(planes) // 2]
         lower = order(part[along < cut])
         upper = order(part[along > cut])
-        return np.concatenate([lower, upper, part[along == cut]])
+        on_cut = part[along == cut]
+        return np.concatenate([lower, upper, on_cut])
 
-    return order(np.arange(grid.shape[1]))
+    _, n_nodes = grid.shape
+    return order(np.arange(n_nodes))

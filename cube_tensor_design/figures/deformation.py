@@ -87,8 +87,9 @@ def _draw_pads(axis: Any, layout: Layout, half_side: float) -> None:
     normals = layout.normals[:, [0, 2]]
     for centre, normal in zip(centres, normals, strict=True):
         along_face = layout.pad_size * (1 - np.abs(normal))
-        ends = half_side * (centre + np.outer((-0.5, 0.5), along_face)).T
-        axis.plot(*ends, color="tab:red", linewidth=5, solid_capstyle="butt")
+        ends = centre + np.outer((-0.5, 0.5), along_face)
+        x, z = half_side * ends.T
+        axis.plot(x, z, color="tab:red", linewidth=5, solid_capstyle="butt")
 
 
 def _draw_deformation(axis: Any, deformation: Deformation, window: float) -> float:
@@ -102,7 +103,8 @@ def _draw_deformation(axis: Any, deformation: Deformation, window: float) -> flo
     moved = deformation.displacement
     # Displacements far away are large and not drawn.
     is_near = np.abs(points[0]) < window
-    scale = MAX_DISPLACEMENT * d0 / np.hypot(*moved[:, is_near]).max()
+    distances = np.hypot(*moved[:, is_near])
+    scale = MAX_DISPLACEMENT * d0 / distances.max()
     drawn = 1e3 * (d0 * points + scale * moved)
     _draw_stress(axis, deformation, drawn, window)
     _draw_arrows(axis, deformation, window)
@@ -110,15 +112,20 @@ def _draw_deformation(axis: Any, deformation: Deformation, window: float) -> flo
     # The cube before the deformation is dotted, and after it white.
     side = 2e3 * d0
     lower_left = (-side / 2, -side / 2)
-    axis.add_patch(Rectangle(lower_left, side, side, fill=False, linestyle=":", linewidth=0.8))
-    face = np.flatnonzero(np.isclose(np.abs(points).max(axis=0), 1))
-    by_angle = np.argsort(np.arctan2(*points[::-1, face]))
+    square = Rectangle(lower_left, side, side, fill=False, linestyle=":", linewidth=0.8)
+    axis.add_patch(square)
+    ring = np.abs(points).max(axis=0)
+    face = np.flatnonzero(np.isclose(ring, 1))
+    x, z = points[:, face]
+    by_angle = np.argsort(np.arctan2(z, x))
     outline = drawn[:, face[by_angle]]
     axis.fill(*outline, facecolor="white", edgecolor="black", linewidth=1.2)
 
-    x = 1e3 * d0 * window
-    z = min(x, 600 * deformation.height)
-    axis.set(xlim=(-x, x), ylim=(-z, z), aspect="equal", ylabel=r"$z$ / mm")
+    half_width = 1e3 * d0 * window
+    half_height = min(half_width, 600 * deformation.height)
+    axis.set_xlim(-half_width, half_width)
+    axis.set_ylim(-half_height, half_height)
+    axis.set(aspect="equal", ylabel=r"$z$ / mm")
     axis.grid(False)
     return float(scale)
 
@@ -130,7 +137,8 @@ def _draw_stress(axis: Any, deformation: Deformation, drawn: Array, window: floa
     """
     points = deformation.points
     ring = np.abs(points).max(axis=0)
-    is_outside = ring[deformation.triangles].max(axis=0) > 1 + 1e-9
+    farthest = ring[deformation.triangles].max(axis=0)
+    is_outside = farthest > 1 + 1e-9
     triangles = deformation.triangles[:, is_outside]
 
     # The value of a node is the mean of the triangles around it.
@@ -139,7 +147,8 @@ def _draw_stress(axis: Any, deformation: Deformation, drawn: Array, window: floa
     count = np.bincount(triangles.ravel(), minlength=len(ring))
     kilopascal = total / np.maximum(count, 1)
     is_near = (np.abs(points[0]) < window) & (ring >= 1)
-    limit = np.percentile(np.abs(kilopascal[is_near]), COLOUR_PERCENTILE)
+    magnitude = np.abs(kilopascal[is_near])
+    limit = np.percentile(magnitude, COLOUR_PERCENTILE)
 
     mesh = Triangulation(drawn[0], drawn[1], triangles.T)
     image = axis.tripcolor(mesh, kilopascal, shading="gouraud", cmap=SIGNED_COLOURS)
@@ -157,14 +166,19 @@ def _draw_arrows(axis: Any, deformation: Deformation, window: float) -> None:
     """
     d0 = deformation.half_side
     # Arrows at the edges of the picture would leave it.
-    half_height = min(window - 1, deformation.height / 2 / d0 - 0.5)
+    body_half_height = deformation.height / 2 / d0
+    half_height = min(window - 1, body_half_height - 0.5)
     columns = np.linspace(1 - window, window - 1, ARROW_COLUMNS)
     rows = np.linspace(-half_height, half_height, ARROW_ROWS)
     x, z = np.meshgrid(columns, rows)
     node_x, node_z = deformation.points
     mesh = Triangulation(node_x, node_z, deformation.triangles.T)
-    moved = [LinearTriInterpolator(mesh, along)(x, z) for along in deformation.displacement]
-    arrows = 1e3 * d0 * np.array(moved) / np.hypot(*moved).max()
+    moved = []
+    for along in deformation.displacement:
+        interpolate = LinearTriInterpolator(mesh, along)
+        moved.append(interpolate(x, z))
+    longest = np.hypot(*moved).max()
+    arrows = 1e3 * d0 * np.array(moved) / longest
     tails = 1e3 * d0 * np.array([x, z])
     axis.quiver(
         *tails,

@@ -41,7 +41,8 @@ def save_paper(folder: Path, report: Progress) -> list[Path]:
     save_picture(draw_figure_4(figure_4()), "figure_4")
     numbers: dict[str, Any] = {}
     for law in ("linear", "finite"):
-        results = experiments(finite=law == "finite", progress=_report_part(report, law))
+        report_law = _report_part(report, law)
+        results = experiments(finite=law == "finite", progress=report_law)
         for number, result in enumerate(results, 1):
             save_picture(draw_experiment(result, law), f"experiment_{number}_{law}")
             numbers[f"{result.name}, {law}"] = vars(result)
@@ -67,4 +68,8 @@ def save_paper(folder: Path, report: Progress) -> list[Path]:
 def _report_part(report: Progress, name: str) -> Progress:
     """Return a function that reports the progress of a part as progress of the whole."""
     before = PARTS.index(name)
-    return lambda done, total, what: report(before + done / total, len(PARTS), f"{name}: {what}")
+
+    def report_part(done: float, total: float, what: str) -> None:
+        report(before + done / total, len(PARTS), f"{name}: {what}")
+
+    return report_part

@@ -22,7 +22,8 @@ from skfem.helpers import ddot, det, inv, mul, trace, transpose
 
 from cube_tensor_driver.core.arrays import Array
 
-_ONE = np.eye(2)[:, :, None, None]
+IDENTITY = np.eye(2)[:, :, None, None]
+"""Unit tensor 1 (2, 2, 1, 1), for all elements and quadrature points."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,9 +43,10 @@ class Material:
     def energy(self, f: Array) -> Array:
         """Return W (E, Q), in Pa, where the deformation is F (2, 2, E, Q)."""
         if not self.finite:
-            return ddot(f - _ONE, self.stress(f)) / 2
+            return ddot(f - IDENTITY, self.stress(f)) / 2
         log = np.log(det(f))
-        distortion = self.mu / 2 * (ddot(f, f) - 2 - 2 * log)
+        square = ddot(f, f)
+        distortion = self.mu / 2 * (square - 2 - 2 * log)
         return distortion + self.lam / 2 * log**2
 
     def stress(self, f: Array) -> Array:
@@ -53,11 +55,12 @@ class Material:
         P is the force over the undeformed area.
         """
         if not self.finite:
-            strain = (f + transpose(f)) / 2 - _ONE
-            volume_part = self.lam * trace(strain) * _ONE
+            strain = (f + transpose(f)) / 2 - IDENTITY
+            volume_part = self.lam * trace(strain) * IDENTITY
             return volume_part + 2 * self.mu * strain
         inverse = transpose(inv(f))
-        pressure_part = self.lam * np.log(det(f)) * inverse
+        log = np.log(det(f))
+        pressure_part = self.lam * log * inverse
         return self.mu * (f - inverse) + pressure_part
 
     def cauchy(self, f: Array) -> Array:
@@ -66,15 +69,19 @@ class Material:
         In a linear material the true stress is P itself.
         """
         p = self.stress(f)
-        return mul(p, transpose(f)) / det(f) if self.finite else p
+        if not self.finite:
+            return p
+        return mul(p, transpose(f)) / det(f)
 
     def moduli(self, f: Array) -> Array:
         """Return the moduli dP_ij/dF_kl (2, 2, 2, 2, E, Q), in Pa; Q is 1 for a linear material,
         which has the same moduli at all points."""
-        inverse, log = _ONE, 0.0
+        inverse = IDENTITY
+        log = 0.0
         if self.finite:
-            inverse, log = transpose(inv(f)), np.log(det(f))
-        identity = np.einsum("ik...,jl...->ijkl...", _ONE, _ONE)
+            inverse = transpose(inv(f))
+            log = np.log(det(f))
+        identity = np.einsum("ik...,jl...->ijkl...", IDENTITY, IDENTITY)
         # With g = F^-T (1 for a linear material), these are g_ij g_kl and g_il g_kj.
         outer = np.einsum("ij...,kl...->ijkl...", inverse, inverse)
         crossed = np.swapaxes(outer, 1, 3)

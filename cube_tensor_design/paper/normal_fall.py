@@ -61,13 +61,15 @@ def normal_fall(experiment: Experiment) -> NormalFall:
     field = np.array([zz - zz_before, shear_part, normal_part])
     # The part of the change that the true stresses do not explain is a change of the stress that
     # the cube adds.
-    stress = np.append(field, after - before - field.sum())
+    added = after - before - field.sum()
+    stress = np.append(field, added)
 
     # The signal that four equal pads would give, after each part in turn has been added to their
     # stress.
     mean_stress = np.cumsum([before, *stress])
     equal_pads = np.tile(mean_stress[:, None], 4)
-    signal = prototype(foam_frequency(equal_pads))[:, 0]
+    frequencies = foam_frequency(equal_pads)
+    signal = prototype(frequencies)[:, 0]
     # The last part leads from four equal pads to the pads as they are.
     end = experiment.prototype[-1, 0]
     return NormalFall(stress, np.diff(signal, append=end))

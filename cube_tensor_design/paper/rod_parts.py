@@ -115,9 +115,11 @@ def rod_parts(
         rows = []
         for place in places:
             report(f"{rod} at {1e3 * place:g} mm")
-            step = dent(bench.body, Rod(ROD_DEPTH, place, edge_radius=radius))
-            rows.append(split_signals(bench, step, signals, held))
-        by_pads = np.moveaxis(np.array(rows), 1, 0)  # (pads, places, parts)
+            pressed = Rod(ROD_DEPTH, place, edge_radius=radius)
+            step = dent(bench.body, pressed)
+            parts_by_pads = split_signals(bench, step, signals, held)
+            rows.append(parts_by_pads)
+        by_pads = np.stack(rows, axis=1)  # (pads, places, parts)
         for pads, parts in zip(PADS, by_pads, strict=True):
             signal = parts.sum(axis=1)
             found[f"{rod}, {pads}"] = RodParts(np.array(places), signal, parts)
@@ -140,7 +142,8 @@ def draw_back(bench: VirtualBench, step: LoadStep) -> LoadStep:
         _, forces = bench.rod_pressure(step_to(depth))
         return float(forces.sum() / force - 1)
 
-    force = bench.without_cube().rod_pressure(step)[1].sum()
+    _, forces_without_cube = bench.without_cube().rod_pressure(step)
+    force = forces_without_cube.sum()
     # The force is nearly proportional to the depth.
     guess = rod.pressed / (1 + excess(rod.pressed))
     depth = newton(excess, rod.pressed, x1=guess, tol=SAME_DEPTH)
@@ -179,8 +182,8 @@ def split_signals(
     polynomials = polynomials[:, dofs]
     # Columns of equal norm keep the fit well conditioned.
     size = np.linalg.norm(polynomials, axis=1)
-    scaled = (polynomials / size[:, None]).T
-    scaled_amplitude = np.linalg.lstsq(scaled, field[dofs], rcond=None)[0]
+    scaled = polynomials / size[:, None]
+    scaled_amplitude, *_ = np.linalg.lstsq(scaled.T, field[dofs], rcond=None)
     amplitude = scaled_amplitude / size
 
     rows = []
@@ -189,13 +192,16 @@ def split_signals(
         # The signal depends on w, the displacement that the cube adds. Instead of solving for the
         # w of each polynomial, the transposed (symmetric) system is solved once, with the weights
         # of the signal on the right. The matrix has one row more if the rod's force is held.
+        n_free = len(free)
+        forces = _forces(bench, weights, ~in_cube)
         right = np.zeros(matrix.shape[0])
-        right[: len(free)] = -_forces(bench, weights, ~in_cube)[free]
-        adjoint[free] = solver.solve(right)[: len(free)]
+        right[:n_free] = -forces[free]
+        adjoint[free] = solver.solve(right)[:n_free]
         # The signal is the product of `response` and the displacements without the cube (`field`).
         response = _forces(empty, weights + adjoint, in_cube)
         response -= _forces(bench, adjoint, in_cube)
-        each = (polynomials @ response[dofs]) * amplitude
+        per_amplitude = polynomials @ response[dofs]
+        each = per_amplitude * amplitude
         parts = np.bincount(part, each, len(PARTS))
         # The residual of the fit by polynomials belongs to the higher derivatives.
         parts[-1] += response @ field - each.sum()

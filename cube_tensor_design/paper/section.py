@@ -19,7 +19,7 @@ from skfem.helpers import det
 from cube_tensor_driver.core.arrays import Array, Mask
 
 from ..fem.solid import sample_matrix
-from .material import Material
+from .material import IDENTITY, Material
 from .newton import Balance
 
 
@@ -45,7 +45,8 @@ class Section:
 
         # This sparse matrix computes the gradients d u_i / d x_j (2, 2, E, Q) at all quadrature
         # points from the unknowns u.
-        slopes = np.stack([shape[0].grad for shape in self.basis.basis])
+        gradients = [shape[0].grad for shape in self.basis.basis]
+        slopes = np.stack(gradients)
         self._gradient = sample_matrix(self.basis, slopes)
         self._linear_tangent: sp.csr_matrix | None = None
         self._set_up_tangent(slopes)
@@ -60,27 +61,30 @@ class Section:
         `_columns`, which of the unknowns each entry of the sparse tangent belongs to; and `_entry`
         (E x n x n,), the entry to which a pair of unknowns of an element contributes.
         """
-        n = len(slopes)
-        by_point = np.moveaxis(slopes.reshape(n, 4, *slopes.shape[3:]), (0, 1), (3, 2))
+        n, _, _, *points = slopes.shape
+        by_component = slopes.reshape(n, 4, *points)
+        by_point = by_component.transpose(2, 3, 1, 0)
         self._slopes = np.ascontiguousarray(by_point)
+        size = self.basis.N
         dofs = self.basis.element_dofs.T.astype(np.int64)
         rows = np.repeat(dofs, n, axis=1)
         columns = np.tile(dofs, (1, n))
-        pairs = rows.ravel() * self.basis.N + columns.ravel()
+        pairs = rows.ravel() * size + columns.ravel()
         entries, self._entry = np.unique(pairs, return_inverse=True)
-        self._rows, self._columns = np.divmod(entries, self.basis.N)
+        self._rows, self._columns = np.divmod(entries, size)
 
     def node(self, x: float, z: float) -> int:
         """Return the number of the corner of an element that is nearest to this point."""
-        from_point = self.mesh.p - np.array([[x], [z]])
-        return int(np.hypot(*from_point).argmin())
+        node_x, node_z = self.mesh.p
+        distance = np.hypot(node_x - x, node_z - z)
+        return int(distance.argmin())
 
     def deformation(self, u: Array) -> Array:
         """Return the gradient of the deformation F = 1 + grad u (2, 2, E, Q) at the quadrature
         points."""
         gradient = self._gradient @ u
         by_component = gradient.reshape(2, 2, *self.basis.dx.shape)
-        return by_component + np.eye(2)[:, :, None, None]
+        return by_component + IDENTITY
 
     def balance(self, u: Array) -> Balance | None:
         """Return nodal forces (dofs,) and energy; None when an element is turned inside out."""
@@ -100,8 +104,10 @@ class Section:
             stress: (2, 2, E, Q) in Pa.
             elements: (E,) whether an element counts; True: all count.
         """
-        volume = self.basis.dx * np.reshape(elements, (-1, 1))
-        return (stress * volume).ravel() @ self._gradient
+        is_counted = np.reshape(elements, (-1, 1))
+        volume = self.basis.dx * is_counted
+        weighted = stress * volume
+        return weighted.ravel() @ self._gradient
 
     def tangent(self, u: Array) -> sp.csr_matrix:
         """Return the derivative of the nodal forces by u, sparse (dofs, dofs).
@@ -110,20 +116,24 @@ class Section:
         """
         if self._linear_tangent is not None:
             return self._linear_tangent
-        moduli = self.material.moduli(self.deformation(u)) * self.basis.dx
-        n_elements, n_points = self.basis.dx.shape
-        by_component = moduli.reshape(4, 4, n_elements, n_points)
+        volume = self.basis.dx
+        n_elements, n_points = volume.shape
+        moduli = self.material.moduli(self.deformation(u))
+        weighted = moduli * volume
+        by_component = weighted.reshape(4, 4, n_elements, n_points)
         by_point = np.moveaxis(by_component, (0, 1), (2, 3))
 
         # In each element, all quadrature points and components are summed by one product.
         n = self._slopes.shape[-1]
         slopes = self._slopes.reshape(n_elements, -1, n)
-        stress_change = (by_point @ self._slopes).reshape(slopes.shape)
+        stress_change = by_point @ self._slopes
+        stress_change = stress_change.reshape(slopes.shape)
         by_element = slopes.swapaxes(1, 2) @ stress_change
 
         values = np.bincount(self._entry, by_element.ravel())
+        places = self._rows, self._columns
         size = self.basis.N
-        matrix = sp.csr_matrix((values, (self._rows, self._columns)), (size, size))
+        matrix = sp.csr_matrix((values, places), (size, size))
         if not self.material.finite:
             self._linear_tangent = matrix
         return matrix

@@ -206,8 +206,8 @@ class VirtualBench:
             u = position.u
             if not step.gripped:
                 loose = u
-            pads = self._pad_stresses(u)
-            rows.append((pads, self._state(u), self._rotation(u)))
+            results = self._pad_stresses(u), self._state(u), self._rotation(u)
+            rows.append(results)
             report()
         columns = zip(*rows, strict=True)
         return BenchRun(*map(np.array, columns))
@@ -314,7 +314,8 @@ class VirtualBench:
         basis = self.section.basis
         component = self.section.component
         by_component = step.prescribed(self._half_side * basis.doflocs)
-        prescribed = by_component[component, np.arange(basis.N)] / self._half_side
+        dofs = np.arange(basis.N)
+        prescribed = by_component[component, dofs] / self._half_side
         if step.gripped:
             prescribed = prescribed + np.where(component == 0, loose, 0.0)
         # The mean displacement of the bottom is held only if the bottom slides.
@@ -353,7 +354,8 @@ class VirtualBench:
         if rod is not None:
             pressed = start.rod.pressed if start.rod else 0.0
             rod = replace(rod, pressed=(rod.pressed + pressed) / 2)
-        return replace(task, prescribed=(start.u + task.prescribed) / 2, rod=rod)
+        prescribed = (start.u + task.prescribed) / 2
+        return replace(task, prescribed=prescribed, rod=rod)
 
     def _newton(self, u: Array, task: _Task) -> Array | None:
         """Return displacements (dofs,) in balance, found from the guess u; None if none were
@@ -410,17 +412,16 @@ class VirtualBench:
         section = self.section
         is_near = np.all(np.abs(section.points) < 0.5, axis=0)
         f = section.deformation(u)
-        stress = section.material.cauchy(f)[:, :, is_near]
+        stress = section.material.cauchy(f)
+        stress = stress[:, :, is_near]
         x = section.points[:, is_near]
         ones = np.ones(x.shape[1])
         design = np.vstack([ones, x]).T
         columns = stress[[0, 1, 0], [0, 1, 1]].T  # xx, zz, zx
         # The fit has the value, the slope along x and the slope along z of each component.
-        fit = np.linalg.lstsq(design, columns, rcond=None)[0]
-        xx, zz, zx = fit.T
-        values = [zz[0], zx[0], xx[0]]
-        slopes = [zz[1], zz[2], xx[2], xx[1]]
-        return np.array(values + slopes)
+        fit, *_ = np.linalg.lstsq(design, columns, rcond=None)
+        (xx, xx_x, xx_z), (zz, zz_x, zz_z), (zx, _, _) = fit.T
+        return np.array([zz, zx, xx, zz_x, zz_z, xx_z, xx_x])
 
 
 def _bench_mesh(
@@ -435,20 +436,26 @@ def _bench_mesh(
     half_pad = layout.pad_size / 2
     on_face = np.abs(layout.positions - layout.normals)
     across = on_face.max(axis=1)
-    edges = np.round([across - half_pad, across + half_pad], 9)
-    stops = np.unique(edges)
+    edges = [across - half_pad, across + half_pad]
+    stops = np.unique(np.round(edges, 9))
     top = body.height / 2 / half_side
     half = [body.width / 2 / half_side, top]
-    # Two rings at the corner of the cube; the cuts below refine its faces.
-    quarter = mesh_quarter(half, stops, 1, smallest=0.3, largest=size)
-    quarter = _refine(quarter, lambda x, z: (z > top - 0.9) & (x < 6.0))
-    # Rods stretch the surface most here.
-    quarter = _refine(quarter, lambda x, z: (z > top - 0.25) & (x < 2.4))
+
+    def is_near_rods(x: Array, z: Array) -> Mask:
+        return (z > top - 0.9) & (x < 6.0)
+
+    def is_below_rods(x: Array, z: Array) -> Mask:
+        return (z > top - 0.25) & (x < 2.4)
 
     def is_at_cube(x: Array, z: Array) -> Mask:
         from_centre = np.maximum(x, z)
         return np.abs(from_centre - 1.15) < 0.15
 
+    # Two rings at the corner of the cube; the cuts below refine its faces.
+    quarter = mesh_quarter(half, stops, 1, smallest=0.3, largest=size)
+    quarter = _refine(quarter, is_near_rods)
+    # Rods stretch the surface most here.
+    quarter = _refine(quarter, is_below_rods)
     for _ in range(CUBE_REFINEMENTS if cube else 0):
         # The ring of triangles from the faces of the cube to 0.3 d0 outside of it.
         quarter = _refine(quarter, is_at_cube)

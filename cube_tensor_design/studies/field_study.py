@@ -84,9 +84,10 @@ class FieldStudy:
         """
         saved = np.full((len(self.widths), len(SKIN_KINDS)), np.nan)
         for row, curves in enumerate(self.error):
-            pitch = np.array([self._pitch_for(error, curve) for curve in curves.T])
+            pitches = [self._pitch_for(error, curve) for curve in curves.T]
+            ratio = np.array(pitches) / pitches[0]
             # The number of cubes per area falls with the square of the pitch.
-            saved[row] = (pitch / pitch[0]) ** 2
+            saved[row] = ratio**2
         return saved
 
     def _pitch_for(self, error: float, curve: Array) -> float:
@@ -129,10 +130,12 @@ def flat_skin(pitch: float, side: float = SKIN_SIDE) -> CubePoses:
     """
     count = 2 * round(side / pitch / 2) + 1
     line = (np.arange(count) - count // 2) * pitch
-    x, y = (column.ravel() for column in np.meshgrid(line, line))
-    position = np.stack([x, y, 0 * x], axis=1)
-    rotation = np.tile(np.eye(3), (len(position), 1, 1))
-    return CubePoses(position, rotation, np.full(len(position), SURFACE_DEPTH / 2))
+    x, y = np.meshgrid(line, line)
+    position = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3)
+    n_cubes = len(position)
+    rotation = np.tile(np.eye(3), (n_cubes, 1, 1))
+    half_side = np.full(n_cubes, SURFACE_DEPTH / 2)
+    return CubePoses(position, rotation, half_side)
 
 
 def draw_force(random: np.random.Generator) -> Array:
@@ -162,8 +165,9 @@ def true_components(
     """
     order = contact.hertz_order(width / 2, SURFACE_DEPTH)
     load = contact.hertz(width / 2, force, centre, order)
+    field = field_below(points, SURFACE_DEPTH, load, POISSONS_RATIO)
     # Of the gradients, those of the normal stresses come first.
-    return field_below(points, SURFACE_DEPTH, load, POISSONS_RATIO)[:, : len(COMPONENTS)]
+    return field[:, : len(COMPONENTS)]
 
 
 def field_below(
@@ -219,11 +223,13 @@ def field_study(
         for row, width in enumerate(widths):
             # The same contacts for every pitch and width make the errors comparable.
             random = np.random.default_rng(SEED)
-            errors = np.array([trial.errors(width, random) for _ in range(cases)])
-            squares, distances, forces = np.moveaxis(errors, 1, 0)  # Each (cases, kinds).
-            error[row, column] = np.sqrt(squares.mean(axis=0))
+            errors = [trial.errors(width, random) for _ in range(cases)]
+            squares, distances, forces = np.stack(errors, axis=1)  # Each (cases, kinds).
+            mean_square = squares.mean(axis=0)
+            mean_force_square = (forces**2).mean(axis=0)
+            error[row, column] = np.sqrt(mean_square)
             position[row, column] = np.percentile(distances, 95, axis=0)
-            force[row, column] = np.sqrt((forces**2).mean(axis=0))
+            force[row, column] = np.sqrt(mean_force_square)
     return FieldStudy(pitches, widths, error, position, force)
 
 
@@ -261,7 +267,8 @@ class _Trial:
                 values[:, UNOBSERVED_BY_PLANAR] = np.nan
             computed = surface.field(values).pressure[self._window]
             difference = computed - pressure
-            square = (difference**2).mean() / (pressure**2).mean()
+            error_square = (difference**2).mean()
+            square = error_square / (pressure**2).mean()
             distance = WINDOW
             force_error = -1.0
             contacts = surface.contacts(values, CONTACT_PRESSURE)
