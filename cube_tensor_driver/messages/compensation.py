@@ -32,11 +32,14 @@ def read_motion(message: Any, stamp_ns: int) -> Motion | None:
     if not message.weight:
         return None
     offsets = np.asarray(message.time_offset, np.int64)
+    n = len(offsets)
+    force = np.asarray(message.specific_force, float)
+    gradient = np.asarray(message.gradient, float)
     try:
         return Motion(
             stamp_ns + offsets,
-            np.asarray(message.specific_force, float).reshape(len(offsets), 3),
-            np.asarray(message.gradient, float).reshape(len(offsets), 3, 3),
+            force.reshape(n, 3),
+            gradient.reshape(n, 3, 3),
         )
     except ValueError:
         raise MessageError(
@@ -47,5 +50,9 @@ def read_motion(message: Any, stamp_ns: int) -> Motion | None:
 
 def read_states(message: Any) -> dict[str, Array]:
     """Return the states in a SkinCompensation message, by the `STATES`; empty ones are left out."""
-    states = {name: np.asarray(getattr(message, name), float) for name in STATES}
-    return {name: state for name, state in states.items() if len(state)}
+    states = {}
+    for name in STATES:
+        state = np.asarray(getattr(message, name), float)
+        if len(state):
+            states[name] = state
+    return states

@@ -75,10 +75,12 @@ def contacts_message(
     # Only tracked contacts have an id, a moment (torque about the normal), further uncertainties,
     # and `refined` (force from a fit of the traction). Without a tracker, these arrays stay empty.
     tracked = [contact for contact in contacts if isinstance(contact, TrackedContact)]
+    ids = [contact.id for contact in tracked]
+    are_refined = [contact.refined for contact in tracked]
     fields: dict[str, Any] = {name: _collect(contacts, name) for name in _NUMBERS}
     fields |= {name: _collect(tracked, name) for name in _TRACKED_NUMBERS}
-    fields["id"] = np.array([contact.id for contact in tracked], np.uint32)
-    fields["refined"] = np.array([contact.refined for contact in tracked], bool)
+    fields["id"] = np.array(ids, np.uint32)
+    fields["refined"] = np.array(are_refined, bool)
     for name, kind in _VECTORS.items():
         vectors = [getattr(contact, name) for contact in contacts]
         fields[name] = [_make_xyz(make, kind, vector) for vector in vectors]

@@ -32,12 +32,15 @@ def cube_poses(info: Any) -> CubePoses:
     """
     if not info.cubes:
         raise MessageError(f"info of the skin {info.name}: it has no cubes")
-    positions, rotations, half_sides = [], [], []
+    positions = []
+    rotations = []
     for cube in info.cubes:
-        position, q = cube.pose.position, cube.pose.orientation
+        position = cube.pose.position
+        q = cube.pose.orientation
+        rotation = rotation_from_quaternion([q.x, q.y, q.z, q.w])
         positions.append((position.x, position.y, position.z))
-        rotations.append(rotation_from_quaternion([q.x, q.y, q.z, q.w]))
-        half_sides.append(cube.half_side)
+        rotations.append(rotation)
+    half_sides = [cube.half_side for cube in info.cubes]
     poses = CubePoses(
         position=np.array(positions),
         rotation=np.array(rotations),
@@ -103,7 +106,9 @@ def skin_elastomer(info: Any) -> Elastomer | None:
         info: SkinInfo message (depth, thickness and Poisson's ratio of the elastomer).
     """
     numbers = (info.elastomer_depth, info.elastomer_thickness, info.elastomer_poisson)
-    return None if np.isnan(numbers).any() else Elastomer(*numbers)
+    if np.isnan(numbers).any():
+        return None
+    return Elastomer(*numbers)
 
 
 def geometry(info: Any) -> list[object]:

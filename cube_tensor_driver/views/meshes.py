@@ -35,9 +35,9 @@ CUBE: Mesh = (
 )
 """Triangle mesh of a cube with its centre at the origin and half a side of 1."""
 
-CUBE_EDGES = np.array(
-    [ends for ends in combinations(CUBE[0], 2) if np.count_nonzero(ends[0] != ends[1]) == 1]
-)
+_CORNER_PAIRS = np.array(list(combinations(CUBE[0], 2)))
+_N_DIFFERENT = np.count_nonzero(_CORNER_PAIRS[:, 0] != _CORNER_PAIRS[:, 1], axis=1)
+CUBE_EDGES = _CORNER_PAIRS[_N_DIFFERENT == 1]
 """Edges (12, 2, 3) of `CUBE`: the positions of both ends of each edge."""
 
 COLOUR_STEPS = 32
@@ -65,7 +65,8 @@ def corner_lines(rotation: Array, side: float) -> Array:
         neighbours = np.roll(corners, step, axis=0)
         ends = corners + 0.25 * (neighbours - corners)
         lines.append(np.stack([corners, ends], axis=1))
-    return np.asarray(np.concatenate(lines) @ rotation[:, :2].T)
+    in_plane = np.concatenate(lines)
+    return np.asarray(in_plane @ rotation[:, :2].T)
 
 
 def find_hit_cube(
@@ -93,8 +94,10 @@ def find_hit_cube(
     near = distance < pitch
     if not near.any():
         return None
-    in_front = near & (depth < depth[near].min() + 2 * pitch)
-    return int(np.where(in_front, distance, np.inf).argmin())
+    max_depth = depth[near].min() + 2 * pitch
+    in_front = near & (depth < max_depth)
+    distance = np.where(in_front, distance, np.inf)
+    return int(distance.argmin())
 
 
 class SquareLayer:
@@ -141,8 +144,12 @@ class SquareLayer:
             top: Value at the upper end of the colour scale, in SI units.
             visible: (M,) whether each square is drawn.
         """
-        steps = np.where(visible, colour_steps(quantity, values, top), -1)
-        return [self._mesh(np.flatnonzero(steps == step)) for step in range(COLOUR_STEPS + 1)]
+        steps = colour_steps(quantity, values, top)
+        meshes = []
+        for step in range(COLOUR_STEPS + 1):
+            chosen = np.flatnonzero(visible & (steps == step))
+            meshes.append(self._mesh(chosen))
+        return meshes
 
     def _mesh(self, chosen: Index) -> Mesh:
         if not len(chosen):
@@ -166,8 +173,8 @@ def colour_steps(
     """
     bottom = -top if quantity.signed else 0.0
     share = (np.nan_to_num(values) - bottom) / (top - bottom)
-    step = np.clip(share * COLOUR_STEPS, 0, COLOUR_STEPS - 1).astype(int)
-    return np.where(np.isfinite(values), step, COLOUR_STEPS)
+    step = np.clip(share * COLOUR_STEPS, 0, COLOUR_STEPS - 1)
+    return np.where(np.isfinite(values), step.astype(int), COLOUR_STEPS)
 
 
 def step_colours(quantity: Quantity) -> NDArray[np.uint8]:

@@ -19,7 +19,8 @@ def round_down(length: float) -> float:
     power = 10.0 ** np.floor(np.log10(length))
     # Without the tolerance, rounding could reduce a length of exactly 1, 2 or 5.
     limit = length * (1 + 1e-9)
-    return float(power * max(factor for factor in (1, 2, 5) if factor * power <= limit))
+    candidates = [power, 2 * power, 5 * power]
+    return float(max(number for number in candidates if number <= limit))
 
 
 def round_range(low: float, high: float) -> tuple[float, float]:
@@ -31,11 +32,16 @@ def round_range(low: float, high: float) -> tuple[float, float]:
     """
     size = max(-low, high, 1e-9)
     # One noisy value below zero would add a whole step of empty space below positive values.
-    low, high = (end if abs(end) > NOISE_SHARE * size else 0.0 for end in (low, high))
+    noise = NOISE_SHARE * size
+    if abs(low) <= noise:
+        low = 0.0
+    if abs(high) <= noise:
+        high = 0.0
     power = 10.0 ** np.floor(np.log10(size))
     # Without the tolerance, rounding could give a size of exactly 1, 2 or 5 the next larger step.
     min_step = size * (1 - 1e-9)
-    step = power * next(factor for factor in (1, 2, 5, 10) if factor * power >= min_step) / 2
+    candidates = [power, 2 * power, 5 * power, 10 * power]
+    step = min(number for number in candidates if number >= min_step) / 2
     n_below = np.floor(min(low, 0) / step)
     n_above = np.ceil(max(high, 0) / step)
     return float(n_below * step), float(n_above * step)

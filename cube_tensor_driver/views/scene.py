@@ -20,7 +20,7 @@ from ..core.arrays import AnyArray, Array, Mask
 from ..core.latest_stress import FINE
 from ..core.modes import COMPONENTS, STRESS
 from ..core.poses import CubePoses
-from ..core.tensor import principal_stresses
+from ..core.tensor import TRACTION_COMPONENTS, principal_stresses
 
 SEQUENTIAL = "ffffcc ffeda0 fed976 feb24c fd8d3c fc4e2a e31a1c bd0026 800026"
 """Colour scale of values that are never negative, as hexadecimal RGB (YlOrRd of ColorBrewer).
@@ -240,7 +240,8 @@ def colours(
     entries = np.linspace(0, 1, len(table))
     channels = [np.interp(share, entries, channel) for channel in table.T]
     mixed = np.stack(channels, axis=1)
-    return np.where(np.isfinite(values)[:, None], mixed, GREY)
+    is_known = np.isfinite(values)
+    return np.where(is_known[:, None], mixed, GREY)
 
 
 def linear_light(colours: Array) -> NDArray[np.uint8]:
@@ -255,8 +256,8 @@ def linear_light(colours: Array) -> NDArray[np.uint8]:
 
 
 def _colour_table(hexes: str) -> Array:
-    colours = [bytes.fromhex(text) for text in hexes.split()]
-    return np.array([tuple(colour) for colour in colours]) / 255
+    colours = [tuple(bytes.fromhex(text)) for text in hexes.split()]
+    return np.array(colours) / 255
 
 
 def above(poses: CubePoses, factor: float) -> Array:
@@ -267,7 +268,8 @@ def above(poses: CubePoses, factor: float) -> Array:
         factor: Height of the points, relative to half the side of the cube; 1 is the upper face.
     """
     height = factor * poses.half_side[:, None]
-    return np.asarray(poses.position + height * poses.rotation[:, :, 2])
+    z_axis = poses.rotation[:, :, 2]
+    return np.asarray(poses.position + height * z_axis)
 
 
 def traction_arrows(
@@ -290,10 +292,11 @@ def traction_arrows(
     Returns:
         Tails and tips (N, 2, 3), in metres.
     """
-    traction = np.nan_to_num(values[:, [4, 3, 2]]) * length
-    arrow = np.einsum("nij,nj->ni", poses.rotation, traction)
+    traction = np.nan_to_num(values[:, TRACTION_COMPONENTS])
+    in_cube = traction * length
+    arrow = np.einsum("nij,nj->ni", poses.rotation, in_cube)
     face = above(poses, 1.0)
-    presses = traction[:, 2:] < 0
+    presses = in_cube[:, 2:] < 0
     tail = np.where(presses, face - arrow, face)
     return np.stack([tail, tail + arrow], axis=1)
 
@@ -317,8 +320,9 @@ def gradient_arrows(
     """
     # Pressure is −σzz, so it grows in the direction opposite to the gradient of σzz.
     columns = [COMPONENTS.index("zz_x"), COMPONENTS.index("zz_y")]
-    gradient = -np.nan_to_num(values[:, columns]) * length
-    arrow = np.einsum("nij,nj->ni", poses.rotation[:, :, :2], gradient)
+    gradient = -np.nan_to_num(values[:, columns])
+    in_cube = gradient * length
+    arrow = np.einsum("nij,nj->ni", poses.rotation[:, :, :2], in_cube)
     # The arrows lie a little above the upper faces, so that these do not hide them.
     tail = above(poses, 1.15)
     return np.stack([tail, tail + arrow], axis=1)
@@ -344,10 +348,12 @@ def principal_crosses(
     Returns:
         Both ends of each line (N, 3, 2, 3), in metres; whether the stress is tension (N, 3).
     """
+    stress = np.nan_to_num(values[:, : len(STRESS)])
     # Each row of `directions` is one principal direction, in the frame of the cube.
-    principal, directions = principal_stresses(np.nan_to_num(values[:, : len(STRESS)]))
+    principal, directions = principal_stresses(stress)
     in_parent = np.einsum("nij,nkj->nki", poses.rotation, directions)
-    half = in_parent * (0.5 * length * np.abs(principal))[..., None]
+    half_length = 0.5 * length * np.abs(principal)
+    half = in_parent * half_length[..., None]
     centre = above(poses, 1.0)[:, None]
     lines = np.stack([centre - half, centre + half], axis=2)
     return lines, np.asarray(principal > 0)
@@ -365,13 +371,16 @@ def fault_crosses(poses: CubePoses, health: AnyArray) -> Array:
     Returns:
         Both ends of both lines (N, 2, 2, 3), in metres; the lines of a fine cube have no length.
     """
-    diagonals = [[[-1, -1, 0], [1, 1, 0]], [[-1, 1, 0], [1, -1, 0]]]
-    has_fault = (health != FINE)[:, None, None, None]
-    # The crosses lie a little above the upper face, so that the face does not hide them.
-    corner = np.where(has_fault, CROSS_SIZE * np.array(diagonals), 0.0)
-    scaled = corner * poses.half_side[:, None, None, None]
+    falling = [[-1, 1, 0], [1, -1, 0]]
+    rising = [[-1, -1, 0], [1, 1, 0]]
+    cross = CROSS_SIZE * np.array([rising, falling])
+    has_fault = health != FINE
+    ends = np.where(has_fault[:, None, None, None], cross, 0.0)
+    scaled = ends * poses.half_side[:, None, None, None]
     in_parent = np.einsum("nij,nabj->nabi", poses.rotation, scaled)
-    return np.asarray(above(poses, CROSS_HEIGHT)[:, None, None] + in_parent)
+    # The crosses lie a little above the upper face, so that the face does not hide them.
+    centre = above(poses, CROSS_HEIGHT)
+    return np.asarray(centre[:, None, None] + in_parent)
 
 
 def heads(arrows: Array, normal: Array) -> Array:
@@ -392,7 +401,8 @@ def heads(arrows: Array, normal: Array) -> Array:
     across = np.cross(back, tilted)
     size = np.linalg.norm(across, axis=1, keepdims=True)
     half_width = 0.5 * np.linalg.norm(back, axis=1, keepdims=True)
-    across *= half_width / np.where(size > 0, size, 1)
+    size_safe = np.where(size > 0, size, 1)
+    across *= half_width / size_safe
     ends = (tip + back + across, tip + back - across)
     barbs = [np.stack([tip, end], axis=1) for end in ends]
     return np.stack([arrows, *barbs], axis=1)
@@ -409,12 +419,15 @@ def ring(centre: Array, normal: Array, radius: float, corners: int) -> Array:
     """
     # `first` and `second` span the plane of the circle. The cross product is taken with the
     # coordinate axis that is least parallel to the normal, so that its length is not close to 0.
-    axis = np.eye(3)[np.abs(normal).argmin()]
+    least_parallel = np.abs(normal).argmin()
+    axis = np.eye(3)[least_parallel]
     first = np.cross(normal, axis)
     first /= np.linalg.norm(first)
     second = np.cross(normal, first)
     angle = 2 * np.pi * np.arange(corners) / corners
-    unit_circle = np.outer(np.cos(angle), first) + np.outer(np.sin(angle), second)
+    along_first = np.outer(np.cos(angle), first)
+    along_second = np.outer(np.sin(angle), second)
+    unit_circle = along_first + along_second
     points = centre + radius * unit_circle
     next_points = np.roll(points, -1, axis=0)
     return np.stack([points, next_points], axis=1)

@@ -47,10 +47,10 @@ def draw_layout(layout: Layout) -> Figure:
     ):
         _draw_pad(axes, name, centre, normal, layout.pad_size)
     # matplotlib needs the direction of view as two angles.
-    horizontal = np.hypot(*_VIEW[:2])
-    elevation = np.degrees(np.arctan2(_VIEW[2], horizontal))
-    azimuth = np.degrees(np.arctan2(_VIEW[1], _VIEW[0]))
-    axes.view_init(elev=elevation, azim=azimuth)
+    x, y, z = _VIEW
+    elevation = np.arctan2(z, np.hypot(x, y))
+    azimuth = np.arctan2(y, x)
+    axes.view_init(elev=np.degrees(elevation), azim=np.degrees(azimuth))
     axes.set(
         xlabel="$x$ / $d_0$",
         ylabel="$y$ / $d_0$",
@@ -93,10 +93,13 @@ def _draw_pad(
         normal: (3,) unit normal out of the cube; one coordinate is 1 or −1, the others are 0.
         size: Length of the sides of the pad.
     """
-    u, w = np.eye(3)[np.flatnonzero(normal == 0)] * size / 2
+    in_plane = np.flatnonzero(normal == 0)
+    u, w = np.eye(3)[in_plane] * size / 2
     outline = np.array([centre + a * u + b * w for a, b in _SQUARE])
     is_in_front = normal @ _VIEW > 0
-    color, dash, order = ("C0", "-", 3) if is_in_front else ("0.55", "--", 1)
+    color, dash, order = "0.55", "--", 1
+    if is_in_front:
+        color, dash, order = "C0", "-", 3
     axes.plot(
         *outline.T,
         color=color,
@@ -105,14 +108,8 @@ def _draw_pad(
         zorder=order,
     )
     if is_in_front:
-        axes.add_collection3d(
-            Poly3DCollection(
-                [outline],
-                facecolor="C0",
-                alpha=0.25,
-                zorder=2,
-            )
-        )
+        area = Poly3DCollection([outline], facecolor="C0", alpha=0.25, zorder=2)
+        axes.add_collection3d(area)
     axes.text(
         # The name is written a little above the face, so that the pad does not cover it.
         *(centre + 0.02 * normal),
@@ -163,7 +160,8 @@ def draw_fit(fit: Fit, measured: Array) -> Figure:
             label="outlier",
         )
     # The points of a perfect fit lie on the diagonal.
-    lowest, highest = np.nanmin(fit.fitted), np.nanmax(fit.fitted)
+    lowest = np.nanmin(fit.fitted)
+    highest = np.nanmax(fit.fitted)
     ends = np.array([lowest, highest]) * 1e-3
     left.plot(
         ends,

@@ -81,14 +81,15 @@ def cube_series(
     parts = []
     for segment, rows in reconstruct(source):
         seconds = (rows.stamp_ns - bag.start_ns) * 1e-9
-        chosen = (rows.cube == number) & (seconds >= start) & (seconds <= end)
+        is_in_time = (seconds >= start) & (seconds <= end)
+        chosen = is_in_time & (rows.cube == number)
         # The array has a column for each pad of the cube with the most pads; those behind the
         # pads of this cube are unused.
         frequency = segment.messages.rows.frequency[chosen, :n_pads]
-        values = np.hstack([rows.stress, rows.gradient])[chosen]
-        parts.append(
-            (seconds[chosen], frequency, values, rows.residual[chosen], rows.status[chosen])
-        )
+        own = rows.select(chosen)
+        values = np.hstack([own.stress, own.gradient])
+        part = (seconds[chosen], frequency, values, own.residual, own.status)
+        parts.append(part)
     if not sum(len(part[0]) for part in parts):
         length = (bag.end_ns - bag.start_ns) * 1e-9
         raise BagError(
