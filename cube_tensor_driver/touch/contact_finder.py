@@ -227,7 +227,8 @@ class _InverseFinder:
 
     def cloud(self, values: Array) -> Array:
         field = self._tracker.field
-        shear = np.hypot(field.traction[:, 0], field.traction[:, 1])
+        along_x, along_y, _ = field.traction.T
+        shear = np.hypot(along_x, along_y)
         deviation = self._tracker.deviation(values).pressure
         return np.column_stack(
             [

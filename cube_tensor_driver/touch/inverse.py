@@ -198,7 +198,8 @@ class SurfaceInverse:
             raise ElasticError("no cube of the skin observes any component; check the calibrations")
         self.observed = observed[:, self.columns]
         # Gradients times the half side are in Pa, too, so that all components are comparable.
-        self._unit_factors = np.where(self.columns < len(STRESS), 1.0, scale)
+        is_stress = self.columns < len(STRESS)
+        self._unit_factors = np.where(is_stress, 1.0, scale)
         self.by_pad = by_pad[:, self.columns] * self._unit_factors[:, None]
         self._all_pads = self.by_pad.copy()
 

@@ -367,14 +367,15 @@ def _solve_window(
     prior_variance = AMPLITUDE**2 * np.tile(per_point, len(points))
     explained = (known_gain * cross).sum(axis=1)
     variance = prior_variance - explained
-    gain = np.zeros((len(cross), n * width), np.float32)
+    n_results = len(cross)
+    gain = np.zeros((n_results, n * width), np.float32)
     gain[:, known] = known_gain
 
     # With the noise matrix B of the pads, diag(G M G') is a sum of (G B)^2 over the pads.
     by_point = gain.reshape(-1, ROWS_PER_POINT, n, width)
     pressure_gain = by_point[:, 2:].reshape(-1, n, width)
     by_pad = np.einsum("rwc,wcp->rwp", pressure_gain, pads, optimize=True)
-    by_pad = by_pad**2
+    by_pad = by_pad.reshape(len(pressure_gain), -1) ** 2
 
     inner = min(INNER_CUBES, n)
     size = inner * width
@@ -391,7 +392,7 @@ def _solve_window(
         gain=gain,
         precision=precision.astype(np.float32),
         variance=np.maximum(pressure_variance, 0),
-        by_pad=by_pad.reshape(len(pressure_gain), -1).astype(np.float32),
+        by_pad=by_pad.astype(np.float32),
         trace=trace.ravel().astype(np.float32),
     )
 
@@ -431,6 +432,7 @@ def _cross_covariance(
     pressure = traction_prior.pressure(offset, angles, variants)
     pressure = pressure[:, columns].reshape(n, n_points, width)
     cross = np.empty((n_points, ROWS_PER_POINT, n, width))
+    # The first axis becomes the points, the third and fourth the cubes and their components.
     cross[:, :3] = traction.transpose(1, 3, 0, 2)
     cross[:, 3] = pressure.transpose(1, 0, 2)
     return AMPLITUDE**2 * cross.reshape(-1, n * width)
@@ -449,7 +451,8 @@ def _invert_known(matrix: Array, known: Mask) -> Array:
     inverse = np.zeros_like(matrix)
     block = np.ix_(known, known)
     factor = cho_factor(matrix[block])
-    inverse[block] = cho_solve(factor, np.eye(known.sum()))
+    identity = np.eye(known.sum())
+    inverse[block] = cho_solve(factor, identity)
     return inverse
 
 

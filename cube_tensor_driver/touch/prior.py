@@ -52,5 +52,6 @@ def covariance_matrix(
     # The covariance of a cube with itself is symmetric only up to rounding.
     cube = np.arange(n)
     own = pairs[first == second]
-    matrix[cube, :, cube] = (own + own.swapaxes(1, 2)) / 2
+    transposed = own.swapaxes(1, 2)
+    matrix[cube, :, cube] = (own + transposed) / 2
     return matrix.reshape(n * width, -1)

@@ -177,7 +177,8 @@ class SlipEstimator:
         self._inverse = inverse
         self._noise = CubeNoise(inverse)
         poses = inverse.poses
-        self._above_cubes = poses.position + inverse.depth * poses.rotation[:, :, 2]
+        normals = poses.rotation[:, :, 2]
+        self._above_cubes = poses.position + inverse.depth * normals
 
         count = min(N_CUBES, len(self._above_cubes))
         n_values = count * len(inverse.columns)

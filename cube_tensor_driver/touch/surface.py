@@ -303,7 +303,9 @@ class Surface:
         moment_deviation = np.sqrt(moment_variance)
         is_pressed = pressure > 0.5 * pressure.max()
         n_pressed = np.count_nonzero(is_pressed)
-        shear_force = float(np.linalg.norm(shear)) if loaded.sees_shear else np.nan
+        shear_force = np.nan
+        if loaded.sees_shear:
+            shear_force = float(np.linalg.norm(shear))
         return Contact(
             position=position,
             normal=normal,

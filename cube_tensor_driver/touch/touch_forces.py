@@ -116,12 +116,13 @@ def estimate_forces(
     sources = poses.pitch * np.concatenate([own, other])
     solved = []
     for cube in first.tolist():
+        window = near[cube]
         offset = place[cube, :, None] - sources
         angles = np.repeat(angle[cube], len(sources))
         signal = response(offset.reshape(-1, 2), angles)
-        signal = signal.reshape(*offset.shape[:2], -1, 3)
+        signal = signal.reshape(len(window), len(sources), -1, 3)
         signal = signal.swapaxes(1, 2)
-        estimate = _solve(signal, len(own), covariance[near[cube]])
+        estimate = _solve(signal, len(own), covariance[window])
         solved.append(estimate)
     weights, deviations, errors = zip(*solved, strict=True)
     return ForceEstimate(

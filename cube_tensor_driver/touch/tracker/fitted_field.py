@@ -75,8 +75,10 @@ def fit_variances(inverse: SurfaceInverse, fits: list[HertzFit | NodeFit]) -> Ar
         force_root = np.concatenate(contacts.root)
         surface_root = share @ normal_force_root / inverse.area
         depth_root = below @ force_root
-        total[points, 0] += (surface_root**2).sum(axis=1)
-        total[points, 1] += (depth_root**2).sum(axis=1)
+        surface_variance = (surface_root**2).sum(axis=1)
+        depth_variance = (depth_root**2).sum(axis=1)
+        total[points, 0] += surface_variance
+        total[points, 1] += depth_variance
     return total
 
 
@@ -114,15 +116,17 @@ def _distribute(
     contact = np.repeat(np.arange(count), len(offsets))
     normal_weight = weights[:, 2]
     weight = np.tile(normal_weight, count)
-    entries = nearest[is_on_skin], contact[is_on_skin]
+    rows = nearest[is_on_skin]
+    columns = contact[is_on_skin]
     share = np.zeros((n_points, count))
-    np.add.at(share, entries, weight[is_on_skin])
+    np.add.at(share, (rows, columns), weight[is_on_skin])
 
     below = np.zeros((n_points, 3, count))
     zz = FIELD.index("zz")
     for size in np.unique(sizes):
         of_this_size = np.flatnonzero(sizes == size)
-        from_contacts = place[:, None] - contacts.places[of_this_size]
+        centres = contacts.places[of_this_size]
+        from_contacts = place[:, None] - centres
         from_contacts = from_contacts.reshape(-1, 2)
         stress = inverse.contact_response.field(from_contacts, size)
         pressure = -stress[:, zz]

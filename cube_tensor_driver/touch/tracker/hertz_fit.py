@@ -391,10 +391,14 @@ class HertzFit:
         slopes = np.zeros((3, count, 7, count, _N_PARAMETERS))
         wider_share = 1 / (1 + np.exp(2 * FLATNESS_STEP))
         narrower_share = 1 - wider_share
-        x_shifted, y_shifted, resized = [1, 2], [3, 4], [5, 6]
+        # Numbers of these Hertz contacts among the seven of a fitted contact.
+        x_shifted = [1, 2]
+        y_shifted = [3, 4]
+        resized = [5, 6]
         # Four forces of 1 / (4 step) at this arm have a moment of 1 N m.
         unit_moment_force = np.array([1, -1]) / (4 * step)
-        for j, force in enumerate(self.found.forces[:, :, None]):
+        all_forces = self.found.forces[:, :, None]
+        for j, force in enumerate(all_forces):
             own = slopes[:, j, :, j]
             difference = force * [1, -1]
             by_shift = difference / (2 * step)
@@ -402,7 +406,8 @@ class HertzFit:
             own[:, x_shifted, 3] = by_shift
             own[:, y_shifted, 4] = by_shift
             own[:, resized, 5] = difference / (2 * FLATNESS_STEP)
-            own[:, [0, *resized], 6] = force * [1, -wider_share, -narrower_share]
+            own[:, 0, 6] = force[:, 0]
+            own[:, resized, 6] = force * [-wider_share, -narrower_share]
             own[1, x_shifted, 7] = unit_moment_force
             own[0, y_shifted, 7] = -unit_moment_force
         by_flatness = slopes[..., 6]
@@ -431,7 +436,8 @@ class HertzFit:
             own = slice(first, first + _N_PARAMETERS)
             covariance = self.inflation * self.linear.covariance[own, own]
             variances = np.diag(covariance)
-            area = float(np.pi * np.exp(2 * log_size))
+            squared_radius = np.exp(2 * log_size)
+            area = float(np.pi * squared_radius)
             # The area is proportional to exp(2 ln a), so its derivative by ln a is 2 area.
             area_variance = (2 * area) ** 2 * variances[5]
             estimate = ContactEstimate(
@@ -461,7 +467,8 @@ def linearise(inverse: SurfaceInverse, fits: Sequence[HertzFit]) -> None:
     by_shape: dict[tuple[int, int], list[HertzFit]] = {}
     for fit in fits:
         fit.values.refresh()
-        shape = len(fit.found.forces), len(fit.values.cubes)
+        n_contacts = len(fit.found.forces)
+        shape = n_contacts, len(fit.values.cubes)
         by_shape.setdefault(shape, []).append(fit)
     for (contacts, cubes), alike in by_shape.items():
         _linearise_alike(inverse, alike, contacts, cubes)
@@ -478,7 +485,8 @@ def _linearise_alike(
         contacts: Number J of contacts of each fit.
         cubes: Number n of cubes of each fit.
     """
-    shape = len(fits), contacts, cubes
+    n_fits = len(fits)
+    shape = n_fits, contacts, cubes
     forces = np.stack([fit.found.forces for fit in fits])
     centres = np.stack([fit.found.centres for fit in fits])
     log_sizes = np.stack([fit.found.log_sizes for fit in fits])
@@ -492,7 +500,8 @@ def _linearise_alike(
     positions = offset.reshape(-1, 2)
     angles = np.broadcast_to(angle[:, None], shape).ravel()
     variants = np.broadcast_to(variant[:, None], shape).ravel()
-    all_sizes = np.repeat(np.exp(log_sizes), cubes)
+    sizes = np.exp(log_sizes)
+    all_sizes = np.repeat(sizes, cubes)
     all_forces = forces.reshape(-1, 3)
     all_forces = np.repeat(all_forces, cubes, axis=0)
     slopes = response.response_slopes(positions, angles, variants, all_sizes, all_forces)
@@ -516,7 +525,6 @@ def _linearise_alike(
     by_elastomer = by_elastomer.swapaxes(2, 3)
     derivatives = np.concatenate([by_contacts, by_elastomer], axis=3)
 
-    n_fits = len(fits)
     n_parameters = derivatives.shape[3]
     whitening = np.stack([fit.values.whitening for fit in fits])
     jacobian = whitening @ derivatives
@@ -526,13 +534,16 @@ def _linearise_alike(
 
     quantities = sensitivity.shape[1]
     precision = np.stack([fit.prior_precision(quantities) for fit in fits])
+    usual_size = USUAL_SIZE * inverse.depth
     prior_offset = np.zeros_like(precision)
-    of_contacts = prior_offset[:, : _N_PARAMETERS * contacts]
+    n_contact_parameters = _N_PARAMETERS * contacts
+    of_contacts = prior_offset[:, :n_contact_parameters]
     of_contacts = of_contacts.reshape(n_fits, contacts, _N_PARAMETERS)
     of_contacts[:, :, :3] = forces
-    of_contacts[:, :, 5] = log_sizes - np.log(USUAL_SIZE * inverse.depth)
+    of_contacts[:, :, 5] = log_sizes - np.log(usual_size)
+    prior_information = precision[:, None] * np.eye(n_parameters)
     information = jacobian.swapaxes(1, 2) @ jacobian
-    information += precision[:, None] * np.eye(n_parameters)
+    information += prior_information
     covariance = np.linalg.inv(information)
     distance = np.linalg.norm(offset, axis=3)
     distance = distance.min(axis=1)

@@ -75,7 +75,8 @@ class CubeNoise:
         values = scaled[cubes]
         known = np.isfinite(values) & inverse.observed[cubes]
         values = np.where(known, values, 0.0)
-        is_other_value = known != self.known[cubes]
+        known_before = self.known[cubes]
+        is_other_value = known != known_before
         has_no_variance = self._variance[cubes, 0] == 0
         is_outdated = is_other_value.any(axis=1) | has_no_variance
         if is_outdated.any():
@@ -85,12 +86,13 @@ class CubeNoise:
 
         # The predicted stress of a pad is wrong by interpolation errors of the tabulated response
         # and by contacts that are not found yet. Both grow with the stress in the cubes around.
-        self._peak[cubes] = np.abs(stresses).max(axis=1)
+        magnitudes = np.abs(stresses)
+        self._peak[cubes] = magnitudes.max(axis=1)
         around = inverse.near[cubes]
         largest_around = self._peak[around].max(axis=1)
-        model_deviation = MODEL_ERROR * largest_around[:, None]
+        model_deviation = MODEL_ERROR * largest_around
         gain_deviation = GAIN_ERROR * stresses
-        variance = 1 + gain_deviation**2 + model_deviation**2
+        variance = 1 + gain_deviation**2 + model_deviation[:, None] ** 2
 
         before = self._variance[cubes]
         larger = np.maximum(variance, before)
@@ -108,8 +110,9 @@ class CubeNoise:
             known: Whether each of the C components is known (n, C).
         """
         by_pad = self._inverse.by_pad[cubes]
+        known_by_pad = np.where(known[:, :, None], by_pad, 0.0)
         self.known[cubes] = known
-        self._by_pad[cubes] = np.where(known[:, :, None], by_pad, 0.0)
+        self._by_pad[cubes] = known_by_pad
         self._to_pads[cubes] = stress_matrices(by_pad, known)
         self._variance[cubes] = 0.0
 
@@ -229,7 +232,8 @@ class LocalValues:
             scaled: Values (cubes of the skin, C) in Pa. Unknown values give 0.
             others: Response (n, C) in Pa to other contacts, which is subtracted.
         """
-        values = np.where(self.known, scaled[self.cubes] - others, 0.0)
+        unexplained = scaled[self.cubes] - others
+        values = np.where(self.known, unexplained, 0.0)
         white = self.whitening @ values[:, :, None]
         return np.asarray(white.ravel())
 
@@ -245,7 +249,8 @@ class LocalValues:
             (n C, 3 K), in 1/N. The last axis holds forces along x of all contacts, then along y,
             then along z.
         """
-        n, count = len(self.cubes), len(centres)
+        n = len(self.cubes)
+        count = len(centres)
         offset = self.place[:, None] - centres
         offset = offset.reshape(-1, 2)
         angle = np.repeat(self.angle, count)
@@ -274,7 +279,8 @@ class LocalValues:
             Changes (n, C, S) in Pa of the C components of n cubes, if the error of a property is
             one standard deviation.
         """
-        n, count = len(self.cubes), len(centres)
+        n = len(self.cubes)
+        count = len(centres)
         response = self._inverse.contact_response
         offset = self.place[:, None] - centres
         offset = offset.reshape(-1, 2)

@@ -190,7 +190,8 @@ class NodeFit:
         signal_to_noise = prior_variances * eigenvalues
         weights = prior_variances / (1 + signal_to_noise)
         explained_by_forces = np.einsum("se,ea,eb->sab", weights, projected, projected)
-        products = columns.T @ columns - explained_by_forces
+        total_products = columns.T @ columns
+        products = total_products - explained_by_forces
 
         # The errors of all quantities but the depth are estimated together with the forces. The
         # depth only adds to the covariance.
@@ -208,7 +209,8 @@ class NodeFit:
         scores = np.log1p(signal_to_noise).sum(axis=1)
         _, log_information = np.linalg.slogdet(information)
         scores += log_information
-        scores += chi_squared / misfit + count * np.log(misfit)
+        noise_term = count * np.log(misfit)
+        scores += chi_squared / misfit + noise_term
         best = int(np.argmin(scores))
         best_errors = errors[best]
         self.misfit = float(misfit[best])
@@ -219,7 +221,8 @@ class NodeFit:
         amplitudes = variances[:, None] * projected
         means = basis @ amplitudes
         by_errors = means[:, 2:]
-        corrected = means[:, :2] - by_errors @ best_errors
+        explained_means = by_errors @ best_errors
+        corrected = means[:, :2] - explained_means
         forces, by_depth = corrected.T
         # The covariance is the sum of three parts: for an exactly known elastomer, by its estimated
         # errors, and by the error of the depth. Its square root has the columns of all three.
@@ -261,7 +264,8 @@ class NodeFit:
         normal_root = posterior.root[2]
         normal_variance = (normal_root**2).sum(axis=1)
         mean_square = posterior.forces[2] ** 2 + normal_variance
-        smoothing = np.exp(-self._squared_distances / (2 * self.spacing**2))
+        exponents = self._squared_distances / (2 * self.spacing**2)
+        smoothing = np.exp(-exponents)
         smooth_square = smoothing @ mean_square / smoothing.sum(axis=1)
         envelope = np.sqrt(smooth_square)
         relative_envelope = envelope / envelope.max()
@@ -280,11 +284,13 @@ class NodeFit:
         """Set `labels`: assign each node to one of the peaks of the pressure, which are
         contacts."""
         forces, force_root, _ = self.posterior
-        smoothing = np.exp(-self._squared_distances / (2 * self._peak_width**2))
+        exponents = self._squared_distances / (2 * self._peak_width**2)
+        smoothing = np.exp(-exponents)
         pressure = -smoothing @ forces[2]
         root = smoothing @ force_root[2]
         # Diagonal neighbours on the grid are 1.41 spacings apart.
-        is_neighbour = self._squared_distances < (1.5 * self.spacing) ** 2
+        reach = 1.5 * self.spacing
+        is_neighbour = self._squared_distances < reach**2
         self.labels = split_peaks(pressure, root, is_neighbour)
 
     @property
