@@ -175,7 +175,11 @@ class Page:
         """
         is_frozen = self._history is not None
         if not self._paused or not is_frozen:
-            self._scan, self._ranges_before = scan, self._ranges
+            shown = self._scan
+            # Without new values, as in a replay that is held, the automatic ranges stay.
+            if shown is None or not np.array_equal(shown.values, scan.values, equal_nan=True):
+                self._ranges_before = self._ranges
+            self._scan = scan
             # A paused page keeps the first scan that it gets after the pause began. Its history is
             # copied, because the pages of other browsers still add to the common one.
             self._history = copy.deepcopy(history) if self._paused else None

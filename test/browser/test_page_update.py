@@ -22,7 +22,8 @@ import zstandard
 from sensor_msgs.msg import PointCloud2
 from websockets.sync.client import connect
 
-from cube_tensor_driver.browser.page import LEFT_WIDTH, RIGHT_WIDTH, Layout
+from cube_tensor_driver.browser import page as page_module
+from cube_tensor_driver.browser.page import LEFT_WIDTH, RIGHT_WIDTH, Layout, Page
 from cube_tensor_driver.browser.viewer import Viewer
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import read_skin
@@ -252,6 +253,29 @@ def test_a_paused_page_stays_and_only_follows_the_choices_of_its_user(page, ros)
 
     reader.click("view", "go on")
     ros.wait(lambda: "live" in reader.states[-1].headline and reader.states[-1].zz < before.zz)
+
+
+def test_automatic_ranges_fall_only_with_new_values(monkeypatch):
+    """In a replay that is held, the page is shown again and again with the same values."""
+
+    def build(skin, scan, history, choices, before):
+        return {}, before.follow(scan.values, np.ones(N), 0.0)
+
+    def ignore(*_: object) -> None:
+        pass
+
+    monkeypatch.setattr(page_module, "build_update", build)
+    ranges = scene.Ranges()
+    shown = SimpleNamespace(_scan=None, _history=None, _paused=False, _skin=None, _ranges=ranges)
+    shown.send = shown._choices = shown._show_status = ignore
+    tops = []
+    for pressure in (TOP_PA, 0.0, 0.0, 0.0, 1.0):
+        values = np.full((N, 15), np.nan)
+        values[CHOSEN] = -pressure
+        Page.show(shown, SimpleNamespace(values=values), None, None)
+        tops.append(shown._ranges.traction / TOP_PA)
+    decay = scene.RANGE_DECAY
+    np.testing.assert_allclose(tops, [1, decay, decay, decay, decay**2])
 
 
 @pytest.mark.parametrize(
