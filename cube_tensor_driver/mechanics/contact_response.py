@@ -157,11 +157,12 @@ class ContactResponse:
         radial = cosine * force_x + sine * force_y
         tangential = cosine * force_y - sine * force_x
         n, n_orders = len(place), len(self._order)
-        by_radial = radial[:, None] * parts[:, :, 0]
-        by_normal = force_z[:, None] * parts[:, :, 1]
+        all_r, all_z, all_t = np.moveaxis(parts, 2, 0)
+        by_radial = radial[:, None] * all_r
+        by_normal = force_z[:, None] * all_z
         loads = np.empty((n, 4, n_orders), np.complex64)
         loads.real = by_radial + by_normal
-        loads.imag = tangential[:, None] * parts[:, :, 2]
+        loads.imag = tangential[:, None] * all_t
         value, by_r, by_log, by_log_twice = loads.swapaxes(0, 1)
         order = self._order.astype(np.float32)
         inverse = (1 / distance).astype(np.float32)[:, None]
@@ -173,7 +174,8 @@ class ContactResponse:
         moment = 0.5j * (twisting - t_slope)
         # R, Z and T were interpolated at `_MIN_DISTANCE` if the contact is nearer. Their values at
         # the true distance are extrapolated linearly from there.
-        below = (true_distance - distance).astype(np.float32)[:, None]
+        below = true_distance - distance
+        below = below[:, None].astype(np.float32)
         r = r + below * r_slope
         z = z + below * z_slope
         t = 1j * (t + below * t_slope)
@@ -182,8 +184,10 @@ class ContactResponse:
         circular[:, 0] = cosine * r - sine * t
         circular[:, 1] = sine * r + cosine * t
         circular[:, 2] = z
-        circular[:, 3] = sine * inverse * by_phi - cosine * by_r
-        circular[:, 4] = -cosine * inverse * by_phi - sine * by_r
+        by_x = sine * inverse * by_phi - cosine * by_r
+        by_y = -cosine * inverse * by_phi - sine * by_r
+        circular[:, 3] = by_x
+        circular[:, 4] = by_y
         circular[:, 5] = by_log
         circular[:, 6] = by_log_twice
         circular[:, 7] = moment
@@ -218,10 +222,10 @@ class ContactResponse:
         value, size_slope, size_curvature = by_size
         by_log = size_slope / _SIZE_LOG_STEP
         by_log_twice = size_curvature / _SIZE_LOG_STEP**2
-        over_size = np.stack([value, value, by_log, by_log_twice]).T
+        over_size = np.stack([value, value, by_log, by_log_twice])
         slope = distance_slope / self._table.step
-        over_distance = np.stack([by_distance, slope, by_distance, by_distance]).T
-        weights = over_size[:, :, None] * over_distance[:, None]
+        over_distance = np.stack([by_distance, slope, by_distance, by_distance])
+        weights = over_size.T[:, :, None] * over_distance.T[:, None]
         by_row = weights.reshape(-1, 16, 4).swapaxes(1, 2)
         functions = by_row.astype(np.float32) @ neighbours
         shape = len(distance), 4, 3, -1
@@ -310,7 +314,8 @@ class ContactResponse:
         columns = self._response.shape[1]
         first = narrower * columns + below + 1
         steps = [0, 1, columns, columns + 1]
-        neighbours = rows.take(first[:, None] + steps, axis=0)
+        indices = first[:, None] + steps
+        neighbours = rows.take(indices, axis=0)
         farther = index - below
         wider = size_index - narrower
         by_distance = np.stack([1 - farther, farther]) * decay

@@ -282,8 +282,8 @@ class PolygonTables(_ContactTables):
         alpha_slope = d * t_slope / r_safe**2
         exponents = ORDERS + np.array([-1, 1, 0, 0])[:, None]
         phases = direction[..., None, None] ** exponents
-        integrand = over_distance(np.minimum(r, REACH_DEPTHS))
-        integrand = integrand * phases
+        reached = np.minimum(r, REACH_DEPTHS)
+        integrand = over_distance(reached) * phases
         integrand *= alpha_slope[..., None, None]
         integral = CubicSpline(eta, integrand, axis=1).antiderivative()
         table = integral(eta)
@@ -343,8 +343,10 @@ class PolygonTables(_ContactTables):
         Returns:
             Stress (N, 6) in Pa and gradient (N, 6, 3) in Pa/m, as `contact.field`.
         """
-        first = _to_complex(np.asarray(start, float)) / self.depth
-        second = _to_complex(np.asarray(end, float)) / self.depth
+        starts = _to_complex(np.asarray(start, float))
+        stops = _to_complex(np.asarray(end, float))
+        first = starts / self.depth
+        second = stops / self.depth
         # `edge` is the unit vector along the edge as a complex number x + i y.
         edge = second - first
         edge /= np.maximum(np.abs(edge), _MIN_EDGE_LENGTH)

@@ -56,7 +56,8 @@ class LoadResponse:
         period = PERIOD_DEPTHS * depth
         spacing = 2 * np.pi / period
         count = int(MAX_WAVENUMBER / depth / spacing)
-        k: Array = spacing * np.arange(-count, count + 1.0)
+        number = np.arange(-count, count + 1.0)
+        k: Array = spacing * number
         self._step = depth / POINTS_PER_DEPTH
         n_points = PERIOD_DEPTHS // 2 * POINTS_PER_DEPTH
         distance = self._step * np.arange(n_points)

@@ -182,7 +182,8 @@ class Spectra:
         result = np.zeros((n_distances, *order.shape))
         for one in np.unique(order):
             chosen = order == one
-            wave = bessel(int(one)) * (self.weight * prior)
+            weighted_prior = self.weight * prior
+            wave = bessel(int(one)) * weighted_prior
             result[:, chosen] = wave @ spectrum[:, chosen]
         return result
 

@@ -275,7 +275,8 @@ class PadDiagnosis:
         # A step of the frequency between two windows is not visible in the span of either of them.
         jumped = np.abs(window.mean - self._mean_before) > limit
         is_unmoved = (span < limit) & ~jumped
-        is_unused = (state & LEFT_OUT > 0) | ~self._exists
+        is_left_out = state & LEFT_OUT > 0
+        is_unused = is_left_out | ~self._exists
         all_unmoved = (is_unmoved | is_unused).all(axis=1)
         self.still = has_enough_rows & all_unmoved
         has_mean = ~np.isnan(window.mean)
@@ -290,7 +291,8 @@ class PadDiagnosis:
         Args:
             window: Statistics of the window that has ended.
         """
-        moved = ~self.still & (window.rows > 0)
+        has_rows = window.rows > 0
+        moved = ~self.still & has_rows
         self._mean_at_rest[moved] = np.nan
         has_come_to_rest = self.still[:, None] & np.isnan(self._mean_at_rest)
         self._mean_at_rest[has_come_to_rest] = window.mean[has_come_to_rest]

@@ -48,7 +48,10 @@ def draw_panels(times: Array, time_label: str, panels: Sequence[Panel]) -> Figur
     broken_times = np.insert(times, gaps, np.nan)
     spacing = max(1, len(times) // MARKERS_PER_LINE)
     for axis, (label, lines) in zip(axes, panels, strict=True):
-        shown = {name: values for name, values in lines.items() if np.isfinite(values).any()}
+        shown = {}
+        for name, values in lines.items():
+            if np.isfinite(values).any():
+                shown[name] = values
         for number, (name, values) in enumerate(shown.items()):
             # The first marker of each line is at another sample, so that markers do not overlap.
             first_marker = number * spacing // len(shown)

@@ -158,7 +158,9 @@ class LiveTable:
         """
         # Tension is positive in the stress tensor, so the pressure is −σzz.
         pressure = np.nan_to_num(-self._component("zz"))
-        self._peak = max(self._peak * PEAK_DECAY, float(pressure.max()), MIN_PEAK)
+        decayed_peak = self._peak * PEAK_DECAY
+        highest = float(pressure.max())
+        self._peak = max(decayed_peak, highest, MIN_PEAK)
         shown = np.arange(len(pressure))
         notes = []
         if len(shown) > max_rows:
@@ -179,12 +181,16 @@ class LiveTable:
         # The width of the table depends on its content, so it is made and measured until it fits.
         for n_omitted in range(len(omissible) + 1):
             omitted = omissible[:n_omitted]
-            shown_columns = {
-                heading: column for heading, column in columns.items() if heading not in omitted
-            }
+            shown_columns = {}
+            left_out = []
+            for heading, column in columns.items():
+                if heading in omitted:
+                    # The first line of a heading is a name, the second one a unit.
+                    name, *_ = heading.split("\n")
+                    left_out.append(name)
+                else:
+                    shown_columns[heading] = column
             table = self._table(shown_columns, has_lines=not omitted)
-            # The first line of a heading is a name, the second one a unit.
-            left_out = [heading.split("\n")[0] for heading in columns if heading in omitted]
             too_narrow = [f"too narrow for {', '.join(left_out)}"] if left_out else []
             table.caption = "; ".join([*notes, *too_narrow])
             if Measurement.get(self._console, options, table).maximum <= width:
@@ -206,9 +212,10 @@ class LiveTable:
         for name in SHOWN:
             values = self._component(name)
             if np.isfinite(values).any():
-                is_gradient = "_" in name
-                label = f"∂{name[:2]}/∂{name[3]}" if is_gradient else name
-                scale, unit = (1e-6, "kPa/mm") if is_gradient else (1e-3, "kPa")
+                label, scale, unit = name, 1e-3, "kPa"
+                if "_" in name:
+                    stress, axis = name.split("_")
+                    label, scale, unit = f"∂{stress}/∂{axis}", 1e-6, "kPa/mm"
                 columns[f"{label}\n{unit}"] = _numbers(scale * values, shown, "+7.2f")
         columns["residual"] = _numbers(self._latest.residual, shown, ".2f")
         columns["Hz"] = _numbers(self._rate, shown, "4.0f")
@@ -254,4 +261,8 @@ class LiveTable:
 
 def _numbers(values: Array, shown: Sequence[int], form: str) -> Cells:
     """Return the cells of some cubes: numbers in a format of Python, `UNOBSERVED` for NaN."""
-    return [UNOBSERVED if np.isnan(values[cube]) else f"{values[cube]:{form}}" for cube in shown]
+    cells: Cells = []
+    for value in values[list(shown)].tolist():
+        cell = UNOBSERVED if np.isnan(value) else f"{value:{form}}"
+        cells.append(cell)
+    return cells
