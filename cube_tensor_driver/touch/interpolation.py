@@ -291,7 +291,7 @@ def _covariance(
     result[..., 1:, 0] = slope * along_u
     u_dot_v = np.einsum("...ai,...bi->...ab", u, v)
     product = along_u[..., None] * along_v[..., None, :]
-    first = -2 * phi1[..., None, None] * u_dot_v
+    first = -slope[..., None] * u_dot_v
     second = -4 * phi2[..., None, None] * product
     result[..., 1:, 1:] = first + second
     return result

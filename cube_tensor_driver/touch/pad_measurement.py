@@ -89,15 +89,11 @@ def model_pads(influence: Influence, calibrations: Sequence[Calibration]) -> Mea
 
     pipeline = Pipeline(variants)
     components = []
-    pads = np.zeros(
-        (
-            len(variants),
-            len(all_pads),
-            pipeline.n_pads,
-        )
-    )
+    shape = len(variants), len(all_pads), pipeline.n_pads
+    pads = np.zeros(shape)
     for number, calibration in enumerate(variants):
-        own = all_pads[:, _match_pads(influence, calibration)]
+        matches = _match_pads(influence, calibration)
+        own = all_pads[:, matches]
         matrix = np.nan_to_num(pipeline.matrix(number))
         components.append(own @ matrix.T)  # circular components -> pads -> measured components
         pads[number, :, : own.shape[1]] = own / calibration.noise
@@ -136,8 +132,10 @@ def _match_pads(influence: Influence, calibration: Calibration) -> list[int]:
         layout.normals,
         strict=True,
     ):
-        difference = np.abs(given.positions - position).max(axis=1)
-        difference += np.abs(given.normals - normal).max(axis=1)
+        shift = np.abs(given.positions - position)
+        turn = np.abs(given.normals - normal)
+        difference = shift.max(axis=1)
+        difference += turn.max(axis=1)
         nearest = int(np.argmin(difference))
         if difference[nearest] > _LENGTH_TOLERANCE or not same_size:
             raise ElasticError(
@@ -193,9 +191,11 @@ def _decompose(influence: Influence) -> tuple[Spectra, Array]:
     for order, (left, values, right) in enumerate(decompositions):
         is_kept = values > MIN_SINGULAR_VALUE * largest
         n_kept = int(is_kept.sum())
-        functions = right[is_kept].reshape(n_kept, 3, -1) / root
+        weighted_functions = right[is_kept].reshape(n_kept, 3, -1)
+        functions = weighted_functions / root
         orders += [order] * n_kept
-        spectra.append(_hankel_transforms(functions, order, bessel, r * weight))
+        transforms = _hankel_transforms(functions, order, bessel, r * weight)
+        spectra.append(transforms)
         weighted = left[:, is_kept] * values[is_kept]
         pads.append(weighted.reshape(2, -1, n_kept))
 
@@ -235,7 +235,8 @@ def _hankel_transforms(
 
     def transform(function: Array, shift: int) -> Array:
         waves = bessel(order + shift).T
-        return np.asarray(2 * np.pi * waves @ (function * weight).T)
+        weighted = function * weight
+        return np.asarray(2 * np.pi * waves @ weighted.T)
 
     plus = transform(along + across, -1)
     minus = transform(along - across, 1)

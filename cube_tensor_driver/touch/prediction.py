@@ -83,7 +83,8 @@ class MissingValuePrediction:
         n_pressures = windows.prior.shape[1]
         self.variance = np.zeros((len(known), n_pressures))
         self._predictions: list[_Prediction] = []
-        for cube in np.flatnonzero(missing.any(axis=1)).tolist():
+        incomplete = np.flatnonzero(missing.any(axis=1))
+        for cube in incomplete.tolist():
             self._add_cube(windows, missing, cube)
 
     def _add_cube(

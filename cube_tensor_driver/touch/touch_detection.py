@@ -439,7 +439,8 @@ class Touch:
         variance = estimate.noise[kind] ** 2
         variance += GAIN_ERROR**2 * square_terms.sum(axis=1)
         variance += np.einsum("mij,mj->mi", squared_error, square)
-        variance += OTHER_LOADS**2 * others @ total_square
+        other_variance = OTHER_LOADS**2 * others @ total_square
+        variance += other_variance
         variance += lasting_force**2
 
         is_missing = np.isnan(self._slow[near])

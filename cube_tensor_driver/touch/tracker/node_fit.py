@@ -231,9 +231,10 @@ class NodeFit:
         exact_root = basis * np.sqrt(variances)
         parts = [exact_root, by_errors @ errors_root, by_depth[:, None]]
         root = np.sqrt(self.misfit) * np.hstack(parts)
+        n_nodes = len(self.places)
         self.posterior = Posterior(
-            forces=forces.reshape(3, -1),
-            root=root.reshape(3, len(self.places), -1),
+            forces=forces.reshape(3, n_nodes),
+            root=root.reshape(3, n_nodes, -1),
             score=float(scores[best]),
         )
 
@@ -409,4 +410,5 @@ def _place_nodes(region: Array, around: Array, inverse: SurfaceInverse) -> tuple
         if len(nodes) <= MAX_NODES:
             return nodes, step
         # The number of nodes is proportional to 1 / step^2. The 2 % spare a further round.
-        step *= np.sqrt(1.02 * len(nodes) / MAX_NODES)
+        squared_growth = 1.02 * len(nodes) / MAX_NODES
+        step *= np.sqrt(squared_growth)

@@ -170,7 +170,8 @@ def split_peaks(pressure: Array, root: Array, is_neighbour: Mask) -> Index:
     # Nodes are assigned in the order of falling pressure, each one to the peak of its neighbours. A
     # node with neighbours of two peaks is the saddle point between these peaks.
     for node in np.argsort(-pressure).tolist():
-        around = np.unique(owner[is_neighbour[node]])
+        neighbour_owners = owner[is_neighbour[node]]
+        around = np.unique(neighbour_owners)
         around = around[around >= 0]
         if not len(around):
             if pressure[node] < limit and peaks:

@@ -282,7 +282,9 @@ class TrackedRegion:
             return True
         home, discs = self.discs
         old_home, old = self._responded
-        if home != old_home or len(old.forces) != len(discs.forces):
+        if home != old_home:
+            return True
+        if len(old.forces) != len(discs.forces):
             return True
         shift = np.abs(discs.centres - old.centres)
         relative_shift = shift.max() / self.gap
@@ -320,7 +322,8 @@ class TrackedRegion:
             return Work.FIT if is_given_up else Work.NONE
         if self._is_hertz_due:
             return Work.CHOOSE
-        peak_change = abs(self.peak / self._fitted_peak - 1)
+        peak_ratio = self.peak / self._fitted_peak
+        peak_change = abs(peak_ratio - 1)
         joined = _new_share(self.points, self._fitted_points)
         left = _new_share(self._fitted_points, self.points)
         is_changed = max(peak_change, joined, left) > MAX_CHANGE
@@ -519,9 +522,9 @@ def _update_stale_responses(
     region_of_disc = np.repeat(np.arange(len(regions)), counts)
 
     unrolled = [inverse.unroll(home, cubes) for home in homes.tolist()]
-    places, angles = (np.stack(one) for one in zip(*unrolled, strict=True))
-    place = places[region_of_disc]
-    angle = angles[region_of_disc]
+    places, angles = zip(*unrolled, strict=True)
+    place = np.stack(places)[region_of_disc]
+    angle = np.stack(angles)[region_of_disc]
     offset = place - centres[:, None]
     variant = np.tile(inverse.variant[cubes], n_discs)
     sizes = np.repeat(np.exp(log_sizes), n_cubes)
