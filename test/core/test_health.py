@@ -421,13 +421,13 @@ def test_bits_are_those_of_the_message():
 def test_a_line_says_when_a_cube_breaks_and_when_it_is_fine_again():
     """The one is bad, the other is not; and neither is said twice."""
     pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
-    from cube_tensor_driver.config.package_data import package_data
-    from cube_tensor_driver.config.skin import read_skin
+    from diagnostic_msgs.msg import KeyValue
+
     from cube_tensor_driver.ros.diagnostics.reconstruction import CubeHealth
 
     skin = Skin(16)
     words = CubeHealth(read_skin(package_data() / "config" / "skin_demo.yaml"), skin.reconstructor)
-    said = []
+    said, statuses, summaries = [], [], []
     for harm in (
         lambda frequency, row: None,
         set_pad(np.nan),
@@ -435,11 +435,32 @@ def test_a_line_says_when_a_cube_breaks_and_when_it_is_fine_again():
         *[lambda frequency, row: None] * 3,
     ):
         skin.play(2 * WINDOW_S, harm)
-        said.append(words.statuses({})[1])
+        summaries.append(words.summary())
+        now, lines = words.statuses({2: 0xC2})
+        said.append(lines)
+        statuses.append([(one.level, one.hardware_id, one.values) for one in now])
+    rows = [KeyValue(key="rows since the last", value=str(round(2 * WINDOW_S * 1e9 / PERIOD_NS)))]
+    assert statuses[0] == [] and statuses[1] == [(b"\2", "0xc2", rows)]
+    assert summaries[:2] == [{}, {"pads short": 1}] and summaries[-1] == {}
     pad = CALIBRATION.layout.pads[5]
     assert said[1] == [(f"cube c02: pad {pad} short", True)]
     assert [line for lines in said[2:] for line in lines] == [("cube c02: ok", False)]
     assert not said[0]
+
+
+def test_a_cube_with_a_residual_is_a_warning_and_counted():
+    pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
+    from cube_tensor_driver.ros.diagnostics.reconstruction import CubeHealth
+
+    skin = Skin(16)
+    words = CubeHealth(read_skin(package_data() / "config" / "skin_demo.yaml"), skin.reconstructor)
+    skin.play(2)
+    words.statuses({})
+    skin.play(3, lambda frequency, row: frequency[2].__setitem__(5, 1.01 * frequency[2, 5]))
+    (status,), _ = words.statuses({})
+    assert (status.name, status.level) == ("cube c02", b"\1")
+    assert status.message.startswith("residual above its level")
+    assert words.summary() == {"cubes with a residual": 1}
 
 
 def test_a_start_is_quiet_and_a_cube_that_stays_away_is_not():

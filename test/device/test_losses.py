@@ -114,6 +114,55 @@ def test_losses_that_turn_out_to_be_in_the_hub_are_told_when_its_stats_come(link
     assert (values["lost_on_the_way"], values["dropped_in_hub"]) == (0, 9)
 
 
+def test_samples_dropped_in_the_hub_count_from_our_start_or_its_restart_on() -> None:
+    """Its samples take two frames, each of which counts. Its STATS count whole samples."""
+    account = SampleAccount()
+    account.announce(80, 2)
+
+    def places(*numbers: int, stats: Stats) -> tuple[int, int]:
+        for number in numbers:
+            for first in (0, 40):
+                account.classify(sample(number, first=first, n_cubes=40))
+        account.add_stats(stats)
+        counters = account.counters()
+        return counters["dropped_in_hub"], counters["lost_on_the_way"]
+
+    assert places(500, stats=Stats(1000, 501, 100)) == (0, 0)
+    assert places(506, stats=Stats(1100, 507, 103)) == (6, 4)
+    assert places(stats=Stats(10, 0, 0)) == (6, 4)
+    assert places(0, 5, stats=Stats(20, 6, 2)) == (10, 8)
+    assert places(stats=Stats(30, 6, 50)) == (18, 0), "more than were ever missing"
+
+
+def test_each_value_of_a_report_is_in_its_unit(link) -> None:
+    link.give(Stats(12_500, 0, 0, 4900), sample(0))
+    record = link.live._records[0]
+    track = record.track
+    track.first_ns, track.first_us, track.newest_ns = 7_000_000_000, 1_000_000, 0
+    track.offset, track.bounded_offset = 504_000.0, 500_000.0
+    track.drift, track.jitter_ns = 2.5e-5, 1500.0
+    record.clock.resets, record.logger.left_out = 3, 4
+    record.clock.line = SimpleNamespace(error_bound=8300.0)
+    for counter, number in (("opened", 5), ("lost", 6), ("silences", 7)):
+        setattr(link.live._reader.links[0], counter, number)
+    values = link.report()[0]
+    expected = {
+        "clock offset s": 6.0005,
+        "clock drift ppm": 25.0,
+        "clock jitter us": 1.5,
+        "clock delay us": 4.0,
+        "clock error at most us": 8.3,
+        "clock resets": 3,
+        "log lines left out": 4,
+        "opened": 5,
+        "lost": 6,
+        "silences": 7,
+        "hub uptime s": 12.5,
+        "hub supply mV": 4900,
+    }
+    assert {name: values[name] for name in expected} == expected
+
+
 def test_a_host_that_is_too_slow_is_named(link) -> None:
     link.give(sample(0), sample(10))
     link.lag_s = 1.5

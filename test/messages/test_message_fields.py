@@ -18,13 +18,14 @@ from cube_tensor_driver.bags.reprocess.job import Overrides, ReprocessJob, repro
 from cube_tensor_driver.browser.markup import newtons
 from cube_tensor_driver.config.calibration import shipped_calibration
 from cube_tensor_driver.config.package_data import package_data
-from cube_tensor_driver.config.skin import Skin, SkinCube, SkinLink, read_skin
+from cube_tensor_driver.config.skin import Elastomer, Skin, SkinCube, SkinLink, read_skin
 from cube_tensor_driver.config.yaml import parse_yaml
 from cube_tensor_driver.core.calibration import Calibration
 from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rows import FrequencyRows, StressRows
 from cube_tensor_driver.messages.contacts import contacts_message, decode_contacts, traction_message
+from cube_tensor_driver.messages.skin_info import skin_elastomer
 from cube_tensor_driver.touch.slip import SLIP, STICK, UNKNOWN, Slip
 from cube_tensor_driver.touch.surface import Contact
 from cube_tensor_driver.touch.tracker.contact_tracker import TrackedContact
@@ -73,7 +74,8 @@ def test_info_says_what_the_skin_is():
         SkinCube("c1", None, None, 0xC1, (-0.1, 0.0, 0.05), (0.0, 0.0, np.pi / 2), CUBE),
         SkinCube("c2", "left", 4, 0xC2, (0.0, 0.0, 0.0), (np.pi / 2, 0.0, 0.0), PLANAR),
     )
-    skin = Skin("hand", "wrist", None, (SkinLink("left", "/dev/ttyACM0", 0, None),), cubes)
+    links = (SkinLink("left", "/dev/ttyACM0", 0, None),)
+    skin = Skin("hand", "wrist", None, links, cubes, elastomer=Elastomer(4e-3, 9e-3, 0.46))
     pipeline = Pipeline(skin.calibrations)
     rest = pipeline.rest_frequency
     rest[2] *= 1.01
@@ -83,6 +85,9 @@ def test_info_says_what_the_skin_is():
     assert info.version == info.VERSION == 4 and info.header.frame_id == "wrist"
     assert info.header.stamp.sec * 10**9 + info.header.stamp.nanosec == START_NS + 7
     assert (info.sender, info.name) == ("driver", "hand")
+    elastomer = (info.elastomer_depth, info.elastomer_thickness, info.elastomer_poisson)
+    assert elastomer == (4e-3, 9e-3, 0.46)
+    assert skin_elastomer(info) == skin.elastomer
     assert info.calibration_ids == [PLANAR.id, CUBE.id]
     for text, calibration in zip(info.calibrations, (PLANAR, CUBE), strict=True):
         read = Calibration.from_dict(parse_yaml(text, "info"))

@@ -10,6 +10,7 @@ import itertools
 import time
 from dataclasses import replace
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
@@ -17,7 +18,8 @@ pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 
 import numpy as np
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from played_hub import SINGLE
 from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import UInt32
@@ -29,12 +31,14 @@ from cube_tensor_driver.browser import markup
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.reconstructor import Reconstructor
-from cube_tensor_driver.core.rows import FrequencyRows
+from cube_tensor_driver.core.rows import FrequencyRows, StressRows
+from cube_tensor_driver.core.status import INVALID, RESIDUAL
 from cube_tensor_driver.device.chain import LinkReport
 from cube_tensor_driver.device.links.link import LinkState
 from cube_tensor_driver.device.scans.row_counts import RowCounts
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import RECORDED, skin_processes
+from cube_tensor_driver.ros.callbacks import CallbackErrors
 from cube_tensor_driver.ros.commands import record
 from cube_tensor_driver.ros.commands.echo import resolve_topics
 from cube_tensor_driver.ros.compat import make_executor, with_number
@@ -43,8 +47,15 @@ from cube_tensor_driver.ros.diagnostics.reconstruction import (
     LostMessages,
     ReconstructionDiagnostics,
 )
+from cube_tensor_driver.ros.diagnostics.updater import Diagnostics
+from cube_tensor_driver.ros.nodes.driver import Driver
 
 DEPTH = 10
+SKIN = read_skin(package_data() / "config" / "skin_demo.yaml")
+
+
+def pairs(status: DiagnosticStatus) -> dict[str, str]:
+    return {pair.key: pair.value for pair in status.values}
 
 
 @pytest.mark.parametrize("executor", [SingleThreadedExecutor, make_executor])
@@ -103,22 +114,124 @@ def test_a_publisher_that_begins_again_is_no_loss():
     for number in (5, 6, 7, 1, 2, 3, 6, 7, 8, 11, 12):
         lost.note_arrival(number)
     assert lost.count == 4
-    lost.new_subscription()
+    events = lost.new_subscription()
     for number in (40, 41, 44, 45):
         lost.note_arrival(number)
     assert lost.count == 6
+    for total, count in ((1, 6), (5, 9)):
+        events.message_lost(SimpleNamespace(total_count=total))
+        assert lost.count == count, "the same losses, as DDS counts them"
+
+
+def test_each_count_of_the_reconstruction_is_in_its_pair():
+    lost = LostMessages()
+    tare = SimpleNamespace(uids={}, age=lambda: {"cubes tared": "4"})
+    diagnostics = ReconstructionDiagnostics(SKIN, Reconstructor(SKIN), tare, lost)
+
+    def step(numbers, status):
+        for number in numbers:
+            lost.note_arrival(number)
+        blank = np.zeros((len(status), 9))
+        diagnostics.count(
+            StressRows.of(np.arange(len(status)), blank[:, :6], blank, status=np.array(status))
+        )
+        (rows,) = diagnostics.statuses(False)[0]
+        return (rows.level, rows.message.partition("; ")[2]), pairs(rows)
+
+    def expected(rows, rows_per_second, invalid_rows, lost, refused):
+        return {
+            "rows": str(rows),
+            "rows per second": str(rows_per_second),
+            "invalid rows": str(invalid_rows),
+            "messages lost on the way": str(lost),
+            "messages that contradict themselves": str(refused),
+            "cubes tared": "4",
+        }
+
+    said, values = step((5, 8, 9), [0, INVALID, RESIDUAL, INVALID | RESIDUAL, 0])
+    assert said[0] == b"\1" and said[1].startswith("2 messages lost")
+    assert values == expected(5, 5, 2, 2, 0)
+    said, values = step((10,), [0, INVALID, 0])
+    assert said == (b"\0", "") and values == expected(8, 3, 3, 2, 0)
+    diagnostics.refused_messages = 7
+    said, values = step((14, 15), [])
+    assert said[0] == b"\1" and said[1].startswith("3 messages lost")
+    assert values == expected(8, 0, 3, 5, 7)
+
+
+def test_each_count_of_the_driver_is_in_its_pair():
+    """Only what was lost since the last report is a problem now."""
+    counts = RowCounts(100, 1, 2, 0, 3, 4, 5, "OSError()")
+    links = SimpleNamespace(row_counts=lambda: replace(counts))
+    diagnostics = LinkDiagnostics("skin")
+
+    def report():
+        (rows,) = diagnostics.statuses(links, with_links=False)
+        return (rows.level, rows.message), pairs(rows)
+
+    said, values = report()
+    assert said == (b"\2", "5 rows lost by an error: OSError()")
+    assert values == {
+        "rows published": "100",
+        "rows per second": "100",
+        "rows of unknown cubes": "1",
+        "rows with another number of pads": "2",
+        "rows that came twice": "3",
+        "rows dropped by a slow host": "4",
+        "rows lost by errors": "5",
+        "rows unaccounted": "0",
+    }
+    counts.delivered, counts.overload = 140, 14
+    said, values = report()
+    assert said[0] == b"\1" and said[1].startswith("10 of 50 rows dropped since the last report")
+    assert (values["rows published"], values["rows per second"]) == ("140", "40")
+    assert report()[0] == (b"\0", "")
+    counts.unaccounted = 6
+    said, values = report()
+    assert said[0] == b"\2" and said[1].startswith("6 rows are lost in the driver")
+    assert values["rows unaccounted"] == "6"
+
+
+def test_errors_of_callbacks_are_counted_in_the_first_status():
+    """Those in both threads of the driver. Only new ones are a problem now."""
+    errors = CallbackErrors(SimpleNamespace(get_logger=lambda: Mock()))
+    links = SimpleNamespace(callback_errors=0)
+    driver = SimpleNamespace(callback_errors=errors, is_configured=True, _links=links)
+    published = []
+    node = Mock()
+    node.create_publisher.return_value = SimpleNamespace(publish=published.append)
+    node.resolve_topic_name.return_value = "/diagnostics"
+    node.get_fully_qualified_name.return_value = "/driver"
+    node.get_clock.return_value.now.return_value.to_msg.return_value = Time()
+    Diagnostics(
+        node,
+        lambda: [DiagnosticStatus(name="rows"), DiagnosticStatus(name="link")],
+        lambda: Driver._count_errors(driver),
+    )
+    _, publish = node.create_timer.call_args.args
+
+    def report():
+        publish()
+        rows, link = published[-1].status
+        assert (rows.name, link.name, link.values) == ("/driver: rows", "/driver: link", [])
+        return rows.level, rows.message, pairs(rows)["callback errors"]
+
+    assert report() == (b"\0", "", "0")
+    errors.catch(lambda: 1 / 0)()
+    links.callback_errors = 2
+    assert report() == (b"\2", "3 callbacks failed: see the log of the node", "3")
+    assert report() == (b"\0", "", "3")
 
 
 def test_an_inactive_node_says_so_and_blames_no_cube():
-    skin = read_skin(package_data() / "config" / "skin_demo.yaml")
-    reconstructor = Reconstructor(skin)
+    reconstructor = Reconstructor(SKIN)
     tare = SimpleNamespace(uids={}, age=dict)
-    diagnostics = ReconstructionDiagnostics(skin, reconstructor, tare, LostMessages())
-    rest = np.array([cube.calibration.rest_frequency for cube in skin.cubes])
+    diagnostics = ReconstructionDiagnostics(SKIN, reconstructor, tare, LostMessages())
+    rest = np.array([cube.calibration.rest_frequency for cube in SKIN.cubes])
 
     def texts(active: bool, second: int | None = None) -> list[str]:
         if second is not None:
-            cubes = np.arange(len(skin.cubes))
+            cubes = np.arange(len(SKIN.cubes))
             stamps = np.full(len(cubes), second * 1_000_000_000)
             reconstructor(FrequencyRows.of(cubes, rest.astype(np.float32), stamp_ns=stamps))
         statuses, changes = diagnostics.statuses(active)

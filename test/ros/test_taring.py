@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from datetime import datetime, timezone
+from datetime import datetime, timedelta, timezone
 from types import SimpleNamespace
 
 import numpy as np
@@ -71,6 +71,7 @@ def skin(tmp_path):
             SkinInfo(name=SKIN.name, cubes=[CubeInfo(uid=uid)])
         ),
         on_disk=lambda: read_tare(tmp_path, UID, CALIBRATION),
+        tares=tares,
     )
 
 
@@ -116,3 +117,13 @@ def test_a_tare_that_was_taken_before_the_uid_was_known_stays_and_is_kept(skin):
     skin.learn_uid()
     np.testing.assert_allclose(skin.rest(), 1.002 * CALIBRATION.rest_frequency, rtol=1e-7)
     np.testing.assert_allclose(skin.on_disk().rest_frequency, skin.rest())
+
+
+def test_tared_cubes_are_counted_and_the_oldest_tare_gives_the_age(skin):
+    now = datetime.now(timezone.utc)
+    skin.tares.created = {0: None}
+    assert skin.tares.age() == {"cubes tared": "0"}
+    skin.tares.created |= {number: now - timedelta(hours=number) for number in (1, 3, 2)}
+    age = skin.tares.age()
+    assert age.keys() == {"cubes tared", "oldest tare s"} and age["cubes tared"] == "3"
+    assert int(age["oldest tare s"]) == pytest.approx(3 * 3600, abs=60)
