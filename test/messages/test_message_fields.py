@@ -21,9 +21,11 @@ from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import Elastomer, Skin, SkinCube, SkinLink, read_skin
 from cube_tensor_driver.config.yaml import parse_yaml
 from cube_tensor_driver.core.calibration import Calibration
+from cube_tensor_driver.core.compensation.motion import Motion
 from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rows import FrequencyRows, StressRows
+from cube_tensor_driver.messages.compensation import read_motion
 from cube_tensor_driver.messages.contacts import contacts_message, decode_contacts, traction_message
 from cube_tensor_driver.messages.skin_info import skin_elastomer
 from cube_tensor_driver.touch.slip import SLIP, STICK, UNKNOWN, Slip
@@ -169,6 +171,23 @@ def test_each_number_of_a_tensor_and_a_wrench_is_in_its_field():
     force, torque = message.wrench.force, message.wrench.torque
     assert message.header.frame_id == "hand_c1"
     assert (force.x, force.y, force.z, torque.x, torque.y, torque.z) == (0, 1, 2, 10, 11, 12)
+
+
+def test_a_compensation_says_whether_and_when_the_weight_is_known():
+    pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
+    from cube_tensor_driver.ros.messages import compensation_message
+
+    motion = Motion(START_NS + np.array([-7, 9]), np.arange(6.0), np.arange(18.0))
+    states = {"thermal": np.arange(3.0)}
+    message = compensation_message("wrist", START_NS + 5, motion, states)
+    assert message.header.frame_id == "wrist" and message.weight
+    assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == START_NS + 5
+    assert message.time_offset.tolist() == [-12, 4]
+    assert message.specific_force.tolist() == list(range(6))
+    assert message.gradient.tolist() == list(range(18))
+    assert (list(message.creep), message.thermal.tolist()) == ([], [0, 1, 2])
+    without = compensation_message("wrist", START_NS, None, {})
+    assert not without.weight and read_motion(without, START_NS) is None
 
 
 NUMBERS = ("normal_force", "shear_force", "area", "position_uncertainty", "force_uncertainty")

@@ -16,12 +16,13 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message, serialize_message
 
 from cube_tensor_driver.config.package_data import package_data
-from cube_tensor_driver.config.skin import Elastomer, read_skin
+from cube_tensor_driver.config.skin import Elastomer, Skin, read_skin
 from cube_tensor_driver.core.rows import StressRows, concatenate
 from cube_tensor_driver.mechanics import contact
 from cube_tensor_driver.msg import SkinTouch
 from cube_tensor_driver.ros.messages import to_ns
 from cube_tensor_driver.ros.nodes.touch_publisher import TouchPublisher
+from cube_tensor_driver.touch.touch_detection import Touches
 
 SKIN = read_skin(package_data() / "config" / "skin_demo.yaml")
 START_NS = 1_700_000_000_123_456_789
@@ -51,11 +52,41 @@ def scan(number: int, values: np.ndarray) -> StressRows:
     return StressRows.of(np.arange(16), stress, gradient, stamp_ns=stamp_ns)
 
 
-def test_touch_of_each_scan_is_published():
+def make_publisher(skin: Skin) -> tuple[TouchPublisher, Topic]:
     topic = Topic()
     node = SimpleNamespace(own=lambda one: one, create_lifecycle_publisher=lambda *_: topic)
+    return TouchPublisher(node, skin, QoSProfile(depth=1), 1.0), topic
+
+
+def test_each_number_of_a_touch_is_in_its_field():
+    publisher, topic = make_publisher(SKIN)
+    touches = Touches(
+        stamp_ns=START_NS,
+        cube=np.array([3, 5]),
+        pressure=np.array([1.0, 2.0]),
+        pressure_uncertainty=np.array([3.0, 4.0]),
+        force=np.array([[5.0, 6.0, 7.0], [8.0, 9.0, 10.0]]),
+        force_uncertainty=np.array([[11.0, 12.0, 13.0], [14.0, 15.0, 16.0]]),
+    )
+    topic.publish(publisher._make_message(touches))
+    (message,) = topic.heard
+    assert to_ns(message.header.stamp) == START_NS and list(message.cube) == [3, 5]
+    expected = {
+        "pressure": [1, 2],
+        "pressure_uncertainty": [3, 4],
+        "normal_force": [-7, -10],
+        "force_uncertainty": [13, 16],
+        "shear_x": [5, 8],
+        "shear_y": [6, 9],
+        "shear_x_uncertainty": [11, 14],
+        "shear_y_uncertainty": [12, 15],
+    }
+    assert {name: list(getattr(message, name)) for name in expected} == expected
+
+
+def test_touch_of_each_scan_is_published():
     skin = replace(SKIN, elastomer=Elastomer(5e-3, np.inf))
-    publisher = TouchPublisher(node, skin, QoSProfile(depth=1), 1.0)
+    publisher, topic = make_publisher(skin)
     position = skin.poses.position
     force = np.array([0.1, 0.0, -0.5])
     below = position - position[5] - [0, 0, 5e-3]
