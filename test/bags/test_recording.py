@@ -363,6 +363,21 @@ def test_a_recording_that_ends_early_keeps_what_came(tmp_path):
     assert recorded(tmp_path / "bag") == [("/stress", b"early")]
 
 
+def test_messages_that_a_slow_disk_does_not_take_are_counted(tmp_path, monkeypatch):
+    from cube_tensor_driver.ros.commands import record
+
+    monkeypatch.setattr(record, "MAX_WAITING_BYTES", 9)
+    node = Publishers()
+    recorder = record.Recorder(node, ["/stress", "/frequencies"], BagWriter(tmp_path / "bag"))
+    node.connected = {"/stress": True}
+    recorder.find_topics()  # nothing is written before both topics are connected
+    for data in (b"12345", b"6789", b"too much", b"more"):
+        node.receive["/stress"](data)
+    assert (recorder.received, recorder.dropped, recorder.counts) == (4, 2, {"/stress": 4})
+    recorder.close()
+    assert recorded(tmp_path / "bag") == [("/stress", b"12345"), ("/stress", b"6789")]
+
+
 def test_record_says_what_is_wrong(domain, tmp_path):
     (tmp_path / "there").mkdir()
     recorder = cube("record", "-o", tmp_path / "there")

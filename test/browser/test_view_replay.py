@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import time
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
@@ -17,6 +18,7 @@ from cube_tensor_driver.browser.clients import MAX_ANSWER_S, ReplayClient, Servi
 from cube_tensor_driver.browser.controls import ReplayControls
 from cube_tensor_driver.core.latest_stress import STALE_S
 from cube_tensor_driver.msg import ReplayState
+from cube_tensor_driver.ros.commands.replay import ReplayControl
 from cube_tensor_driver.srv import SteerReplay
 
 END_S = 3.0
@@ -148,6 +150,15 @@ def test_a_jump_waits_for_a_replay_that_is_silent_or_not_found_yet(ros, client, 
     ros.wait(lambda: asked == [0.0])
     ros.wait(lambda: not client.replay.update() and not client.replay.is_jumping)
     assert client.said == []
+
+
+def test_the_state_of_a_replay_is_that_of_its_player():
+    published = []
+    node = Mock()
+    node.create_publisher.return_value.publish = published.append
+    player = SimpleNamespace(position=1.5, length=4.0, paused=True)
+    ReplayControl(node, player)._publish_state()
+    assert published == [ReplayState(position=1.5, length=4.0, paused=True)]
 
 
 def test_a_jump_of_no_replay_is_said(ros, client, clock):
