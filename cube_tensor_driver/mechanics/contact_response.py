@@ -157,7 +157,7 @@ class ContactResponse:
         radial = cosine * force_x + sine * force_y
         tangential = cosine * force_y - sine * force_x
         n, n_orders = len(place), len(self._order)
-        all_r, all_z, all_t = np.moveaxis(parts, 2, 0)
+        all_r, all_z, all_t = parts.transpose(2, 0, 1, 3)
         by_radial = radial[:, None] * all_r
         by_normal = force_z[:, None] * all_z
         loads = np.empty((n, 4, n_orders), np.complex64)
@@ -335,7 +335,7 @@ class ContactResponse:
         in_plane = tangential * towards.conj()
         in_plane = in_plane[:, None, None]
         along_z = force_z.astype(np.float32)
-        r, z, t = np.moveaxis(parts, 2, 0)
+        r, z, t = parts.transpose(2, 0, 1, 3)
         by_radial = in_plane.real * r
         by_normal = along_z[:, None, None] * z
         circular = np.empty(r.shape, np.complex64)

@@ -224,8 +224,8 @@ class DiscTables(_ContactTables):
 
         n_distances = _LAST_DISTANCE + 2
         first_row = self._nearest_size(radius) * n_distances + below
-        neighbours = np.stack([first_row, first_row + 1], axis=-1)
-        return self._sum_loads(weights, neighbours, loads.astype(complex), direction)
+        rows = first_row[..., None] + np.array([0, 1])
+        return self._sum_loads(weights, rows, loads.astype(complex), direction)
 
     def _nearest_size(self, radius: ArrayLike) -> Index:
         """Return the index (L,) in `CONTACT_SIZES` of the tabulated radius nearest to each radius.
