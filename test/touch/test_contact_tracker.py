@@ -461,15 +461,16 @@ def counted(function, calls):
 
 
 def test_a_new_contact_above_uncertain_cubes_needs_more_pressure(inverse):
-    """At the depth of the cubes, the field has 0.4 kPa under 0.1 N, and 0.8 kPa under 0.2 N."""
-    light, firm = (ball(inverse, 4e-3, (0, 0), (0, 0, -force)) for force in (0.1, 0.2))
+    """The field at the depth of the cubes has 0.41, 0.50 and 0.83 kPa under these forces."""
+    forces = (0.1, 0.12, 0.2)
+    light, kept, firm = (ball(inverse, 4e-3, (0, 0), (0, 0, -force)) for force in forces)
     uncertain = np.ones(COUNT**2, bool)
     tracker = ContactTracker(inverse, LEAST)
-    assert not tracker.update(light, uncertain)
-    (begun,) = tracker.update(light)
-    (kept,) = tracker.update(light, uncertain)
-    assert kept.id == begun.id
-    assert not tracker.update(0 * light, uncertain) and not tracker.update(light, uncertain)
+    assert not tracker.update(kept, uncertain)
+    (begun,) = tracker.update(kept)
+    (later,) = tracker.update(kept, uncertain)
+    assert later.id == begun.id
+    assert not tracker.update(light, uncertain) and not tracker.update(kept, uncertain)
     (found,) = tracker.update(firm, uncertain)
     assert found.normal_force == pytest.approx(0.2, rel=0.05)
     uncertain[COUNT**2 // 2] = False

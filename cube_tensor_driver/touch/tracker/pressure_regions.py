@@ -92,7 +92,7 @@ class PressureRegions:
             self._regions = self._connect_points()
         if uncertain is not None and uncertain.any():
             least = np.where(uncertain[self._cube], UNCERTAIN_PRESSURE, 0.0)
-            is_certain = before | (pressure > least)
+            is_certain = pressure > np.where(before, RELEASE_FRACTION * least, least)
             for region in self._regions:
                 self._inside[region] = is_certain[region].any()
             self._regions = [region for region in self._regions if self._inside[region[0]]]
