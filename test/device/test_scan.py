@@ -360,6 +360,7 @@ def test_a_link_that_pauses_often_is_one_line_a_minute():
         now[0] += 1.0
     silence, end = "link a: silent: no sample", "link a: open"
     assert [line.partition(" (")[0] for line in log.lines] == [silence, end] * 3
+    assert link_log.left_out == 2 * 130 - len(log.lines)
     link_log.change(LinkState.SILENT, LinkError("no sample", "silent"))
     link_log.change(LinkState.WAITING, LinkError("unplugged", "lost"))
     link_log.change(LinkState.OPEN, None)
@@ -528,6 +529,19 @@ def test_rows_that_the_data_path_forgets_without_an_error_are_unaccounted(monkey
     monkeypatch.setattr(ScanBuilder, "add", lambda self, link, sample, stamp_ns, status: None)
     live.receive([LinkFrames(0, 0, [timed(0, 0)])])
     assert live.row_counts() == RowCounts(unaccounted=1)
+
+
+def test_rows_that_wait_for_their_scan_are_neither_lost_nor_unaccounted():
+    links = [LinkConfig("a", "/dev/none"), LinkConfig("b", "/dev/none")]
+    addresses = [CubeAddress("a", 0, 0, None, 2), CubeAddress("b", 1, 0, None, 2)]
+    live = LiveLinks(links, addresses, lambda rows: None)
+    live.receive([LinkFrames(link, 0, [hello([link + 1]), timed(0, 0)]) for link in (0, 1)])
+    live.receive([LinkFrames(0, 1_000_000, [timed(1, 1000)])])
+    assert live.row_counts() == RowCounts(delivered=2)
+    live._count_error(OSError())
+    assert live.row_counts().lost == 0
+    live.receive([LinkFrames(1, 1_000_000, [timed(1, 1000)])])
+    assert live.row_counts() == RowCounts(delivered=4, lost_reason="OSError()")
 
 
 @pytest.mark.parametrize("step_ns", [5_000_000, -3_600_000_000_000])

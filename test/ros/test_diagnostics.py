@@ -247,19 +247,23 @@ def test_an_inactive_node_says_so_and_blames_no_cube():
 
 
 @pytest.mark.parametrize(
-    ("state", "notes", "level"),
+    ("states", "notes", "level"),
     [
-        (LinkState.OPEN, (), b"\0"),
-        (LinkState.OPEN, ("5 of 10 samples lost or dropped since the last report",), b"\1"),
-        (LinkState.WAITING, ("5 of 10 samples lost", "no port"), b"\2"),
-        (LinkState.SILENT, (), b"\3"),
+        ([LinkState.OPEN], (), b"\0"),
+        ([LinkState.OPEN], ("5 of 10 samples lost or dropped since the last report",), b"\1"),
+        ([LinkState.WAITING], ("5 of 10 samples lost", "no port"), b"\2"),
+        ([LinkState.SILENT], (), b"\3"),
+        ([LinkState.OPEN, LinkState.WAITING, LinkState.CLOSED], ("no port",), b"\2"),
     ],
 )
-def test_losses_of_a_link_are_a_warning_and_coloured_on_the_page(state, notes, level):
-    report = LinkReport("hub0", 7, state, (), notes, {"lost_on_the_way": 5})
+def test_losses_of_a_link_are_a_warning_and_coloured_on_the_page(states, notes, level):
+    state, *past_states = states
+    report = LinkReport("hub0", 0xAB, state, tuple(past_states), notes, {"lost_on_the_way": 5})
     links = SimpleNamespace(row_counts=RowCounts, report=lambda: [report])
     rows, link = LinkDiagnostics("skin").statuses(links, with_links=True)
     assert (rows.level, link.level) == (b"\0", level)
+    assert (link.name, link.hardware_id) == ("link hub0", "0xab")
+    assert pairs(link) == {"lost_on_the_way": "5"}
     assert link.message == "; ".join(notes) or state.value
     scan = SimpleNamespace(health=np.zeros(1, int), links=((link.message, link.level[0]),))
     html = markup.conditions(["c"], scan)
