@@ -82,7 +82,8 @@ def stress_matrices(by_pad: Array, known: Mask) -> Array:
         known: Whether each component (n, C) is known; the others are ignored.
     """
     by_pad = np.where(known[:, :, None], by_pad, 0.0)
-    covariance = by_pad @ by_pad.swapaxes(1, 2)
+    transposed = by_pad.swapaxes(1, 2)
+    covariance = by_pad @ transposed
     covariance = regularise(covariance, known)
     matrices = np.linalg.solve(covariance, by_pad)
     return np.asarray(matrices.swapaxes(1, 2))

@@ -77,10 +77,13 @@ class CubeNoise:
         values = np.where(known, values, 0.0)
         known_before = self.known[cubes]
         is_other_value = known != known_before
-        has_no_variance = self._variance[cubes, 0] == 0
-        is_outdated = is_other_value.any(axis=1) | has_no_variance
+        has_other_values = is_other_value.any(axis=1)
+        variance_of_first_pad = self._variance[cubes, 0]
+        has_no_variance = variance_of_first_pad == 0
+        is_outdated = has_other_values | has_no_variance
         if is_outdated.any():
-            self._replace_pads(cubes[is_outdated], known[is_outdated])
+            outdated = cubes[is_outdated]
+            self._replace_pads(outdated, known[is_outdated])
         stresses = self._to_pads[cubes] @ values[:, :, None]
         stresses = stresses[:, :, 0]
 
@@ -100,7 +103,8 @@ class CubeNoise:
         is_pad_changed = larger > MAX_NOISE_CHANGE * smaller
         is_changed = is_pad_changed.any(axis=1)
         if is_changed.any():
-            self._whiten(cubes[is_changed], variance[is_changed])
+            changed = cubes[is_changed]
+            self._whiten(changed, variance[is_changed])
 
     def _replace_pads(self, cubes: Index, known: Mask) -> None:
         """Store the noise matrices of n cubes for other known components or pads in use.
@@ -302,7 +306,8 @@ def rotations_about_normal(angle: Array) -> Array:
     """
     cosine = np.cos(angle)
     sine = np.sin(angle)
-    rotation = np.zeros((*np.shape(angle), 3, 3))
+    shape = np.shape(angle)
+    rotation = np.zeros((*shape, 3, 3))
     rotation[..., 0, 0] = cosine
     rotation[..., 0, 1] = sine
     rotation[..., 1, 0] = -sine
