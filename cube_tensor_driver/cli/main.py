@@ -33,9 +33,12 @@ It is 128 plus the number of the signal SIGPIPE: shells report it for programs t
 ended.
 """
 
-RESEND_S = 0.01
+RESEND_S = 0.2
 """Time, in seconds, after which SIGINT is sent again if Python has lost the KeyboardInterrupt of a
-Ctrl-C (see `interrupt_again`)."""
+Ctrl-C (see `interrupt_again`).
+
+Until then the hook that lost it must have ended, also on a busy machine; a user does not notice it.
+"""
 
 WHEELS = {
     "PIL": "pillow",

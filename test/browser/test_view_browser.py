@@ -129,10 +129,12 @@ class Skin(threading.Thread):
         self.join()
 
 
+@pytest.mark.alone
 def test_the_page_shows_a_load_a_cube_and_a_tare(ros, tmp_path, page):
     """Beside a browser that has stopped reading, and without the internet; before, that there is
     none."""
-    heard = ros.listen(SkinStress, "stress")
+    # The queue holds the messages of the longest waits for the browser.
+    heard = ros.listen(SkinStress, "stress", 10_000)
     skin = Skin(ros.node)
     with ExitStack() as stack:
         children = stack.enter_context(Children(tmp_path))

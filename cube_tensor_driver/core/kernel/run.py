@@ -18,8 +18,6 @@ try:
 except ImportError:
     native = None  # type: ignore[assignment]
 
-__all__ = ["native", "run"]
-
 _NO_HEALTH = (None,) * len(HealthState._fields)
 """Arguments of the kernel in C instead of a `HealthState`, where health is not judged."""
 
