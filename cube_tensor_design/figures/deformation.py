@@ -35,8 +35,10 @@ do, because the stress is infinite at the corners of the cube."""
 CONTOURS = np.linspace(-0.9, 0.9, 10)
 """Stresses of the contour lines, relative to the end of the colour scale. None of them is 0, which
 large parts of a body under shear have."""
-ARROW_COLUMNS, ARROW_ROWS = 12, 6
-"""Number of arrows along x and along z."""
+ARROW_COLUMNS = 12
+"""Number of displacement arrows along x."""
+ARROW_ROWS = 6
+"""Number of displacement arrows along z."""
 
 
 @print_style()

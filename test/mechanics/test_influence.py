@@ -41,7 +41,11 @@ def test_reciprocity_gives_what_a_force_on_the_surface_does(influence):
 
 
 def test_reciprocity_in_space(monkeypatch):
-    """The same for a pad on each face: forces at y = 0, on a body without the mirror along x."""
+    """In space, too, a pad's influence function is its stress under a unit force at each place.
+
+    The cube has one pad on each face. The forces act on the line y = 0 of the surface, and the body
+    is moved along x so that the solver uses no mirror symmetry along x.
+    """
     monkeypatch.setattr(bodies, "BRICK_SIZES", (bodies.BrickSizes(1.0, 0.3, 6.0),))
     layer = Body(9e-3, 9e-3, 7e-3, ground=True, cube_young=float("inf"))
     faces = np.concatenate([np.eye(3), -np.eye(3)])
