@@ -502,7 +502,7 @@ def test_replay_starts_late_pauses_steps_and_quits(ros, tmp_path):
     os.close(far)
     os.set_blocking(near, False)
     try:
-        ros.wait(lambda: len(raw) > 10)
+        ros.wait(lambda: len(raw) > 10 and infos)
         # The player may know of the subscription a little before the subscriber knows of the
         # player, whose first messages are lost then.
         first = int(raw[0].sequence[0])
