@@ -22,7 +22,8 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Imu
 
 from cube_tensor_driver.bags.metadata import quality, typestore
-from cube_tensor_driver.bags.reprocess.job import reconstruct
+from cube_tensor_driver.bags.read import Bag
+from cube_tensor_driver.bags.reprocess.job import ReprocessJob, reconstruct, reprocess
 from cube_tensor_driver.bags.reprocess.table import frequency_table, reprocess_table
 from cube_tensor_driver.bags.source import open_bag
 from cube_tensor_driver.bags.write import BagWriter
@@ -221,12 +222,12 @@ def quaternion(rotation: np.ndarray) -> tuple:
 IMU_FRAME = (quaternion(IMU_AXES), IMU_POINT, 0)
 
 
-def played(node, moving: MovingSkin, seconds: float) -> FrequencyRows:
-    """Play an IMU and rows, each when it arrives; returns the rows."""
+def played(node, moving: MovingSkin, seconds: float, imu_end_s: float = 1e9) -> FrequencyRows:
+    """Play an IMU, until it stops, and rows, each when it arrives; returns the rows."""
     sent, scans = 0, []
     for k in range(round(seconds / ROW_PERIOD_S)):
         t = 0.1 + k * ROW_PERIOD_S
-        while sent * IMU_PERIOD_S + IMU_DELAY_S <= t:
+        while sent * IMU_PERIOD_S + IMU_DELAY_S <= min(t, imu_end_s):
             node._motion.on_imu(imu_message(moving, sent * IMU_PERIOD_S))
             sent += 1
         scans.append(scan_at(t, moving))
@@ -254,11 +255,16 @@ def test_a_shaken_arm_leaves_no_weight_and_no_contact(start, monkeypatch):
     assert np.abs(off.stress[:, [0, 2, 4]]).max() > 200
 
 
-def write_lasting_effects(folder) -> None:
-    """Give the cubes of the skin file creep and an effect of temperature, too."""
+def write_lasting_effects(folder, ramp: float = 0.0) -> None:
+    """Give the cubes of the skin file creep and an effect of temperature, too.
+
+    The effect is uncertain by `ramp`, in Pa per K by which the elastomer lags, alike for all pads.
+    """
     pads = np.linspace(0.5, 1.5, 8)[:, None]
     creep = CreepModel(np.array([0.1, 3.0]), 0.05 * np.hstack([pads, 2 * pads]))
-    thermal = ThermalModel(np.array(25.0), np.array([20.0, 5.0]), 10 * pads)
+    thermal = ThermalModel(
+        np.array(25.0), np.array([20.0, 5.0]), 10 * pads, ramp=np.full((8, 1), ramp)
+    )
     cube = replace(illustrative("planar"), weight=WeightModel(RESPONSE))
     write_calibration(folder / "heavy.yaml", replace(cube, creep=creep, thermal=thermal))
 
@@ -331,6 +337,40 @@ def test_a_bag_gives_the_bits_of_the_node_from_every_state_on(start, monkeypatch
     # The state comes every 0.1 s; two messages of motion are lost until the next one.
     assert not differs[30:80].any() and not differs[130:].any()
     assert (found.status[80:84] & COMPENSATION).all()
+
+
+@pytest.mark.parametrize(
+    ("imu_end_s", "ramp", "certain_s", "uncertain"),
+    [
+        pytest.param(0.0, 0.0, 0.0, WEIGHT, id="no_imu"),
+        # The last sample is of 0.295 s, and is extrapolated by 20 ms.
+        pytest.param(0.3, 0.0, 0.315, WEIGHT, id="stale_imu"),
+        # At the step at 0.4 s the elastomer lags by 3 K, which make 24 Pa, and the unknown start
+        # makes 10 Pa: more than 30 Pa.
+        pytest.param(1e9, 8.0, 0.4, THERMAL, id="temperature_ramp"),
+    ],
+)
+def test_uncertain_rows_are_reprocessed_to_the_bytes_of_the_node(
+    start, monkeypatch, tmp_path, imu_end_s, ramp, certain_s, uncertain
+):
+    fake_tf(monkeypatch, imu=IMU_FRAME)
+    write_lasting_effects(tmp_path, ramp)
+    node = start(imu="/imu")
+    rows = played(node, MovingSkin(), 0.5, imu_end_s)
+    sent = node.sent["stress"]
+    status = concatenate([stress_codec.decode(one).rows for one in sent]).status
+    effects = WEIGHT | CREEP | THERMAL
+    is_certain = np.repeat(rows.stamp_ns[::2] < START_NS + round(1e9 * certain_s), 2)
+    expected = np.where(is_certain, effects, effects ^ uncertain | COMPENSATION)
+    # Before 0.2 s, the second step, earlier loads and temperatures are unknown.
+    found = status & (effects | COMPENSATION)
+    np.testing.assert_array_equal(found[50:], expected[50:])
+
+    write_bag(tmp_path / "bag", node, rows, range(0))
+    reprocess(ReprocessJob(tmp_path / "bag", tmp_path / "again", "bag"))
+    with Bag(tmp_path / "again") as bag:
+        again = [entry.data for entry in bag.entries({"/stress"})]
+    assert again == sent
 
 
 @pytest.mark.parametrize(
