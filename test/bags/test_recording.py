@@ -513,7 +513,7 @@ def test_replay_starts_late_pauses_steps_and_quits(ros, tmp_path):
 
         def still() -> bool:
             held.append(len(raw))
-            return len(held) > 4 and len(set(held[-4:])) == 1
+            return len(held) > 8 and len(set(held[-8:])) == 1  # for 0.7 s
 
         ros.wait(still)
         before = len(raw)
