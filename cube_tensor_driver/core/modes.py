@@ -155,20 +155,6 @@ class Modes:
         state: Array = fields @ self.reading.T
         return state
 
-    def field(self, state: Array) -> tuple[Array, Array]:
-        """Compute the stress fields of states, the inverse of `state`.
-
-        Args:
-            state: Amplitudes of the modes (N, M), in Pa.
-
-        Returns:
-            Stress at the centre of the cube (N, 3, 3), and gradient d(sigma_ij)/dx_k times d0 (half
-            the side of the cube) (N, 3, 3, 3), both in Pa.
-        """
-        amplitudes = np.asarray(state, dtype=float)
-        amplitudes = amplitudes.reshape(-1, self.n_modes)
-        return _split_fields(amplitudes @ self.fields.T)
-
     def action(self, rotation: Array) -> Array:
         """Compute the matrix that transforms states when the field is rotated or mirrored.
 
@@ -213,20 +199,6 @@ class Modes:
         return [self.names.index(name) for name in names]
 
 
-def _split_fields(flat: Array) -> tuple[Array, Array]:
-    """Split linear stress fields into the stress at the centre and its gradient.
-
-    Args:
-        flat: Fields (N, 36): 9 entries of the stress, then 27 of the gradient, row-major.
-
-    Returns:
-        Stress (N, 3, 3), and gradient times half the side of the cube (N, 3, 3, 3).
-    """
-    stress = flat[:, :9]
-    gradient = flat[:, 9:]
-    return stress.reshape(-1, 3, 3), gradient.reshape(-1, 3, 3, 3)
-
-
 def _parse_terms(name: str) -> list[tuple[float, int]]:
     """Return the terms of the name of a mode (linear stress field): "xy_y-zx_z" has two terms.
 
@@ -265,7 +237,8 @@ def _make_modes(
     for row, name in zip(flat, names, strict=True):
         for sign, place in _parse_terms(name):
             row[place] = sign
-    stress, gradient = _split_fields(flat)
+    stress = flat[:, :9].reshape(-1, 3, 3)
+    gradient = flat[:, 9:].reshape(-1, 3, 3, 3)
 
     if symmetric:
         # So far, only the entry of the stress tensor that stands in a mode's name is set, such as
