@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from .arguments import read_numbers
-from .arrays import Array
+from .arrays import Array, pad_table
 from .compensation.models import CreepModel, EffectModel, ThermalModel, WeightModel
 from .defaults import BETA, FOAM_MODULUS, FREQUENCY_NOISE, HALF_SIDE, REST_FREQUENCY
 from .errors import CalibrationError, LayoutError, SymmetryError
@@ -325,6 +325,24 @@ class Calibration:
                 "remove the id to accept it"
             )
         return calibration
+
+
+def tabulate_pads(
+    calibrations: Sequence[Calibration],
+    name: str,
+    n_pads: int,
+    fill: float,
+) -> Array:
+    """Return a quantity of the pads of several cubes as a table (cubes, n_pads).
+
+    Args:
+        calibrations: Calibration of each cube.
+        name: Name of the quantity, one of `PAD_QUANTITIES`.
+        n_pads: Number of columns, the largest number of pads of a cube.
+        fill: Value of the entries for pads that a cube does not have.
+    """
+    values = [getattr(calibration, name) for calibration in calibrations]
+    return pad_table(values, n_pads, fill)
 
 
 def illustrative(

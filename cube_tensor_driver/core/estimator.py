@@ -131,7 +131,7 @@ class Estimator:
         is_similar = drop > best[:, None] - SUSPECT_MARGIN
         # After leaving out the broken pad, chi-square is that of noise alone, with one degree of
         # freedom less because there is one pad less.
-        limit_without = chi2_limit(self.dof - 1, FALSE_ALARM)
+        limit_without = chi2_limit(self.dof - 1)
         is_explained = (chi2 > self.limit) & (chi2 - best < limit_without)
         is_specific = is_similar.sum(axis=1) < is_checked.sum()
         has_suspects = is_explained & is_specific
@@ -217,7 +217,7 @@ def make_estimator(
         observed=observed,
         covariance=covariance,
         null=null,
-        limit=chi2_limit(len(null), FALSE_ALARM),
+        limit=chi2_limit(len(null)),
         rank=rank,
         noise=noise,
     )
@@ -360,12 +360,11 @@ def chi2_tail(x: float, dof: int) -> float:
 
 
 @lru_cache
-def chi2_limit(dof: int, probability: float) -> float:
-    """Compute the value that chi-square exceeds with a given probability.
+def chi2_limit(dof: int) -> float:
+    """Compute the value that chi-square exceeds with the probability `FALSE_ALARM`.
 
     Args:
         dof: Number of degrees of freedom; the result is NaN if it is 0.
-        probability: Probability of a larger chi-square.
 
     Returns:
         The value to 10 digits, because the last bits of logarithms depend on the processor.
@@ -374,12 +373,12 @@ def chi2_limit(dof: int, probability: float) -> float:
         return math.nan
     low = 0.0
     high = 1.0
-    while chi2_tail(high, dof) > probability:
+    while chi2_tail(high, dof) > FALSE_ALARM:
         high *= 2
     # Each bisection halves the interval, and a float has 53 bits of precision.
     for _ in range(60):
         centre = (low + high) / 2
-        if chi2_tail(centre, dof) > probability:
+        if chi2_tail(centre, dof) > FALSE_ALARM:
             low = centre
         else:
             high = centre

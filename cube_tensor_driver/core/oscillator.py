@@ -89,31 +89,6 @@ def pad_frequency(
         return np.where(is_possible, f, np.nan)
 
 
-def stress_slope(
-    frequency: ArrayLike,
-    rest_frequency: ArrayLike,
-    beta: Real,
-    modulus: Real,
-) -> Array:
-    """Compute the derivative of a pad's stress v with respect to its frequency f, in Pa/Hz.
-
-    Without load it is E (1 + beta) / f0.
-
-    Args:
-        frequency: Frequency f of a pad's oscillator, in Hz.
-        rest_frequency: Frequency f0 without load, in Hz.
-        beta: Ratio of the parasitic to the active capacitance without load.
-        modulus: Modulus E of the pad's foam, in Pa.
-    """
-    f = np.asarray(frequency)
-    f0 = np.asarray(rest_frequency)
-    with np.errstate(all="ignore"):
-        denominator = 1 - beta * (f - f0) / f0
-        slope = modulus * (1 + beta) / (f0 * denominator**2)
-        is_possible = (f > 0) & (denominator > 0)
-        return np.where(is_possible, slope, np.nan)
-
-
 def highest_frequency(rest_frequency: ArrayLike, beta: ArrayLike) -> Array:
     """Compute the upper limit f0 (1 + beta) / beta of a pad's frequency, in Hz.
 

@@ -21,10 +21,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .arrays import AnyArray, Array, Index, Mask, PadMasks, Real, pad_table
-from .calibration import Calibration
+from .arrays import AnyArray, Array, Index, Mask, PadMasks, Real
+from .calibration import Calibration, tabulate_pads
 from .errors import CalibrationError, CubeError, LayoutError
-from .estimator import FALSE_ALARM, Estimator, chi2_limit, make_estimator
+from .estimator import Estimator, chi2_limit, make_estimator
 from .kernel.contract import (
     BLOCK,
     DONE,
@@ -35,6 +35,7 @@ from .kernel.contract import (
     Columns,
     Numbers,
     Tables,
+    Task,
 )
 from .kernel.rows import (
     N_COMPONENTS,
@@ -157,10 +158,8 @@ class Pipeline:
         group = np.array([numbers[c.id] for c in self.calibrations], np.int32)
         # For pads that a cube does not have, these values give a stiffness of 0 without a division
         # by 0.
-        betas = [calibration.beta for calibration in self._groups]
-        moduli = [calibration.modulus for calibration in self._groups]
-        beta = pad_table(betas, self.n_pads, fill=1)
-        modulus = pad_table(moduli, self.n_pads, fill=0)
+        beta = tabulate_pads(self._groups, "beta", self.n_pads, fill=1)
+        modulus = tabulate_pads(self._groups, "modulus", self.n_pads, fill=0)
         self._beta = np.maximum(beta, MIN_BETA)
         self._stiffness = modulus * (1 + self._beta) / self._beta
         whole = [_find_estimator(calibration, 0) for calibration in self._groups]
@@ -172,8 +171,9 @@ class Pipeline:
             self._store_table(number, number, estimator)
         self._n_extra = 0
         self.newest_offset: Real | None = None
-        rest = [c.rest_frequency for c in self.calibrations]
-        self.rest_frequency = pad_table(rest, self.n_pads, fill=np.nan)
+        self.rest_frequency = tabulate_pads(
+            self.calibrations, "rest_frequency", self.n_pads, fill=np.nan
+        )
 
     def __repr__(self) -> str:
         return (
@@ -305,20 +305,18 @@ class Pipeline:
             out = self.make_rows(rows)
         if watch is None or known is not None:
             out.left_out[:] = rows.pad_fault if left_out is None else left_out
-        sums = watch.sums if watch else None
-        offsets = effects.offsets if effects else None
+        task = Task(
+            n_residuals=self._n_residuals,
+            tables=self._tables,
+            health=watch.sums if watch else None,
+            offsets=effects.offsets if effects else None,
+            columns=columns,
+            out=out,
+            offset=offset,
+        )
         row = 0
         while row < len(rows):
-            row, request = run(
-                row,
-                self._n_residuals,
-                self._tables,
-                sums,
-                offsets,
-                columns,
-                out,
-                offset,
-            )
+            row, request = run(row, task)
             if request == UNKNOWN_CUBE:
                 if watch:
                     raise self._misfit(rows)
@@ -570,7 +568,7 @@ class Pipeline:
             # which is about 1 for noise alone.
             end = N_COMPONENTS + dof
             matrix[:n_pads, N_COMPONENTS:end] = null.T / np.sqrt(dof)
-            limit = np.sqrt(chi2_limit(dof, FALSE_ALARM) / dof)
+            limit = np.sqrt(chi2_limit(dof) / dof)
         # The matrix will be applied to pad stresses divided by the stiffness, so the stiffness is
         # included in it.
         stiffness = self._stiffness[group]

@@ -97,7 +97,7 @@ class Reconstructor:
         self.compensation = Compensation(self.pipeline)
         self.drift_time = 0.0
         self._calibrated_rest = self.pipeline.rest_frequency
-        self._drift = DriftTracker(self.pipeline, self.health)
+        self._drift = DriftTracker(self.health)
 
     def __repr__(self) -> str:
         changes = f"{self.rest_changes} changes of rest frequencies"
@@ -247,7 +247,7 @@ class Reconstructor:
             raise TareError("tare of no cube; name one, or leave the list out for all")
         self._check_cubes(cubes)
         present = self.rest_frequency
-        measured = measure_rest(self.pipeline, self.health, cubes, duration, self.names)
+        measured = measure_rest(self.health, cubes, duration, self.names)
         # The compensation of creep hides a part of a constant error of the rest frequencies, so
         # the measured difference is smaller than the error.
         visible_share = self.compensation.creep.find_visible_share()

@@ -36,7 +36,7 @@ class Skin:
         self.cubes = cubes
         self.pipeline = Pipeline([calibration] * cubes, np.float32)
         self.health = Health(self.pipeline)
-        self.tracker = DriftTracker(self.pipeline, self.health)
+        self.tracker = DriftTracker(self.health)
         self.seconds = 0.0
         self.noise = noise
         self._random = np.random.default_rng(2)
@@ -65,9 +65,7 @@ class Skin:
             left -= scans
 
     def tare(self, cubes=(0, 1, 2), duration=1.0):
-        self.pipeline.rest_frequency = measure_rest(
-            self.pipeline, self.health, cubes, duration, NAMES
-        )
+        self.pipeline.rest_frequency = measure_rest(self.health, cubes, duration, NAMES)
         self.health.refresh()
         return self.pipeline.rest_frequency
 

@@ -27,7 +27,6 @@ from cube_tensor_driver.cli.main import main
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import Skin, read_skin
 from cube_tensor_driver.core.estimator import make_estimator
-from cube_tensor_driver.core.oscillator import stress_slope
 from cube_tensor_driver.core.rows import concatenate
 from cube_tensor_driver.core.status import STAMP
 from cube_tensor_driver.device.wire.decoder import Decoder
@@ -311,10 +310,10 @@ def resolution(skin: Skin) -> np.ndarray:
     bounds = []
     for calibration in (cube.calibration for cube in skin.cubes):
         rest = calibration.rest_frequency
-        slope = stress_slope(rest, rest, calibration.beta, calibration.modulus)
+        stiffness = calibration.modulus * (1 + calibration.beta)
         # Less than two periods are missing at the ends; 1 % for slope and frequency under load.
         relative = 1.01 / (ticks - 2 * COUNTER_HZ / rest) + 1e-7
         matrix = make_estimator(calibration.response, calibration.noise, calibration.modes).matrix
         scale = np.where(np.arange(15) < 6, 1.0, 1 / calibration.half_side)
-        bounds.append(scale * (np.abs(matrix) @ (slope * rest * relative)))
+        bounds.append(scale * (np.abs(matrix) @ (stiffness * relative)))
     return np.array(bounds)

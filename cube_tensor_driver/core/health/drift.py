@@ -16,7 +16,6 @@ from __future__ import annotations
 import numpy as np
 
 from ..arrays import Array, Mask
-from ..pipeline import Pipeline
 from ..status import LEFT_OUT
 from .health import Health
 from .statistics import WINDOW_S
@@ -70,7 +69,8 @@ class DriftTracker:
             corrected (cubes,), relative to the rest frequencies; 0 for an unloaded cube.
     """
 
-    def __init__(self, pipeline: Pipeline, health: Health) -> None:
+    def __init__(self, health: Health) -> None:
+        pipeline = health.pipeline
         self._pipeline = pipeline
         self._health = health
         self._rest_in_use = pipeline.rest_frequency

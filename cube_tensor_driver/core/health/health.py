@@ -14,10 +14,11 @@ from collections import deque
 
 import numpy as np
 
-from ..arrays import Index, Mask, Single, StatusBits, pad_table
+from ..arrays import Index, Mask, Single, StatusBits
+from ..calibration import tabulate_pads
 from ..kernel.contract import Columns, Tables
-from ..kernel.rows import find_impossible, mask_bits
-from ..oscillator import pad_frequency, stress_slope
+from ..kernel.rows import find_impossible
+from ..oscillator import pad_frequency
 from ..pipeline import Pipeline
 from ..status import OPEN, RANGE, REPORTED, SHORT
 from .diagnosis import Conditions, PadDiagnosis, has_high_residual
@@ -123,12 +124,9 @@ class Health:
         """
         calibrations = self.pipeline.calibrations
         n_pads = self.pipeline.n_pads
-        betas = [calibration.beta for calibration in calibrations]
-        moduli = [calibration.modulus for calibration in calibrations]
-        noises = [calibration.noise for calibration in calibrations]
-        beta = pad_table(betas, n_pads, fill=1.0)
-        modulus = pad_table(moduli, n_pads, fill=1.0)
-        noise = pad_table(noises, n_pads, fill=1.0)
+        beta = tabulate_pads(calibrations, "beta", n_pads, fill=1.0)
+        modulus = tabulate_pads(calibrations, "modulus", n_pads, fill=1.0)
+        noise = tabulate_pads(calibrations, "noise", n_pads, fill=1.0)
         rest = self.pipeline.rest_frequency
         low = pad_frequency(MIN_STRAIN * modulus, rest, beta, modulus)
         high = pad_frequency(MAX_STRAIN * modulus, rest, beta, modulus)
@@ -136,7 +134,8 @@ class Health:
         self.sums.pads("low")[:] = low
         self.sums.pads("high")[:] = high
         self._open = disconnected.astype(np.float32)
-        slope = stress_slope(rest, rest, beta, modulus)
+        # The slope of the pad law without load, dv/df = E (1 + beta) / f0, converts noise to Hz.
+        slope = modulus * (1 + beta) / rest
         self.diagnosis.set_reference(rest, noise / slope)
 
     def advance(self) -> None:
@@ -163,19 +162,12 @@ class Health:
         scan = columns.find_scan(row)
         rows = columns.select(scan)
         cube = rows.cube.astype(np.intp)
-        calibration = tables.calibration[cube]
         f = rows.frequency.astype(np.float32)
-        reported = mask_bits(tables, calibration, rows.pad_fault)
-        bits = np.where(f >= self._open[cube], OPEN, RANGE)
+        is_impossible, is_reported = find_impossible(tables, self.sums, rows, cube)
+        causes = np.where(f >= self._open[cube], OPEN, RANGE)
         # The comparison is also false for NaN, which stands for a pad without a frequency.
-        bits = np.where(f > 0, bits, SHORT)
-        low = self.sums.pads("low")[cube]
-        high = self.sums.pads("high")[cube]
-        is_possible = (f > low) & (f < high)
-        bits[is_possible] = 0
-        bits |= reported * REPORTED
-        has_condition = find_impossible(tables, self.sums, rows, cube)
-        bits[~has_condition] = 0
+        causes = np.where(f > 0, causes, SHORT)
+        bits = is_impossible * causes + is_reported * REPORTED
         self._conditions.add(cube, bits.astype(np.uint16))
 
     def collect(self) -> tuple[StatusBits, Mask, Index]:

@@ -19,9 +19,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array, Index, Mask, pad_table
+from ..arrays import Array, Index, Mask
+from ..calibration import tabulate_pads
 from ..errors import TareError
-from ..pipeline import Pipeline
 from ..status import LEFT_OUT
 from .diagnosis import MIN_ROWS
 from .health import HISTORY_WINDOWS, Health
@@ -89,7 +89,6 @@ class _Means(NamedTuple):
 
 
 def measure_rest(
-    pipeline: Pipeline,
     health: Health,
     cubes: Sequence[int],
     duration: float,
@@ -100,8 +99,7 @@ def measure_rest(
     Pads that do not work, and cubes that are not tared, keep their rest frequencies.
 
     Args:
-        pipeline: Pipeline with the calibrations and the present rest frequencies.
-        health: Health of the pads, with the statistics of the last windows.
+        health: Health of the pads, with the statistics of the last windows, and its pipeline.
         cubes: Numbers of the cubes to tare.
         duration: Duration of the newest data to average, in s, in steps of `WINDOW_S`.
         names: Names of all cubes, for messages.
@@ -113,6 +111,7 @@ def measure_rest(
         TareError: The frequencies of a cube moved, are noisy, are too far from its calibration, or
             were received for a shorter time than `duration`; or none of its pads works.
     """
+    pipeline = health.pipeline
     chosen = np.asarray(cubes, dtype=int)
     windows = _select_windows(health, chosen, duration, names)
     result = pipeline.rest_frequency
@@ -126,7 +125,7 @@ def measure_rest(
         means = _average(windows, chosen)
         factor = pipeline.unloaded_factor(chosen, health.temperature[chosen])
         rest = means.frequency / factor
-        _check_pads(pipeline, health, chosen, used, rest, means, names)
+        _check_pads(health, chosen, used, rest, means, names)
     result[chosen] = np.where(used, rest, result[chosen])
     return result
 
@@ -246,7 +245,6 @@ def _average(windows: Sequence[Window], chosen: Index) -> _Means:
 
 
 def _check_pads(
-    pipeline: Pipeline,
     health: Health,
     chosen: Index,
     used: Mask,
@@ -257,17 +255,16 @@ def _check_pads(
     """Raise TareError if a quantity of a pad exceeds its limit; the error names the worst pad.
 
     Args:
-        pipeline: Pipeline with the calibrations, which name the pads.
-        health: Health of the pads, with their noise.
+        health: Health of the pads, with their noise and calibrations.
         chosen: Numbers of the cubes to tare.
         used: Whether a pad of these cubes is checked (cubes, P).
         rest: New rest frequencies (frequencies without load) of these cubes, in Hz.
         means: Statistics of the frequencies of these cubes.
         names: Names of all cubes.
     """
+    pipeline = health.pipeline
     calibrations = [pipeline.calibrations[cube] for cube in chosen.tolist()]
-    frequencies = [calibration.rest_frequency for calibration in calibrations]
-    calibrated = pad_table(frequencies, pipeline.n_pads, np.nan)
+    calibrated = tabulate_pads(calibrations, "rest_frequency", pipeline.n_pads, np.nan)
     noise = health.diagnosis.noise[chosen]
     jumped = means.span > JUMP_SPAN_RATIO * means.noise
     noise_ratio = np.where(jumped, 0, means.noise / noise)

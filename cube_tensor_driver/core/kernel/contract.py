@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import AnyArray, Array, Mask, PadMasks, Real, Single, StatusBits, Times
+from ..rows import StressRows
 
 BLOCK = 16
 """Number of outputs (15 components of stress and gradient, then residuals) that the kernel in C
@@ -266,3 +267,27 @@ class Columns(NamedTuple):
         """Return the columns of some successive rows, as views."""
         columns = (None if column is None else column[rows] for column in self)
         return Columns(*columns)  # type: ignore[arg-type]
+
+
+class Task(NamedTuple):
+    """Everything that the kernel reads and writes in one call of `Pipeline.process`.
+
+    Attributes:
+        n_residuals: Number of outputs of a matrix (see `Tables.matrix`) that are residuals.
+        tables: Tables of the skin.
+        health: State of the health, which is changed; None: health is not judged.
+        offsets: What is subtracted and its state, which is changed; None: nothing is.
+        columns: Rows to process.
+        out: Rows to write; its arrays are contiguous. Before the call, `left_out` and `status` hold
+            the pads that are not used and the conditions of the pads, for all rows whose health is
+            not judged in this call.
+        offset: Array for what is subtracted (N, P), stress / stiffness; None: not wanted.
+    """
+
+    n_residuals: int
+    tables: Tables
+    health: HealthState | None
+    offsets: Offsets | None
+    columns: Columns
+    out: StressRows
+    offset: Real | None

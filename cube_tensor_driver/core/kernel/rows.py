@@ -16,7 +16,6 @@ from ..arrays import Array, Index, Mask, PadMasks, Real, Single, StatusBits, Tim
 from ..health.statistics import GAP_NS, MAX_JITTER_RATIO
 from ..modes import COMPONENTS, STRESS
 from ..oscillator import rest_ratio
-from ..rows import StressRows
 from ..status import COMPENSATION, INVALID, PAD_FAULT, RESIDUAL, STAMP, TEMPERATURE
 from .contract import (
     DONE,
@@ -32,6 +31,7 @@ from .contract import (
     Numbers,
     Offsets,
     Tables,
+    Task,
 )
 
 N_COMPONENTS = len(COMPONENTS)
@@ -45,44 +45,34 @@ the health of pads is judged, a scan (at most one row per cube) is computed at a
 """
 
 
-def run(
-    start: int,
-    n_residuals: int,
-    tables: Tables,
-    health: HealthState | None,
-    offsets: Offsets | None,
-    columns: Columns,
-    results: StressRows,
-    offset: Real | None,
-) -> tuple[int, int]:
+def run(start: int, task: Task) -> tuple[int, int]:
     """Process rows of frequencies until the caller has to do something.
 
     Arguments and results are those of the function `run` in `kernel/run.py`.
     """
-    is_unknown = columns.cube[start:] >= len(tables.calibration)
+    cube = task.columns.cube
+    is_unknown = cube[start:] >= len(task.tables.calibration)
     unknown = np.flatnonzero(is_unknown)
-    if health is not None and len(unknown):
+    if task.health is not None and len(unknown):
         return start, UNKNOWN_CUBE
-    n_rows = len(columns.cube)
+    n_rows = len(cube)
     if len(unknown):
         n_rows = start + int(unknown[0])
     # A scan begins where the cube number does not rise.
-    begins_scan = np.ones(len(columns.cube) + 1, bool)
-    begins_scan[1:-1] = columns.cube[1:] <= columns.cube[:-1]
+    begins_scan = np.ones(len(cube) + 1, bool)
+    begins_scan[1:-1] = cube[1:] <= cube[:-1]
     while start < n_rows:
         end = start + MAX_ROWS
-        if health is not None or offsets is not None:
+        if task.health is not None or task.offsets is not None:
             later_begins = begins_scan[start + 1 :]
             end = start + 1 + int(np.argmax(later_begins))
         scan = slice(start, min(end, n_rows))
         if begins_scan[start]:
-            due = _find_due(health, offsets, columns, scan)
+            due = _find_due(scan, task)
             if due != DONE:
                 return start, due
         with np.errstate(all="ignore"):
-            start, request = _process(
-                scan, n_residuals, tables, health, offsets, columns, results, offset
-            )
+            start, request = _process(scan, task)
         if request != DONE:
             return start, request
     if len(unknown):
@@ -167,62 +157,39 @@ def pack_bits(bits: Mask) -> PadMasks:
     return masks
 
 
-def _find_due(
-    health: HealthState | None,
-    offsets: Offsets | None,
-    columns: Columns,
-    scan: slice,
-) -> int:
+def _find_due(scan: slice, task: Task) -> int:
     """Return what is due before a scan, because of its newest time stamp.
 
-    Args:
-        health: State of the health, in which the newest time stamp is also stored.
-        offsets: What is subtracted.
-        columns: Rows of frequencies.
-        scan: The rows of the scan.
+    The time stamp is also stored in the state of the health.
 
     Returns:
         `NEEDS_WINDOW`, `NEEDS_STEP`, or `DONE` if nothing is due.
     """
-    newest_ns = int(columns.stamp_ns[scan].max())
-    if health is not None:
-        health.window_ns[2] = newest_ns
-        begin_ns, end_ns, _ = health.window_ns
-        if not begin_ns <= newest_ns < end_ns:
+    newest_ns = int(task.columns.stamp_ns[scan].max())
+    if task.health is not None:
+        window_ns = task.health.window_ns
+        window_ns[2] = newest_ns
+        if not window_ns[0] <= newest_ns < window_ns[1]:
             return NEEDS_WINDOW
-    if offsets is not None:
-        begin_ns, end_ns = offsets.step_ns
+    if task.offsets is not None:
+        begin_ns, end_ns = task.offsets.step_ns
         if not begin_ns <= newest_ns < end_ns:
             return NEEDS_STEP
     return DONE
 
 
-def _process(
-    scan: slice,
-    n_residuals: int,
-    tables: Tables,
-    health: HealthState | None,
-    offsets: Offsets | None,
-    columns: Columns,
-    results: StressRows,
-    offset: Real | None,
-) -> tuple[int, int]:
+def _process(scan: slice, task: Task) -> tuple[int, int]:
     """Process the rows of one scan, up to the first for which the caller has to do something.
 
     Args:
         scan: The rows of the scan (at most one row of each cube).
-        n_residuals: Number of outputs of a matrix that are residuals.
-        tables: Tables of the skin.
-        health: State of the health, which is changed; None: health is not judged.
-        offsets: What is subtracted and its state, which is changed; None: nothing is.
-        columns: All rows of frequencies.
-        results: All rows of stress to write.
-        offset: Array for what is subtracted from all rows (N, P); None: not wanted.
+        task: All rows, and the arrays that are read and written.
 
     Returns:
         Number of the first row that is not processed, and what the caller has to do: `DONE`,
         `NEEDS_CONDITION`, or the key (see `Tables.keys`) of a matrix that must be added.
     """
+    n_residuals, tables, health, offsets, columns, results, offset = task
     rows = columns.select(scan)
     out = results.select(scan)
     cube = rows.cube.astype(np.intp)
@@ -234,8 +201,8 @@ def _process(
         left_out = rows.pad_fault | state["mask"]
         np.copyto(out.left_out, left_out, where=is_judged)
         np.copyto(out.status, state["status"], where=is_judged)
-        is_impossible = find_impossible(tables, health, rows, cube)
-        new_conditions = pack_bits(is_impossible) & ~state["found"]
+        is_impossible, is_reported = find_impossible(tables, health, rows, cube)
+        new_conditions = pack_bits(is_impossible | is_reported) & ~state["found"]
         has_new_condition = new_conditions != 0
 
     v, is_good = apply_law(tables, cube, rows.frequency, rows.temperature)
@@ -360,14 +327,17 @@ def find_impossible(
     health: HealthState,
     rows: Columns,
     cube: Index,
-) -> Mask:
-    """Return whether a pad has an impossible frequency or a fault that the device reports (N, P).
+) -> tuple[Mask, Mask]:
+    """Find the pads with an impossible frequency, and those with a fault that the device reports.
 
     Args:
         tables: Tables of the skin.
         health: State of the health, with the possible range of frequencies.
         rows: N rows of one scan.
         cube: Numbers of their cubes, to index with.
+
+    Returns:
+        Whether the frequency of a pad is impossible, and whether the device reports it (N, P).
     """
     f = rows.frequency.astype(np.float32)
     low = health.pads("low")[cube]
@@ -376,8 +346,7 @@ def find_impossible(
     is_possible = (f > low) & (f < high)
     is_impossible = ~is_possible & find_existing(tables, calibration)
     # The device may set the bit of a pad that the cube does not have.
-    is_reported = mask_bits(tables, calibration, rows.pad_fault)
-    return is_impossible | is_reported
+    return is_impossible, mask_bits(tables, calibration, rows.pad_fault)
 
 
 def _add_to_window(

@@ -6,10 +6,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..arrays import Real
-from ..rows import StressRows
 from . import rows
-from .contract import Columns, HealthState, Offsets, Tables
+from .contract import HealthState, Offsets, Task
 
 __all__ = ["native", "run"]
 
@@ -25,38 +23,22 @@ _NO_OFFSETS = (None,) * len(Offsets._fields)
 """Arguments of the kernel in C instead of `Offsets`, where nothing is compensated."""
 
 
-def run(
-    start: int,
-    n_residuals: int,
-    tables: Tables,
-    health: HealthState | None,
-    offsets: Offsets | None,
-    columns: Columns,
-    out: StressRows,
-    offset: Real | None,
-) -> tuple[int, int]:
+def run(start: int, task: Task) -> tuple[int, int]:
     """Process rows of frequencies, from one row on, until the caller has to do something.
 
     Args:
         start: Number of the first row to process.
-        n_residuals: Number of outputs of a matrix (see `Tables.matrix`) that are residuals.
-        tables: Tables of the skin.
-        health: State of the health, which is changed; None: health is not judged.
-        offsets: What is subtracted and its state, which is changed; None: nothing is.
-        columns: Rows to process.
-        out: Rows to write; its arrays are contiguous. Before the call, `left_out` and `status` hold
-            the pads that are not used and the conditions of the pads, for all rows whose health is
-            not judged in this call.
-        offset: Array for what is subtracted (N, P), stress / stiffness; None: not wanted.
+        task: The rows, and all arrays that are read and written.
 
     Returns:
         Number of the first row that is not processed, and what the caller has to do: `DONE`,
         `NEEDS_WINDOW`, `NEEDS_STEP`, `NEEDS_CONDITION`, `UNKNOWN_CUBE`, or the key (see
         `Tables.keys`) of a matrix that must be added.
     """
+    n_residuals, tables, health, offsets, columns, out, offset = task
     # The kernel in C computes in float32, the precision of messages.
     if native is None or columns.frequency.dtype != np.float32:
-        return rows.run(start, n_residuals, tables, health, offsets, columns, out, offset)
+        return rows.run(start, task)
     state = health or _NO_HEALTH
     subtracted = offsets or _NO_OFFSETS
     written = out.stress, out.gradient, out.residual, out.status, out.observed, out.left_out
