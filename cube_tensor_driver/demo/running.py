@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,36 +26,25 @@ class Interrupted(CubeError):
     """The user has pressed Ctrl-C, or another signal asked the process to end."""
 
 
+@dataclass
 class Observer:
     """A ROS node that receives what the nodes in child processes publish; see `observing`.
 
     Attributes:
         node: The ROS node.
+        executor: The executor that contains the node.
+        children: The processes that are observed.
+        interrupted: Event that lets `spin` raise Interrupted; None: no such event.
+        on_step: Function that `spin` calls repeatedly while it receives messages.
+        checked_s: Monotonic time, in s, at which `spin` checked the processes last.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        executor: Any,
-        children: Children,
-        interrupted: threading.Event | None,
-        on_step: Callable[[], None],
-    ) -> None:
-        """Store the node and what `spin` uses.
-
-        Args:
-            node: The ROS node.
-            executor: The executor that contains the node.
-            children: The processes that are observed.
-            interrupted: Event that lets `spin` raise Interrupted; None: no such event.
-            on_step: Function that `spin` calls repeatedly while it receives messages.
-        """
-        self.node = node
-        self._executor = executor
-        self._children = children
-        self._interrupted = interrupted
-        self._on_step = on_step
-        self._checked_s = 0.0
+    node: Node
+    executor: Any
+    children: Children
+    interrupted: threading.Event | None
+    on_step: Callable[[], None]
+    checked_s: float = 0.0
 
     def listen(
         self,
@@ -71,13 +61,7 @@ class Observer:
             receive: Function that is called with each message in its serialised form (CDR).
             quality: Quality of service of the subscription.
         """
-        self.node.create_subscription(
-            kind,
-            topic,
-            receive,
-            quality,
-            raw=True,
-        )
+        self.node.create_subscription(kind, topic, receive, quality, raw=True)
 
     def log_error(self, text: str) -> None:
         """Write an error message to the log of the ROS node."""
@@ -103,16 +87,16 @@ class Observer:
         def check() -> None:
             # The signal handler only sets the event; the exception is raised here, between two
             # messages.
-            if self._interrupted is not None and self._interrupted.is_set():
+            if self.interrupted is not None and self.interrupted.is_set():
                 raise Interrupted("interrupted")
             # Checking the processes after each message would take longer than the message.
             now_s = time.monotonic()
-            if now_s - self._checked_s > STEP_S:
-                self._checked_s = now_s
-                self._children.check()
-            self._on_step()
+            if now_s - self.checked_s > STEP_S:
+                self.checked_s = now_s
+                self.children.check()
+            self.on_step()
 
-        spin_until(self._executor, done, seconds, on_step=check)
+        spin_until(self.executor, done, seconds, on_step=check)
 
 
 @contextmanager

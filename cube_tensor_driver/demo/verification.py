@@ -54,7 +54,6 @@ class Arrivals:
                 members = hub.skin_cubes
                 self.row_count[members[0]] = len(members)
         self.rows = 0
-        self._keeps_all = not one_per_hub
         no_rows = np.empty((4, 0), np.int64)
         self._parts: list[Index] = [no_rows]
 
@@ -68,14 +67,12 @@ class Arrivals:
         """
         # Rows that are not stored count as well, because callers test whether any row has arrived.
         self.rows += len(rows)
-        cube, sequence, stamp_ns = rows.cube, rows.sequence, rows.stamp_ns
-        if not self._keeps_all:
-            kept = self.row_count[cube] > 0
-            cube, sequence, stamp_ns = cube[kept], sequence[kept], stamp_ns[kept]
+        kept = self.row_count[rows.cube] > 0
         # The columns are copied, because the rows may be views of a message whose memory is reused
         # for the next message.
-        received = np.full(len(cube), received_ns)
-        self._parts.append(np.array([cube, sequence, stamp_ns, received], np.int64))
+        received = np.full(len(rows), received_ns)
+        columns = np.array([rows.cube, rows.sequence, rows.stamp_ns, received], np.int64)
+        self._parts.append(columns[:, kept])
 
     def columns(self) -> Index:
         """Return four columns (4, N) of the stored rows, in the order of their arrival.
