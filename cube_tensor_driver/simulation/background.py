@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike
 
 from ..config.skin import Skin
 from ..core.errors import ConfigError
+from .cubes import PadErrors
 from .load import StressField
 from .simulator import Simulator, StopRequest
 
@@ -59,13 +60,7 @@ class BackgroundHubs:
         cubes = len(skin.cubes)
         unloaded = np.zeros((cubes, 6)), np.zeros((cubes, 6, 3))
         self._load = _SetLoad(unloaded)
-        self._simulator = Simulator(
-            skin,
-            self._load,
-            Path(ports),
-            noise=noise,
-            drift=drift,
-        )
+        self._simulator = Simulator(skin, self._load, Path(ports), PadErrors(noise, drift))
         self._stop = StopRequest()
         self._thread = threading.Thread(
             target=self._simulator.run,

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from ..core.arrays import Array, Index
 from ..core.calibration import Calibration
 from ..core.errors import ConfigError
 from ..core.modes import COMPONENTS, STRESS, to_matrix
-from ..core.oscillator import pad_frequency, stress_slope
+from ..core.oscillator import pad_frequency
 from ..core.poses import CubePoses
 from ..device.wire.protocol import NOT_MEASURED
 from .imperfections import Imperfections, PadBehaviour, make_thermal_pads
@@ -28,6 +29,25 @@ from .sample_log import ABSENT
 
 Millihertz = NDArray[np.uint32]
 """Array of frequencies in mHz, as a hub sends them; `NOT_MEASURED` is a pad without a frequency."""
+
+
+class PadErrors(NamedTuple):
+    """Deviations of simulated pads from their calibrations.
+
+    Attributes:
+        noise: Standard deviation of a frequency divided by the frequency, 0 for no noise. None: the
+            noise in the calibration of each cube.
+        drift: Relative change of every rest frequency (frequency without load) per second.
+        imperfections: Spread, creep, temperature and failure of the pads; None: none of them.
+    """
+
+    noise: float | None = 0.0
+    drift: float = 0.0
+    imperfections: Imperfections | None = None
+
+
+NO_ERRORS = PadErrors()
+"""Pads without noise, drift and imperfections."""
 
 
 class SimulatedCubes:
@@ -41,10 +61,8 @@ class SimulatedCubes:
     def __init__(
         self,
         calibrations: Sequence[Calibration],
+        errors: PadErrors = NO_ERRORS,
         *,
-        noise: float | None = 0.0,
-        drift: float = 0.0,
-        imperfections: Imperfections | None = None,
         seed: int = 0,
         poses: CubePoses | None = None,
     ) -> None:
@@ -52,16 +70,13 @@ class SimulatedCubes:
 
         Args:
             calibrations: Calibration of each cube.
-            noise: Standard deviation of a frequency divided by the frequency, 0 for no noise. None:
-                the noise in the calibration of each cube.
-            drift: Relative change of every rest frequency (frequency without load) per second.
-            imperfections: Deviations of the pads from their calibrations; None: no deviations.
+            errors: Deviations of the pads from their calibrations.
             seed: Seed of the random noise. Together with the seed of the imperfections, it also
                 determines the deviation of each pad.
             poses: Poses of the cubes in the parent frame of the skin; None: they weigh nothing.
         """
+        noise, self._drift, imperfections = errors
         self.n_pads = calibrations[0].layout.n_pads
-        self._drift = drift
         self._random = np.random.default_rng(seed)
         self._groups = calibration_groups(calibrations)
 
@@ -191,21 +206,22 @@ def frequency_noise(calibration: Calibration) -> Array:
     Returns:
         Standard deviation (pads,) of each frequency divided by the frequency.
     """
-    rest = calibration.rest_frequency
-    slope = stress_slope(rest, rest, calibration.beta, calibration.modulus)
-    return np.asarray(calibration.noise / (slope * rest))
+    # Without load, the stress of a pad grows by E (1 + beta) per relative change of its frequency.
+    stress_per_change = calibration.modulus * (1 + calibration.beta)
+    return np.asarray(calibration.noise / stress_per_change)
 
 
 def hub_cubes(
     skin: Skin,
-    *,
-    noise: float | None = 0.0,
-    drift: float = 0.0,
-    imperfections: Imperfections | None = None,
+    errors: PadErrors = NO_ERRORS,
 ) -> list[HubCubes]:
     """Create the cubes of all simulated hubs of a skin, in the order of its links.
 
-    Links without cubes are left out. The keyword arguments are those of `SimulatedCubes`.
+    Links without cubes are left out.
+
+    Args:
+        skin: The skin.
+        errors: Deviations of the pads from their calibrations.
 
     Raises:
         ConfigError: Cubes of one hub have different numbers of pads.
@@ -227,9 +243,7 @@ def hub_cubes(
         # The index of the link is the seed, so that the noise of different hubs differs.
         cubes = SimulatedCubes(
             calibrations,
-            noise=noise,
-            drift=drift,
-            imperfections=imperfections,
+            errors,
             seed=number,
             poses=CubePoses(*(column[present] for column in poses)),
         )

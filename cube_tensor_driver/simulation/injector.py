@@ -8,11 +8,9 @@ import heapq
 import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
-from ..core.arrays import Times
 from ..device.wire.protocol import TEMPERATURE_UNKNOWN, VERSION
 from .cubes import Millihertz
 from .faults import FRAME_FAULTS, MOMENTARY_FAULTS, PAD_FAULTS, Fault, HubSize, check_target
@@ -188,9 +186,14 @@ class Injector:
         frequency = frequency.copy()
         if state.warming is not None:
             begin_us, fault = state.warming
-            rise = warming(fault, begin_us, now_us)
-            hub.celsius = int(centi_celsius(rise))
-            frequency = warmed(frequency, rise)
+            # The temperature rises linearly during the fault and then stays constant.
+            elapsed_s = 1e-6 * (now_us - begin_us)
+            share = min(1.0, elapsed_s / max(fault.seconds, 1e-6))
+            rise = share * fault.value
+            # A rise of 0 ends the fault. The hub then reports no temperature, as before it.
+            hub.celsius = round(100 * (ROOM_CELSIUS + rise)) if rise else TEMPERATURE_UNKNOWN
+            warmed = frequency * (1 + RELATIVE_CHANGE_PER_CELSIUS * rise)
+            frequency = np.rint(warmed).astype("<u4")
         for broken in state.pads:
             pad = broken.fault.cube, broken.fault.pad
             sound = int(frequency[pad])
@@ -398,60 +401,12 @@ def broken_reading(
         case "open":
             return min(OPEN_FACTOR * sound, MAX_MILLIHERTZ)
         case "noisy":
-            # The simulated time is the seed of the random noise, so that a check can compute the
-            # same noise again.
+            # The simulated time is the seed of the random noise, so that it is reproducible.
             noise = np.random.default_rng(time_us).standard_normal()
             return round(sound * (1 + fault.value * noise))
         case "stuck":
             return first
     return sound
-
-
-def warming(
-    fault: Fault,
-    begin_us: int,
-    time_us: Times | int,
-) -> Any:
-    """Return the temperature rise above room temperature under a fault `temperature`.
-
-    Args:
-        fault: Fault with the final rise `value` in °C and the duration `seconds`.
-        begin_us: Simulated time in µs at which the fault began.
-        time_us: Simulated times (...) in µs.
-
-    Returns:
-        Temperature rise (...) in °C.
-    """
-    # The temperature rises linearly during the fault and then stays constant.
-    elapsed_us = np.asarray(time_us) - begin_us
-    duration = max(fault.seconds, 1e-6)
-    fraction = elapsed_us * 1e-6 / duration
-    return fault.value * np.minimum(1.0, fraction)
-
-
-def warmed(millihertz: Millihertz, rise: Any) -> Millihertz:
-    """Return the frequencies in mHz of pads that are warmer than room temperature.
-
-    Args:
-        millihertz: Frequencies in mHz at room temperature.
-        rise: Temperature rise in °C above room temperature, a number or an array that broadcasts.
-    """
-    factor = 1 + RELATIVE_CHANGE_PER_CELSIUS * rise
-    changed: Millihertz = np.rint(millihertz * factor).astype("<u4")
-    return changed
-
-
-def centi_celsius(rise: Any) -> Any:
-    """Return the temperature in 0.01 °C that a hub reports.
-
-    Args:
-        rise: Temperature rise in °C above room temperature. At 0, no fault acts, and the hub
-            reports an unknown temperature.
-    """
-    rise = np.asarray(rise)
-    hundredths = 100 * (ROOM_CELSIUS + rise)
-    known = np.rint(hundredths).astype(int)
-    return np.where(rise != 0, known, TEMPERATURE_UNKNOWN)
 
 
 def _report_pads(link: SimulatedLink) -> None:

@@ -16,6 +16,7 @@ from pathlib import Path
 from ..config.skin import read_skin
 from ..config.yaml import read_yaml
 from ..core.errors import CubeError
+from .cubes import PadErrors
 from .faults import parse_faults
 from .imperfections import read_imperfections
 from .load import read_load
@@ -133,9 +134,7 @@ def _create_simulator(
         skin,
         load,
         options.ports,
-        noise=options.noise,
-        drift=options.drift,
-        imperfections=imperfections,
+        PadErrors(options.noise, options.drift, imperfections),
         instants=options.instants,
         faults=faults,
         seed=options.seed,

@@ -22,10 +22,9 @@ from pathlib import Path
 from ..config.skin import Skin, SkinLink
 from ..config.yaml import parse_yaml, write_yaml
 from ..core.errors import ConfigError
-from .cubes import HubCubes, Millihertz, hub_cubes
+from .cubes import NO_ERRORS, HubCubes, Millihertz, PadErrors, hub_cubes
 from .faults import Fault
 from .hub import SimulatedHub
-from .imperfections import Imperfections
 from .injector import Injector, SimulatedLink
 from .line import SimulatedLine
 from .load import Fields, LoadMemory
@@ -101,10 +100,8 @@ class Simulator:
         skin: Skin,
         load: Fields,
         ports: Path,
+        errors: PadErrors = NO_ERRORS,
         *,
-        noise: float | None = 0.0,
-        drift: float = 0.0,
-        imperfections: Imperfections | None = None,
         instants: int = 0,
         faults: Sequence[Fault] = (),
         seed: int = 0,
@@ -115,10 +112,7 @@ class Simulator:
             skin: Skin whose hubs are simulated.
             load: Stress and gradient at the cubes over time.
             ports: Folder in which the ports appear, each under the name of its link.
-            noise: Standard deviation of a frequency divided by the frequency; None: that of the
-                calibration of each cube.
-            drift: Relative change of every rest frequency (frequency without load) per second.
-            imperfections: Deviations of the pads from their calibrations; None: none.
+            errors: Deviations of the pads from their calibrations.
             instants: Number of times, equally spaced over the period of the load, at which the load
                 is computed in advance; successive samples use successive times, again and again.
                 0: the load is computed for each sample.
@@ -138,12 +132,7 @@ class Simulator:
         self._links: list[PlayedLink] = []
         try:
             ports.mkdir(parents=True, exist_ok=True)
-            for carried in hub_cubes(
-                skin,
-                noise=noise,
-                drift=drift,
-                imperfections=imperfections,
-            ):
+            for carried in hub_cubes(skin, errors):
                 line = self._make_line(carried.link)
                 self._links.append(_connect(skin, carried, line))
             sizes = {link.name: asdict(link.size) for link in self._links}

@@ -16,8 +16,8 @@ from ..config.skin import Skin, as_skin
 from ..core.arguments import check_number
 from ..core.arrays import Array
 from ..core.rows import FrequencyRows
-from ..device.wire.protocol import NOT_MEASURED
-from .cubes import hub_cubes
+from ..device.wire.protocol import NOT_MEASURED, to_hertz
+from .cubes import NO_ERRORS, PadErrors, hub_cubes
 from .hub import PERIOD_LIMITS_US, SimulatedHub
 from .imperfections import Imperfections
 from .load import AnyLoad, LoadMemory, read_load
@@ -72,15 +72,8 @@ def simulate(
     # The cubes are created again in each iteration. Creating them here, too, raises errors of the
     # skin before the first iteration.
     hub_cubes(skin)
-    return SimulatedSource(
-        skin,
-        load,
-        period_us=round(1e6 / rate),
-        duration=duration,
-        noise=noise,
-        drift=drift,
-        imperfections=imperfections,
-    )
+    errors = PadErrors(noise, drift, imperfections)
+    return SimulatedSource(skin, load, round(1e6 / rate), duration, errors)
 
 
 @dataclass
@@ -99,9 +92,7 @@ class SimulatedSource:
         load: Load on the skin.
         period_us: Time between two scans in µs.
         duration: Simulated time in s; None: without end.
-        noise: Standard deviation of a frequency divided by the frequency.
-        drift: Relative change of every rest frequency (frequency without load) per second.
-        imperfections: Deviations of the pads from their calibrations; None: none.
+        errors: Deviations of the pads from their calibrations: noise, drift, imperfections.
         scans: Number of scans since the last iteration began.
     """
 
@@ -109,9 +100,7 @@ class SimulatedSource:
     load: AnyLoad
     period_us: int
     duration: float | None = None
-    noise: float = 0.0
-    drift: float = 0.0
-    imperfections: Imperfections | None = None
+    errors: PadErrors = NO_ERRORS
     scans: int = 0
     is_live: ClassVar[bool] = False  # rows are computed on request, not measured
 
@@ -129,7 +118,7 @@ class SimulatedSource:
         }
 
     def __iter__(self) -> Iterator[FrequencyRows]:
-        pads = SkinPads(self.skin, self.noise, self.drift, self.imperfections)
+        pads = SkinPads(self.skin, self.errors)
         fields = LoadMemory(self.load)
         end_us = math.inf if self.duration is None else round(1e6 * self.duration)
         self.scans = 0
@@ -148,31 +137,17 @@ class SimulatedSource:
 class SkinPads:
     """Computes the frequencies of all pads of a skin under given stress fields at the cubes."""
 
-    def __init__(
-        self,
-        skin: Skin,
-        noise: float | None = 0.0,
-        drift: float = 0.0,
-        imperfections: Imperfections | None = None,
-    ) -> None:
+    def __init__(self, skin: Skin, errors: PadErrors) -> None:
         """Create the pads.
 
         Args:
             skin: Skin whose pads are simulated.
-            noise: Standard deviation of a frequency divided by the frequency; None: that of the
-                calibration of each cube.
-            drift: Relative change of every rest frequency (frequency without load) per second.
-            imperfections: Deviations of the pads from their calibrations; None: none.
+            errors: Deviations of the pads from their calibrations.
 
         Raises:
             ConfigError: Cubes of one hub have different numbers of pads.
         """
-        self._hubs = hub_cubes(
-            skin,
-            noise=noise,
-            drift=drift,
-            imperfections=imperfections,
-        )
+        self._hubs = hub_cubes(skin, errors)
         cubes = [hub.skin_cubes for hub in self._hubs]
         self._cube = np.concatenate(cubes).astype(np.uint16)
         self._n_pads = max(hub.cubes.n_pads for hub in self._hubs)
@@ -206,17 +181,12 @@ class SkinPads:
             if hub.cubes.heavy is not None:
                 force[cubes] = hub.cubes.heavy.specific_force(seconds)
         # The rows are sorted link by link, as the driver delivers them.
-        millihertz, temperature = millihertz[self._cube], temperature[self._cube]
-
-        # Frequencies from a real hub are also whole mHz, which the driver converts to float32 Hz.
-        frequency = (millihertz * 1e-3).astype(np.float32)
-        frequency[millihertz == NOT_MEASURED] = np.nan
         return FrequencyRows(
             cube=self._cube,
             sequence=np.full(count, number % SEQUENCE_RANGE, np.uint32),
             stamp_ns=np.full(count, 1000 * time_us),
-            frequency=frequency,
-            temperature=temperature,
+            frequency=to_hertz(millihertz[self._cube]),
+            temperature=temperature[self._cube],
             pad_fault=np.zeros(count, np.uint32),
             status=np.zeros(count, np.uint16),
             specific_force=force[self._cube] if self._is_moving else None,

@@ -34,6 +34,7 @@ from cube_tensor_driver.core.layout import Layout
 from cube_tensor_driver.core.modes import to_matrix, to_voigt
 from cube_tensor_driver.core.tensor import rotate_gradient, rotate_stress, rotation_from_rpy
 from cube_tensor_driver.mechanics import contact
+from cube_tensor_driver.simulation.cubes import PadErrors
 from cube_tensor_driver.simulation.simulator import FIRST_UID, Simulator, StopRequest
 
 TURNS = cube_rotations()
@@ -153,7 +154,7 @@ class Person:
 def played(folder: Path, calibrations: list[Calibration], person: Person) -> Iterator[None]:
     """A hub with these cubes under the person's finger, on a pseudo-terminal."""
     stop = StopRequest()
-    simulator = Simulator(row(calibrations), person, folder / "ports", noise=None)
+    simulator = Simulator(row(calibrations), person, folder / "ports", PadErrors(noise=None))
     thread = threading.Thread(target=simulator.run, args=(stop,))
     thread.start()
     try:

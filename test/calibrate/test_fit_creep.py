@@ -32,7 +32,7 @@ from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.messages.codec import frequency_codec
 from cube_tensor_driver.messages.types import FREQUENCIES, INFO
-from cube_tensor_driver.simulation.cubes import SimulatedCubes
+from cube_tensor_driver.simulation.cubes import PadErrors, SimulatedCubes
 from cube_tensor_driver.simulation.imperfections import Imperfections
 
 PLAIN = illustrative("planar")
@@ -43,7 +43,7 @@ PRESS = np.array([-8e3, 0, -20e3, 0, 2e3, 0])
 def measured(time, scale, growth, exponent=0.2, seed=0):
     """Frequencies (N, P) of a cube under `scale` (N,) times `PRESS`, in Hz."""
     creep = Imperfections(creep_growth=growth, creep_exponent=exponent, creep_spread=0.2, seed=seed)
-    cubes = SimulatedCubes([PLAIN], noise=None, imperfections=creep, seed=seed)
+    cubes = SimulatedCubes([PLAIN], PadErrors(None, imperfections=creep), seed=seed)
     gradient = np.zeros((1, 6, 3))
     found = [
         cubes.frequency(PRESS[None] * s, gradient, t) for t, s in zip(time, scale, strict=True)

@@ -29,7 +29,7 @@ from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.core.status import COMPENSATION, THERMAL
 from cube_tensor_driver.messages.codec import frequency_codec
 from cube_tensor_driver.messages.types import FREQUENCIES, INFO
-from cube_tensor_driver.simulation.cubes import SimulatedCubes
+from cube_tensor_driver.simulation.cubes import PadErrors, SimulatedCubes
 from cube_tensor_driver.simulation.imperfections import Imperfections
 from cube_tensor_driver.touch.contact_finder import ContactSettings, contact_finder
 
@@ -45,7 +45,7 @@ def simulated(knots, faces: str, noise: float | None) -> SimulatedCubes:
     wanted = Imperfections(
         temperature=knots, pad_drift_spread=0.2, layer_spread=0.05, seed=3, **both
     )
-    return SimulatedCubes([CUBE] * N_CUBES, noise=noise, imperfections=wanted)
+    return SimulatedCubes([CUBE] * N_CUBES, PadErrors(noise, imperfections=wanted))
 
 
 def play(cubes: SimulatedCubes, seconds: np.ndarray, load: np.ndarray):

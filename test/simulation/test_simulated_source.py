@@ -24,7 +24,7 @@ from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.core.estimator import make_estimator
 from cube_tensor_driver.core.modes import COMPONENTS
-from cube_tensor_driver.core.oscillator import pad_frequency, stress_slope
+from cube_tensor_driver.core.oscillator import pad_frequency
 from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import FrequencyRows, concatenate
 from cube_tensor_driver.demo.load_verification import component_noise
@@ -32,6 +32,7 @@ from cube_tensor_driver.device.live import open_links
 from cube_tensor_driver.device.wire.decoder import Decoder
 from cube_tensor_driver.device.wire.protocol import Sample
 from cube_tensor_driver.simulation.cubes import (
+    PadErrors,
     SimulatedCubes,
     hub_cubes,
     skin_components,
@@ -52,7 +53,11 @@ def test_the_load_comes_out_again():
     load = Load(SKIN, default_script())
     reconstruct = Reconstructor(SKIN, np.float64)
     calibration = SKIN.cubes[0].calibration
-    law = calibration.rest_frequency, calibration.beta, calibration.modulus
+    rest, beta, modulus = law = (
+        calibration.rest_frequency,
+        calibration.beta,
+        calibration.modulus,
+    )
     matrix = make_estimator(calibration.response, calibration.noise, calibration.modes).matrix
     unit = np.where(np.arange(len(COMPONENTS)) < 6, 1.0, calibration.half_side)
     scans = 0
@@ -63,7 +68,8 @@ def test_the_load_comes_out_again():
             true_state(calibration, stress, gradient) @ calibration.response.T, *law
         )
         rounding = 0.5e-3 + 2.0**-24 * frequency
-        pad_error = np.abs(stress_slope(frequency, *law)) * rounding
+        slope = modulus * (1 + beta) / (rest * (1 - beta * (frequency / rest - 1)) ** 2)
+        pad_error = slope * rounding
         # 1e-6 of the bound: the law is not straight over a rounding.
         bound = (pad_error @ np.abs(matrix).T) * (1 + 1e-6) / unit
         components = np.concatenate([found.stress, found.gradient], axis=1)
@@ -76,7 +82,7 @@ def test_the_load_comes_out_again():
 
 
 def test_values_are_those_that_a_hub_sends():
-    hubs = hub_cubes(SKIN, noise=1e-5, drift=1e-4)
+    hubs = hub_cubes(SKIN, PadErrors(1e-5, 1e-4))
     load = Load(SKIN, default_script())
     source = simulate(SKIN, load, rate=100.0, noise=1e-5, drift=1e-4)
     for number, rows in enumerate(islice(source, 20)):
@@ -196,7 +202,7 @@ def test_what_cannot_be_simulated_is_refused(asked, words):
 def test_noise_of_the_calibration_gives_a_residual_of_one_and_the_stated_deviations(layout):
     calibration = read_calibration(find_calibration(layout, Path()))
     n = 2000
-    cubes = SimulatedCubes([calibration] * n, noise=None)
+    cubes = SimulatedCubes([calibration] * n, PadErrors(noise=None))
     millihertz = cubes.frequency(np.zeros((n, 6)), np.zeros((n, 6, 3)), 0.0)
     rows = Reconstructor([calibration] * n).process(
         FrequencyRows.of(np.arange(n), (millihertz * 1e-3).astype(np.float32))

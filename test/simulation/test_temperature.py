@@ -15,7 +15,7 @@ from cube_tensor_driver.config.yaml import read_yaml
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.core.oscillator import pad_stress
-from cube_tensor_driver.simulation.cubes import SimulatedCubes
+from cube_tensor_driver.simulation.cubes import PadErrors, SimulatedCubes
 from cube_tensor_driver.simulation.imperfections import Imperfections, read_imperfections
 from cube_tensor_driver.simulation.temperature import CELLS, WarmLayer, read_thermal_stress
 
@@ -29,7 +29,9 @@ UNLOADED = np.zeros((2, 6)), np.zeros((2, 6, 3))
 def cubes(**imperfections: object) -> SimulatedCubes:
     calibration = shipped_calibration(LAYOUTS["cube"])
     assert calibration is not None
-    return SimulatedCubes([calibration] * 2, imperfections=Imperfections(**imperfections))  # type: ignore[arg-type]
+    return SimulatedCubes(
+        [calibration] * 2, PadErrors(imperfections=Imperfections(**imperfections))
+    )  # type: ignore[arg-type]
 
 
 def read_stress(hertz: np.ndarray) -> np.ndarray:
@@ -103,7 +105,7 @@ def test_layers_and_drift_differ_by_the_asked_spread():
     )
     calibration = shipped_calibration(LAYOUTS["cube"])
     assert calibration is not None
-    many = SimulatedCubes([calibration] * 50, imperfections=wanted)
+    many = SimulatedCubes([calibration] * 50, PadErrors(imperfections=wanted))
     zero = np.zeros((50, 6)), np.zeros((50, 6, 3))
     drift = (
         read_stress(many.frequency(*zero, 7200.0))

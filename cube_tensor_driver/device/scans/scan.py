@@ -16,7 +16,7 @@ import numpy as np
 
 from ...core.rows import FrequencyRows
 from ..wire.native import wire
-from ..wire.protocol import NOT_MEASURED, TEMPERATURE_UNKNOWN, Sample
+from ..wire.protocol import TEMPERATURE_UNKNOWN, Sample, to_hertz
 from .cube_table import CubeAddress, CubeTable, RowIndex
 from .row_counts import RowCounts
 
@@ -31,11 +31,6 @@ MAX_PERIODS_EARLIER = 0.75
 """Largest time, in sample periods, by which a scan (one sample of each link) may be earlier than a
 sample that is added to it. With 1 or more, a sample could be added to the scan before its own;
 with 0, hubs that do not sample at exactly the same time could not share a scan."""
-
-# This table holds the temperature, in °C, for each of the 65536 possible values in a SAMPLE frame.
-_PATTERNS = np.arange(1 << 16, dtype=np.uint16)
-_CELSIUS = _PATTERNS.view(np.int16) * np.float32(0.01)
-_CELSIUS[TEMPERATURE_UNKNOWN] = np.nan
 
 MakeRows = Callable[[int, int], FrequencyRows]
 """Function that makes rows for the caller to fill. Its arguments are the number of rows and the
@@ -289,7 +284,7 @@ class ScanBuilder:
 
         A link has reached a scan if it has a sample in this scan or in a later one.
         """
-        return min(map(self._n_pending.__getitem__, self._live), default=0)
+        return min((self._n_pending[link] for link in self._live), default=0)
 
     def _align_by_order(self) -> None:
         """Put the first pending samples of all links into one scan, the second ones into the next.
@@ -359,11 +354,7 @@ def _fill(rows: FrequencyRows, part: _SampleRows) -> None:
     rows.sequence[:] = sample.sequence
     rows.stamp_ns[:] = part.stamp_ns
     rows.pad_fault[:] = sample.pad_fault
-    rows.temperature[:] = _CELSIUS[sample.temperature.view(np.uint16)]
-
-    measured = rows.frequency[:, : sample.n_pads]
-    # The sample has frequencies in mHz as integers. They are converted to Hz in double precision
-    # and rounded once, because float32 cannot represent 1 mHz of 100 kHz.
-    np.multiply(sample.frequency, 1e-3, out=measured, casting="same_kind")
+    rows.temperature[:] = sample.temperature * np.float32(0.01)
+    rows.temperature[sample.temperature == TEMPERATURE_UNKNOWN] = np.nan
+    rows.frequency[:, : sample.n_pads] = to_hertz(sample.frequency)
     rows.frequency[:, sample.n_pads :] = np.nan
-    measured[sample.frequency == NOT_MEASURED] = np.nan

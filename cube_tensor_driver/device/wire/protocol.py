@@ -24,7 +24,7 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.arrays import AnyArray
+from ...core.arrays import AnyArray, Single
 from ...core.errors import ProtocolError
 from . import cobs
 
@@ -362,6 +362,17 @@ UNPACK: dict[int, Callable[[bytes, int], Frame | None]] = {
 """Function for each type code (first byte of a frame) that makes the frame. Its arguments are the
 decoded bytes from type to CRC and the length of the payload; it returns None if the fields do not
 fit the length."""
+
+
+def to_hertz(millihertz: NDArray[np.uint32]) -> Single:
+    """Convert frequencies in mHz, as `Sample` has them, to Hz; NaN where a pad was not measured.
+
+    They are converted in double precision and rounded once, because float32 cannot represent 1 mHz
+    of 100 kHz.
+    """
+    hertz = (millihertz * 1e-3).astype(np.float32)
+    hertz[millihertz == NOT_MEASURED] = np.nan
+    return hertz
 
 
 def sample_bytes(n_cubes: int, n_pads: int) -> int:

@@ -43,6 +43,7 @@ from ...core.reconstructor import Reconstructor
 from ...core.rows import FrequencyRows, StressRows
 from ...mechanics.contact_tables import DiscTables, PolygonTables
 from ...mechanics.layer import Layer
+from ..cubes import PadErrors
 from ..imperfections import Imperfections
 from ..load import ContactLoad, StressField, surface_normal
 from ..source import SkinPads
@@ -168,7 +169,7 @@ class MujocoSkin:
         self._discs, self._polygons = _tables(layer, round(self.depth, 6))
         self._stiffness = young / (1 - poisson**2)
         self._curvature = _curvatures(model, self._mujoco)
-        self._pads = SkinPads(skin, noise, drift, imperfections)
+        self._pads = SkinPads(skin, PadErrors(noise, drift, imperfections))
         self._reconstructor = Reconstructor(skin)
         self._scans = 0
 
