@@ -6,24 +6,23 @@ It starts the nodes `driver` and `reconstruction`. Arguments of the launch file 
 `contacts` and `markers`, RViz, the frames of the cubes and a recording.
 """
 
-from typing import Any
-
-from launch import LaunchDescription
+from launch import Action, LaunchContext, LaunchDescription
 from launch.actions import ExecuteProcess, OpaqueFunction
-from launch.conditions import IfCondition, UnlessCondition
-from launch.substitutions import LaunchConfiguration, OrSubstitution
 from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterFile, ParameterValue
+from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import ExecutableInPackage
 
+from cube_tensor_driver.config.output_files import temporary_folder
+from cube_tensor_driver.config.skin import Skin
 from cube_tensor_driver.config.urdf import skin_urdf
+from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, skin_processes
 from cube_tensor_driver.ros.launching import (
     DEMO_LOAD,
-    FromSkin,
-    GivenParameters,
+    SkinArguments,
     check_arguments,
     declare_switch,
     declare_text,
+    parameter_file,
     record_skin,
     rviz_file,
     stay_ended,
@@ -94,105 +93,88 @@ ARGUMENTS = (
 
 
 def generate_launch_description() -> LaunchDescription:
-    autostart = ParameterFile(GivenParameters("autostart"))
-    skin = ParameterFile(
-        GivenParameters(
-            *("autostart", "config", "port", "rate", "publish_period", "frame_prefix", "forces"),
-            "port_directory",
-        )
+    return LaunchDescription([*ARGUMENTS, OpaqueFunction(function=start_skin)])
+
+
+def start_skin(context: LaunchContext) -> list[Action]:
+    """Check the launch arguments, and return the actions that start what they ask for."""
+    given = check_arguments(context, [argument.name for argument in ARGUMENTS])
+    namespace = given.texts["namespace"]
+    wanted = given.switched_on
+    simulated = None
+    if "simulate" in wanted:
+        # Each launch makes a new folder for the pseudo-terminals of its simulated hubs, so that two
+        # simulated skins on one host do not use the same paths.
+        ports = temporary_folder("cube_ports_")
+        simulated = SimulatedHubs(ports, given.load, noise=None)
+    processes = skin_processes(
+        given.config,
+        composed="composed" in wanted,
+        markers=bool(wanted & {"markers", "rviz"}),
+        contacts="contacts" in wanted,
+        simulated=simulated,
+        **given.parameters,
     )
-    is_composed = LaunchConfiguration("composed")
-    return LaunchDescription(
-        [
-            *ARGUMENTS,
-            OpaqueFunction(
-                function=check_arguments, args=[[argument.name for argument in ARGUMENTS]]
-            ),
-            make_simulator(),
-            make_node("reconstruction", skin, UnlessCondition(is_composed)),
-            make_node("driver", skin, UnlessCondition(is_composed)),
-            make_node("composed", skin, IfCondition(is_composed)),
-            make_node("contacts", autostart, if_any("contacts")),
-            make_node("markers", autostart, if_any("markers", "rviz")),
-            OpaqueFunction(function=record_skin, condition=if_any("record")),
-            make_state_publisher(),
+    actions = [make_action(process, given) for process in processes]
+    if "record" in wanted:
+        actions.append(record_skin(context, namespace, given.skin.name))
+    if wanted & {"state_publisher", "rviz"}:
+        actions.append(make_state_publisher(given.skin, namespace))
+    if "rviz" in wanted:
+        actions.append(
             Node(
                 package="rviz2",
                 executable="rviz2",
-                namespace=LaunchConfiguration("namespace"),
-                arguments=["-d", FromSkin(rviz_file)],
-                condition=if_any("rviz"),
-            ),
-        ]
-    )
+                namespace=namespace,
+                arguments=["-d", rviz_file(given.skin)],
+            )
+        )
+    return actions
 
 
-def if_any(argument: str, other: str | None = None) -> IfCondition:
-    """Return the condition that at least one of these launch arguments is true.
-
-    Args:
-        argument: Name of a launch argument.
-        other: Name of a second launch argument; None: there is only one.
-    """
-    first, second = LaunchConfiguration(argument), LaunchConfiguration(other or argument)
-    return IfCondition(OrSubstitution(first, second))
-
-
-def make_node(executable: str, parameters: Any, condition: Any) -> Node:
-    """Return the launch action that starts a node of this package.
+def make_action(process: Process, given: SkinArguments) -> Action:
+    """Return the launch action that starts a process of this package.
 
     Args:
-        executable: Name of the executable.
-        parameters: Parameters of the node, as a file or a mapping.
-        condition: Condition under which the node starts.
+        process: A node, or the simulator of the hubs.
+        given: The launch arguments.
     """
-    # The executable `composed` contains two nodes. If the launch action had a name, both of them
-    # would get it.
-    name = None if executable == "composed" else executable
+    name = process.executable
+    if not process.node:
+        command = [ExecutableInPackage(name, PACKAGE), *process.arguments]
+        return ExecuteProcess(cmd=command, name=name, output="screen")
+    parameters = dict(process.parameters)
+    if "autostart" in given.parameters:
+        parameters["autostart"] = given.parameters["autostart"]
     return Node(
         package=PACKAGE,
-        executable=executable,
-        name=name,
-        namespace=LaunchConfiguration("namespace"),
-        parameters=[parameters],
-        condition=condition,
+        executable=name,
+        # The executable `composed` contains two nodes. If the launch action had a name, both of
+        # them would get it.
+        name=None if name == "composed" else name,
+        namespace=given.texts["namespace"],
+        parameters=[parameter_file(parameters)],
         output="screen",
         emulate_tty=True,
-        respawn=LaunchConfiguration("respawn"),
+        respawn="respawn" in given.switched_on,
         respawn_delay=RESPAWN_DELAY_S,
         on_exit=stay_ended,
     )
 
 
-def make_state_publisher() -> Node:
+def make_state_publisher(skin: Skin, namespace: str) -> Node:
     """Return the action that starts a robot_state_publisher for the frames of the cubes.
 
     Its node and its topic have names of their own, because the robot's own robot_state_publisher
     may run in the same namespace.
     """
-    urdf = ParameterValue(FromSkin(skin_urdf), value_type=str)
+    urdf = ParameterValue(skin_urdf(skin), value_type=str)
     return Node(
         package="robot_state_publisher",
         executable="robot_state_publisher",
         name="skin_state_publisher",
         remappings=[("robot_description", "skin_description")],
-        namespace=LaunchConfiguration("namespace"),
+        namespace=namespace,
         parameters=[{"robot_description": urdf}],
-        output="screen",
-        condition=if_any("state_publisher", "rviz"),
-    )
-
-
-def make_simulator() -> ExecuteProcess:
-    """Return the launch action that starts the simulator of the hubs, which is not a ROS node."""
-    return ExecuteProcess(
-        cmd=[
-            ExecutableInPackage("simulator", PACKAGE),
-            *("--config", LaunchConfiguration("config")),
-            *("--ports", LaunchConfiguration("port_directory")),
-            *("--load", LaunchConfiguration("load")),
-        ],
-        name="simulator",
-        condition=IfCondition(LaunchConfiguration("simulate")),
         output="screen",
     )

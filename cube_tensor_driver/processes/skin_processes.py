@@ -1,9 +1,6 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""The processes that a skin needs, with their arguments, as `./cube demo` starts them.
-
-launch/skin.launch.py starts the same processes with ROS launch.
-"""
+"""The processes that a skin needs, as `./cube demo` and launch/skin.launch.py start them."""
 
 from __future__ import annotations
 
@@ -105,45 +102,32 @@ class SimulatedHubs:
 def skin_processes(
     config: Path,
     *,
-    port: str = "",
-    rate: float = 0.0,
-    publish_period: float = 0.0,
     composed: bool = False,
     markers: bool = False,
     contacts: bool = False,
     simulated: SimulatedHubs | None = None,
+    **parameters: Value,
 ) -> list[Process]:
     """Return the processes of a skin, in the order in which they must be started.
 
     Args:
         config: The skin file.
-        port: Port that replaces the one in the skin file, which must have a single link; empty:
-            the ports of the file.
-        rate: Sampling rate of each cube, in Hz; 0: the rate in the skin file.
-        publish_period: Time, in s, whose scans (samples of all cubes) are sent in one message; 0: a
-            message for each scan.
         composed: Whether driver and reconstruction run in one process.
         markers: Whether the node `markers` (picture for RViz) runs, too.
         contacts: Whether the node `contacts` (contacts on the skin) runs, too.
         simulated: Options of simulated hubs; None: the hubs are real.
+        parameters: Further ROS parameters of both nodes, such as `rate`. Each node takes those that
+            it has.
     """
-    # Both nodes get the publish period, because they compute the depths of their queues from it.
-    common: dict[str, Value] = {"config": str(config), "publish_period": publish_period}
-    port_directory = str(simulated.ports) if simulated else ""
-    driver = {
-        **common,
-        "port": port,
-        "rate": rate,
-        "port_directory": port_directory,
-    }
-
+    given: dict[str, Value] = {"config": str(config), **parameters}
     # The ports of simulated hubs must exist before the driver opens them.
-    processes = [simulated.process(config)] if simulated else []
-    if composed:
-        processes.append(_node("composed", driver))
-    else:
-        # The reconstruction starts first, so that it has subscribed before the driver publishes.
-        processes += [_node("reconstruction", common), _node("driver", driver)]
+    processes = []
+    if simulated is not None:
+        processes.append(simulated.process(config))
+        given["port_directory"] = str(simulated.ports)
+    # The reconstruction starts first, so that it has subscribed before the driver publishes.
+    names = ["composed"] if composed else ["reconstruction", "driver"]
+    processes += [_node(name, given) for name in names]
     if markers:
         processes.append(_node("markers", {}))
     if contacts:

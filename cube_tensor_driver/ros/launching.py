@@ -1,6 +1,6 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Functions of the launch files: they check launch arguments and make texts from the skin file.
+"""Functions of the launch files: they declare and check launch arguments, and write files.
 
 This module imports the package `launch`, which every installation of ROS 2 has, but not the Python
 wheels of ROS 2. So only the launch files import it.
@@ -10,19 +10,14 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
-from launch import Action, LaunchContext, Substitution
-from launch.actions import (
-    DeclareLaunchArgument,
-    EmitEvent,
-    ExecuteProcess,
-    SetLaunchConfiguration,
-)
+from launch import Action, LaunchContext
+from launch.actions import DeclareLaunchArgument, EmitEvent, ExecuteProcess
 from launch.events import matches_action
 from launch.events.process import ProcessExited, ShutdownProcess
 from launch.substitutions import LaunchConfiguration
@@ -37,6 +32,7 @@ from ..config.skin import Skin, read_skin
 from ..config.yaml import read_yaml, write_yaml
 from ..core.errors import ConfigError
 from ..device.live import link_configs
+from ..processes.skin_processes import Value
 
 _CONFIG = package_data() / "config"
 
@@ -55,8 +51,11 @@ SKIN_LAUNCH = package_data() / "launch" / "skin.launch.py"
 RECORD_QOS = _CONFIG / "record_qos.yaml"
 """Path of the file that lists the recorded topics and the quality of service (QoS) of each."""
 
-PARAMETERS = {parameter.name: parameter for parameter in (*RECONSTRUCTION, *DRIVER)}
-"""Name of a ROS parameter of the nodes `driver` and `reconstruction` -> its declaration."""
+PARAMETERS = {one.name: one for one in (*RECONSTRUCTION, *DRIVER) if one.name != "config"}
+"""Name of a ROS parameter of the nodes `driver` and `reconstruction` -> its declaration.
+
+The parameter `config` is left out, because its default depends on the argument `simulate`.
+"""
 
 NEEDED_PACKAGES = {
     "rviz": ("rviz2", "robot_state_publisher"),
@@ -108,51 +107,37 @@ def declare_switch(
     )
 
 
-class FromSkin(Substitution):  # type: ignore[misc]
-    """A launch substitution whose text is computed from the skin file that the launch argument
-    `config` names."""
+class SkinArguments(NamedTuple):
+    """Checked arguments of skin.launch.py.
 
-    def __init__(self, make: Callable[[Skin], str]) -> None:
-        """Store `make`, which returns the text of this substitution for the skin that was read."""
-        super().__init__()
-        self._make = make
-
-    def describe(self) -> str:
-        return f"{self._make.__name__} of config"
-
-    def perform(self, context: LaunchContext) -> str:
-        """Read the skin file, and return the text of this substitution.
-
-        Raises:
-            ConfigError: The skin file cannot be read or has mistakes.
-        """
-        return self._make(_read_skin(context))
-
-
-class GivenParameters(Substitution):  # type: ignore[misc]
-    """A launch substitution that writes launch arguments into a file with parameters of nodes.
-
-    Its text is the path of the file. Arguments that are empty are left out, so that a value that an
-    including launch file sets with SetParameter is kept: a value in the file would override it.
+    Attributes:
+        texts: Name of each argument -> its text.
+        switched_on: Names of the arguments that are true.
+        config: Absolute path of the skin file.
+        skin: Content of the skin file.
+        load: Path of the load script, for simulated hubs.
+        parameters: Name of a ROS parameter -> its value, for the arguments that set parameters of
+            `driver` and `reconstruction`. Empty arguments are left out, so that a value that an
+            including launch file sets with SetParameter is kept.
     """
 
-    def __init__(self, *names: str) -> None:
-        super().__init__()
-        self._parameters = [PARAMETERS[name] for name in names]
+    texts: dict[str, str]
+    switched_on: set[str]
+    config: Path
+    skin: Skin
+    load: Path
+    parameters: dict[str, Value]
 
-    def describe(self) -> str:
-        return f"parameters {', '.join(parameter.name for parameter in self._parameters)}"
 
-    def perform(self, context: LaunchContext) -> str:
-        """Write the parameter file and return its path."""
-        given = {
-            parameter.name: parameter.parse(text)
-            for parameter in self._parameters
-            if (text := _argument(context, parameter.name))
-        }
-        path = temporary_folder("cube_parameters_") / "given.yaml"
-        write_yaml(path, {"/**": {"ros__parameters": given}})
-        return str(path)
+def parameter_file(parameters: dict[str, Value]) -> str:
+    """Write a parameter file of ROS, which is temporary, and return its path.
+
+    Args:
+        parameters: Name of a parameter of a node -> its value.
+    """
+    path = temporary_folder("cube_parameters_") / "given.yaml"
+    write_yaml(path, {"/**": {"ros__parameters": parameters}})
+    return str(path)
 
 
 def rviz_file(skin: Skin) -> str:
@@ -162,36 +147,35 @@ def rviz_file(skin: Skin) -> str:
     return str(path)
 
 
-def record_skin(context: LaunchContext) -> list[Action]:
+def record_skin(context: LaunchContext, namespace: str, skin_name: str) -> ExecuteProcess:
     """Return the action that starts `ros2 bag record` for the topics of the skin.
 
     An including launch file may set a namespace, remaps and the parameter `qos_reliability` for all
     its nodes. launch_ros applies them to actions of the type Node only, so they are applied to the
     arguments of `ros2 bag` here.
+
+    Args:
+        context: Holds what an including launch file has set.
+        namespace: Namespace of the skin, relative to that of an including launch file.
+        skin_name: Name of the skin, which becomes a part of the name of the bag.
     """
     surroundings: dict[str, Any] = context.launch_configurations
     outer_namespace = surroundings.get("ros_namespace", "")
-    relative = prefix_namespace(outer_namespace, _argument(context, "namespace"))
-    namespace = (make_namespace_absolute(relative) or "").strip("/")
-    qualities = _recorded_topics(surroundings, namespace)
+    relative = prefix_namespace(outer_namespace, namespace)
+    full_namespace = (make_namespace_absolute(relative) or "").strip("/")
+    qualities = _recorded_topics(surroundings, full_namespace)
     overrides = temporary_folder("cube_record_") / "qos.yaml"
     write_yaml(overrides, qualities)
 
     time = f"{datetime.now():%Y_%m_%d-%H_%M_%S}"
-    parts = [*namespace.split("/"), _read_skin(context).name, time]
+    parts = [*full_namespace.split("/"), skin_name, time]
     name = "_".join(part for part in parts if part)
     folder = Path(name).absolute()
     command = ["ros2", "bag", "record", "--storage", "mcap", "--output", str(folder)]
     command += ["--qos-profile-overrides-path", str(overrides)]
     # `ros2 bag record` of Humble lacks the option --topics; all releases have --regex.
     command += ["--regex", f"^({'|'.join(qualities)})$"]
-    return [
-        ExecuteProcess(
-            cmd=command,
-            name="recorder",
-            output="screen",
-        )
-    ]
+    return ExecuteProcess(cmd=command, name="recorder", output="screen")
 
 
 def _recorded_topics(surroundings: dict[str, Any], namespace: str) -> dict[str, dict[str, str]]:
@@ -236,53 +220,45 @@ def stay_ended(event: ProcessExited, context: LaunchContext) -> Action | None:
     return EmitEvent(event=ShutdownProcess(process_matcher=matches_action(event.action)))
 
 
-def check_arguments(context: LaunchContext, declared: Iterable[str]) -> list[Action]:
-    """Check all launch arguments. It is the first action of a launch file, before nodes start.
+def check_arguments(context: LaunchContext, declared: Iterable[str]) -> SkinArguments:
+    """Check all launch arguments, before anything starts.
 
     Args:
         context: Holds the launch arguments.
         declared: Names of the arguments of the launch file.
-
-    Returns:
-        Actions that set the launch configuration `config` to the absolute path of the skin file,
-        and `port_directory` to a new temporary folder if hubs are simulated, else to "".
 
     Raises:
         ConfigError: An argument, the skin file or the load script has a mistake, or a ROS package
             that an argument needs is not installed. The error ends the launch.
     """
     _check_names(context, declared)
-    is_simulated = _is_true(context, "simulate")
-    config = _argument(context, "config") or (str(DEMO_SKIN) if is_simulated else "")
+    texts = {name: str(LaunchConfiguration(name).perform(context)) for name in declared}
+    switched_on = {name for name, text in texts.items() if text.lower() == "true"}
+    config = texts["config"] or (str(DEMO_SKIN) if "simulate" in switched_on else "")
     if not config:
         raise ConfigError(
             "config is missing: name a skin file, config:=skin.yaml, or try simulate:=true"
         )
     path = Path(config).expanduser().resolve()
-    skin = read_skin(path, _argument(context, "frame_prefix"))
-    read_script(Path(_argument(context, "load")).expanduser())
+    skin = read_skin(path, texts["frame_prefix"])
+    load = Path(texts["load"]).expanduser()
+    read_script(load)
 
-    for name in PARAMETERS.keys() & declared:
-        text = _argument(context, name)
-        if not text:
+    parameters: dict[str, Value] = {}
+    for name, text in texts.items():
+        if not text or name not in PARAMETERS:
             continue
         parameter = PARAMETERS[name]
-        refusal = parameter.refusal(parameter.parse(text))
+        parameters[name] = parameter.parse(text)
+        refusal = parameter.refusal(parameters[name])
         if refusal:
             raise ConfigError(f"{name}:={text}: {refusal}")
     # This call raises an error if the argument `port` is set for a skin with several links.
-    link_configs(skin, _argument(context, "port"))
+    link_configs(skin, texts["port"])
     for name, packages in NEEDED_PACKAGES.items():
-        if _is_true(context, name):
+        if name in switched_on:
             _check_installed(name, packages)
-
-    # Each launch makes a new folder for the pseudo-terminals of its simulated hubs, so that two
-    # simulated skins on one host do not use the same paths.
-    ports = str(temporary_folder("cube_ports_")) if is_simulated else ""
-    return [
-        SetLaunchConfiguration("config", str(path)),
-        SetLaunchConfiguration("port_directory", ports),
-    ]
+    return SkinArguments(texts, switched_on, path, skin, load, parameters)
 
 
 def _check_names(context: LaunchContext, declared: Iterable[str]) -> None:
@@ -302,18 +278,6 @@ def _check_names(context: LaunchContext, declared: Iterable[str]) -> None:
                 f"no launch argument {name}, there are: {', '.join(declared)}. Parameters of nodes "
                 "are set in a launch file that includes this one, see docs/robot.md"
             )
-
-
-def _argument(context: LaunchContext, name: str) -> str:
-    return str(LaunchConfiguration(name).perform(context))
-
-
-def _is_true(context: LaunchContext, name: str) -> bool:
-    return _argument(context, name).lower() == "true"
-
-
-def _read_skin(context: LaunchContext) -> Skin:
-    return read_skin(Path(_argument(context, "config")), _argument(context, "frame_prefix"))
 
 
 def _check_installed(name: str, packages: tuple[str, ...]) -> None:

@@ -206,15 +206,12 @@ def test_the_recording_follows_namespace_and_remaps():
     context = LaunchContext()
     context.launch_configurations.update(
         {
-            "config": str(SKIN),
-            "frame_prefix": "",
-            "namespace": "hand",
             "ros_namespace": "/robot1",
             "ros_remaps": [("stress", "touch")],
             "global_params": [("qos_reliability", "best_effort")],
         }
     )
-    (action,) = record_skin(context)
+    action = record_skin(context, "hand", "skin")
     command = [words[0].perform(context) for words in action.cmd]
     names = ["frequencies", "touch", "compensation", "info", "driver/info", "diagnostics"]
     whole = [f"/robot1/hand/{name}" for name in names]
@@ -259,44 +256,77 @@ def test_pages_use_arguments_that_launch_files_have():
         assert set(re.findall(r"(\w+):=", arguments)) <= set(declared(file)), file
 
 
-@needs_launch
-def test_the_launch_file_starts_what_the_demo_starts():
-    """And RViz and the publisher of frames. The recorder is made when the launch runs."""
-    from launch.actions import ExecuteProcess
-    from launch.launch_description_sources import get_launch_description_from_python_launch_file
-    from launch_ros.actions import Node
-
-    path = str(ROOT / "launch" / "skin.launch.py")
-    actions = get_launch_description_from_python_launch_file(path).entities
-    started = {
-        action.node_executable if isinstance(action, Node) else action.name[0].text
-        for action in actions
-        if isinstance(action, ExecuteProcess)
-    }
-    every = [
-        *skin_processes(SKIN, simulated=SimulatedHubs(Path("p")), markers=True, contacts=True),
-        *skin_processes(SKIN, composed=True),
-    ]
-    assert started == {process.executable for process in every} | {
-        "rviz2",
-        "robot_state_publisher",
-    }
-
-
-def arguments_refused(**given: str) -> str:
-    """Why skin.launch.py starts nothing with these arguments of the command line."""
+def launch_context(**given: str) -> object:
+    """The context of skin.launch.py with these arguments of the command line."""
     from launch import LaunchContext
-
-    from cube_tensor_driver.core.errors import ConfigError
-    from cube_tensor_driver.ros.launching import check_arguments
 
     context = LaunchContext(argv=[f"{name}:={text}" for name, text in given.items()])
     for argument in declared("skin.launch.py").values():
         context.launch_configurations[argument.name] = given.get(
             argument.name, argument.default_value[0].text
         )
+    return context
+
+
+def started_by(**given: str) -> dict[str, object]:
+    """The actions of skin.launch.py with these arguments, by the names of their executables."""
+    from launch.actions import OpaqueFunction
+    from launch.launch_description_sources import get_launch_description_from_python_launch_file
+    from launch_ros.actions import Node
+
+    path = str(ROOT / "launch" / "skin.launch.py")
+    description = get_launch_description_from_python_launch_file(path)
+    (start,) = (one for one in description.entities if isinstance(one, OpaqueFunction))
+    return {
+        action.node_executable if isinstance(action, Node) else action.name[0].text: action
+        for action in start.execute(launch_context(**given))
+    }
+
+
+@needs_launch
+def test_the_launch_file_starts_what_its_arguments_ask_for(monkeypatch):
+    """In the order in which the processes must start."""
+    monkeypatch.setitem(launching().NEEDED_PACKAGES, "rviz", ())
+    monkeypatch.setitem(launching().NEEDED_PACKAGES, "record", ())
+    assert list(started_by(config=str(SKIN))) == ["reconstruction", "driver"]
+    rviz = started_by(config=str(SKIN), composed="true", rviz="True")
+    assert list(rviz) == ["composed", "markers", "robot_state_publisher", "rviz2"]
+    others = started_by(simulate="true", contacts="true", record="true")
+    assert list(others) == ["simulator", "reconstruction", "driver", "contacts", "recorder"]
+    words = [word[0] for word in others["simulator"].cmd]
+    assert {word.text for word in words[1:]} >= {"--config", str(SKIN), "--ports", "--load"}
+    assert "--noise" not in {word.text for word in words[1:]}
+
+
+@needs_launch
+def test_empty_arguments_set_no_parameter(monkeypatch):
+    """Then a parameter that an including launch file sets stays."""
+    module = launching()
+    written = []
+    monkeypatch.setattr(module, "write_yaml", lambda path, content: written.append(content))
+
+    def parameters(**given: str) -> list[dict[str, object]]:
+        written.clear()
+        started_by(config=str(SKIN), contacts="true", **given)
+        return [content["/**"]["ros__parameters"] for content in written]
+
+    both = {"config": str(SKIN)}
+    assert parameters() == [both, both, {}]
+    both |= {"rate": 80.0, "autostart": False, "frame_prefix": "left_"}
+    given = {"rate": "80", "autostart": "False", "frame_prefix": "left_"}
+    assert parameters(**given) == [both, both, {"autostart": False}]
+
+
+def launching() -> object:
+    return importlib.import_module("cube_tensor_driver.ros.launching")
+
+
+def arguments_refused(**given: str) -> str:
+    """Why skin.launch.py starts nothing with these arguments of the command line."""
+    from cube_tensor_driver.core.errors import ConfigError
+
     with pytest.raises(ConfigError) as refused:
-        check_arguments(context, declared("skin.launch.py"))
+        launching().check_arguments(launch_context(**given), declared("skin.launch.py"))
     return str(refused.value)
 
 
