@@ -248,108 +248,124 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
     assert not np.ptp(rings[1:], axis=1).any()
 
 
-def test_the_text_of_a_contact_is_pale_until_it_is_fitted():
+def picture(quantity="pressure", top=2e3, health=None, contacts=None, n=12) -> list[object]:
+    """The markers of a picture of cubes of which one is loaded, as other nodes read them."""
     pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
-    from geometry_msgs.msg import Point, Vector3
     from rclpy.serialization import deserialize_message
     from visualization_msgs.msg import MarkerArray
 
-    from cube_tensor_driver.msg import SkinContacts
     from cube_tensor_driver.ros.markers.canvas import Canvas
 
-    canvas = Canvas("skin", places(), crosses=False, signed=False)
+    values = np.zeros((n, 15))
+    values[n // 2, 2:5] = -2e3, 500, 0
+    ranges = scene.Ranges().follow(values, np.zeros(n), top)
+    health = np.full(n, FINE) if health is None else health
+    canvas = Canvas("skin", places(n), crosses=True)
+    chosen = scene.QUANTITIES[quantity]
+    data = canvas.draw(chosen, -values[:, 2], values, ranges, health, contacts)
+    return deserialize_message(data, MarkerArray).markers
+
+
+def test_the_text_of_a_contact_is_pale_until_it_is_fitted():
+    pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
+    from geometry_msgs.msg import Point, Vector3
+
+    from cube_tensor_driver.msg import SkinContacts
+
     one = {"normal_force": [1.0] * 2, "shear_force": [0.5] * 2, "area": [1e-5] * 2}
     one |= {"position": [Point()] * 2, "normal": [Vector3(z=1.0)] * 2}
     opacities = []
     for refined in ([True, False], []):
-        canvas.draw_contacts(SkinContacts(refined=refined, **one))
-        drawn = deserialize_message(bytes(canvas.data), MarkerArray).markers
+        drawn = picture(contacts=SkinContacts(refined=refined, **one))
         texts = {marker.ns: marker for marker in drawn}
         opacities.append([texts[f"contact {number}"].color.a for number in range(2)])
     assert opacities == [[1.0, 0.5], [1.0, 1.0]]
 
 
-def test_the_title_has_no_padding_and_leaves_the_rest_of_the_picture_as_it_was():
-    pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
-    from rclpy.serialization import deserialize_message
-    from visualization_msgs.msg import MarkerArray
-
-    from cube_tensor_driver.ros.markers.canvas import Canvas
-
-    canvas = Canvas("skin", places(12), crosses=True, signed=False)
-    values, health = np.zeros((12, 15)), np.full(12, FINE)
-    values[3, 2:5] = -2e3, 500, 0
+def test_the_title_states_quantity_range_and_health_without_padding():
+    health = np.full(12, FINE)
     health[7] = FAULTY
-    colours = np.random.default_rng(1).random((12, 3))
-    canvas.draw_cubes(colours)
-    canvas.draw_arrows(values, scene.Ranges().follow(values, np.zeros(12), 2e3))
-    canvas.draw_faults(health)
-
-    def drawn():
-        markers = deserialize_message(bytes(canvas.data), MarkerArray).markers
-        title = markers.pop()
-        assert title.ns == "legend"
-        return title.text, [one for one in markers if not one.ns.startswith("legend number")]
-
-    _, before = drawn()
-    titles = []
-    for name, top in (("pressure", 2e3), ("pressure", 950.0), ("gradient", 3e6), ("residual", 3.0)):
-        canvas.legend.draw(scene.QUANTITIES[name], top, health)
-        titles.append(drawn()[0])
-    canvas.legend.draw(scene.QUANTITIES["pressure"], 5e5, np.full(12, STALE))
-    title, after = drawn()
-    assert [*titles, title] == [
+    shown = [("pressure", 2e3), ("pressure", 950.0), ("gradient", 3e6), ("residual", 3.0)]
+    drawn = [picture(name, top, health) for name, top in shown]
+    drawn.append(picture("pressure", 5e5, np.full(12, STALE)))
+    assert [markers[-1].ns for markers in drawn] == ["legend"] * 5
+    assert [markers[-1].text for markers in drawn] == [
         "pressure -szz: 0 to 2.00 kPa; 11 ok, 1 no tensor",
         "pressure -szz: 0 to 0.95 kPa; 11 ok, 1 no tensor",
         "gradient |dszz/dx, dszz/dy|: 0 to 3.00 kPa/mm; 11 ok, 1 no tensor",
         "residual: 0 to 3.00 sigma; 11 ok, 1 no tensor",
         "pressure -szz: 0 to 500. kPa; 0 ok, 12 stale",
     ]
-    bars = [next(one for one in made if one.ns == "legend bar") for made in (before, after)]
-    bars[0].colors = bars[1].colors
-    assert before == after
-    cubes = next(one for one in after if one.ns == "cubes 0")
-    np.testing.assert_allclose([[c.r, c.g, c.b] for c in cubes.colors], colours, 1e-6)
+
+
+def test_faults_are_drawn_anew_when_the_health_changes():
+    pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
+    from rclpy.serialization import deserialize_message
+    from visualization_msgs.msg import MarkerArray
+
+    from cube_tensor_driver.ros.markers.canvas import Canvas
+
+    canvas = Canvas("skin", places(3), crosses=False)
+    values, ranges = np.zeros((3, 15)), scene.Ranges(1.0, 1.0, 1.0)
+    counts = []
+    for health in ([FINE] * 3, [FINE, FAULTY, STALE], [FINE, FINE, STALE], [FINE, FINE, STALE]):
+        data = canvas.draw(
+            QUANTITIES["pressure"], np.zeros(3), values, ranges, np.array(health), None
+        )
+        (faults,) = (
+            one for one in deserialize_message(data, MarkerArray).markers if one.ns == "faults"
+        )
+        crosses = np.array([[p.x, p.y] for p in faults.points]).reshape(3, 4, 2)
+        counts.append(np.count_nonzero(np.ptp(crosses, axis=1).any(axis=1)))
+        shown = np.array([[c.r, c.g, c.b, c.a] for c in faults.colors])[::4]
+        np.testing.assert_allclose(shown[:, :3], scene.MARK[health], atol=1e-6)
+        assert (shown[:, 3] == 1).all()
+    assert counts == [0, 2, 1, 1]
 
 
 @pytest.mark.parametrize("name", ["a", "ab", "abc", "abcd", "a name of many letters"])
-def test_arrays_of_serialised_markers_are_where_other_nodes_read_them(name):
+def test_serialised_shapes_are_the_markers_of_rclpy(name):
     """Lengths of texts decide about the alignment of all that follows."""
     pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
     from geometry_msgs.msg import Point
-    from rclpy.serialization import deserialize_message
+    from rclpy.serialization import deserialize_message, serialize_message
     from std_msgs.msg import ColorRGBA
     from visualization_msgs.msg import Marker, MarkerArray
 
-    from cube_tensor_driver.ros.markers.serialised import SerialisedMarkers
+    from cube_tensor_driver.ros.markers.serialised import Shape, serialise
 
-    lines = Marker(ns=name, points=[Point()] * 5, colors=[ColorRGBA()] * 5)
-    text = Marker(ns=f"{name}'s legend", text=" " * 7)
-    text.header.frame_id = name
-    empty = Marker(ns=f"{name}, empty")
-    made = SerialisedMarkers([lines, text, empty, Marker(ns="last", points=[Point()] * 2)])
     random = np.random.default_rng(len(name))
-    points, colours, last = random.random((5, 3)), random.random((5, 4)), random.random((2, 3))
-    made[name].points[:] = points
-    made[name].colours[:] = colours
-    made["last"].points[:] = last
-    made[f"{name}'s legend"].text[:] = np.frombuffer(b"7 bytes", np.uint8)
+    points, colours = random.random((5, 3)), random.random((5, 3)).astype(np.float32)
+    scale, position, colour = random.random((3, 3)).tolist()
+    rotation = random.random(4).tolist()
+    look = {"scale": scale, "position": position, "rotation": rotation, "colour": colour}
+    shapes = [
+        Shape(name, Marker.LINE_LIST, points=points, colours=colours, opacity=0.25, **look),
+        Shape(f"{name}'s legend", Marker.TEXT_VIEW_FACING, text=name, **look),
+        Shape(f"{name}, empty", Marker.CUBE_LIST, scale),
+        Shape("last", Marker.CUBE_LIST, points=points[:2], **look),
+    ]
+    data = serialise(name, shapes)
 
-    read = {one.ns: one for one in deserialize_message(bytes(made.data), MarkerArray).markers}
-    assert list(read) == [name, f"{name}'s legend", f"{name}, empty", "last"]
-    assert [[p.x, p.y, p.z] for p in read[name].points] == points.tolist()
-    assert [[p.x, p.y, p.z] for p in read["last"].points] == last.tolist()
-    np.testing.assert_allclose([[c.r, c.g, c.b, c.a] for c in read[name].colors], colours, 1e-6)
-    assert read[f"{name}'s legend"].text == "7 bytes" and "nobody" not in made
-
-    # All else is moved when a text gets another length, and keeps its values.
-    read[f"{name}'s legend"].text = "more than 7 bytes"
-    made.write_text(f"{name}'s legend", "more than 7 bytes")
-    moved = deserialize_message(bytes(made.data), MarkerArray).markers
-    assert moved == list(read.values())
-    made["last"].points[:] = last = random.random((2, 3))
-    moved = deserialize_message(bytes(made.data), MarkerArray).markers
-    assert [[p.x, p.y, p.z] for p in moved[-1].points] == last.tolist()
+    markers = []
+    for shape in shapes:
+        made = Marker(ns=shape.name, type=shape.kind, text=shape.text, frame_locked=True)
+        made.header.frame_id = name
+        made.lifetime.sec = 2
+        given = zip("xyz", shape.position, shape.scale, strict=True)
+        for axis, coordinate, extent in given:
+            setattr(made.pose.position, axis, coordinate)
+            setattr(made.scale, axis, extent)
+        for axis, part in zip("xyzw", shape.rotation, strict=True):
+            setattr(made.pose.orientation, axis, part)
+        made.color.r, made.color.g, made.color.b = shape.colour
+        made.color.a = shape.opacity
+        made.points = [Point(x=x, y=y, z=z) for x, y, z in shape.points.tolist()]
+        made.colors = [ColorRGBA(r=r, g=g, b=b, a=1.0) for r, g, b in shape.colours.tolist()]
+        markers.append(made)
+    expected = serialize_message(MarkerArray(markers=markers))
+    assert len(data) == len(expected)
+    assert deserialize_message(data, MarkerArray) == deserialize_message(expected, MarkerArray)
 
 
 def test_the_head_of_an_arrow_is_at_its_tip_and_flat_to_the_viewer():

@@ -7,20 +7,17 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from geometry_msgs.msg import Vector3
 from visualization_msgs.msg import Marker
 
 from ...core.arrays import Array, Index
 from ...core.latest_stress import FINE, HEALTH_WORDS
 from ...core.poses import CubePoses
 from ...views import scene
-from .serialised import (
-    Colour,
-    SerialisedMarkers,
-    allocate,
-    make_marker,
-    make_text,
-)
+from .serialised import Colour, Shape, make_lines, make_text
+
+LINE_WIDTH = 0.05
+"""Width of the lines of arrows and crosses, divided by the pitch (distance of neighbouring cubes).
+"""
 
 UPSIDE_DOWN = np.array([-1.0, 1.0, -1.0])
 """Rotation by 180 degrees about the y axis, as factors of the x, y and z coordinates.
@@ -159,110 +156,77 @@ class LegendPlace(NamedTuple):
         return np.array([x, bar_bottom_y - below, self.z])
 
 
-class Legend:
-    """Draws the legend by writing into the serialised markers that `legend_markers` has made."""
-
-    def __init__(self, markers: SerialisedMarkers, place: LegendPlace) -> None:
-        self._markers = markers
-        edges_and_centres = np.linspace(0, 1, 2 * BAR_BOXES + 1)
-        centres = edges_and_centres[1::2]
-        bar = np.array([place.point(across, 0) for across in centres])
-        bar[:, 1] += 0.15 * place.pitch
-        markers["legend bar"].points[:] = bar * UPSIDE_DOWN
-        upwards = np.array([[0.0, 0.0, 1.0]])
-        for number, scale in enumerate(SCALES):
-            tail = place.point(0, FIRST_SCALE_LINE + SCALE_LINES * number)
-            length = scale.length * place.pitch
-            tip = tail + np.array([length, 0, 0])
-            arrow = np.stack([tail, tip])
-            lines = scene.heads(arrow[np.newaxis], upwards)
-            markers[f"{scale.name} arrow"].points[:] = lines.reshape(-1, 3)
-
-    def draw(
-        self,
-        quantity: scene.Quantity,
-        top: float,
-        health: Index,
-    ) -> None:
-        """Draw the colour bar with its numbers, and the title with the health of the cubes.
-
-        Args:
-            quantity: The quantity that colours show.
-            top: Value at the upper end of the colour scale, in SI units.
-            health: Health of each cube, (cubes,): fine, doubtful, faulty or stale, as
-                `LatestStress.health` returns it.
-        """
-        low = -top if quantity.signed else 0.0
-        values = np.linspace(low, top, BAR_BOXES)
-        bar = self._markers["legend bar"]
-        bar.colours[:, :3] = scene.colours(quantity, values, top)
-        for number, position in enumerate(NUMBER_POSITIONS):
-            value = (low + position * (top - low)) / quantity.size
-            # Numbers of a quantity that can be negative always have a sign, so that the length of
-            # the text does not change.
-            sign = "-" if value < 0 else "+" if quantity.signed else ""
-            text = sign + four_characters(abs(value))
-            self._markers.write_text(f"legend number {number}", text)
-
-        self._markers.write_text("legend", _title(quantity, top, health))
-
-    def draw_scale(self, traction_pa: float, gradient_pa_per_m: float) -> None:
-        """Write the values of the longest arrows.
-
-        Args:
-            traction_pa: Traction (force per area on the upper face) of the longest arrow, in Pa.
-            gradient_pa_per_m: Gradient of stress of the longest arrow, in Pa/m.
-        """
-        for scale, value in zip(SCALES, (traction_pa, gradient_pa_per_m), strict=True):
-            self._markers.write_text(f"{scale.name} scale", _scale_text(scale, value))
-
-
-def legend_markers(
-    frame_id: str,
-    place: LegendPlace,
-    signed: bool,
-) -> list[Marker]:
-    """Return the markers of a legend, with placeholders for texts and colours.
+def draw_arrows(scale: ArrowScale, name: str, arrows: Array, normal: Array, pitch: float) -> Shape:
+    """Return arrows as a shape of lines.
 
     Args:
-        frame_id: Frame id of the parent frame of the skin.
+        scale: The kind of arrow.
+        name: Name of the marker.
+        arrows: Tails and tips of the arrows, (n, 2, 3), in m.
+        normal: Direction perpendicular to the plane of each arrow, (n, 3).
+        pitch: Distance of neighbouring cubes, in m.
+    """
+    return make_lines(name, scene.heads(arrows, normal), LINE_WIDTH * pitch, scale.colour)
+
+
+def draw_legend(
+    place: LegendPlace,
+    quantity: scene.Quantity,
+    ranges: scene.Ranges,
+    health: Index,
+) -> list[Shape]:
+    """Return the shapes of the legend.
+
+    Args:
         place: Position and size of the legend.
-        signed: Whether the quantity that colours show can be negative, so that its numbers have
-            signs.
+        quantity: The quantity that colours show.
+        ranges: Values at the upper end of the colour scale and of the longest arrows.
+        health: Health of each cube, (cubes,): fine, doubtful, faulty or stale, as
+            `LatestStress.health` returns it.
     """
     height = TEXT_HEIGHT * place.width
-    bar = make_marker(frame_id, "legend bar", Marker.CUBE_LIST)
-    # This quaternion is the rotation `UPSIDE_DOWN`, by 180 degrees about the y axis.
-    bar.pose.orientation.y, bar.pose.orientation.w = 1.0, 0.0
-    bar.scale = Vector3(
-        x=place.width / BAR_BOXES,
-        y=0.3 * place.pitch,
-        z=0.05 * place.pitch,
+    top = ranges.colours
+    low = -top if quantity.signed else 0.0
+    edges_and_centres = np.linspace(0, 1, 2 * BAR_BOXES + 1)
+    centres = edges_and_centres[1::2]
+    boxes = np.array([place.point(across, 0) for across in centres])
+    boxes[:, 1] += 0.15 * place.pitch
+    values = np.linspace(low, top, BAR_BOXES)
+    bar = Shape(
+        "legend bar",
+        Marker.CUBE_LIST,
+        (place.width / BAR_BOXES, 0.3 * place.pitch, 0.05 * place.pitch),
+        boxes * UPSIDE_DOWN,
+        scene.colours(quantity, values, top),
+        # This quaternion is the rotation `UPSIDE_DOWN`, by 180 degrees about the y axis.
+        rotation=(0.0, 1.0, 0.0, 0.0),
     )
-    allocate(bar, BAR_BOXES, with_colours=True)
-    markers = [bar]
+    shapes = [bar]
 
-    for number, across in enumerate(NUMBER_POSITIONS):
-        placeholder = ("+" if signed else "") + four_characters(0.0)
-        position = place.point(across, NUMBERS_LINE)
-        name = f"legend number {number}"
-        markers.append(make_text(frame_id, name, height, placeholder, position))
+    for number, position in enumerate(NUMBER_POSITIONS):
+        value = (low + position * (top - low)) / quantity.size
+        sign = "-" if value < 0 else "+" if quantity.signed else ""
+        text = sign + four_characters(abs(value))
+        centre = place.point(position, NUMBERS_LINE)
+        shapes.append(make_text(f"legend number {number}", text, height, centre))
 
-    for number, scale in enumerate(SCALES):
-        arrow = make_marker(frame_id, f"{scale.name} arrow", Marker.LINE_LIST, scale.colour)
-        arrow.scale.x = 0.05 * place.pitch
-        allocate(arrow, 6, with_colours=False)
-        placeholder = _scale_text(scale, 0.0)
+    upwards = np.array([[0.0, 0.0, 1.0]])
+    longest = (ranges.traction, ranges.gradient)
+    for number, (scale, value) in enumerate(zip(SCALES, longest, strict=True)):
+        line = FIRST_SCALE_LINE + SCALE_LINES * number
+        tail = place.point(0, line)
+        tip = tail + np.array([scale.length * place.pitch, 0, 0])
+        arrow = np.stack([tail, tip])[np.newaxis]
+        shapes.append(draw_arrows(scale, f"{scale.name} arrow", arrow, upwards, place.pitch))
+        text = f"{scale.name} {four_characters(value / scale.unit_si)} {scale.unit}"
         # The text begins to the right of the longest arrow. The position of a text marker is the
         # centre of the text. To compute it, letters are assumed to be half as wide as high.
         begin = (TRACTION_LENGTH + 0.3) * place.pitch / place.width
-        across = begin + 0.25 * len(placeholder) * TEXT_HEIGHT
-        position = place.point(across, FIRST_SCALE_LINE + SCALE_LINES * number)
-        text = make_text(frame_id, f"{scale.name} scale", height, placeholder, position)
-        markers += [arrow, text]
+        centre = place.point(begin + 0.25 * len(text) * TEXT_HEIGHT, line)
+        shapes.append(make_text(f"{scale.name} scale", text, height, centre))
 
-    centre = place.point(0.5, TITLE_LINE)
-    return [*markers, make_text(frame_id, "legend", height, "title", centre)]
+    title = _title(quantity, top, health)
+    return [*shapes, make_text("legend", title, height, place.point(0.5, TITLE_LINE))]
 
 
 def four_characters(value: float) -> str:
@@ -281,7 +245,6 @@ def _title(quantity: scene.Quantity, top: float, health: Index) -> str:
     """Return the title: quantity and range of the colours, and number of cubes in each health.
 
     It is a single line, because RViz draws a second line 1 cm lower, whatever the size of the text.
-    Its length changes only with the numbers of cubes.
 
     Args:
         quantity: The quantity that colours show.
@@ -298,13 +261,3 @@ def _title(quantity: scene.Quantity, top: float, health: Index) -> str:
         if count or state == FINE:
             states.append(f"{count} {word}")
     return f"{label}: {low} to {high} {unit}; {', '.join(states)}"
-
-
-def _scale_text(scale: ArrowScale, value: float) -> str:
-    """Return a text of constant length with the value of the longest arrow.
-
-    Args:
-        scale: The kind of arrow.
-        value: Value of the longest arrow, in SI units.
-    """
-    return f"{scale.name} {four_characters(value / scale.unit_si)} {scale.unit}"

@@ -41,13 +41,7 @@ class Markers(SkinSubscriberNode):
 
     def prepare(self, skin: FollowedSkin) -> None:
         frame_id = skin.info.header.frame_id
-        signed = self._quantity.signed
-        self._canvas = Canvas(
-            frame_id,
-            skin.poses,
-            crosses=self.value("crosses"),
-            signed=signed,
-        )
+        self._canvas = Canvas(frame_id, skin.poses, crosses=self.value("crosses"))
         self._ranges = scene.Ranges()
 
     def compute_message(self, skin: FollowedSkin, health: Index) -> bytes:
@@ -58,15 +52,8 @@ class Markers(SkinSubscriberNode):
         last = self._ranges.colours
         top = fixed or scene.automatic_top(self._quantity, shown, last)
         ranges = self._ranges = self._ranges.follow(values, residual, top)
-        canvas = self._canvas
-        canvas.draw_cubes(scene.colours(self._quantity, shown, ranges.colours))
-        canvas.draw_arrows(values, ranges)
-        canvas.draw_faults(health)
-        canvas.draw_crosses(values, ranges.traction)
-        canvas.draw_contacts(self._newest_contacts(skin))
-        canvas.legend.draw(self._quantity, ranges.colours, health)
-        canvas.legend.draw_scale(ranges.traction, ranges.gradient)
-        return bytes(canvas.data)
+        contacts = self._newest_contacts(skin)
+        return self._canvas.draw(self._quantity, shown, values, ranges, health, contacts)
 
     def _newest_contacts(self, skin: FollowedSkin) -> SkinContacts | None:
         """Return the newest contacts; None if no message of `contacts` has arrived, or the newest
