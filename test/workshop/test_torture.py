@@ -54,6 +54,20 @@ def test_a_tortured_skin_loses_nothing_uncounted_and_says_nothing_wrong(tmp_path
 
 
 @pytest.mark.alone
+def test_a_mutation_is_caught_in_a_short_torture():
+    """The frequencies are 1 ppm too high."""
+    code = (
+        "import threading\n"
+        "from workshop.torture.torture import failures, torture\n"
+        "print(*failures(torture(2.0, 1, threading.Event(), 'scaled')))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=120
+    )
+    assert "wrong" in done.stdout.split(), done.stderr
+
+
+@pytest.mark.alone
 @pytest.mark.campaign
 def test_mutations_are_caught(tmp_path, effort):
     if effort == 1:
