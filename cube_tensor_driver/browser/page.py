@@ -24,7 +24,7 @@ from .history import History
 from .markup import PageStatus
 from .scan import Scan
 from .scene_3d import SPAN, Update
-from .update import Choices, ShownSkin, build_update
+from .update import ShownSkin, ViewSettings, build_update
 
 BRAND_COLOUR = (24, 100, 171)
 """Colour of buttons and check boxes, as red, green and blue from 0 to 255."""
@@ -110,7 +110,7 @@ NOTE_S = 8.0
 """Time, in seconds, for which the page shows a note about an action of the user."""
 
 
-class Layout:
+class PageLayout:
     """Arrangement of the page for the size that a browser has when it opens the page.
 
     Attributes:
@@ -142,7 +142,7 @@ class Page:
     """
 
     def __init__(
-        self, client: viser.ClientHandle, layout: Layout, skin: ShownSkin, act: Act
+        self, client: viser.ClientHandle, layout: PageLayout, skin: ShownSkin, act: Act
     ) -> None:
         self._client, self._layout, self._skin = client, layout, skin
         self._scan: Scan | None = None
@@ -185,27 +185,27 @@ class Page:
             self._history = copy.deepcopy(history) if self._paused else None
         self._show_status(status)
         shown_history = self._history or history
-        choices = self._choices(shown_history, status)
+        settings = self._read_settings(shown_history, status)
         update, self._ranges = build_update(
             self._skin,
             self._scan or scan,
             shown_history,
-            choices,
+            settings,
             self._ranges_before,
         )
-        self.send(update, choices)
+        self.send(update, settings)
 
-    def send(self, update: Update, choices: Choices) -> None:
+    def send(self, update: Update, settings: ViewSettings) -> None:
         """Send the changed properties of all objects to the browser, as one update.
 
         Args:
             update: Name of an object on the page -> its properties.
-            choices: What the user has chosen to see.
+            settings: What the user has chosen to see.
         """
         # `atomic` makes the browser apply all changes at once. Otherwise it could show numbers of
         # one instant beside the picture of another one.
         with self._client.atomic():
-            for name, plot in self._charts.replace_plots(choices.charts).items():
+            for name, plot in self._charts.replace_plots(settings.charts).items():
                 self._objects[name] = plot
                 self._sent = {key: value for key, value in self._sent.items() if key[0] != name}
             for name, properties in update.items():
@@ -215,14 +215,14 @@ class Page:
                         self._sent[name, key] = value
                         setattr(self._objects[name], key, value)
 
-    def _choices(self, history: History, status: PageStatus) -> Choices:
+    def _read_settings(self, history: History, status: PageStatus) -> ViewSettings:
         """Return what the user has chosen, as the browser has reported it."""
         quantity = self._colours.quantity
         if quantity is not self._quantity:
             # The old range is that of another quantity, so the automatic range starts anew.
             self._quantity = quantity
             self._ranges_before = self._ranges_before._replace(colours=0.0)
-        return Choices(
+        return ViewSettings(
             quantity=quantity,
             fixed_top=self._colours.fixed_top,
             cube=self._cube,
@@ -344,7 +344,7 @@ def is_same(one: Any, other: Any) -> bool:
 
 def show_waiting(
     client: viser.ClientHandle,
-    layout: Layout,
+    layout: PageLayout,
     text: str,
 ) -> None:
     """Show a text in a browser while no skin is published."""
@@ -367,7 +367,7 @@ def clear(client: viser.ClientHandle) -> None:
 
 def set_up(
     client: viser.ClientHandle,
-    layout: Layout,
+    layout: PageLayout,
     name: str,
 ) -> None:
     """Set the colours, the main panel and the camera of a browser.
@@ -391,7 +391,7 @@ def set_up(
     place_camera(client, layout, INCLINED)
 
 
-def place_camera(client: viser.ClientHandle, layout: Layout, direction: str) -> None:
+def place_camera(client: viser.ClientHandle, layout: PageLayout, direction: str) -> None:
     """Look at the skin from one of `CAMERA_DIRECTIONS`; unknown texts do nothing."""
     if direction not in CAMERA_DIRECTIONS:  # a browser may send any text
         return

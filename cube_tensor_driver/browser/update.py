@@ -65,7 +65,7 @@ class ShownSkin:
         self.scene = Scene(names, poses, self.surface)
 
 
-class Choices(NamedTuple):
+class ViewSettings(NamedTuple):
     """What the user of a page has chosen to see.
 
     Attributes:
@@ -88,7 +88,7 @@ class Choices(NamedTuple):
 
 
 def build_update(
-    skin: ShownSkin, scan: Scan, history: History, choices: Choices, before: Ranges
+    skin: ShownSkin, scan: Scan, history: History, settings: ViewSettings, before: Ranges
 ) -> tuple[Update, Ranges]:
     """Return everything that a page shows of one scan.
 
@@ -96,44 +96,44 @@ def build_update(
         skin: The skin.
         scan: The instant.
         history: Values of all cubes in the last seconds; the newest are those of the scan.
-        choices: What the user has chosen.
+        settings: What the user has chosen.
         before: Upper ends of the automatic ranges in the picture of the scan before, from which
             they fall slowly.
 
     Returns:
         Name of an object on the page -> its properties; upper ends of the ranges in this picture.
     """
-    cube = choices.cube
+    cube = settings.cube
     colouring = Colouring.of(
         scan,
         skin.surface,
-        choices.quantity,
-        choices.fixed_top,
+        settings.quantity,
+        settings.fixed_top,
         before.colours,
     )
     ranges = before.follow(scan.values, scan.residual, colouring.top)
-    update = skin.scene.draw(scan, colouring, choices.parts, cube, ranges)
+    update = skin.scene.draw(scan, colouring, settings.parts, cube, ranges)
 
     above = None if colouring.above is None else colouring.above[cube]
     # Each text is the content of an HTML element of the same name (page.py).
     texts = {
-        "headline": markup.headline(scan, choices.is_paused, choices.is_recording),
-        "legend": markup.legend(choices.quantity, colouring.top, scan.field),
+        "headline": markup.headline(scan, settings.is_paused, settings.is_recording),
+        "legend": markup.legend(settings.quantity, colouring.top, scan.field),
         "meaning": markup.explanation(skin.scene.bar, *skin.scene.per_bar(ranges), scan.field),
         "numbers": markup.numbers(scan, cube, above),
         "contact list": markup.contacts(scan),
         "health": markup.conditions(skin.names, scan),
     }
     update |= {name: {"content": text} for name, text in texts.items()}
-    for number, chart in enumerate(choices.charts):
+    for number, chart in enumerate(settings.charts):
         update[f"chart {number}"] = chart_properties(history, chart)
-    return update | _options(history, scan, choices), ranges
+    return update | _options(history, scan, settings), ranges
 
 
 def _options(
     history: History,
     scan: Scan,
-    choices: Choices,
+    settings: ViewSettings,
 ) -> Update:
     """Return the entries of the drop-down lists: only what can be shown of this skin.
 
@@ -149,10 +149,10 @@ def _options(
         for name, quantity in QUANTITIES.items()
         if name not in COMPONENTS or name in observed
     ]
-    if scan.field.sigma is not None or choices.quantity is DEVIATION:
+    if scan.field.sigma is not None or settings.quantity is DEVIATION:
         quantities.append(DEVIATION.label)
     groups = tuple(group for group, names in GROUPS.items() if observed.intersection(names))
     update: Update = {"colour": {"options": tuple(quantities)}}
-    for number in range(len(choices.charts)):
+    for number in range(len(settings.charts)):
         update[f"chart list {number}"] = {"options": groups}
     return update

@@ -51,7 +51,7 @@ from .clients import BagRecorder, ReplayClient, ServiceCalls
 from .gate import LOCAL_HOSTS, check_host, guarded_server
 from .history import History
 from .markup import PageStatus
-from .page import CLEAR_TARE, HOLD, TARE, Layout, Page, clear, show_waiting
+from .page import CLEAR_TARE, HOLD, TARE, Page, PageLayout, clear, show_waiting
 from .scan import Links, Scan, ScanSynchronizer
 from .update import ShownSkin
 
@@ -135,7 +135,7 @@ class Viewer:
         self._scans = ScanSynchronizer(0)
         self._history = History(0, 1)
         self._pages: dict[int, Page] = {}
-        self._layouts: dict[int, Layout] = {}
+        self._layouts: dict[int, PageLayout] = {}
         # viser calls both functions in threads of its own, so they only put actions into the queue.
         put = self._actions.put
         self._server.on_client_connect(lambda client: put(lambda: self._open_page(client)))
@@ -224,7 +224,7 @@ class Viewer:
             return
         # The size is read before panels are added, because they make the picture narrower.
         size = client.camera.image_width, client.camera.image_height
-        layout = self._layouts.setdefault(client.client_id, Layout(*size))
+        layout = self._layouts.setdefault(client.client_id, PageLayout(*size))
         if self._shown is None:
             show_waiting(client, layout, markup.waiting(_domain()))
             return

@@ -146,7 +146,7 @@ class _Hold(NamedTuple):
     reading: Array
 
 
-class _Solution(NamedTuple):
+class _CreepSolution(NamedTuple):
     """Amplitudes of the creep law for K relaxation times, by least squares.
 
     Attributes:
@@ -425,7 +425,7 @@ def _solve(
     forecast: Array,
     growth: float,
     bend: float,
-) -> _Solution:
+) -> _CreepSolution:
     """Fit the amplitudes of the law to averaged readings by regularised least squares.
 
     The regularisation makes amplitudes of successive relaxation times a smooth sequence.
@@ -455,7 +455,7 @@ def _solve(
     smooth[:, 1:] = rows / (bend * mean_amplitude + 1e-9)
 
     shape = len(load), n_times
-    found = _Solution(
+    found = _CreepSolution(
         amplitude=np.empty(shape),
         error=np.empty_like(means.reading),
         deviation=np.empty(shape),

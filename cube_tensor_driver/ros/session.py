@@ -41,7 +41,7 @@ def start_ros() -> None:
         raise ConfigError(f"ROS 2 does not start: {reason}; correct ROS_* and RMW_*") from None
 
 
-class Session(NamedTuple):
+class NodeSession(NamedTuple):
     """The node of a command, and the executor to which it was added.
 
     The main thread must spin the executor.
@@ -52,7 +52,7 @@ class Session(NamedTuple):
 
 
 @contextmanager
-def node_session(name: str) -> Iterator[Session]:
+def node_session(name: str) -> Iterator[NodeSession]:
     """Start rclpy with a node for a `with` block, and shut rclpy down at its end.
 
     Args:
@@ -67,7 +67,7 @@ def node_session(name: str) -> Iterator[Session]:
         executor = make_executor()
         executor.add_node(node)
         try:
-            yield Session(node, executor)
+            yield NodeSession(node, executor)
         finally:
             executor.remove_node(node)
             node.destroy_node()

@@ -258,7 +258,7 @@ def test_the_duration_of_a_recording_begins_with_its_first_message(tmp_path, mon
     for module in (record, session):
         monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: now[0]))
     bag = SimpleNamespace(folder=tmp_path, messages=1)
-    its_node = session.Session(None, SimpleNamespace(spin_once=spin_once))
+    its_node = session.NodeSession(None, SimpleNamespace(spin_once=spin_once))
     stop, show = threading.Event(), lambda *_: None
     record.record_into(bag, its_node, [], stop=stop, duration=5.0, show=show)
     assert now[0] == pytest.approx(108.0, abs=2 * session.STEP_S)

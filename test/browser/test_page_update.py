@@ -23,7 +23,7 @@ from sensor_msgs.msg import PointCloud2
 from websockets.sync.client import connect
 
 from cube_tensor_driver.browser import page as page_module
-from cube_tensor_driver.browser.page import LEFT_WIDTH, RIGHT_WIDTH, Layout, Page
+from cube_tensor_driver.browser.page import LEFT_WIDTH, RIGHT_WIDTH, Page, PageLayout
 from cube_tensor_driver.browser.viewer import Viewer
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import read_skin
@@ -258,7 +258,7 @@ def test_a_paused_page_stays_and_only_follows_the_choices_of_its_user(page, ros)
 def test_automatic_ranges_fall_only_with_new_values(monkeypatch):
     """In a replay that is held, the page is shown again and again with the same values."""
 
-    def build(skin, scan, history, choices, before):
+    def build(skin, scan, history, settings, before):
         return {}, before.follow(scan.values, np.ones(N), 0.0)
 
     def ignore(*_: object) -> None:
@@ -267,7 +267,7 @@ def test_automatic_ranges_fall_only_with_new_values(monkeypatch):
     monkeypatch.setattr(page_module, "build_update", build)
     ranges = scene.Ranges()
     shown = SimpleNamespace(_scan=None, _history=None, _paused=False, _skin=None, _ranges=ranges)
-    shown.send = shown._choices = shown._show_status = ignore
+    shown.send = shown._read_settings = shown._show_status = ignore
     tops = []
     for pressure in (TOP_PA, 0.0, 0.0, 0.0, 1.0):
         values = np.full((N, 15), np.nan)
@@ -282,7 +282,7 @@ def test_automatic_ranges_fall_only_with_new_values(monkeypatch):
     ("size", "folded"), [((1440, 900), False), ((1024, 768), True), ((390, 844), True)]
 )
 def test_the_skin_keeps_at_least_half_of_the_width(size, folded):
-    layout = Layout(*size)
+    layout = PageLayout(*size)
     assert layout.is_folded == folded
     if size[0] > size[1]:
         panels = RIGHT_WIDTH + (0 if folded else LEFT_WIDTH)

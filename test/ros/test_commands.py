@@ -311,6 +311,6 @@ def test_a_list_of_nodes_waits_until_lost_announcements_are_repeated(monkeypatch
         get_service_names_and_types=found, get_fully_qualified_name=lambda: "/parameters"
     )
     executor = types.SimpleNamespace(spin_once=lambda timeout_sec: None)
-    session = contextlib.nullcontext(services.Session(node, executor))
+    session = contextlib.nullcontext(services.NodeSession(node, executor))
     monkeypatch.setattr(services, "node_session", lambda _: session)
     assert services.list_nodes() == ["/driver", "/reconstruction"]

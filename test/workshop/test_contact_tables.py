@@ -14,7 +14,7 @@ pytest.importorskip("skfem", reason="needs skfem: pip install scikit-fem")
 from conftest import ROOT
 from cube_tensor_design.studies.pads_study import FORMS, THIN
 from cube_tensor_design.studies.traction_study import ContactErrors, Errors
-from workshop.bench.contacts import SHAPES, SKINS, Outcome
+from workshop.bench.contacts import SHAPES, SKINS, TrackingResult
 from workshop.pictures import contact_tables
 
 FORMS_TABLE = "cubes as points and as pads in a layer of 11 mm"
@@ -50,9 +50,9 @@ def test_tables_are_those_of_the_shipped_file(studies, tmp_path):
     """Other tables of the file stay."""
     path = tmp_path / "contacts.json"
     path.write_text(SHIPPED.read_text())
-    outcome = Outcome(ContactErrors(0.03, 0.02, 1e-4, 2e-4), 1, 9.0, 2.0)
-    outcomes = {(skin, shape): [outcome] for skin in SKINS for shape in SHAPES}
-    contact_tables.write_contact_tables(path, None, outcomes)
+    result = TrackingResult(ContactErrors(0.03, 0.02, 1e-4, 2e-4), 1, 9.0, 2.0)
+    results = {(skin, shape): [result] for skin in SKINS for shape in SHAPES}
+    contact_tables.write_contact_tables(path, None, results)
     shipped, written = json.loads(SHIPPED.read_text()), json.loads(path.read_text())
     assert list(written) == list(shipped)
     assert written["field without tension"] == shipped["field without tension"]

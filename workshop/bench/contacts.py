@@ -135,7 +135,7 @@ SHAPES = {
 """Loads by their names in the result."""
 
 
-class Outcome(NamedTuple):
+class TrackingResult(NamedTuple):
     """What the tracker found of one load.
 
     Attributes:
@@ -151,8 +151,8 @@ class Outcome(NamedTuple):
     last_ms: float
 
 
-Outcomes = dict[tuple[str, str], list[Outcome]]
-"""Outcomes of all loads by the names of skin and shape."""
+TrackingResults = dict[tuple[str, str], list[TrackingResult]]
+"""Results of all loads by the names of skin and shape."""
 
 
 def values_under(
@@ -182,18 +182,18 @@ def _pads_under(bench: TractionBench, forces: Array, centre: Array, force: Array
     return bench.pads_in(field_below(bench.poses.position, setting.depth, load, setting.poisson))
 
 
-def bench_shapes(loads: int) -> Outcomes:
+def bench_shapes(loads: int) -> TrackingResults:
     """Find the contacts of a number of loads of each shape on each skin."""
-    outcomes: Outcomes = {}
+    results: TrackingResults = {}
     for skin, setting in SKINS.items():
         bench = TractionBench(setting, side=2)
         for name, shape in SHAPES.items():
             random = np.random.default_rng(SEED)
-            outcomes[skin, name] = [_bench_load(bench, shape, random) for _ in range(loads)]
-    return outcomes
+            results[skin, name] = [_bench_load(bench, shape, random) for _ in range(loads)]
+    return results
 
 
-def _bench_load(bench: TractionBench, shape: Shape, random: np.random.Generator) -> Outcome:
+def _bench_load(bench: TractionBench, shape: Shape, random: np.random.Generator) -> TrackingResult:
     """Find the contacts of a load in a random direction at a random place."""
     pitch = bench.setting.pitch
     angle = random.uniform(0, 2 * np.pi)
@@ -215,18 +215,18 @@ def _bench_load(bench: TractionBench, shape: Shape, random: np.random.Generator)
         found = tracker.update(values)
         times_ms.append(1e3 * (time.process_time() - start_s))
     errors = contact_errors(found, centre)
-    return Outcome(errors, len(found), times_ms[0], times_ms[-1])
+    return TrackingResult(errors, len(found), times_ms[0], times_ms[-1])
 
 
-def summarise(outcomes: Outcomes) -> dict[str, dict[str, float]]:
+def summarise(results: TrackingResults) -> dict[str, dict[str, float]]:
     """Return the errors and times of each skin and shape by its name.
 
     A calibration ratio is an rms error divided by the predicted standard deviation.
     """
-    return {f"{name}, {skin}": _summarise(name, loads) for (skin, name), loads in outcomes.items()}
+    return {f"{name}, {skin}": _summarise(name, loads) for (skin, name), loads in results.items()}
 
 
-def _summarise(name: str, loads: list[Outcome]) -> dict[str, float]:
+def _summarise(name: str, loads: list[TrackingResult]) -> dict[str, float]:
     errors, contacts, first_ms, last_ms = zip(*loads, strict=True)
     force, force_deviation, place, place_deviation = np.array(errors).T
     expected = 2 if SHAPES[name].apart else 1

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from cube_tensor_design.studies.field_study import FORCE
 from cube_tensor_driver.views.figures.style import curve_style, print_style
 
-from .contacts import SHAPES, SKINS, Outcomes, summarise
+from .contacts import SHAPES, SKINS, TrackingResults, summarise
 
 ERRORS = np.array([0.02, 10.0])
 """Range of errors and of their predicted standard deviations that the picture shows, in % of the
@@ -20,17 +20,17 @@ force."""
 
 
 @print_style()
-def draw_shapes(outcomes: Outcomes) -> Figure:
+def draw_shapes(results: TrackingResults) -> Figure:
     """Draw the rms error of the force of each shape, and the error of each load over the stated
     standard deviation."""
     figure = Figure(figsize=(9, 4))
     by_shape, by_load = figure.subplots(1, 2, width_ratios=[3, 2])
-    summary = summarise(outcomes)
+    summary = summarise(results)
     for row, skin in enumerate(SKINS):
         style = curve_style(row) | {"linestyle": "none", "alpha": 0.8}
         errors = [summary[f"{name}, {skin}"]["force_error_percent"] for name in SHAPES]
         by_shape.semilogx(errors, list(SHAPES), label=skin, **style)
-        _draw_loads(by_load, outcomes, skin, style)
+        _draw_loads(by_load, results, skin, style)
     by_shape.invert_yaxis()
     by_shape.set(xlim=ERRORS, xlabel="force, rms error / %")
     by_shape.legend(loc="lower center", bbox_to_anchor=(0.4, 1), ncols=3, fontsize=7)
@@ -47,8 +47,8 @@ def draw_shapes(outcomes: Outcomes) -> Figure:
     return figure
 
 
-def _draw_loads(axis: Any, outcomes: Outcomes, skin: str, style: dict[str, Any]) -> None:
+def _draw_loads(axis: Any, results: TrackingResults, skin: str, style: dict[str, Any]) -> None:
     """Draw a point for each load on a skin; those without error are left out of the axes."""
-    loads = [load.errors for name in SHAPES for load in outcomes[skin, name]]
+    loads = [load.errors for name in SHAPES for load in results[skin, name]]
     error, deviation = 100 * np.abs(np.array(loads)[:, :2].T) / FORCE
     axis.loglog(deviation, error, **style | {"markersize": 2})

@@ -169,9 +169,9 @@ def _measure(options: argparse.Namespace) -> dict[str, Any]:
         from ..bench.contacts import bench_moving_balls, bench_shapes, summarise
         from ..bench.contacts_figure import draw_shapes
 
-        outcomes = bench_shapes(options.loads)
-        save(draw_shapes(outcomes), options.figure)
-        return summarise(outcomes) | bench_moving_balls()
+        results = bench_shapes(options.loads)
+        save(draw_shapes(results), options.figure)
+        return summarise(results) | bench_moving_balls()
     if options.what == "links":
         from ..bench.links import bench_links
 

@@ -22,7 +22,7 @@ from cube_tensor_design.studies.traction_study import (
 from cube_tensor_driver.config.output_files import write_json
 from cube_tensor_driver.mechanics.influence import Influence
 
-from ..bench.contacts import SCANS, Outcomes, summarise
+from ..bench.contacts import SCANS, TrackingResults, summarise
 
 WIDTHS = [2e-3, 5e-3, 10e-3, 20e-3]
 """Widths of the simulated contacts, in m; each table has one row for each width."""
@@ -55,14 +55,14 @@ QUANTITIES = {
 def write_contact_tables(
     path: Path,
     true_pads: Influence,
-    shapes: Outcomes,
+    shapes: TrackingResults,
 ) -> None:
     """Run the studies and write their tables; other tables of the file stay as they are.
 
     Args:
         path: The JSON file.
         true_pads: True influence functions of the pads in a layer.
-        shapes: Outcomes of loads of each shape.
+        shapes: Results of loads of each shape.
     """
     tables = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     tables |= contact_tables(true_pads)

@@ -26,7 +26,7 @@ from ...core.errors import BagError
 from ...processes.stop_signals import stop_event
 from ..messages import message_class
 from ..qos import offered_profile
-from ..session import Session, domain_text, node_session, spin_until
+from ..session import NodeSession, domain_text, node_session, spin_until
 from .echo import resolve_topics
 
 QUEUE_DEPTH = 2000
@@ -288,7 +288,7 @@ def record(
 
 def record_into(
     bag: BagWriter,
-    session: Session,
+    session: NodeSession,
     names: Sequence[str],
     *,
     stop: threading.Event,

@@ -21,7 +21,7 @@ from std_srvs.srv import Trigger
 
 from ...core.errors import ConfigError, CubeError, TareError
 from ...srv import Tare
-from ..session import Session, domain_text, node_session, spin_until
+from ..session import NodeSession, domain_text, node_session, spin_until
 
 MAX_DISCOVERY_S = 5.0
 """Maximum time, in seconds, to search for topics and services of other nodes."""
@@ -160,7 +160,7 @@ def set_parameter(name: str, parameter: str, text: str) -> Any:
 class _NodeParameters:
     """Reads and sets the parameters of another node through the services of that node."""
 
-    def __init__(self, session: Session, name: str) -> None:
+    def __init__(self, session: NodeSession, name: str) -> None:
         """Find the node whose parameters are read and set.
 
         Args:
@@ -233,7 +233,7 @@ class _NodeParameters:
         return call_service(self._session, service_type, f"{self._name}/{service}", request)
 
 
-def _find_nodes(session: Session, wanted_service: str = "") -> list[str]:
+def _find_nodes(session: NodeSession, wanted_service: str = "") -> list[str]:
     """Return the full names of the nodes in the DDS domain that have parameters.
 
     Args:
@@ -252,7 +252,7 @@ def _find_nodes(session: Session, wanted_service: str = "") -> list[str]:
     return nodes
 
 
-def find_services(session: Session, kind: str, wanted: str = "") -> list[str]:
+def find_services(session: NodeSession, kind: str, wanted: str = "") -> list[str]:
     """Return the full names of all services of one type, sorted; the list may be empty.
 
     Args:
@@ -276,7 +276,7 @@ def find_services(session: Session, kind: str, wanted: str = "") -> list[str]:
     return find()
 
 
-def call_service(session: Session, service_type: type, name: str, request: object) -> Any:
+def call_service(session: NodeSession, service_type: type, name: str, request: object) -> Any:
     """Call a service and return its response.
 
     The request is sent again every `REPEAT_S`, so it must be one that may be executed twice.

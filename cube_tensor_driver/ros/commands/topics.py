@@ -14,7 +14,7 @@ from rclpy.subscription import Subscription
 from ...core.errors import BagError, CubeError
 from ..messages import message_class
 from ..qos import offered_profile
-from ..session import Session, domain_text, node_session, spin_until
+from ..session import NodeSession, domain_text, node_session, spin_until
 from .echo import QUEUE_DEPTH
 from .services import SETTLE_S, discover
 
@@ -98,7 +98,7 @@ def _find_topics(node: Node) -> list[ListedTopic]:
     return list(topics.values())
 
 
-def _count_messages(session: Session, topics: list[ListedTopic]) -> None:
+def _count_messages(session: NodeSession, topics: list[ListedTopic]) -> None:
     """Count the messages of topics for `COUNT_S`, and store the number in each `ListedTopic`.
 
     Args:

@@ -21,7 +21,7 @@ from ...config.skin import Skin
 from ...core.arrays import Array
 from ...core.errors import ConfigError
 from ..load import Resultant, StressField, total
-from .source import MujocoSkin, Touch, load_mujoco
+from .source import BodyContact, MujocoSkin, load_mujoco
 
 if TYPE_CHECKING:
     from mujoco import MjModel
@@ -127,7 +127,7 @@ class MujocoLoad:
         if len(self._times):
             self.repeats = float(self._times[-1])
         self.period = self.repeats or UNBOUNDED_PERIOD_S
-        self._touches: dict[int, list[Touch]] = {}
+        self._touches: dict[int, list[BodyContact]] = {}
         self._step = 0
         self._restart()
 
@@ -139,7 +139,7 @@ class MujocoLoad:
         """Return total force, centre of pressure and mean normal of all contacts at a time in s."""
         return total([touch.press for touch in self._touches_at(seconds)])
 
-    def _touches_at(self, seconds: float) -> list[Touch]:
+    def _touches_at(self, seconds: float) -> list[BodyContact]:
         """Return the contacts at a time in s; the scene is computed up to it if necessary."""
         # A scene can only be computed forwards. Contacts at an earlier time are still in memory, or
         # the scene is computed again from its start.

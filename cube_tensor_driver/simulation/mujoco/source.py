@@ -98,7 +98,7 @@ class _BodyCubes(NamedTuple):
     position: Array
 
 
-class Touch(NamedTuple):
+class BodyContact(NamedTuple):
     """One contact of a skin, in the skin's parent frame.
 
     Attributes:
@@ -188,7 +188,7 @@ class MujocoSkin:
             round(1e6 * self.data.time),
         )
 
-    def touches(self) -> list[Touch]:
+    def touches(self) -> list[BodyContact]:
         """Return all contacts of the skin in the state of `data`."""
         data = self.data
         geoms = data.contact.geom[: data.ncon]
@@ -196,7 +196,7 @@ class MujocoSkin:
         body_of_geom = self.model.geom_bodyid
         bodies = np.where(geoms >= 0, body_of_geom[geoms], -1)
 
-        found: list[Touch] = []
+        found: list[BodyContact] = []
         for part in self._parts:
             for side in (0, 1):
                 rows = np.flatnonzero(bodies[:, side] == part.body)
@@ -208,7 +208,7 @@ class MujocoSkin:
                         found.append(touch)
         return found
 
-    def field(self, touches: list[Touch]) -> StressField:
+    def field(self, touches: list[BodyContact]) -> StressField:
         """Compute stress and gradient at the cubes under contacts.
 
         Args:
@@ -241,7 +241,7 @@ class MujocoSkin:
         part: _BodyCubes,
         rows: Index,
         side: int,
-    ) -> Touch | None:
+    ) -> BodyContact | None:
         """Return the contact of one pair of bodies; None if no force presses on the skin's surface.
 
         Args:
@@ -279,7 +279,7 @@ class MujocoSkin:
                 total,
                 radius=float(np.sqrt(area / np.pi)),
             )
-            return Touch(part.body, load, polygon)
+            return BodyContact(part.body, load, polygon)
         # For a Hertz contact, the curvatures (1 / radius) of both bodies add up (Johnson 4.2).
         geoms = contact.geom[rows[0]]
         curvature = self._curvature[geoms].sum()
@@ -291,7 +291,7 @@ class MujocoSkin:
             total,
             radius=hertz_radius(pressing, curvature, self._stiffness),
         )
-        return Touch(part.body, load)
+        return BodyContact(part.body, load)
 
     def _contact_points(
         self,
@@ -499,7 +499,7 @@ def _field_of_discs(
 
 def _field_of_polygons(
     part: _BodyCubes,
-    touches: list[Touch],
+    touches: list[BodyContact],
     tables: PolygonTables,
 ) -> StressField:
     """Compute stress and gradient at the cubes of a body under tractions on polygons.
