@@ -130,12 +130,12 @@ class Compensation:
         divided by stiffness).
         """
         thermal = self._thermal.offset
-        self.offsets.offset[:] = thermal + self.creep.offset
+        self.offsets.offset[:] = (thermal + self.creep.offset).T
         # The kernel multiplies the gain by the whole reading of a pad, but creep depends only on
         # the reading minus the effect of temperature. The slope contains the difference.
         correction = self.creep.gain * thermal
-        self.offsets.slope[:] = self.creep.slope - correction
-        self.offsets.gain[:] = self.creep.gain
+        self.offsets.slope[:] = (self.creep.slope - correction).T
+        self.offsets.gain[:] = self.creep.gain.T
         self.offsets.lasting[:] = 0
         for effect in self._lasting:
             bits = np.where(effect.is_known, effect.bit, COMPENSATION)

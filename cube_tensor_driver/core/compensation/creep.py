@@ -57,9 +57,9 @@ class Creep:
 
     Attributes:
         has_model: Whether the calibration of a cube has a law of creep (C,).
-        offset: Creep in the newest row of each cube at the last step (C, P).
-        slope: Factor of t (C, P), per second.
-        gain: Factor of u t (C, P), per second.
+        offset: Creep in the newest row of each cube at the last step (P, C).
+        slope: Factor of t (P, C), per second.
+        gain: Factor of u t (P, C), per second.
     """
 
     key = "creep"
@@ -89,13 +89,13 @@ class Creep:
             if model is None:
                 continue
             places = np.searchsorted(self._times, model.time)
-            self._amplitude[places, cube, : model.n_pads] = model.amplitude.T
+            self._amplitude[places, : model.n_pads, cube] = model.amplitude.T
         self._total = self._amplitude.sum(axis=0)
         self._stiffness = pipeline.stiffness
         self._rest = pipeline.rest_frequency
         self._rest_version = pipeline.rest_changes
 
-        shape = n_cubes, n_pads
+        shape = n_pads, n_cubes
         # Time stamp, in ns, and readings of the newest row of each cube at the last step.
         self._time_ns = np.zeros(n_cubes, np.int64)
         self._reading = np.zeros(shape)
@@ -108,6 +108,7 @@ class Creep:
         self.offset = np.zeros(shape)
         self.slope = np.zeros(shape)
         self.gain = np.zeros(shape)
+        self._set_duration(np.ones(n_cubes))
 
     @property
     def is_known(self) -> Mask:
@@ -118,11 +119,11 @@ class Creep:
         """Advance the low-pass filters of the readings to the newest row of each cube.
 
         Args:
-            thermal: Effect of temperature (C, P), stress / stiffness, which the readings contain.
+            thermal: Effect of temperature (P, C), stress / stiffness, which the readings contain.
             end_ns: Newest time stamp of the scan that is processed next, in ns.
         """
         elapsed_ns, is_lost, is_gap = self._find_gaps()
-        newest = self._newest.reading.astype(float)
+        newest = np.array(self._newest.reading.T, float, order="C")
         # The newest reading of a pad that is not used is NaN. The earlier one is kept instead.
         is_unused = np.isnan(newest)
         now = np.where(is_unused, self._reading, newest - thermal)
@@ -136,7 +137,7 @@ class Creep:
             before = np.abs(self._reading)
             larger = np.maximum(before, np.abs(now))
             largest = self._largest_unknown
-            np.maximum(largest, larger, out=largest, where=is_gap[:, None])
+            np.maximum(largest, larger, out=largest, where=is_gap)
             self._is_certain[is_gap] = False
         self._time_ns[:] = self._newest.newest_ns
         self._reading[:] = now
@@ -168,24 +169,33 @@ class Creep:
         Args:
             duration_s: Duration for each cube (C,), in s.
         """
+        # The durations of successive steps are usually equal.
+        if not np.array_equal(duration_s, self._duration_s):
+            self._set_duration(duration_s)
+        self.offset[:] = self._total * self._reading
+        self.slope[:] = 0
+        for k, amplitude in enumerate(self._amplitude):
+            lagging = amplitude * self._memories.lag[k]
+            self.offset -= lagging
+            lagging *= self._of_lag[k]
+            self.slope += lagging
+        self.gain[:] = self._full_gain
+        # A cube without any row so far has no earlier reading from which its first one differs.
+        self.gain[:, self._time_ns == 0] = 0
+        self.slope -= self.gain * self._reading
+
+    def _set_duration(self, duration_s: Array) -> None:
+        """Compute what depends only on the duration of `_set_line` for each cube (C,), in s."""
+        self._duration_s = duration_s
         share, mean = self._memories.find_shares(duration_s)
         seconds = duration_s[: share.shape[1]]
         # The low-passed reading changes, per second, by one fraction of its lag behind the reading
         # and by another fraction of the change of the reading.
-        of_lag = share / seconds
+        self._of_lag = share / seconds
         of_change = (1 - mean) / seconds
-        self.offset[:] = self._total * self._reading
-        self.slope[:] = 0
-        self.gain[:] = 0
+        self._full_gain = np.zeros_like(self.gain)
         for k, amplitude in enumerate(self._amplitude):
-            lagging = amplitude * self._memories.lag[k]
-            self.offset -= lagging
-            lagging *= of_lag[k, :, None]
-            self.slope += lagging
-            self.gain += amplitude * of_change[k, :, None]
-        # A cube without any row so far has no earlier reading from which its first one differs.
-        self.gain[self._time_ns == 0] = 0
-        self.slope -= self.gain * self._reading
+            self._full_gain += amplitude * of_change[k]
 
     def deviation(self, cube: int) -> Array:
         """Return the errors (P, k) of a cube's creep that its k independent causes make, in Pa.
@@ -193,7 +203,7 @@ class Creep:
         Each column has the size of one standard deviation.
         """
         model = self._models[cube]
-        reading = self._reading[cube]
+        reading = self._reading[:, cube]
         if model is None:
             return np.zeros((len(reading), 0))
         stiffness = self._stiffness[cube]
@@ -206,11 +216,11 @@ class Creep:
             newest = np.nan_to_num(self._newest.reading[cube])
             before = np.abs(reading)
             larger = np.maximum(before, np.abs(newest))
-            largest = self._total[cube] * larger * stiffness
+            largest = self._total[:, cube] * larger * stiffness
             errors = [largest * UNIFORM_DEVIATION]
         if model.deviation is not None:
             places = np.searchsorted(self._times, model.time)
-            memory = reading - self._memories.lag[places, cube]
+            memory = reading - self._memories.lag[places, :, cube]
             pads = slice(model.n_pads)
             amplitude = model.deviation.swapaxes(1, 2)
             products = amplitude * memory[:, pads]
@@ -236,9 +246,9 @@ class Creep:
         Args:
             cube: Numbers of cubes (n,).
         """
-        amplitude = self._amplitude[:, cube].swapaxes(0, 1)
+        amplitude = self._amplitude.T[cube].swapaxes(1, 2)
         share = multiply(self._unknown.T[cube], amplitude)
-        largest = share * self._largest_unknown[cube]
+        largest = share * self._largest_unknown.T[cube]
         largest = largest * self._stiffness[cube]
         deviation: Array = largest * UNIFORM_DEVIATION
         return deviation
@@ -251,8 +261,8 @@ class Creep:
         tare divides what it measures by the fraction, in order to correct the whole error.
         """
         known = 1 - self._unknown
-        creeping = known[..., None] * self._amplitude
-        visible: Array = 1 - creeping.sum(axis=0)
+        creeping = known[:, None] * self._amplitude
+        visible: Array = 1 - creeping.sum(axis=0).T
         return visible
 
     def follow_rest(self) -> bool:
@@ -267,14 +277,14 @@ class Creep:
         pipeline = self._pipeline
         if self._rest_version == pipeline.rest_changes:
             return False
-        shift = np.nan_to_num(pipeline.shift_of_zero(self._rest))
+        shift = np.nan_to_num(pipeline.shift_of_zero(self._rest)).T
         self._rest[:] = pipeline.rest_frequency
         self._rest_version = pipeline.rest_changes
         self._reading -= shift
-        self._newest.reading[:] -= shift
+        self._newest.reading[:] -= shift.T
         # The known fraction of a low-passed reading shifts with the readings. So the lag, reading
         # minus low-passed reading, changes by the unknown fraction of the shift.
-        self._memories.lag -= self._unknown[..., None] * shift
+        self._memories.lag -= self._unknown[:, None] * shift
         size = np.abs(self._reading)
         largest = self._largest_unknown
         np.minimum(largest, size, out=largest, where=shift != 0)
@@ -286,13 +296,13 @@ class Creep:
             self._newest.reading,
             self._time_ns.view(float),
             self._rest,
-            self._reading,
+            self._reading.T,
             self._unknown,
-            self._largest_unknown,
-            self._memories.lag,
-            self.offset,
-            self.slope,
-            self.gain,
+            self._largest_unknown.T,
+            self._memories.lag.swapaxes(1, 2),
+            self.offset.T,
+            self.slope.T,
+            self.gain.T,
         ]
 
     def resume(self) -> None:

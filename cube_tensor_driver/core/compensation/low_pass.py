@@ -71,8 +71,10 @@ def relaxed_share(ratio: Array) -> Array:
 class LowPass:
     """K low-pass filters for each of C cubes, each of which filters P signals.
 
+    The cubes are the last axis of all arrays, because numpy is fastest along it.
+
     Attributes:
-        lag: How far the outputs of the filters lag behind the inputs (K, C, P).
+        lag: How far the outputs of the filters lag behind the inputs (K, P, C).
     """
 
     def __init__(self, time: Array, n_signals: int) -> None:
@@ -86,14 +88,15 @@ class LowPass:
         # Whether a cube has other time constants than the one before.
         is_different = time[:, 1:] != time[:, :-1]
         self._is_other = is_different.any(axis=0)
-        self.lag = np.zeros((*time.shape, n_signals))
+        n_times, n_cubes = time.shape
+        self.lag = np.zeros((n_times, n_signals, n_cubes))
 
     def advance(self, elapsed_s: Real, change: Real) -> Array:
         """Advance the filters by one interval for each cube.
 
         Args:
             elapsed_s: Lengths of the intervals (C,), in s; the outputs stay where it is 0.
-            change: Changes of the inputs (C, P), along straight lines.
+            change: Changes of the inputs (P, C), along straight lines.
 
         Returns:
             Fraction m = 1 - exp(-elapsed_s / time) of each output that the interval replaced, as an
@@ -102,8 +105,8 @@ class LowPass:
         share, mean = self.find_shares(elapsed_s)
         kept = 1 - share
         for k, lag in enumerate(self.lag):
-            lag *= kept[k, :, None]
-            lag += mean[k, :, None] * change
+            lag *= kept[k]
+            lag += mean[k] * change
         return share
 
     def find_shares(self, elapsed_s: Real) -> tuple[Array, Array]:

@@ -48,7 +48,7 @@ class Thermal:
     Attributes:
         has_model: Whether the calibration of a cube has a model of this effect (C,).
         is_known: Whether the effect is known up to `MAX_DEVIATION` (C,).
-        offset: The effect on each pad now (C, P), stress / stiffness.
+        offset: The effect on each pad now (P, C), stress / stiffness.
     """
 
     key = "thermal"
@@ -67,7 +67,7 @@ class Thermal:
         degrees_by_model = [model.coefficient.shape[1] for model in present]
         n_lags = max(lag_counts, default=0)
         n_degrees = max(degrees_by_model, default=0)
-        stiffness = np.where(pipeline.stiffness > 0, pipeline.stiffness, np.inf)
+        stiffness = np.where(pipeline.stiffness > 0, pipeline.stiffness, np.inf).T
         n = len(self._models)
         times = np.full((n_lags, n), MIN_LAG_S)
         self._reference = np.zeros(n)
@@ -88,7 +88,7 @@ class Thermal:
             self._weight[filters, number] = filter_weights(lag)
             self._reference[number] = model.reference
             pads, degrees = model.coefficient.shape
-            self._coefficient[:degrees, number, :pads] = model.coefficient.T
+            self._coefficient[:degrees, :pads, number] = model.coefficient.T
             self._slope[number] = _typical_size(model.coefficient[:, :1])
             if model.ramp is not None:
                 self._ramp[number] = _typical_size(model.ramp)
@@ -107,7 +107,7 @@ class Thermal:
         self._level = np.zeros(n)
         # Measured temperature minus that of the elastomer, in K.
         self._lag = np.full(n, np.nan)
-        self.offset = np.zeros_like(stiffness)
+        self.offset = np.zeros(stiffness.shape)
         self.is_known = np.zeros(n, bool)
 
     def advance(self, scan: Columns) -> None:
@@ -131,7 +131,7 @@ class Thermal:
         change = given - self._measured
         change[is_missing | is_first] = 0
         elapsed_s = elapsed_ns * 1e-9
-        share = self._filters.advance(elapsed_s, change[:, None])
+        share = self._filters.advance(elapsed_s, change[None])
         # The deviation decays like the slowest filter of the cube.
         decay = 1 - share.min(axis=0, initial=1.0)
         is_gap = elapsed_ns > MAX_STEP_NS
@@ -147,14 +147,14 @@ class Thermal:
         is_unknown = np.isnan(self._measured)
         lag = np.where(is_unknown, np.nan, 0)
         for number, weight in enumerate(self._weight):
-            lag += weight * self._filters.lag[number, :, 0]
+            lag += weight * self._filters.lag[number, 0]
         self._lag[:] = lag
         level = self._measured - lag - self._reference
         self._level[:] = np.nan_to_num(level)
         self.offset[:] = 0
         for coefficient in self._coefficient[::-1]:
             self.offset += coefficient
-            self.offset *= self._level[:, None]
+            self.offset *= self._level
 
         lag_deviation = self._ramp * abs(self._lag)
         start_deviation = self._slope * self._unknown
@@ -171,7 +171,7 @@ class Thermal:
         temperature is assumed, with a standard deviation of 5 K.
         """
         model = self._models[cube]
-        _, n_pads = self.offset.shape
+        n_pads = len(self.offset)
         if model is None:
             return np.zeros((n_pads, 0))
         lag = self._lag[cube]
