@@ -40,6 +40,7 @@ from cube_tensor_driver.messages.codec import frequency_codec, stress_codec
 from cube_tensor_driver.messages.types import COMPENSATION as COMPENSATION_TYPE
 from cube_tensor_driver.messages.types import FREQUENCIES, INFO, STRESS
 from cube_tensor_driver.ros.messages import to_ns, to_time
+from cube_tensor_driver.ros.motion import _decode
 from cube_tensor_driver.ros.nodes.reconstruction import Reconstruction
 
 START_NS = 1_700_000_000_000_000_000
@@ -228,7 +229,7 @@ def played(node, moving: MovingSkin, seconds: float, imu_end_s: float = 1e9) -> 
     for k in range(round(seconds / ROW_PERIOD_S)):
         t = 0.1 + k * ROW_PERIOD_S
         while sent * IMU_PERIOD_S + IMU_DELAY_S <= min(t, imu_end_s):
-            node._motion.on_imu(imu_message(moving, sent * IMU_PERIOD_S))
+            node._motion.on_imu(serialize_message(imu_message(moving, sent * IMU_PERIOD_S)))
             sent += 1
         scans.append(scan_at(t, moving))
         node.on_rows(scans[-1])
@@ -377,6 +378,7 @@ def test_uncertain_rows_are_reprocessed_to_the_bytes_of_the_node(
     ("case", "text"),
     [
         ("none", "no message on /imu: start the IMU"),
+        ("damaged", "no message on /imu: start the IMU"),
         ("frame", "no transform from imu to tool: imu does not exist; publish it"),
         ("stopped", "samples on /imu are 0.5"),
         ("clock", "s newer than the rows"),
@@ -395,7 +397,8 @@ def test_a_missing_imu_is_one_line_and_the_node_goes_on(start, monkeypatch, case
         message = imu_message(moving, k * IMU_PERIOD_S)
         if case == "no_acceleration":
             message.linear_acceleration_covariance[0] = -1.0
-        node._motion.on_imu(message)
+        data = serialize_message(message)
+        node._motion.on_imu(data[:200] if case == "damaged" else data)
     node.on_rows(scan_at(row_s))
     (stress,) = node.sent["stress"]
     assert (stress_codec.decode(stress).rows.status & COMPENSATION).all()
@@ -404,6 +407,20 @@ def test_a_missing_imu_is_one_line_and_the_node_goes_on(start, monkeypatch, case
     status = node._statuses()[0]
     assert text in status.message and "weight is not compensated" in status.message
     assert "\n" not in status.message and status.level != b"\0"
+
+
+@pytest.mark.parametrize("frame", ["", "a", "imu_link", "base/imu", "left_imu_"])
+def test_an_imu_is_decoded_as_by_rclpy_whatever_its_frame(frame):
+    message = imu_message(MovingSkin(), 0.123)
+    message.header.frame_id = frame
+    sample, found = _decode(serialize_message(message))
+    assert found == frame
+    assert sample.time_ns == to_ns(message.header.stamp)
+    for vector, expected in (
+        (sample.specific_force, message.linear_acceleration),
+        (sample.angular_velocity, message.angular_velocity),
+    ):
+        assert vector == (expected.x, expected.y, expected.z)
 
 
 def test_gravity_comes_from_tf_alone(start, monkeypatch):
