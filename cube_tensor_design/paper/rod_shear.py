@@ -53,9 +53,6 @@ class RodShear:
         tensor: (n,) shear from the tensor of all eight pads.
         points: (n,) shear from the surface traction that the tensor gives.
         pads: (n,) shear from the surface traction that the pads give.
-        seen: (n, 8) mean stress of the pads on the bench.
-        predicted: (n, 8) mean stress of the pads by influence functions from the traction under
-            the rod.
     """
 
     place: Array
@@ -65,8 +62,6 @@ class RodShear:
     tensor: Array
     points: Array
     pads: Array
-    seen: Array
-    predicted: Array
 
 
 def rod_shear(
@@ -112,7 +107,6 @@ def rod_shear(
         modes = estimator @ pads
         positions, force = with_cube.rod_pressure(step)
         shear_at_rod = np.interp(positions, x, shear_kernel[:, 1])
-        pads_at_rod = influence.at(positions[:, None])[:, :, 1]
         row = {
             "place": place,
             "truth": without.run([step]).state[0, zx],
@@ -122,8 +116,6 @@ def rod_shear(
             "tensor": modes[zx],
             "points": from_tensor @ modes,
             "pads": from_pads @ pads,
-            "seen": pads,
-            "predicted": -pads_at_rod @ force,
         }
         rows.append(row)
     columns = {}

@@ -14,11 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cube_tensor_driver.core.arrays import Array
-from cube_tensor_driver.core.defaults import (
-    CONTACT_PRESSURE,
-    POISSONS_RATIO,
-    SURFACE_DEPTH,
-)
+from cube_tensor_driver.core.defaults import POISSONS_RATIO, SURFACE_DEPTH
 from cube_tensor_driver.core.modes import COMPONENTS
 from cube_tensor_driver.core.poses import CubePoses
 from cube_tensor_driver.mechanics import contact
@@ -56,21 +52,15 @@ class FieldStudy:
 
     The kinds are those of `SKIN_KINDS`.
 
-    A contact that was not found counts as a position error of `WINDOW` and a force error of 1.
-
     Attributes:
         pitches: (columns,) distances between neighbouring cubes, in m.
         widths: (rows,) widths of the contact, in m.
         error: rms of the pressure's error over rms of the pressure, in the window.
-        position: 95th percentile of the contact's position error, in m.
-        force: rms error of the contact's normal force over the force.
     """
 
     pitches: Array
     widths: Array
     error: Array
-    position: Array
-    force: Array
 
     def cubes_saved(self, error: float) -> Array:
         """Return by what factor fewer cubes per area suffice for an error than if only their
@@ -216,21 +206,15 @@ def field_study(
 ) -> FieldStudy:
     """Compute the errors for all pitches and widths, in about two minutes; the same numbers every
     time."""
-    shape = (len(widths), len(pitches), len(SKIN_KINDS))
-    error, position, force = np.zeros((3, *shape))
+    error = np.zeros((len(widths), len(pitches), len(SKIN_KINDS)))
     for column, pitch in enumerate(pitches):
         trial = _Trial(pitch)
         for row, width in enumerate(widths):
             # The same contacts for every pitch and width make the errors comparable.
             random = np.random.default_rng(SEED)
-            errors = [trial.errors(width, random) for _ in range(cases)]
-            squares, distances, forces = np.stack(errors, axis=1)  # Each (cases, kinds).
-            mean_square = squares.mean(axis=0)
-            mean_force_square = (forces**2).mean(axis=0)
-            error[row, column] = np.sqrt(mean_square)
-            position[row, column] = np.percentile(distances, 95, axis=0)
-            force[row, column] = np.sqrt(mean_force_square)
-    return FieldStudy(pitches, widths, error, position, force)
+            squares = [trial.square_errors(width, random) for _ in range(cases)]
+            error[row, column] = np.sqrt(np.mean(squares, axis=0))
+    return FieldStudy(pitches, widths, error)
 
 
 class _Trial:
@@ -249,32 +233,20 @@ class _Trial:
         self._window = from_centre < WINDOW / 2
         self._points = points[self._window]
 
-    def errors(self, width: float, random: np.random.Generator) -> Array:
-        """Return the errors (3, kinds) of a random contact of this width.
-
-        The rows are the square error of the pressure over its square, the distance of the contact's
-        position in m, and the relative error of its force.
-        """
+    def square_errors(self, width: float, random: np.random.Generator) -> list[float]:
+        """Return, by kind of skin, the mean square error of the pressure over its mean square
+        under a random contact of this width."""
         centre = self._pitch * (random.random(2) - 0.5)
         force = draw_force(random)
         true = true_components(self._points, width, force, centre)
         pressure = -true[:, COMPONENTS.index("zz")]
         measured = true_components(self._skin.position, width, force, centre)
-        columns = []
+        square_errors = []
         for kind, surface in self._surfaces.items():
             values = measured.copy()
             if kind == "planar cubes":
                 values[:, UNOBSERVED_BY_PLANAR] = np.nan
             computed = surface.field(values).pressure[self._window]
-            difference = computed - pressure
-            error_square = (difference**2).mean()
-            square = error_square / (pressure**2).mean()
-            distance = WINDOW
-            force_error = -1.0
-            contacts = surface.contacts(values, CONTACT_PRESSURE)
-            if contacts:
-                offset = contacts[0].position[:2] - centre
-                distance = float(np.linalg.norm(offset))
-                force_error = contacts[0].normal_force / FORCE - 1
-            columns.append([square, distance, force_error])
-        return np.transpose(columns)
+            error_square = ((computed - pressure) ** 2).mean()
+            square_errors.append(error_square / (pressure**2).mean())
+        return square_errors

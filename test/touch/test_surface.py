@@ -46,43 +46,12 @@ def measured(places: CubePoses, width: float, force: tuple, centre: np.ndarray) 
     return np.concatenate([stress, gradient[:, :3].reshape(len(stress), 9)], axis=1)
 
 
-def errors(pitch: float, width: float, places: int = 4) -> tuple[float, float]:
-    """Relative rms error of the pressure without and with gradients; contacts all over a cell."""
-    skin = flat(7, 7, pitch)
-    without, with_them = Surface(skin, DEPTH, 3, gradients=False), Surface(skin, DEPTH, 3)
-    random = np.random.default_rng(1)
-    squares = np.zeros((places, 2))
-    for row in squares:
-        centre = pitch * (random.random(2) - 0.5)
-        truth = -at(with_them.points, width, (0, 0, -3), centre)[0][:, 2]
-        values = measured(skin, width, (0, 0, -3), centre)
-        row[:] = [
-            np.mean((s.field(values).pressure - truth) ** 2) / np.mean(truth**2)
-            for s in (without, with_them)
-        ]
-    without_rms, with_rms = np.sqrt(squares.mean(axis=0))
-    return float(without_rms), float(with_rms)
-
-
-# The factors are half of what was measured, so that they fail when the gradients stop helping.
-@pytest.mark.parametrize(
-    ("pitch", "width", "factor"), [(0.006, 0.010, 3.0), (0.006, 0.020, 1.5), (0.012, 0.020, 1.3)]
-)
-def test_gradients_make_the_field_better(pitch, width, factor):
-    without, with_them = errors(pitch, width)
-    assert with_them < 0.2
-    assert without > factor * with_them
-
-
 def test_a_study_ranks_the_kinds_of_cubes_and_counts_those_that_are_saved():
-    """For the field, one gradient is better than none and worse than two.
-
-    A planar cube knows less of the position.
-    """
+    """One gradient is better than none and worse than two."""
     study = field_study(np.array([0.006, 0.012]), np.array([0.02]), cases=3)
     alone, whole, planar = np.moveaxis(study.error[0], 1, 0)
     assert (whole < planar).all() and (planar < alone).all()
-    assert (study.position[0, :, 1] < study.position[0, :, 2]).all()
+    assert (whole < 0.2).all() and (alone > 2 * whole).all()
     ((one, saved, some),) = study.cubes_saved(0.14)
     assert one == 1 and 1 < some < saved
     assert np.isnan(study.cubes_saved(0.9)).all()

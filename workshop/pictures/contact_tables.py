@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -57,15 +56,14 @@ def write_contact_tables(
     true_pads: Influence,
     shapes: TrackingResults,
 ) -> None:
-    """Run the studies and write their tables; other tables of the file stay as they are.
+    """Run the studies and write their tables.
 
     Args:
         path: The JSON file.
         true_pads: True influence functions of the pads in a layer.
         shapes: Results of loads of each shape.
     """
-    tables = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    tables |= contact_tables(true_pads)
+    tables = contact_tables(true_pads)
     tables["shapes"] = {
         "loads in each row": max(map(len, shapes.values())),
         "scans of each load": SCANS,
