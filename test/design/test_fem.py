@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Finite elements against exact solutions, balance, symmetry and their own convergence."""
 
-import json
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -21,7 +20,7 @@ from conftest import ROOT
 from cube_tensor_design.fem import body as bodies
 from cube_tensor_design.fem import fem, memory, mesh
 from cube_tensor_design.fem.body import Body, strip_layout
-from cube_tensor_design.fem.fem import calibration_from_fem, compute_response
+from cube_tensor_design.fem.fem import compute_response
 from cube_tensor_design.fem.pads import interval_weights
 from cube_tensor_design.fem.solid import Solid, lame, stiffness
 from cube_tensor_design.fem.volume_loads import (
@@ -31,9 +30,8 @@ from cube_tensor_design.fem.volume_loads import (
 )
 from cube_tensor_design.paper.virtual_bench import VirtualBench
 from cube_tensor_driver.config.calibration import read_calibration
-from cube_tensor_driver.config.output_files import to_json
-from cube_tensor_driver.core.errors import ElasticError, LayoutError, SymmetryError
-from cube_tensor_driver.core.layout import LAYOUTS, Layout
+from cube_tensor_driver.core.errors import ElasticError
+from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.core.modes import PLANE
 from cube_tensor_driver.core.response import project
 
@@ -84,8 +82,9 @@ def reactions(ends, order, traction):
 # exact solutions
 
 
-@pytest.mark.parametrize("place", [(1e-9, 0.0), (0.0, 1e-9), (-1e-9, 1e-9)])
-@pytest.mark.parametrize("cube_young", [RIGID, 200e9], ids=["rigid", "steel"])
+@pytest.mark.parametrize(
+    ("place", "cube_young"), [((1e-9, 0.0), RIGID), ((0.0, 1e-9), 200e9), ((-1e-9, 1e-9), RIGID)]
+)
 def test_without_its_mirrors_a_body_gives_the_same(place, cube_young):
     """A cube next to the middle is solved on all of the body, one in the middle on a quarter."""
     layout, off = LAYOUTS["planar"], Body(x=place[0], z=place[1], cube_young=cube_young)
@@ -359,7 +358,6 @@ def test_cubic_body_has_the_full_structure(coarse):
 @pytest.mark.parametrize(
     "changes, words",
     [
-        ({"side": 11e-3}, "cube's side is 11 mm but the body's height is 11 mm"),
         ({"x": 30e-3}, "30 mm off the body's centre along x"),
         ({"width": float("nan")}, "the body's width is nan mm"),
     ],
@@ -367,21 +365,6 @@ def test_cubic_body_has_the_full_structure(coarse):
 def test_bad_bodies(changes, words):
     with pytest.raises(ElasticError, match=words):
         Body(**changes)
-
-
-def test_bad_pads():
-    with pytest.raises(LayoutError, match="face ends at 1"):
-        strip_layout(LAYOUTS["planar"], 1.0, centre=0.6)
-    with pytest.raises(ElasticError, match="overlap"):
-        compute_response(Body(), strip_layout(LAYOUTS["planar"], 0.8, centre=0.3))
-    with pytest.raises(ElasticError, match="apart"):
-        compute_response(Body(), strip_layout(LAYOUTS["planar"], 0.99999, centre=0.5))
-
-
-def test_too_little_memory(monkeypatch):
-    monkeypatch.setattr(memory, "available_memory", lambda: 1e8)
-    with pytest.raises(ElasticError, match=r"GB of memory and 0\.1 GB are available"):
-        compute_response(Body(), LAYOUTS["cube"], "slab")
 
 
 def test_a_limit_on_this_process_counts(monkeypatch):
@@ -404,32 +387,6 @@ def test_memory_that_runs_out_is_said(monkeypatch):
     monkeypatch.setattr(fem, "make_solid", work)
     with pytest.raises(ElasticError, match=r"ran out on mesh 1, of .* ask for fewer meshes"):
         compute_response(Body(), HALVES)
-
-
-def test_a_layout_without_the_symmetry():
-    one = LAYOUTS["quad"]
-    layout = Layout("three", one.positions[:3], one.normals[:3])
-    with pytest.raises(SymmetryError):
-        compute_response(Body(), layout, "mirrors")
-    assert compute_response(Body(), layout, "none", meshes=1).rank == 3
-
-
-# results as files
-
-
-def test_calibration_holds_the_response(square):
-    calibration = calibration_from_fem(square, source="test")
-    assert np.allclose(calibration.response, square.matrix, atol=1e-8)
-    whole = calibration_from_fem(square, whole_matrix=True)
-    assert np.array_equal(whole.response, square.matrix)
-    again = type(calibration).from_dict(calibration.to_dict())
-    assert again.id == calibration.id
-
-
-def test_result_as_plain_types(square):
-    data = json.loads(to_json(square.to_dict()))
-    assert {"matrix", "coefficients", "structure_residual", "convergence", "seconds"} <= set(data)
-    assert np.array(data["matrix"]).shape == (8, 7)
 
 
 def test_progress_counts_to_the_end():

@@ -168,22 +168,9 @@ def test_pads_under_loads_on_the_surface(coarse, fem, tmp_path, capsys, layout):
         assert np.abs(written.pads - pads).max() < 2e-5 * np.abs(pads).max()
 
 
-def test_a_layout_of_ones_own(fem, tmp_path):
-    """A layout file is looked up beside the model."""
-    out = tmp_path / "fem.json"
-    (tmp_path / "mine.yaml").write_text(
-        "name: mine\npad_size: 0.4\npositions: [[0, 0, 1], [1, 0, 0], [-1, 0, 0], [0, 0, -1]]\n"
-        "normals: [[0, 0, 1], [1, 0, 0], [-1, 0, 0], [0, 0, -1]]\n"
-    )
-    assert fem(SMALL + "layout: mine.yaml\n", "--meshes", 2, "--json", out) == 0
-    result = json.loads(out.read_text())
-    assert result["pads"] == ["+z", "+x", "-x", "-z"] and result["symmetry"] == "full"
-    assert "zx" in result["unobservable"]
-
-
 def test_a_layout_of_ones_own_in_space(coarse, fem, tmp_path, capsys):
     """One pad in the middle of each face tells the three normal stresses and their slopes along
-    themselves."""
+    themselves. A layout file is looked up beside the model."""
     faces = [[0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]]
     out, saved = tmp_path / "fem.json", tmp_path / "mine.yaml"
     (tmp_path / "six.yaml").write_text(
@@ -246,7 +233,6 @@ pads: {width: 0.0015, centre: 0.00125}
 @pytest.mark.parametrize(
     ("pads", "size", "centre"),
     [
-        ("{width: 0.002, centre: 0.001}", 1.0, 0.5),
         ("{width: 0.0005}", 0.25, 0.5),
         ("{centre: 0.0012}", 0.4, 0.6),
     ],
