@@ -105,6 +105,31 @@ def test_wrong_data_of_the_elastomer_are_found_or_stated(wrong, shape):
     assert errors.force[1] < 0.003 and errors.position[1] < 0.1e-3
 
 
+@pytest.mark.parametrize("error", [-0.06, 0.06])
+def test_a_ball_over_cubes_at_another_depth_has_its_force_and_place(inverse, error):
+    """Two standard deviations off, without noise. A response that is linear in the depth costs
+    0.3 % of the force, four stated deviations."""
+    force, centre = np.array([0.6, -0.3, -3.0]), np.array([2e-3, 1e-3])
+    load = contact.hertz(2.5e-3, force, centre, order=12)
+    below = inverse.poses.position - [0, 0, (1 + error) * DEPTH]
+    stress, gradient = contact.field(below, *load, 0.48)
+    values = np.concatenate([stress, gradient[:, :3].reshape(len(below), 9)], axis=1)
+    (found,) = ContactTracker(inverse, LEAST).update(values, max_work=np.inf)
+    np.testing.assert_allclose(found.force, force, atol=0.0002 * 3)
+    np.testing.assert_allclose(found.position[:2], centre, atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 4])
+def test_a_flat_punch_is_no_hertz_contact_even_if_far_cubes_fit(inverse, seed):
+    """The evidence of all cubes preferred a Hertz contact, more than five stated deviations off."""
+    random = np.random.default_rng(seed)
+    centre = random.uniform(-PITCH / 2, PITCH / 2, 2)
+    values = noisy(flat_punch(inverse, 8e-3, centre, (0.6, -0.3, -3.0)), random)
+    (found,) = ContactTracker(inverse, LEAST).update(values, max_work=np.inf)
+    assert np.abs(found.position[:2] - centre).max() < 4 * found.position_uncertainty
+    assert abs(found.normal_force - 3) < 4 * found.force_uncertainty
+
+
 @pytest.mark.parametrize("cubes", CUBES[:2])
 def test_between_wide_pitches_the_field_is_that_of_the_fitted_ball(cubes):
     """The linear inverse alone is off by a quarter and more. Eight loads leave 0.65 to 1.35 of the

@@ -22,7 +22,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ...core.arrays import Array, Index
+from ...core.modes import STRESS
 from ...mechanics.contact_response import DISC_SIZES
+from ...mechanics.sensitivity import DEPTH_DEVIATION
 from ..inverse import SurfaceInverse
 from .contact_estimate import ContactEstimate, ContactSum, Discs
 from .local_values import LocalValues, rotations_about_normal
@@ -180,7 +182,7 @@ class HertzFit:
         ]
         precision = np.array(deviations) ** -2
         self._contact_precision = np.tile(precision, n_contacts)
-        self._elastomer_errors = np.zeros(0)
+        self._elastomer_errors = np.zeros(1)  # the depth comes first
 
     def prior_precision(self, quantities: int) -> Array:
         """Return the prior precisions (p,) of the parameters for the next linearisation.
@@ -192,6 +194,11 @@ class HertzFit:
         precision = START_ELASTOMER_PRECISION if is_first else self.misfit
         elastomer_precision = np.full(quantities, precision)
         return np.append(self._contact_precision, elastomer_precision)
+
+    @property
+    def depth_error(self) -> float:
+        """Error of the depth of the cubes' centres that the last step has found, divided by it."""
+        return DEPTH_DEVIATION * float(self._elastomer_errors[0])
 
     @property
     def displacement(self) -> float:
@@ -506,7 +513,15 @@ def _linearise_alike(
     all_forces = np.repeat(all_forces, cubes, axis=0)
     slopes = response.response_slopes(positions, angles, variants, all_sizes, all_forces)
     slopes = slopes[:, :, inverse.columns]
-    sensitivity = response.sensitivity(positions, angles, all_sizes, all_forces)
+    # The response changes with the depth faster than linearly: by its derivative halfway between
+    # the stated depth and the one found. In a half space, that is the derivative at the stated
+    # depth under a load whose lengths are divided by `halfway`, up to a factor of all values,
+    # which only scales the error that the next step finds.
+    depth_errors = np.array([fit.depth_error for fit in fits])
+    halfway = np.repeat(1 + depth_errors / 2, contacts * cubes)
+    near_positions = positions / halfway[:, None]
+    sensitivity = response.sensitivity(near_positions, angles, all_sizes / halfway, all_forces)
+    sensitivity[:, :, len(STRESS) :] /= halfway[:, None, None]
     sensitivity = sensitivity[:, :, inverse.columns]
 
     by_contact = slopes.reshape(*shape, *slopes.shape[1:])
