@@ -4,6 +4,7 @@
 
 The stress is that of point forces on a half space. It goes through the whole chain: pads whose
 gains are known to 1 %, the pad law, a counter's noise, the pipeline. The estimator uses none of it.
+Depth and Poisson's ratio differ from those it is told, as much as its deviations assume.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from cube_tensor_design.studies.traction_study import (
 from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.defaults import CONTACT_PRESSURE
 from cube_tensor_driver.mechanics import contact
+from cube_tensor_driver.mechanics.sensitivity import DEPTH_DEVIATION, POISSON_DEVIATION
 from cube_tensor_driver.touch.tracker.contact_tracker import ContactTracker
 
 SCANS = 12
@@ -161,6 +163,8 @@ def values_under(
     centre: Array,
     force: Array,
     random: np.random.Generator,
+    depth_error: float = 0.0,
+    poisson_error: float = 0.0,
 ) -> Array:
     """Return the components (cubes, 15) that the pipeline computes under a load.
 
@@ -170,16 +174,27 @@ def values_under(
         centre: Centre (2,) of the load in m.
         force: Force (3,) in N.
         random: Source of gain errors and noise.
+        depth_error: How much deeper the cubes are than the inverse knows, divided by the depth.
+        poisson_error: How much larger Poisson's ratio is.
     """
-    return bench.measured(_pads_under(bench, forces, centre, force), random)
+    pads = _pads_under(bench, forces, centre, force, depth_error, poisson_error)
+    return bench.measured(pads, random)
 
 
-def _pads_under(bench: TractionBench, forces: Array, centre: Array, force: Array) -> Array:
+def _pads_under(
+    bench: TractionBench,
+    forces: Array,
+    centre: Array,
+    force: Array,
+    depth_error: float = 0.0,
+    poisson_error: float = 0.0,
+) -> Array:
     """Return the pad stresses (cubes, P) in Pa; the arguments are those of `values_under`."""
     place = np.column_stack([forces[:, :2] + centre, np.zeros(len(forces))])
     load = place, forces[:, 2:] * force
-    setting = bench.setting
-    return bench.pads_in(field_below(bench.poses.position, setting.depth, load, setting.poisson))
+    depth = bench.setting.depth * (1 + depth_error)
+    poisson = min(bench.setting.poisson + poisson_error, 0.5)
+    return bench.pads_in(field_below(bench.poses.position, depth, load, poisson))
 
 
 def bench_shapes(loads: int) -> TrackingResults:
@@ -206,7 +221,9 @@ def _bench_load(bench: TractionBench, shape: Shape, random: np.random.Generator)
         shift = np.array([shape.apart * pitch / 2, 0, 0])
         forces = np.concatenate([forces - shift, forces + shift]) * [1, 1, 0.5]
     turned = np.column_stack([forces[:, :2] @ turn, forces[:, 2]])
-    values = values_under(bench, turned, centre, draw_force(random), random)
+    force = draw_force(random)
+    errors = random.standard_normal(2) * [DEPTH_DEVIATION, POISSON_DEVIATION]
+    values = values_under(bench, turned, centre, force, random, *errors)
 
     tracker = ContactTracker(bench.inverse, CONTACT_PRESSURE)
     times_ms = []
@@ -214,8 +231,7 @@ def _bench_load(bench: TractionBench, shape: Shape, random: np.random.Generator)
         start_s = time.process_time()
         found = tracker.update(values)
         times_ms.append(1e3 * (time.process_time() - start_s))
-    errors = contact_errors(found, centre)
-    return TrackingResult(errors, len(found), times_ms[0], times_ms[-1])
+    return TrackingResult(contact_errors(found, centre), len(found), times_ms[0], times_ms[-1])
 
 
 def summarise(results: TrackingResults) -> dict[str, dict[str, float]]:
