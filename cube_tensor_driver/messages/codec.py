@@ -11,6 +11,8 @@ as 4 bytes, at an offset that is a multiple of 4.
 
 from __future__ import annotations
 
+import contextlib
+import math
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -105,22 +107,6 @@ class _Shape(NamedTuple):
     frame: int
     rows: int
     pads: int
-
-
-class _FieldOffsets(NamedTuple):
-    """Byte offsets of one field from the start of the serialised message.
-
-    Attributes:
-        field: Definition of the field.
-        count_at: Byte offset of the number of its values; None if the field is no sequence.
-        at: Byte offset of its first value.
-        values: Number of its values.
-    """
-
-    field: _Field
-    count_at: int | None
-    at: int
-    values: int
 
 
 class _Layout(NamedTuple):
@@ -259,8 +245,7 @@ class MessageCodec(Generic[AnyRows]):
         names = [field.name for field in message_fields]
         self.columns = [name for name in names if name not in ("time_offset", "n_pads")]
         self.columns.append("stamp_ns")
-        self._n_fields_before_pads = names.index("n_pads") if "n_pads" in names else None
-        self._find_end = lru_cache(MAX_CACHED_LAYOUTS)(self._compute_end)
+        self._has_pads = "n_pads" in names
         self._find_layout = lru_cache(MAX_CACHED_LAYOUTS)(self._make_layout)
 
     def decode(self, messages: bytes | AnyArray) -> Decoded[AnyRows]:
@@ -405,7 +390,7 @@ class MessageCodec(Generic[AnyRows]):
         record["frame_id"] = np.void(frame_id)
         for name, count in zip(layout.sequences, layout.counts, strict=True):
             record[f"length of {name}"] = count
-        if self._n_fields_before_pads is not None:
+        if self._has_pads:
             record["n_pads"] = layout.shape.pads
 
     def _read_records(self, messages: bytes | AnyArray) -> tuple[AnyArray, Times]:
@@ -423,7 +408,7 @@ class MessageCodec(Generic[AnyRows]):
             MessageError: See `decode`.
         """
         first = messages if isinstance(messages, bytes) else messages[0].tobytes()
-        layout: _Layout = self._find_layout(self._read_shape(first))
+        layout = self._read_layout(first)
         stamp_ns = np.array([self._read_stamp(layout, first)])
         if isinstance(messages, bytes) or len(messages) == 1:
             return np.frombuffer(first, layout.record, 1), stamp_ns
@@ -439,8 +424,8 @@ class MessageCodec(Generic[AnyRows]):
         stamp_ns = record["sec"].astype(np.int64) * SECOND + record["nanosec"]
         return record, stamp_ns
 
-    def _read_shape(self, data: bytes) -> _Shape:
-        """Return the length of the frame id and the numbers of rows and pads that a message states.
+    def _read_layout(self, data: bytes) -> _Layout:
+        """Return the layout of a message with the numbers of rows and pads that it states.
 
         Raises:
             MessageError: The message is too short, is not little-endian CDR, or has another length
@@ -460,22 +445,25 @@ class MessageCodec(Generic[AnyRows]):
         # The first field that follows the header is a sequence with one value per row, so its
         # number of values is the number of rows.
         (rows,) = struct.unpack_from("<I", data, rows_at)
-        pads = 0
-        if self._n_fields_before_pads is not None:
-            pads_at = self._find_end(_Shape(frame, rows, 0), self._n_fields_before_pads)
-            # A damaged message may be too short to have this byte. Then the check of its length
-            # below refuses it.
-            pads = data[pads_at] if pads_at < len(data) else 0
-        shape = _Shape(frame, rows, pads)
-        # DDS middleware may add up to three bytes at the end. Before this check no memory is
-        # allocated for rows, because a damaged message may state any number of them.
-        n_extra = len(data) - self._find_end(shape, len(self._fields))
-        if not 0 <= n_extra < 4:
-            raise MessageError(
-                f"{self._name} of {len(data)} bytes says it has {rows} rows of {pads} pads: "
-                "damaged, or of another version of the messages"
-            )
-        return shape
+        shape = _Shape(frame, rows, 0)
+        # A damaged message may state any number of rows. A layout allocates no memory for rows, and
+        # numpy refuses one that is longer than any message.
+        with contextlib.suppress(ValueError):
+            layout: _Layout = self._find_layout(shape)
+            if self._has_pads:
+                _, pads_at, *_ = layout.record.fields["n_pads"]
+                # A damaged message may be too short to have this byte. Then the check of its length
+                # below refuses it.
+                pads = data[pads_at] if pads_at < len(data) else 0
+                shape = _Shape(frame, rows, pads)
+                layout = self._find_layout(shape)
+            # DDS middleware may add up to three bytes at the end.
+            if 0 <= len(data) - layout.record.itemsize < 4:
+                return layout
+        raise MessageError(
+            f"{self._name} of {len(data)} bytes says it has {rows} rows of {shape.pads} pads: "
+            "damaged, or of another version of the messages"
+        )
 
     def _read_stamp(self, layout: _Layout, message: bytes) -> int:
         """Check the sequences of a message, and return its time stamp in ns since the Unix epoch.
@@ -493,42 +481,7 @@ class MessageCodec(Generic[AnyRows]):
                 )
         return int(seconds * SECOND + nanoseconds)
 
-    def _compute_end(self, shape: _Shape, n_fields: int) -> int:
-        """Return the byte offset, from the start of a message, where its first fields end.
-
-        Args:
-            shape: Numbers of rows and pads, and length of the frame id.
-            n_fields: Number of fields after the header that are counted.
-        """
-        _, end = self._locate_fields(shape, n_fields)
-        return end
-
-    def _locate_fields(self, shape: _Shape, n_fields: int) -> tuple[list[_FieldOffsets], int]:
-        """Return the byte offsets of the first fields of a message, and the offset of their end.
-
-        No memory is allocated for values, because a damaged message may state any number of rows.
-
-        Args:
-            shape: Numbers of rows and pads, and length of the frame id.
-            n_fields: Number of fields to locate.
-        """
-        located = []
-        end = _FRAME_AT + shape.frame
-        for field in self._fields[:n_fields]:
-            count_at, values = None, 1
-            if field.width != PER_MESSAGE:
-                # The values follow their number (4 bytes) without a gap, because CDR aligns values
-                # to their size, and no value is larger than 4 bytes.
-                count_at = _align(end)
-                end = count_at + 4
-                width = shape.pads if field.width == PER_PAD else field.width
-                values = shape.rows * width
-            located.append(_FieldOffsets(field, count_at, end, values))
-            end += values * int(field.type[-1])
-        return located, end
-
     def _make_layout(self, shape: _Shape) -> _Layout:
-        located, size = self._locate_fields(shape, len(self._fields))
         # Each entry of the structured dtype has a name, a type and a byte offset.
         entries: list[tuple[str, Any, int]] = [
             ("encapsulation", "S4", 0),
@@ -540,21 +493,28 @@ class MessageCodec(Generic[AnyRows]):
         sequences = ["frame_id"]
         counts = [shape.frame]
         counts_at: list[int] = [_FRAME_LENGTH_AT]
-        for field, count_at, at, values in located:
-            if count_at is not None:
+        end = _FRAME_AT + shape.frame
+        for field in self._fields:
+            dimensions = _dimensions(field.width, shape)
+            values = math.prod(dimensions)
+            if field.width != PER_MESSAGE:
+                # The values follow their number (4 bytes) without a gap, because CDR aligns values
+                # to their size, and no value is larger than 4 bytes.
+                count_at = _align(end)
                 entries.append((f"length of {field.name}", "<u4", count_at))
                 sequences.append(field.name)
                 counts.append(values)
                 counts_at.append(count_at)
-            form = (field.type, _dimensions(field.width, shape))
-            entries.append((field.name, form, at))
+                end = count_at + 4
+            entries.append((field.name, (field.type, dimensions), end))
+            end += values * int(field.type[-1])
         names, formats, offsets = zip(*entries, strict=True)
         record = np.dtype(
             {
                 "names": names,
                 "formats": formats,
                 "offsets": offsets,
-                "itemsize": size,
+                "itemsize": end,
             }
         )
         return _Layout(
