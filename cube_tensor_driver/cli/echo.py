@@ -46,22 +46,16 @@ def reading_line(reading: StressReading) -> str:
     Args:
         reading: One row of a stress message: one cube at one time.
     """
-    from ..core.modes import COMPONENTS, STRESS
-
-    pairs = zip(COMPONENTS, reading.values, strict=True)
-    observed = {name: value for name, value in pairs if not math.isnan(value)}
-    stress, gradient = [], []
-    for name, value in observed.items():
-        if name in STRESS:
-            stress.append(f"{name} {value:9.1f}")
-        else:
-            gradient.append(f"{name} {value:10.0f}")
     parts = [f"{reading.stamp_ns * 1e-9:.3f} s", reading.cube]
-    # The unit is written once after all stresses, and once after all gradients.
-    if stress:
-        parts += [*stress[:-1], f"{stress[-1]} Pa"]
-    if gradient:
-        parts += [*gradient[:-1], f"{gradient[-1]} Pa/m"]
+    for components, form, unit in (
+        (reading.stress, "9.1f", "Pa"),
+        (reading.gradient, "10.0f", "Pa/m"),
+    ):
+        observed = {name: value for name, value in components.items() if not math.isnan(value)}
+        # The unit is written once, after the last component.
+        if observed:
+            texts = [f"{name} {value:{form}}" for name, value in observed.items()]
+            parts.append(f"{'  '.join(texts)} {unit}")
     if not math.isnan(reading.residual):
         parts.append(f"residual {reading.residual:.2f}")
     words = status_words(reading.status)
@@ -76,18 +70,12 @@ def reading_json(reading: StressReading) -> str:
         reading: The row: one cube at one time. Components that are not observed (NaN) become null.
     """
     from ..config.output_files import to_json
-    from ..core.modes import COMPONENTS, STRESS
 
-    stress: dict[str, float] = {}
-    gradient: dict[str, float] = {}
-    for name, value in zip(COMPONENTS, reading.values, strict=True):
-        components = stress if name in STRESS else gradient
-        components[name] = value
     content = {
         "stamp_ns": reading.stamp_ns,
         "cube": reading.cube,
-        "stress_pa": stress,
-        "gradient_pa_per_m": gradient,
+        "stress_pa": reading.stress,
+        "gradient_pa_per_m": reading.gradient,
         "residual": reading.residual,
         "status": status_words(reading.status),
     }

@@ -29,6 +29,7 @@ from cube_tensor_driver.cli.echo import reading_json, reading_line
 from cube_tensor_driver.cli.main import BROKEN_PIPE, main
 from cube_tensor_driver.config.grid import grid
 from cube_tensor_driver.config.yaml import parse_yaml, write_yaml
+from cube_tensor_driver.core.modes import GRADIENT, STRESS
 from cube_tensor_driver.device.wire.protocol import Command
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import SimulatedHubs, skin_processes
@@ -121,9 +122,9 @@ def test_tare_clears_all_cubes_or_none(capfd):
 
 
 def test_a_reading_as_a_line_and_as_json():
-    values = [np.nan] * 15
-    values[2], values[4], values[14] = -1234.56, 7.0, 3e5
-    reading = StressReading(12_345_000_000, "c05", values, np.nan, status=1 | 16)
+    stress = dict.fromkeys(STRESS, np.nan) | {"zz": -1234.56, "zx": 7.0}
+    gradient = dict.fromkeys(GRADIENT, np.nan) | {"zz_z": 3e5}
+    reading = StressReading(12_345_000_000, "c05", stress, gradient, np.nan, status=1 | 16)
     assert reading_line(reading) == (
         "12.345 s  c05  zz   -1234.6  zx       7.0 Pa  zz_z     300000 Pa/m  PAD_FAULT, pad open"
     )

@@ -14,6 +14,7 @@ from rclpy.node import Node
 from rclpy.subscription import Subscription
 
 from ...core.errors import ConfigError, CubeError, MessageError
+from ...core.modes import GRADIENT, STRESS
 from ...core.rows import StressRows
 from ...messages.codec import stress_codec
 from ...msg import SkinInfo, SkinStress, StressTensorStamped
@@ -43,8 +44,8 @@ class StressReading:
     Attributes:
         stamp_ns: Time at which the pads were read, in ns since the Unix epoch.
         cube: Name of the cube.
-        values: 6 stress components, in Pa, and 9 gradients, in Pa/m, in the order of
-            `core.modes.COMPONENTS`; NaN for those that are not observed.
+        stress: Name of each stress component -> its value, in Pa; NaN if it is not observed.
+        gradient: Name of each gradient -> its value, in Pa/m; NaN if it is not observed.
         residual: Disagreement between the signals of the pads, sqrt(chi-square / degrees of
             freedom): about 1 for noise alone, larger for a faulty pad or an unusual load.
         status: Status bits, see `core/status.py`.
@@ -52,7 +53,8 @@ class StressReading:
 
     stamp_ns: int
     cube: str
-    values: list[float]
+    stress: dict[str, float]
+    gradient: dict[str, float]
     residual: float
     status: int
 
@@ -238,18 +240,21 @@ class _Listener:
 
     def _read_rows(self, rows: StressRows) -> Iterator[StressReading]:
         names = dict(enumerate(self._names or []))
-        values = np.hstack([rows.stress, rows.gradient]).tolist()
-        columns = (rows.stamp_ns, rows.cube, rows.residual, rows.status)
-        each_row = zip(
-            *(column.tolist() for column in columns),
-            values,
-            strict=True,
+        columns = (
+            rows.stamp_ns,
+            rows.cube,
+            rows.stress,
+            rows.gradient,
+            rows.residual,
+            rows.status,
         )
-        for stamp_ns, cube, residual, status, row in each_row:
+        lists = [column.tolist() for column in columns]
+        for stamp_ns, cube, stress, gradient, residual, status in zip(*lists, strict=True):
             yield StressReading(
                 stamp_ns,
                 names.get(cube, f"cube {cube}"),
-                row,
+                dict(zip(STRESS, stress, strict=True)),
+                dict(zip(GRADIENT, gradient, strict=True)),
                 residual,
                 status,
             )
@@ -259,12 +264,12 @@ class _Listener:
         normal = tensor.normal
         shear = tensor.shear
         stress = [normal.x, normal.y, normal.z, shear.x, shear.y, shear.z]
-        values = [*stress, *tensor.normal_gradient.tolist()]
-        stamp_ns = to_ns(message.header.stamp)
+        gradient = tensor.normal_gradient.tolist()
         return StressReading(
-            stamp_ns,
+            to_ns(message.header.stamp),
             self._cube,
-            values,
+            dict(zip(STRESS, stress, strict=True)),
+            dict(zip(GRADIENT, gradient, strict=True)),
             tensor.residual,
             tensor.status,
         )
