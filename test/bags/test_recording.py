@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pty
 import shutil
@@ -259,8 +260,11 @@ def test_the_duration_of_a_recording_begins_with_its_first_message(tmp_path, mon
         monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: now[0]))
     bag = SimpleNamespace(folder=tmp_path, messages=1)
     its_node = session.NodeSession(None, SimpleNamespace(spin_once=spin_once))
-    stop, show = threading.Event(), lambda *_: None
-    record.record_into(bag, its_node, [], stop=stop, duration=5.0, show=show)
+    monkeypatch.setattr(record, "node_session", lambda _: contextlib.nullcontext(its_node))
+    monkeypatch.setattr(record, "stop_event", threading.Event)
+    monkeypatch.setattr(record, "BagWriter", lambda *_: bag)
+    limits = {"storage": "mcap", "max_bytes": 0, "max_seconds": 0.0}
+    record.record(tmp_path, [], duration=5.0, show=lambda *_: None, **limits)
     assert now[0] == pytest.approx(108.0, abs=2 * session.STEP_S)
 
 

@@ -26,7 +26,7 @@ from ...core.errors import BagError
 from ...processes.stop_signals import stop_event
 from ..messages import message_class
 from ..qos import offered_profile
-from ..session import NodeSession, domain_text, node_session, spin_until
+from ..session import domain_text, node_session, spin_until
 from .echo import resolve_topics
 
 QUEUE_DEPTH = 2000
@@ -276,73 +276,40 @@ def record(
     with node_session("recorder") as session:
         names = resolve_topics(session.node, topics)
         bag = BagWriter(folder, storage, max_bytes, max_seconds)
-        return record_into(
-            bag,
-            session,
-            names,
-            stop=stop,
-            duration=duration,
-            show=show,
-        )
+        recorder = Recorder(session.node, names, bag)
+        begin = find_at = show_at = time.monotonic()
+        until = float("inf") if duration is None else begin + duration
+        has_come = False
 
+        def is_done() -> bool:
+            nonlocal has_come, until
+            now = time.monotonic()
+            if not has_come and recorder.has_begun and any(recorder.counts.values()):
+                # The duration is counted from the first message on and not from the start, because
+                # finding the topics may take seconds on a busy machine.
+                has_come = True
+                until += now - begin
+            return stop.is_set() or recorder.error is not None or now >= until
 
-def record_into(
-    bag: BagWriter,
-    session: NodeSession,
-    names: Sequence[str],
-    *,
-    stop: threading.Event,
-    duration: float | None,
-    show: Callable[[Recorder, float], None],
-) -> Recorder:
-    """Record topics into an open bag until an event is set or the duration is over; close the bag.
+        def find_and_show() -> None:
+            nonlocal find_at, show_at
+            now = time.monotonic()
+            if now >= find_at:
+                find_at = now + FIND_PERIOD_S
+                recorder.find_topics()
+            if now >= show_at:
+                show_at = now + SHOW_PERIOD_S
+                show(recorder, now - begin)
 
-    Args:
-        bag: The bag, which is empty.
-        session: The node that subscribes.
-        names: Full names of the topics.
-        stop: Recording ends when this event is set.
-        duration: Time, in s, from the first message on, after which recording ends; None: it ends
-            only at the event.
-        show: Called once a second with the recorder and the time since the start, in s.
-
-    Raises:
-        BagError: Writing the bag has failed, or no message arrived.
-    """
-    recorder = Recorder(session.node, names, bag)
-    begin = find_at = show_at = time.monotonic()
-    until = float("inf") if duration is None else begin + duration
-    has_come = False
-
-    def is_done() -> bool:
-        nonlocal has_come, until
-        now = time.monotonic()
-        if not has_come and recorder.has_begun and any(recorder.counts.values()):
-            # The duration is counted from the first message on and not from the start, because
-            # finding the topics may take seconds on a busy machine.
-            has_come = True
-            until += now - begin
-        return stop.is_set() or recorder.error is not None or now >= until
-
-    def find_and_show() -> None:
-        nonlocal find_at, show_at
-        now = time.monotonic()
-        if now >= find_at:
-            find_at = now + FIND_PERIOD_S
-            recorder.find_topics()
-        if now >= show_at:
-            show_at = now + SHOW_PERIOD_S
-            show(recorder, now - begin)
-
-    try:
-        spin_until(session.executor, is_done, on_step=find_and_show)
-    finally:
-        _close(recorder, bag.folder)
-    if not bag.messages:
-        # An empty bag is removed, so that the next recording can use the same name.
-        shutil.rmtree(bag.folder, ignore_errors=True)
-        raise BagError(f"nothing recorded, no bag made: {_why_nothing(recorder)}")
-    return recorder
+        try:
+            spin_until(session.executor, is_done, on_step=find_and_show)
+        finally:
+            _close(recorder, bag.folder)
+        if not bag.messages:
+            # An empty bag is removed, so that the next recording can use the same name.
+            shutil.rmtree(bag.folder, ignore_errors=True)
+            raise BagError(f"nothing recorded, no bag made: {_why_nothing(recorder)}")
+        return recorder
 
 
 def _why_nothing(recorder: Recorder) -> str:
