@@ -194,15 +194,6 @@ class MessageBuffer(Generic[AnyRows]):
         stamp_ns = np.zeros(layout.shape.rows, np.int64)
         self.rows: AnyRows = codec.make_rows(self._record, stamp_ns)
         self._time_offset = self._record["time_offset"][0]
-        # The columns are looked up only once, because this takes as long as copying the rows of a
-        # skin with few cubes.
-        self._names = codec.columns
-        self._columns = [getattr(self.rows, name) for name in self._names]
-
-    def fill(self, rows: AnyRows) -> None:
-        """Copy rows (samples of cubes) into the message, which must have as many rows."""
-        for name, column in zip(self._names, self._columns, strict=True):
-            column[:] = getattr(rows, name)
 
     def data(self, stamp_ns: int | None = None) -> bytes:
         """Return the bytes of the message with the values that `rows` has now.

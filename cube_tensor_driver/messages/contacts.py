@@ -9,7 +9,7 @@ library.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -19,20 +19,13 @@ from ..core.errors import BagError
 from ..touch.slip import NO_CONTACTS, SLIP, Slip
 from ..touch.surface import Contact
 from ..touch.tracker.contact_tracker import TrackedContact
-from .codec import SECOND
-from .types import CONTACTS, TRACTION
-
-MakeMessage = Callable[..., Any]
-"""Function that constructs a message. Its arguments are the name of the type, such as
-"geometry_msgs/msg/Point", and the fields by name; arrays of numbers are numpy arrays."""
+from .point_cloud import MakeMessage, cloud_message, make_header
+from .types import CONTACTS
 
 CLOUD = ("x", "y", "z", "pressure", "shear", "sigma")
 """Names of the fields of each point of the topic `traction`, all float32: position x, y, z in the
 parent frame of the skin, in m; pressure and shear stress on the surface, in Pa; and sigma, the
 standard deviation of the pressure, in Pa."""
-
-POINT_SIZE = 4 * len(CLOUD)
-"""Size of one point of the topic `traction`, in bytes."""
 
 _NUMBERS = (
     "normal_force",
@@ -53,7 +46,6 @@ _VECTORS = {
     "normal": "Vector3",
     "force": "Vector3",
 }
-_FLOAT32 = 7  # value of the constant FLOAT32 of sensor_msgs/msg/PointField
 
 
 def contacts_message(
@@ -87,7 +79,7 @@ def contacts_message(
     fields["slip"] = slip.state.astype(np.uint8)
     fields |= {name: getattr(slip, name) for name in _FRICTION}
     fields["slip_velocity"] = [_make_xyz(make, "Vector3", one) for one in slip.velocity]
-    header = _make_header(make, stamp_ns, frame_id)
+    header = make_header(make, stamp_ns, frame_id)
     return make(CONTACTS, header=header, **fields)
 
 
@@ -106,30 +98,7 @@ def traction_message(
         cloud: Points (M, 6) with the columns of `CLOUD`: position in m, pressure, shear stress and
             standard deviation of the pressure in Pa.
     """
-    data = cloud.astype("<f4")
-    fields = [
-        make(
-            "sensor_msgs/msg/PointField",
-            name=name,
-            offset=4 * number,
-            datatype=_FLOAT32,
-            count=1,
-        )
-        for number, name in enumerate(CLOUD)
-    ]
-    return make(
-        TRACTION,
-        header=_make_header(make, stamp_ns, frame_id),
-        height=1,
-        width=len(data),
-        fields=fields,
-        is_bigendian=False,
-        point_step=POINT_SIZE,
-        row_step=POINT_SIZE * len(data),
-        # PointCloud2 stores the values of all points as bytes.
-        data=data.reshape(-1).view(np.uint8),
-        is_dense=True,
-    )
+    return cloud_message(make, stamp_ns, frame_id, CLOUD, cloud)
 
 
 def decode_contacts(message: Any) -> list[Contact]:
@@ -161,7 +130,7 @@ def decode_traction(message: Any) -> Array:
         BagError: The points of the message have other fields than those of `CLOUD`.
     """
     names = tuple(field.name for field in message.fields)
-    if names != CLOUD or message.point_step != POINT_SIZE:
+    if names != CLOUD or message.point_step != 4 * len(CLOUD):
         raise BagError(
             f"a point cloud has the fields {', '.join(names)}; those of the topic traction are "
             f"{', '.join(CLOUD)}: listen to the topic of the node contacts"
@@ -177,16 +146,6 @@ def decode_traction(message: Any) -> Array:
 def _collect(contacts: Sequence[Any], name: str) -> Array:
     """Return one attribute of all contacts as an array whose first axis counts the contacts."""
     return np.array([getattr(contact, name) for contact in contacts], float)
-
-
-def _make_header(
-    make: MakeMessage,
-    stamp_ns: int,
-    frame_id: str,
-) -> Any:
-    seconds, nanoseconds = divmod(stamp_ns, SECOND)
-    stamp = make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
-    return make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
 
 
 def _make_xyz(

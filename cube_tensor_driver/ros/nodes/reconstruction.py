@@ -213,7 +213,7 @@ class Reconstruction(CubeNode):
         # Touches are published first, because a robot that reacts to them needs the lowest latency.
         if self._touch is not None:
             self._touch.publish(stress, rest_changes)
-        self._publisher.publish(stress, stamp_ns, frame_id)
+        self._publisher.publish(stamp_ns)
         if self._state_interfaces is not None:
             self._state_interfaces.publish(stress, stamp_ns)
         self._diagnostics.count(stress)

@@ -14,18 +14,20 @@ import numpy as np
 from geometry_msgs.msg import WrenchStamped
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
-from sensor_msgs.msg import PointCloud2, PointField
+from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
 from ...config.skin import Skin
+from ...core.arrays import Array
 from ...core.forces import Forces
 from ...core.reconstructor import Reconstructor
 from ...core.rows import FrequencyRows, StressRows
 from ...core.status import INVALID
 from ...core.tensor import contact_wrench
 from ...messages.codec import stress_codec
+from ...messages.point_cloud import cloud_message
 from ...msg import SkinStress, StressTensorStamped
-from ..messages import pack_array, tensor_message, to_time, wrench_message
+from ..messages import make_message, pack_array, tensor_message, to_time, wrench_message
 from ..node import MAX_BUFFERS, CubeNode
 
 LISTENERS_PERIOD_S = 0.5
@@ -75,17 +77,9 @@ class StressPublisher:
         """
         self._buffer = lru_cache(maxsize=MAX_BUFFERS)(stress_codec.buffer)
         self._publisher = node.own(node.create_lifecycle_publisher(SkinStress, "stress", profile))
-        self._cubes = CubeTopics(node, skin, reconstructor, side)
-        self._forces = (
-            ForceCloud(
-                node,
-                skin,
-                profile,
-                side,
-            )
-            if with_forces
-            else None
-        )
+        forces = Forces(skin, side)
+        self._cubes = CubeTopics(node, skin, reconstructor, forces.side)
+        self._forces = ForceCloud(node, skin, profile, forces) if with_forces else None
         node.own(node.create_timer(LISTENERS_PERIOD_S, self._cubes.find_listeners))
 
     def make_rows(self, rows: FrequencyRows, frame_id: bytes) -> StressRows:
@@ -96,31 +90,24 @@ class StressPublisher:
                 stamps are copied into the returned rows.
             frame_id: Frame id of the message, encoded and with a closing zero byte.
         """
-        out = self._buffer(frame_id, len(rows)).rows
+        self._message = self._buffer(frame_id, len(rows))
+        out = self._message.rows
         out.cube[:] = rows.cube
         out.sequence[:] = rows.sequence
         out.stamp_ns[:] = rows.stamp_ns
         return out
 
-    def publish(
-        self,
-        stress: StressRows,
-        stamp_ns: int,
-        frame_id: bytes,
-    ) -> None:
-        """Publish rows as one message of `stress`, and on other topics that have subscribers.
+    def publish(self, stamp_ns: int) -> None:
+        """Publish the rows that `make_rows` returned last and the caller has filled.
 
-        The other topics are `forces` and those of single cubes.
+        They become one message of `stress`, and messages of `forces` and of the topics of single
+        cubes that have subscribers.
 
         Args:
-            stress: Rows of stress, one cube at one sampling time each.
             stamp_ns: Stamp of the message, in ns since the Unix epoch.
-            frame_id: Frame id of the message, encoded and with a closing zero byte.
         """
-        message = self._buffer(frame_id, len(stress))
-        if stress is not message.rows:
-            message.fill(stress)
-        self._publisher.publish(message.data(stamp_ns))
+        stress = self._message.rows
+        self._publisher.publish(self._message.data(stamp_ns))
         self._cubes.publish(stress)
         if self._forces is not None:
             self._forces.publish(stress, stamp_ns)
@@ -138,31 +125,14 @@ class ForceCloud:
         node: CubeNode,
         skin: Skin,
         profile: QoSProfile,
-        side: float | None,
+        forces: Forces,
     ) -> None:
-        self._forces = Forces(skin, side)
-        n_cubes = len(skin.cubes)
+        self._forces = forces
         self._publisher = node.own(node.create_lifecycle_publisher(PointCloud2, "forces", profile))
         # The message is made once, and later only its data and stamp are replaced. The description
         # of its fields consists of many Python objects that never change.
-        item = np.dtype("<f4").itemsize
-        step = item * len(FORCE_FIELDS)
-        self._message = PointCloud2(
-            height=1,
-            width=n_cubes,
-            point_step=step,
-            row_step=step * n_cubes,
-        )
-        self._message.header.frame_id = skin.parent_frame
-        self._message.fields = [
-            PointField(
-                name=name,
-                offset=item * k,
-                datatype=PointField.FLOAT32,
-                count=1,
-            )
-            for k, name in enumerate(FORCE_FIELDS)
-        ]
+        points = np.zeros((len(skin.cubes), len(FORCE_FIELDS)))
+        self._message = cloud_message(make_message, 0, skin.parent_frame, FORCE_FIELDS, points)
 
     def publish(self, rows: StressRows, stamp_ns: int) -> None:
         """Publish the force of the last row of each cube; it is NaN for cubes without a row.
@@ -193,13 +163,11 @@ class CubeTopics:
         node: CubeNode,
         skin: Skin,
         reconstructor: Reconstructor,
-        side: float | None,
+        sides: Array,
     ) -> None:
-        self._node = node
         self._skin = skin
         self._reconstructor = reconstructor
-        own_sides = [2 * cube.calibration.half_side for cube in skin.cubes]
-        self._sides = np.array([side or own_side for own_side in own_sides])
+        self._sides = sides
         self._tensors = _CubePublishers(node, skin, "stress", StressTensorStamped)
         self._wrenches = _CubePublishers(node, skin, "wrench", WrenchStamped)
 
