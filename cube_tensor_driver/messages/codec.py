@@ -14,7 +14,7 @@ from __future__ import annotations
 import contextlib
 import math
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -399,7 +399,7 @@ class MessageCodec(Generic[AnyRows]):
             MessageError: See `decode`.
         """
         first = messages if isinstance(messages, bytes) else messages[0].tobytes()
-        layout = self._read_layout(first)
+        layout: _Layout = self._read_layout(first)
         stamp_ns = np.array([self._read_stamp(layout, first)])
         if isinstance(messages, bytes) or len(messages) == 1:
             return np.frombuffer(first, layout.record, 1), stamp_ns
@@ -442,7 +442,8 @@ class MessageCodec(Generic[AnyRows]):
         with contextlib.suppress(ValueError):
             layout: _Layout = self._find_layout(shape)
             if self._has_pads:
-                _, pads_at, *_ = layout.record.fields["n_pads"]
+                fields: Mapping[str, Any] = layout.record.fields or {}
+                pads_at = fields["n_pads"][1]
                 # A damaged message may be too short to have this byte. Then the check of its length
                 # below refuses it.
                 pads = data[pads_at] if pads_at < len(data) else 0
