@@ -35,6 +35,12 @@ from .metadata import SUFFIXES, BagFiles, Connection, merge_connections, read_me
 from .sqlite_file import SqliteReader
 from .stored_messages import StoredMessages, join_in_blocks
 
+MAX_DISORDER_NS = SECOND
+"""Largest difference of stamps, in ns, by which messages and samples in a bag may be out of order.
+
+To find what belongs to a sample, the bag is read until stamps are this much later.
+"""
+
 VERSION = 4
 """Version of this package's message definitions that can be read: ``SkinInfo.VERSION``."""
 

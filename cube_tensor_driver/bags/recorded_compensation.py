@@ -18,13 +18,10 @@ from ..core.compensation.motion import UNKNOWN_MOTION, ForcesAtCubes, Motion
 from ..core.errors import MessageError
 from ..core.poses import CubePoses
 from ..core.rows import FrequencyRows, concatenate
-from ..messages.codec import SECOND, Decoded
+from ..messages.codec import Decoded
 from ..messages.compensation import read_motion, read_states
 from ..messages.types import COMPENSATION
-from .read import Bag, stamp_ns
-
-MAX_DISORDER_NS = SECOND
-"""Largest difference of stamps, in ns, by which messages in a bag may be out of order."""
+from .read import MAX_DISORDER_NS, Bag, stamp_ns
 
 
 class RecordedCompensation(NamedTuple):

@@ -21,15 +21,8 @@ from ..core.matching import NO_MATCH, match_rows
 from ..core.reconstructor import RecordedHealth
 from ..core.rows import FrequencyRows
 from ..core.status import WORDS
-from ..messages.codec import SECOND
 from ..messages.types import STRESS
-from .read import Bag
-
-MAX_DISORDER_NS = SECOND
-"""Largest difference of stamps, in ns, by which samples in a bag may be out of order.
-
-To find the stress of a sample of frequencies, the bag is read until stamps are this much later.
-"""
+from .read import MAX_DISORDER_NS, Bag
 
 HEALTH_BITS = np.uint16(sum(WORDS))
 """Status bits in a row of stress that state conditions of the cube's pads (open, short, noisy, …).

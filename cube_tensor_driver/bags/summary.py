@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..core.arrays import AnyArray, Times
+from ..core.rows import COUNTER_RANGE
 from .read import Bag
 
 DIAGNOSTICS_TYPE = "diagnostic_msgs/msg/DiagnosticArray"
@@ -19,10 +20,6 @@ DIAGNOSTICS_TYPE = "diagnostic_msgs/msg/DiagnosticArray"
 MIN_GAP_PERIODS = 1.5
 """Time between two successive samples of a cube above which it counts as a gap, as a multiple of
 the cube's median sampling period."""
-
-SEQUENCE_RANGE = 1 << 32
-"""Number of different sequence numbers of samples (32 bits). After the largest one, a hub continues
-with 0."""
 
 
 @dataclass(frozen=True)
@@ -100,10 +97,10 @@ def _summarise(
     if len(sequence) < 2:
         return CubeSummary(name, uid, len(sequence))
     differences = np.diff(sequence.astype(np.int64))
-    steps = np.mod(differences, SEQUENCE_RANGE)
+    steps = np.mod(differences, COUNTER_RANGE)
     # A forward step of at least half the range is in fact a step back: the hub restarted and
     # counts from 0 again, so no samples were lost.
-    is_forward = (steps > 0) & (steps < SEQUENCE_RANGE // 2)
+    is_forward = (steps > 0) & (steps < COUNTER_RANGE // 2)
     lost = (steps[is_forward] - 1).sum()
     periods_ns = np.diff(stamp_ns)
     # The median is used because a pause of the recording would lengthen the mean period.

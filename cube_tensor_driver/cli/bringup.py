@@ -37,13 +37,6 @@ AVERAGE_S = 0.25
 The live table of the pads is drawn with the same period.
 """
 
-PITCH = 0.012
-"""Distance of neighbouring cubes in the written file, in metres.
-
-It is a placeholder, because the hub does not know where its cubes are: the user replaces the
-positions in the file.
-"""
-
 PPM = 1e6
 """Number of ppm (parts per million) in 1."""
 
@@ -149,12 +142,12 @@ def skin_of_hub(options: argparse.Namespace) -> tuple[dict[str, Any], Skin]:
         # the user gave is made absolute.
         name = str(file.resolve())
     calibration = read_calibration(file)
-    # The cubes are written as one row, because the hub does not know how they are arranged.
+    # The cubes are written as one row at the default pitch: the hub does not know how they are
+    # arranged, and the user replaces the positions.
     data = grid(
         options.name,
         nx=hello.n_cubes,
         ny=1,
-        pitch=PITCH,
         rate=options.rate,
         calibration=name,
         layout=calibration.layout.name,

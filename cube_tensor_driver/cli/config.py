@@ -9,6 +9,7 @@ import sys
 from collections import Counter
 from pathlib import Path
 
+from ..config.grid import DEFAULT_PITCH
 from .parser import Parser, count, positive
 
 
@@ -19,7 +20,7 @@ def arguments(parser: Parser) -> None:
     grid.add_argument(
         "--pitch",
         type=positive,
-        default=0.012,
+        default=DEFAULT_PITCH,
         metavar="M",
         help="distance from cube to cube, m (default: %(default)s)",
     )

@@ -19,9 +19,6 @@ Number = TypeVar("Number", int, float)
 MAX_WIDTH = 100
 """Maximum width of help texts, in characters; longer lines are hard to read on wide terminals."""
 
-MAX_UID = (1 << 64) - 1
-"""Maximum of the unique id (uid) of a hub or cube, which has 64 bits."""
-
 
 @dataclass(frozen=True)
 class Output:
@@ -299,5 +296,5 @@ uid = _number_type(
     # With base 0, `int` accepts decimal numbers, and hexadecimal numbers that begin with 0x.
     lambda text: int(text, 0),
     "a uid, 0 to 2^64 - 1",
-    lambda n: 0 <= n <= MAX_UID,
+    lambda n: 0 <= n < 1 << 64,
 )

@@ -11,6 +11,9 @@ from ..core.errors import ConfigError
 MAX_CUBES = 1 << 16
 """Maximum number of cubes of a skin. Messages give the index of a cube as a 16-bit integer."""
 
+DEFAULT_PITCH = 0.012
+"""Distance of neighbouring cubes, in m, of a grid whose true distances are unknown or invented."""
+
 LINK_NUMBER = "{}"
 """Placeholder in the text of a port, as in /dev/ttyACM{}, which is replaced by the number of the
 link, from 0 up."""
@@ -21,7 +24,7 @@ def grid(
     *,
     nx: int,
     ny: int,
-    pitch: float,
+    pitch: float = DEFAULT_PITCH,
     rate: float,
     links: int = 1,
     calibration: str | None = None,

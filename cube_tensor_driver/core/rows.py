@@ -18,6 +18,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from .arrays import AnyArray, Index, Mask, PadMasks, Real, Single, StatusBits, Times
 
+COUNTER_RANGE = 1 << 32
+"""Number of values of a hub's counters, which have 32 bits. After the largest one, the numbers of
+samples and the counts of lost samples continue at 0."""
+
 COLUMN_TYPES: dict[str, type] = {
     "sequence": np.uint32,
     "stamp_ns": np.int64,

@@ -26,9 +26,6 @@ from ..processes.stop_signals import INTERRUPTED, stop_event
 MAX_CUBES = 4096
 """Maximum number of cubes of a grid that `./cube demo --cubes N` simulates."""
 
-PITCH = 0.012
-"""Distance of neighbouring cubes, in metres, in the grid that `./cube demo --cubes N` simulates."""
-
 DEFAULT_RATE = 100.0
 """Samples per second of each cube, if neither the option --rate nor the skin file states a rate."""
 
@@ -173,7 +170,7 @@ def write_grid(
     nx = math.ceil(math.sqrt(cubes))
     ny = math.ceil(cubes / nx)
     links = math.ceil(cubes / cubes_per_hub)
-    skin = grid(nx=nx, ny=ny, pitch=PITCH, links=links, rate=rate)
+    skin = grid(nx=nx, ny=ny, links=links, rate=rate)
     # Surplus cubes of the last row are removed, and with them links (hubs) without any cube.
     skin["cubes"] = skin["cubes"][:cubes]
     used = {cube["link"] for cube in skin["cubes"]}

@@ -19,6 +19,7 @@ from ..config.output_files import atomic_write
 from ..core.arrays import Index, Times
 from ..core.errors import ConfigError
 from ..core.matching import NO_MATCH, SampleKeys, SampleRows, match_rows
+from ..core.rows import COUNTER_RANGE
 from .faults import Fault
 
 ABSENT = -1
@@ -29,10 +30,6 @@ NO_LINK = -1
 
 CUBE_RANGE = 1 << 16
 """Number of possible indices of a cube in a skin, which have 16 bits in messages."""
-
-SEQUENCE_RANGE = 1 << 32
-"""Number of different sequence numbers in frames and messages, where they wrap around after 32
-bits. The sample numbers in this log do not wrap."""
 
 
 @dataclass
@@ -237,7 +234,7 @@ class SampleTable:
         if among is None:
             among = np.arange(len(self))
         # A sample contains all cubes of a hub, so it is identified by the link instead of the cube.
-        number = self.number[among] % SEQUENCE_RANGE
+        number = self.number[among] % COUNTER_RANGE
         known = SampleKeys(self.link[among], number, self.time_ns[among])
         wanted = SampleKeys(self.link_of_cube[rows.cube], rows.sequence, rows.stamp_ns)
         found = match_rows(known, wanted)

@@ -15,13 +15,12 @@ import numpy as np
 from ..config.skin import Skin, as_skin
 from ..core.arguments import check_number
 from ..core.arrays import Array
-from ..core.rows import FrequencyRows
+from ..core.rows import COUNTER_RANGE, FrequencyRows
 from ..device.wire.protocol import NOT_MEASURED, to_hertz
 from .cubes import NO_ERRORS, PadErrors, hub_cubes
 from .hub import PERIOD_LIMITS_US, SimulatedHub
 from .imperfections import Imperfections
 from .load import AnyLoad, LoadMemory, read_load
-from .sample_log import SEQUENCE_RANGE
 
 
 def simulate(
@@ -183,7 +182,7 @@ class SkinPads:
         # The rows are sorted link by link, as the driver delivers them.
         return FrequencyRows(
             cube=self._cube,
-            sequence=np.full(count, number % SEQUENCE_RANGE, np.uint32),
+            sequence=np.full(count, number % COUNTER_RANGE, np.uint32),
             stamp_ns=np.full(count, 1000 * time_us),
             frequency=to_hertz(millihertz[self._cube]),
             temperature=temperature[self._cube],

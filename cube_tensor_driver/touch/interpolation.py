@@ -20,10 +20,10 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.sparse import csr_matrix
-from scipy.spatial import cKDTree
 
 from ..core.arrays import Array, Index, Mask
 from ..core.poses import CubePoses
+from .nearest_cubes import find_nearest_cubes
 
 NEIGHBOURS = 9
 """Number of cubes from which the points of a patch are interpolated: the cube in the centre of the
@@ -55,7 +55,7 @@ class Interpolation:
         self._poses = poses
         self._patches = patches
         self._length = length
-        self._near = _nearest_cubes(poses)
+        self._near = find_nearest_cubes(poses, NEIGHBOURS)
         self._weights: dict[tuple[int, ...], _Weights] = {}
 
     def values(self, values: Array, columns: list[int]) -> Array:
@@ -232,30 +232,6 @@ class _Weights:
             shape=(rows, n * width),
             copy=False,
         )
-
-
-def _nearest_cubes(poses: CubePoses) -> Index:
-    """Return the indices (cubes, neighbours) of the cubes nearest to each cube, itself included.
-
-    Of several cubes at the same distance, those with the lower indices are chosen.
-    """
-    n = len(poses.position)
-    count = min(NEIGHBOURS, n)
-    # More cubes than needed are requested, because of several cubes at the same distance the tree
-    # returns arbitrary ones.
-    candidates = min(3 * count, n)
-    tree = cKDTree(poses.position)
-    distance, near = tree.query(poses.position, candidates)
-    distance = distance.reshape(n, -1)
-    near = near.reshape(n, -1)
-
-    # Distances are rounded, because otherwise their rounding errors would decide the order of
-    # equally distant cubes.
-    pitches = distance / poses.pitch
-    rounded = pitches.round(6)
-    order = np.lexsort((near, rounded))
-    order = order[:, :count]
-    return np.asarray(np.take_along_axis(near, order, axis=1))
 
 
 def _covariance(

@@ -30,12 +30,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
-from scipy.spatial import cKDTree
 
 from ..core.arrays import AnyArray, Array, Index, Mask, Single
 from ..core.poses import CubePoses
 from ..mechanics.cache import Arrays, load_or_compute
 from ..mechanics.traction_prior import TractionPrior
+from .nearest_cubes import find_nearest_cubes
 from .prior import AMPLITUDE, covariance_matrix
 from .surface import square_points
 from .unrolled_skin import unroll
@@ -131,7 +131,7 @@ class WindowPosteriors:
             spacing: Distance of the points on the patch of a cube, in m.
             side: Number of points along a side of the patch.
         """
-        self.near = _nearest_cubes(poses)
+        self.near = find_nearest_cubes(poses, WINDOW_CUBES, by_position=True)
         self.inner = min(INNER_CUBES, self.near.shape[1])
         self.pads = np.nan_to_num(model.by_pad)
         n = len(self.near)
@@ -471,34 +471,6 @@ def select_pressure(rows: Array) -> Array:
     by_point = rows.reshape(*leading, -1, ROWS_PER_POINT)
     chosen = by_point[..., 2:]
     return chosen.reshape(*leading, -1)
-
-
-def _nearest_cubes(poses: CubePoses) -> Index:
-    """Return the indices (cubes, W) of the cubes nearest to each cube, which itself comes first.
-
-    Neighbours at equal distances are sorted by their position in the frame of the cube, so that
-    windows of the same kind list their cubes in the same order.
-    """
-    n = len(poses.position)
-    count = min(WINDOW_CUBES, n)
-    # More cubes than needed are requested, because of several cubes at the same distance the tree
-    # returns arbitrary ones.
-    candidates = min(3 * count, n)
-    tree = cKDTree(poses.position)
-    _, near = tree.query(poses.position, candidates)
-    near = near.reshape(n, -1)
-
-    offset = poses.position[near] - poses.position[:, None]
-    local = np.einsum("nji,nkj->nki", poses.rotation, offset)
-    # Positions are rounded, because otherwise rounding errors would decide the order of equally
-    # distant cubes.
-    local = np.round(local / poses.pitch, 4)
-    distance = np.linalg.norm(local, axis=2)
-    distance = np.round(distance, 4)
-    x, y, _ = np.moveaxis(local, -1, 0)
-    order = np.lexsort((y, x, distance))
-    order = order[:, :count]
-    return np.asarray(np.take_along_axis(near, order, axis=1))
 
 
 def _number_distinct(rows: Array) -> Index:

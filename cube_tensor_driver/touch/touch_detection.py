@@ -31,6 +31,7 @@ from ..core.arrays import Array, Index, PadMasks
 from ..core.modes import COMPONENTS
 from ..core.pipeline import Pipeline
 from ..core.rows import StressRows
+from .nearest_cubes import find_nearest_cubes
 from .pad_noise import GAIN_ERROR
 from .touch_forces import estimate_forces
 
@@ -178,7 +179,7 @@ class Touch:
         self._deviation = np.sqrt(pressure_variance)
         poses = skin.poses
         self._place = poses.position / poses.pitch
-        near = _find_neighbours(poses.position)
+        near = find_nearest_cubes(poses, NEIGHBOURS)
         self._estimate = None
         if skin.elastomer is not None:
             self._estimate = estimate_forces(poses, skin.elastomer, near, covariance)
@@ -450,20 +451,3 @@ class Touch:
         deviation = np.sqrt(variance)
         deviation[is_unknown] = np.nan
         return force, deviation
-
-
-def _find_neighbours(position: Array) -> Index:
-    """Return the indices (cubes, W) of the cubes nearest to each cube, itself first.
-
-    Args:
-        position: Positions (cubes, 3) of the cubes, in m.
-    """
-    near = []
-    for one in position:
-        # Distances are rounded, because otherwise their rounding errors would decide the order of
-        # equally distant cubes.
-        distance = np.linalg.norm(position - one, axis=1)
-        distance = distance.round(6)
-        order = np.argsort(distance, kind="stable")
-        near.append(order[:NEIGHBOURS])
-    return np.array(near)

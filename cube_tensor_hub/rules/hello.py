@@ -10,6 +10,7 @@ from statistics import mode
 
 import numpy as np
 
+from cube_tensor_driver.core.layout import MAX_PADS
 from cube_tensor_driver.device.wire.protocol import Ack, Command, Hello, Sample, Stats
 
 from ..rule import RuleResult, failed, never_tried, not_tried, passed, rule
@@ -22,10 +23,6 @@ HELLO may be one of those that a hub sends once a second without a request."""
 MAX_FIRST_HELLO_S = 0.9
 """Longest time, in seconds, from power-up of a hub to its first HELLO. A later one would be the
 first of those that a hub sends once a second."""
-
-MAX_PADS = 32
-"""Largest number of pads of a cube, which is the number of bits in the mask of pad faults of a
-SAMPLE."""
 
 
 def once_a_second(transcript: Transcript, kind: type) -> str:

@@ -13,6 +13,7 @@ from itertools import groupby, pairwise
 import numpy as np
 
 from cube_tensor_driver.core.arrays import Array
+from cube_tensor_driver.core.rows import COUNTER_RANGE
 from cube_tensor_driver.device.clock.line import MAX_DRIFT
 from cube_tensor_driver.device.wire.protocol import Hello, Sample, Stats
 
@@ -20,9 +21,6 @@ from ..conversation import UNREAD_S
 from ..rule import RuleResult, failed, not_tried, passed, rule
 from ..transcript import Transcript
 from .hello import frames_per_sample, of_kind, once_a_second
-
-HALF = 1 << 31
-"""Half of the number of different sequence numbers of samples, which have 32 bits."""
 
 MAX_STATS_GAP_S = 2.5
 """Largest difference of the uptimes in two successive STATS, in seconds, which a hub sends once a
@@ -54,7 +52,8 @@ MIN_DRIFT_SAMPLES = 20
 def forward(later: int, earlier: int) -> int:
     """Return by how much a number that wraps at 2^32 grew; negative if it went back."""
     # The shift by half of the range makes a small step back negative instead of nearly 2^32.
-    return (later - earlier + HALF) % (1 << 32) - HALF
+    half = COUNTER_RANGE // 2
+    return (later - earlier + half) % COUNTER_RANGE - half
 
 
 def first_frames(samples: list[Sample]) -> list[Sample]:

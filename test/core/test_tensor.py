@@ -103,7 +103,10 @@ def test_rotations_agree_with_the_groups_action():
     state = RNG.normal(size=21)
     for r in find_group("full")[::5]:
         rotated = SPACE.action(r) @ state
-        stress, gradient = rotated @ to_voigt(SPACE.stress), np.tensordot(rotated, SPACE.gradient, 1)
+        stress, gradient = (
+            rotated @ to_voigt(SPACE.stress),
+            np.tensordot(rotated, SPACE.gradient, 1),
+        )
         before, slope = state @ to_voigt(SPACE.stress), np.tensordot(state, SPACE.gradient, 1)
         np.testing.assert_allclose(stress, rotate_stress(before, r), atol=1e-12)
         np.testing.assert_allclose(gradient, rotate_gradient(slope, r), atol=1e-12)

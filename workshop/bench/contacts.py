@@ -64,7 +64,7 @@ SKINS = {
 """Skins by their names in the result. Cubes 8 mm apart are 5 mm deep, the others 4 mm."""
 
 
-class Shape(NamedTuple):
+class LoadShape(NamedTuple):
     """Pressure of a load, with the total force 1 N.
 
     Attributes:
@@ -81,7 +81,7 @@ class Shape(NamedTuple):
 
 
 def ellipse(length: float, width: float, order: int = 16) -> Array:
-    """Return Hertz's pressure on an ellipse with 1 N, as point forces (see `Shape.forces`).
+    """Return Hertz's pressure on an ellipse with 1 N, as point forces (see `LoadShape.forces`).
 
     Args:
         length: Axis of the ellipse along x, in m.
@@ -123,16 +123,16 @@ BALL = ellipse(5e-3, 5e-3)
 """Pressure of a ball with a contact width of 5 mm."""
 
 SHAPES = {
-    "ball 5 mm": Shape(BALL),
-    "flat punch 8 mm": Shape(punch(8e-3)),
-    "flat punch 16 mm": Shape(punch(16e-3)),
-    "fingertip 16 x 8 mm": Shape(ellipse(16e-3, 8e-3)),
-    "edge 12 x 1 mm": Shape(bar(12e-3, 1e-3)),
-    "edge 24 x 2 mm": Shape(bar(24e-3, 2e-3)),
-    "rod 40 x 3 mm": Shape(bar(40e-3, 3e-3)),
-    "two balls 1.2 pitches apart": Shape(BALL, apart=1.2),
-    "ball half a pitch outside": Shape(BALL, outside=0.5),
-    "ball a pitch outside": Shape(BALL, outside=1.0),
+    "ball 5 mm": LoadShape(BALL),
+    "flat punch 8 mm": LoadShape(punch(8e-3)),
+    "flat punch 16 mm": LoadShape(punch(16e-3)),
+    "fingertip 16 x 8 mm": LoadShape(ellipse(16e-3, 8e-3)),
+    "edge 12 x 1 mm": LoadShape(bar(12e-3, 1e-3)),
+    "edge 24 x 2 mm": LoadShape(bar(24e-3, 2e-3)),
+    "rod 40 x 3 mm": LoadShape(bar(40e-3, 3e-3)),
+    "two balls 1.2 pitches apart": LoadShape(BALL, apart=1.2),
+    "ball half a pitch outside": LoadShape(BALL, outside=0.5),
+    "ball a pitch outside": LoadShape(BALL, outside=1.0),
 }
 """Loads by their names in the result."""
 
@@ -170,7 +170,7 @@ def values_under(
 
     Args:
         bench: The skin.
-        forces: Point forces as in `Shape.forces`.
+        forces: Point forces as in `LoadShape.forces`.
         centre: Centre (2,) of the load in m.
         force: Force (3,) in N.
         random: Source of gain errors and noise.
@@ -208,7 +208,9 @@ def bench_shapes(loads: int) -> TrackingResults:
     return results
 
 
-def _bench_load(bench: TractionBench, shape: Shape, random: np.random.Generator) -> TrackingResult:
+def _bench_load(
+    bench: TractionBench, shape: LoadShape, random: np.random.Generator
+) -> TrackingResult:
     """Find the contacts of a load in a random direction at a random place."""
     pitch = bench.setting.pitch
     angle = random.uniform(0, 2 * np.pi)

@@ -20,9 +20,6 @@ from cube_tensor_hub.firmware import build
 FIRMWARE = Path(__file__).resolve().parents[2] / "firmware"
 """Folder of the source of the program that simulates hubs."""
 
-PITCH = 0.012
-"""Distance of neighbouring cubes, in m."""
-
 LAYOUTS = {8: "planar", 24: "cube"}
 """Layout of the cubes by their number of pads."""
 
@@ -77,7 +74,6 @@ class HubLoad:
         data = grid(
             nx=self.cubes,
             ny=1,
-            pitch=PITCH,
             links=self.hubs,
             rate=rate,
             layout=LAYOUTS[self.pads],

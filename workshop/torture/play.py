@@ -40,9 +40,6 @@ from .recorder import recording
 CUBES_PER_ROW = 8
 """Number of cubes side by side on the tortured skin."""
 
-PITCH = 0.012
-"""Distance of neighbouring cubes of the tortured skin, in m."""
-
 SETTLE_S = 3.0
 """Time, in seconds, from the end of the mix of faults to the end of the torture."""
 
@@ -212,7 +209,6 @@ def _write_skin(folder: Path, ports: Path) -> Path:
     data = grid(
         nx=CUBES_PER_ROW,
         ny=rows,
-        pitch=PITCH,
         links=HUBS,
         rate=RATE,
         port="{}",

@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 
-from ..track import MAX_DEVICE_US, NEVER, LinkTrack
+from ..track import MAX_DEVICE_US, NEVER, RESTART_US, LinkTrack
 from .line import ClockLine, ClockRoundTrip
 from .steps import MAX_DECISION_NS, StepDecision, find_step
 
@@ -26,10 +26,6 @@ MAX_PAUSE_NS = 60_000_000_000
 line (host time over device time) is still used. After a longer pause the error of the drift, up to
 6 ms per minute, would look like a step of the hub's clock. The line is then begun anew, and only
 its drift is kept."""
-RESTART_US = 1_000_000
-"""Smallest step back of the device time (the hub's clock), in µs, that is taken for a restart of
-the hub. If the device time of a sample is earlier by less, the sample has only come out of
-order."""
 MIN_STILL_NS = 200_000_000
 """Time, in ns, for which the device times (hub's clock) of samples must stay the same before the
 hub's clock counts as standing still. `MIN_STILL_READS` must be reached, too."""

@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from ...core.rows import COUNTER_RANGE
 from ..track import LinkTrack
 
 MIN_STEP_US = 4000.0
@@ -58,7 +59,6 @@ longer time their difference is not used, because the thread was interrupted bet
 MAX_READS = 3
 """Number of attempts to read the host's clock and the monotonic clock within `MAX_READ_NS`. If all
 fail, no step of the host's clock is reported; the next comparison finds it."""
-_WRAP = 1 << 32
 
 
 class HostClockWatch:
@@ -122,8 +122,8 @@ def find_step(track: LinkTrack, number: int, device_us: int) -> int:
         return 0
     # A number that is not ahead of the reference belongs to a sample that came out of order or to
     # another frame of the same sample, which cannot be checked.
-    n_periods = (number - track.reference) % _WRAP
-    if not 0 < n_periods < _WRAP // 2:
+    n_periods = (number - track.reference) % COUNTER_RANGE
+    if not 0 < n_periods < COUNTER_RANGE // 2:
         return 0
     interval = device_us - track.reference_us
     period = track.period_us

@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable
 
 from ...core.errors import LinkError
+from ...core.rows import COUNTER_RANGE
 from ..wire.protocol import Ack, Command, Frame, Hello, Request, Result, Sample, Time, encode
 from .link import Link, LinkState
 
@@ -342,7 +343,7 @@ class Session:
             now: Monotonic time, in s.
         """
         self._ask_time_at = now + ASK_TIME_S
-        self._question = (self._question + 1) % (1 << 32)
+        self._question = (self._question + 1) % COUNTER_RANGE
         # The clock is read before the request is written, so that the time of asking is not later
         # than the true one.
         self.asked_ns = self._clock_ns()

@@ -7,7 +7,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 from enum import Enum
 
-from ..track import MAX_DEVICE_US, MAX_DISORDER, NEVER, LinkTrack
+from ...core.rows import COUNTER_RANGE
+from ..track import MAX_DEVICE_US, MAX_DISORDER, NEVER, RESTART_US, LinkTrack
 from ..wire.protocol import Sample, Stats
 
 MAX_GAP = 1 << 20
@@ -17,15 +18,10 @@ time has advanced by at least `MIN_PERIOD_US` for each number; otherwise the hub
 MIN_PERIOD_US = 100
 """Shortest sample period of a hub, in µs, because the highest sample rate that can be requested is
 10 kHz (`MAX_RATE` in live.py)."""
-RESTART_US = 1_000_000
-"""Largest age, in µs by the hub's clock, of a sample that was taken before the first counted one
-but came after it. If its time differs by more from that of the newest sample, it is taken for the
-first sample after a restart of the hub."""
 MAX_REPEAT_US = 60_000_000
 """Longest time, in µs of device time (the hub's clock), by which a repeated sample may be older
 than the newest one. No line holds samples for longer, so an older sample shows that the hub has
 restarted and its device time has begun again near zero."""
-_WRAP = 1 << 32
 _MAX_CUBES = 1 << 16
 """Number of indices of a cube on a hub, which have 16 bits."""
 
@@ -163,9 +159,9 @@ class SequenceTracker:
 
         The result is negative if the number is behind.
         """
-        half = _WRAP // 2
-        distance = (sequence - self._track.next) % _WRAP
-        return distance if distance < half else distance - _WRAP
+        half = COUNTER_RANGE // 2
+        distance = (sequence - self._track.next) % COUNTER_RANGE
+        return distance if distance < half else distance - COUNTER_RANGE
 
     def _is_old_repeat(self, number: int, device_us: int) -> bool:
         """Return whether a sample is a repeated one that is older than the kept samples.
@@ -338,7 +334,7 @@ class SampleAccount:
             self._dropped_before = 0
             self.expect_restart()
             return
-        dropped = (frame.dropped - self._dropped_before) % _WRAP
+        dropped = (frame.dropped - self._dropped_before) % COUNTER_RANGE
         self._dropped += dropped * len(self._trackers)
         self._dropped_before = frame.dropped
         for tracker in self._trackers.values():
