@@ -117,7 +117,7 @@ class PageStatus:
 def waiting(domain: str) -> str:
     """Return the text that page and terminal show while no skin is published in a DDS domain."""
     return (
-        f"Waiting for a skin: none is published in DDS domain {domain}. "
+        f"Waiting for a skin: none is published in {domain}. "
         "Start one, for example with ./cube demo; it appears here."
     )
 
@@ -219,18 +219,7 @@ def legend(
     if quantity is DEVIATION and field.sigma is None:
         return box(NO_DEVIATION)
     values = np.linspace(-top if quantity.signed else 0, top, LEGEND_STEPS)
-    colours = (
-        (
-            255
-            * scene.colours(
-                quantity,
-                values,
-                top,
-            )
-        )
-        .astype(int)
-        .tolist()
-    )
+    colours = (255 * scene.colours(quantity, values, top)).astype(int).tolist()
     stops = ",".join(f"rgb({red},{green},{blue})" for red, green, blue in colours)
     middle = (LEGEND_STEPS - 1) // 2
     ticks = "".join(f"<span>{value / quantity.size:.3g}</span>" for value in values[::middle])

@@ -11,11 +11,9 @@ import contextlib
 import io
 import logging
 import math
-import os
 import queue
 import secrets
 import socket
-import threading
 import time
 import warnings
 from collections.abc import Callable
@@ -24,9 +22,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rclpy
 import viser
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 
@@ -40,9 +38,8 @@ from ..messages.skin_info import cube_calibrations
 from ..msg import SkinContacts
 from ..processes.stop_signals import stop_event
 from ..ros.callbacks import CallbackErrors
-from ..ros.compat import make_executor
 from ..ros.messages import to_ns
-from ..ros.session import start_ros
+from ..ros.session import domain_text, node_session, spin_until
 from ..ros.skin_subscriber import FollowedSkin, SkinSubscriber
 from ..srv import Tare
 from . import markup
@@ -70,30 +67,37 @@ So the updates of a very large skin take at most a third of a core, and come les
 WAITING_NOTE_S = 2.0
 """Time, in seconds after the start, at which the terminal prints that no skin is published yet."""
 
+MAX_STEP_S = 0.02
+"""Maximum time, in seconds, from one check whether a picture is due to the next. The check also
+follows each message."""
+
 NEVER_STALE_S = 1e9
 """Maximum age, in seconds, of a cube's latest row (sample) while a replay of a bag is paused.
 
-A paused replay publishes nothing. The limit is so high that no cube is shown as stale then.
+A paused replay publishes nothing. The limit is so high that only cubes that never had a row are
+shown as stale then.
 """
 
 
 class Viewer:
-    """The ROS node of `./cube view`, its web server, and the pages of all browsers.
+    """The web server of `./cube view`, the pages of all browsers, and what they receive from ROS.
 
-    Everything runs in the thread that calls `spin`. viser calls the functions of buttons in threads
-    of its own; these only put an action into a queue, from which `spin` takes it.
+    Everything runs in the thread that spins the node and calls `step`. viser calls the functions of
+    buttons in threads of its own; these only put an action into a queue, which `step` empties.
     """
 
     def __init__(
         self,
+        node: Node,
         host: str,
         port: int,
         depth: float,
         recordings: Path,
     ) -> None:
-        """Start the web server and the ROS node.
+        """Start the web server and subscribe to the topics of the skin.
 
         Args:
+            node: Node of this process.
             host: Name or IP address on which the server listens.
             port: TCP port of the page; if it is in use, the next free one is taken.
             depth: Distance from the centres of the cubes to the surface of the skin, in metres.
@@ -105,10 +109,9 @@ class Viewer:
         self._token = "" if host in LOCAL_HOSTS else secrets.token_urlsafe(16)
         self._server = _serve(host, port, self._token)
         self._depth = depth
-        self._node = rclpy.create_node("view")
-        self._callback_errors = CallbackErrors(self._node)
+        self._callback_errors = CallbackErrors(node)
         self._subscriber = SkinSubscriber(
-            self._node,
+            node,
             self._show_skin,
             self._receive_stress,
         )
@@ -118,16 +121,12 @@ class Viewer:
             (PointCloud2, "traction", self._receive_traction),
         ):
             receive_safely = self._callback_errors.catch(receive)
-            self._node.create_subscription(kind, topic, receive_safely, 10)
-        self._tare = self._node.create_client(Tare, "reconstruction/tare")
-        self._clear_tare = self._node.create_client(Trigger, "reconstruction/clear_tare")
+            node.create_subscription(kind, topic, receive_safely, 10)
+        self._tare = node.create_client(Tare, "reconstruction/tare")
+        self._clear_tare = node.create_client(Trigger, "reconstruction/clear_tare")
         self._status = PageStatus()
         self._services = ServiceCalls(self._status.say)
-        self._replay = ReplayClient(
-            self._node,
-            self._services,
-            self._status.say,
-        )
+        self._replay = ReplayClient(node, self._services, self._status.say)
         self._recorder = BagRecorder(recordings)
         self._links: dict[str, tuple[str, int]] = {}
         self._actions: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
@@ -142,8 +141,8 @@ class Viewer:
         self._server.on_client_disconnect(
             lambda client: put(lambda: self._forget_page(client.client_id))
         )
-        self._executor = make_executor()
-        self._executor.add_node(self._node)
+        self._next_picture_s = time.monotonic()
+        self._waiting_note_s = self._next_picture_s + WAITING_NOTE_S
 
     @property
     def url(self) -> str:
@@ -153,40 +152,27 @@ class Viewer:
         query = f"/?token={self._token}" if self._token else ""
         return f"http://{name}:{self._server.get_port()}{query}"
 
-    def spin(self, stop: threading.Event) -> None:
-        """Receive messages, execute actions of users and update the pages until `stop` is set."""
-        next_picture_s = time.monotonic()
-        waiting_note_s = next_picture_s + WAITING_NOTE_S
-        while not stop.is_set():
-            # `spin_once` waits until the next picture is due, or returns earlier after a message.
-            wait_s = min(next_picture_s - time.monotonic(), PICTURE_PERIOD_S)
-            self._executor.spin_once(timeout_sec=max(0.0, wait_s))
-            while not self._actions.empty():
-                self._callback_errors.catch(self._actions.get())()
-            now_s = time.monotonic()
-            if now_s < next_picture_s:
-                continue
-
-            if self._shown is not None:
-                start_s = time.thread_time()
-                self._callback_errors.catch(self._update)(self._shown)
-                pause_s = MIN_PAUSE_SHARE * (time.thread_time() - start_s)
-                # Pictures that are overdue, for example after the computer slept, are skipped.
-                next_picture_s = max(
-                    next_picture_s + PICTURE_PERIOD_S,
-                    time.monotonic() + pause_s,
-                )
-            elif now_s >= waiting_note_s:
-                waiting_note_s = math.inf
-                print(markup.waiting(_domain()), flush=True)
-            else:
-                next_picture_s = now_s + PICTURE_PERIOD_S
+    def step(self) -> None:
+        """Execute the actions of users, and update the pages if a picture is due."""
+        while not self._actions.empty():
+            self._callback_errors.catch(self._actions.get())()
+        now_s = time.monotonic()
+        if self._shown is not None and now_s >= self._next_picture_s:
+            start_s = time.thread_time()
+            self._callback_errors.catch(self._update)(self._shown)
+            pause_s = MIN_PAUSE_SHARE * (time.thread_time() - start_s)
+            # Pictures that are overdue, for example after the computer slept, are skipped.
+            self._next_picture_s = max(
+                self._next_picture_s + PICTURE_PERIOD_S,
+                time.monotonic() + pause_s,
+            )
+        elif self._shown is None and now_s >= self._waiting_note_s:
+            self._waiting_note_s = math.inf
+            print(markup.waiting(domain_text()), flush=True)
 
     def close(self) -> None:
-        """End a recording that runs, destroy the node and stop the server."""
+        """End a recording that runs, and stop the server."""
         self._recorder.end()
-        self._executor.remove_node(self._node)
-        self._node.destroy_node()  # type: ignore[no-untyped-call]
         # viser prints a message when it stops, which is discarded.
         with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
@@ -226,7 +212,7 @@ class Viewer:
         size = client.camera.image_width, client.camera.image_height
         layout = self._layouts.setdefault(client.client_id, PageLayout(*size))
         if self._shown is None:
-            show_waiting(client, layout, markup.waiting(_domain()))
+            show_waiting(client, layout, markup.waiting(domain_text()))
             return
 
         def act(*arguments: Any) -> None:
@@ -366,10 +352,6 @@ def make_scan(
     )
 
 
-def _domain() -> str:
-    return os.environ.get("ROS_DOMAIN_ID") or "0"
-
-
 def _serve(
     host: str,
     port: int,
@@ -424,18 +406,10 @@ def run_view(
         ConfigError: This machine does not have the address, or the port cannot be opened.
     """
     stop = stop_event()
-    start_ros()
-    try:
-        with contextlib.closing(
-            Viewer(
-                host,
-                port,
-                depth,
-                recordings,
-            )
-        ) as viewer:
-            print(f"{viewer.url}  (Ctrl-C ends it)", flush=True)
-            viewer.spin(stop)
-    finally:
-        rclpy.try_shutdown()
+    with (
+        node_session("view") as (node, executor),
+        contextlib.closing(Viewer(node, host, port, depth, recordings)) as viewer,
+    ):
+        print(f"{viewer.url}  (Ctrl-C ends it)", flush=True)
+        spin_until(executor, stop.is_set, step_s=MAX_STEP_S, on_step=viewer.step)
     return 0

@@ -8,6 +8,7 @@ import re
 import struct
 import threading
 from collections.abc import Iterator
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,6 +18,7 @@ pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 pytest.importorskip("viser", reason="needs viser: run this with ./cube test")
 
 import msgspec
+import rclpy
 import viser
 import zstandard
 from sensor_msgs.msg import PointCloud2
@@ -24,7 +26,7 @@ from websockets.sync.client import connect
 
 from cube_tensor_driver.browser import page as page_module
 from cube_tensor_driver.browser.page import LEFT_WIDTH, RIGHT_WIDTH, Page, PageLayout
-from cube_tensor_driver.browser.viewer import Viewer
+from cube_tensor_driver.browser.viewer import MAX_STEP_S, Viewer
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.pipeline import Pipeline
@@ -32,8 +34,10 @@ from cube_tensor_driver.core.rows import StressRows
 from cube_tensor_driver.messages.codec import stress_codec
 from cube_tensor_driver.messages.contacts import contacts_message, traction_message
 from cube_tensor_driver.msg import SkinContacts, SkinInfo, SkinStress
+from cube_tensor_driver.ros.compat import make_executor
 from cube_tensor_driver.ros.messages import info_message, make_message
 from cube_tensor_driver.ros.qos import LATCHED
+from cube_tensor_driver.ros.session import spin_until
 from cube_tensor_driver.touch.surface import Contact
 from cube_tensor_driver.views import scene
 from workshop.bench.views import CAMERA
@@ -199,9 +203,12 @@ class Source:
 @pytest.fixture
 def page(ros, tmp_path) -> Iterator[SimpleNamespace]:
     """The view in this process, a reader of its page, and a source of scans."""
-    view = Viewer(HERE, 0, 0.004, tmp_path)
+    node, executor = rclpy.create_node("view"), make_executor()
+    executor.add_node(node)
+    view = Viewer(node, HERE, 0, 0.004, tmp_path)
     stop = threading.Event()
-    spinning = threading.Thread(target=view.spin, args=(stop,))
+    spin = partial(spin_until, executor, stop.is_set, step_s=MAX_STEP_S, on_step=view.step)
+    spinning = threading.Thread(target=spin)
     spinning.start()
     reader = PageReader(int(view.url.rpartition(":")[2]))
     source = Source(ros)
@@ -213,6 +220,8 @@ def page(ros, tmp_path) -> Iterator[SimpleNamespace]:
         stop.set()
         spinning.join()
         view.close()
+        executor.remove_node(node)
+        node.destroy_node()
 
 
 def test_all_that_a_browser_receives_at_once_is_of_one_scan(page, ros):
