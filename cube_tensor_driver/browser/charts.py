@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -330,17 +329,15 @@ def csv_of(
         The content of the file. Components that no cube observes have no column.
     """
     observed = history.observed_names
-    header = ["time / s"]
+    header = "time / s"
     columns = [history.times]
     for cube in cubes:
         for column, name in enumerate(History.COLUMNS):
             if name not in observed:
                 continue
             unit = "1" if name == "residual" else "Pa/m" if "_" in name else "Pa"
-            header.append(f"{names[cube]} {name} / {unit}")
+            header += f",{names[cube]} {name} / {unit}"
             columns.append(history.of(cube, column))
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(header)
-    table.writerows([f"{value:.6g}" for value in row] for row in zip(*columns, strict=True))
-    return text.getvalue().encode()
+    content = io.BytesIO()
+    np.savetxt(content, np.column_stack(columns), "%.6g", ",", header=header, comments="")
+    return content.getvalue()

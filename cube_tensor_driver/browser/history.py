@@ -4,9 +4,11 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 
-from ..core.arrays import Array, Index
+from ..core.arrays import Array
 from ..core.modes import COMPONENTS
 from ..core.rows import StressRows
 
@@ -30,29 +32,22 @@ A larger difference (modulo 2**32) means that the hub has restarted and counts f
 class History:
     """Values (stress, gradients, residual) of all cubes at the last instants that the page showed.
 
-    They are stored in a ring buffer: a new instant overwrites the oldest one.
-
     Attributes:
-        count: Number of instants that were added since the buffer was empty.
+        count: Number of instants that were added since the history was empty.
     """
 
     COLUMNS = (*COMPONENTS, "residual")
     """Names of the 16 values that are stored per cube: 6 components of the stress, 9 gradients of
     stress, then the residual (misfit between pads and tensor, relative to the noise)."""
 
-    def __init__(self, cubes: int, length: int) -> None:
-        """Make an empty buffer.
+    def __init__(self, length: int) -> None:
+        """Make an empty history.
 
         Args:
-            cubes: Number of cubes.
             length: Maximum number of instants that are kept.
         """
-        self._values = np.full(
-            (length, cubes, len(self.COLUMNS)),
-            np.nan,
-            np.float32,
-        )
-        self._times = np.full(length, np.nan)
+        # Time of each instant in s, and values (cubes, 16); the newest instant is the last.
+        self._instants: deque[tuple[float, Array]] = deque(maxlen=length)
         self._is_observed = np.zeros(len(self.COLUMNS), bool)
         self.count = 0
 
@@ -62,7 +57,7 @@ class History:
         values: Array,
         residual: Array,
     ) -> None:
-        """Add the values of one instant; the oldest is overwritten if the buffer is full.
+        """Add the values of one instant, and remove the oldest if there are too many.
 
         Args:
             time_s: Time of the instant, in s, on any clock that all calls share.
@@ -70,19 +65,18 @@ class History:
             residual: Misfit between pads and tensor relative to the noise (cubes,); about 1 for
                 noise alone.
         """
-        if self.count and time_s < self._times[self._slots()[-1]]:
+        if self._instants and time_s < self._instants[-1][0]:
             # A replay has jumped back.
             self.clear()
-        slot = self.count % len(self._times)
-        self._values[slot, :, :-1] = values
-        self._values[slot, :, -1] = residual
-        self._times[slot] = time_s
-        self._is_observed |= np.isfinite(self._values[slot]).any(axis=0)
+        both = np.column_stack([values, residual]).astype(np.float32)
+        self._instants.append((time_s, both))
+        self._is_observed |= np.isfinite(both).any(axis=0)
         self.count += 1
 
     def clear(self) -> None:
         """Remove all instants, for example because a replay has jumped to another time."""
         self.count = 0
+        self._instants.clear()
         self._is_observed[:] = False
 
     def of(self, cube: int, column: int) -> Array:
@@ -92,12 +86,12 @@ class History:
             cube: Index of the cube.
             column: Index of the value in `COLUMNS`.
         """
-        return np.asarray(self._values[self._slots(), cube, column], float)
+        return np.array([values[cube, column] for _, values in self._instants], float)
 
     @property
     def times(self) -> Array:
         """Times (M,) of the M stored instants minus that of the newest one, in s, so at most 0."""
-        times = self._times[self._slots()]
+        times = np.array([time_s for time_s, _ in self._instants])
         # Plots end at zero, which is the newest instant.
         return times - times[-1] if len(times) else times
 
@@ -105,12 +99,6 @@ class History:
     def observed_names(self) -> set[str]:
         """Names of the `COLUMNS` that were finite for any cube at any instant since `clear`."""
         return {self.COLUMNS[column] for column in np.flatnonzero(self._is_observed)}
-
-    def _slots(self) -> Index:
-        """Return the indices (M,) of the stored instants in the ring buffer, the oldest first."""
-        length = len(self._times)
-        numbers = np.arange(max(0, self.count - length), self.count)
-        return np.asarray(numbers % length)
 
 
 class SampleRate:

@@ -132,7 +132,7 @@ class Viewer:
         self._actions: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._shown: ShownSkin | None = None
         self._scans = ScanSynchronizer(0)
-        self._history = History(0, 1)
+        self._history = History(1)
         self._pages: dict[int, Page] = {}
         self._layouts: dict[int, PageLayout] = {}
         # viser calls both functions in threads of its own, so they only put actions into the queue.
@@ -193,7 +193,7 @@ class Viewer:
             self._depth,
         )
         self._scans = ScanSynchronizer(len(names))
-        self._history = History(len(names), round(HISTORY_S / PICTURE_PERIOD_S))
+        self._history = History(round(HISTORY_S / PICTURE_PERIOD_S))
         self._pages.clear()
         for client in self._server.get_clients().values():
             clear(client)

@@ -142,7 +142,7 @@ def test_values_that_no_control_offers_do_no_harm() -> None:
 def test_saved_tables_and_pictures_hold_what_the_cubes_showed() -> None:
     """c1 sees σzz and its gradient, no cube sees the others."""
     zz, zz_x = History.COLUMNS.index("zz"), History.COLUMNS.index("zz_x")
-    history = History(2, 3)
+    history = History(3)
     for number in range(5):  # two more than are kept
         values = np.full((2, len(COMPONENTS)), np.nan)
         values[1, [zz, zz_x]] = -1000.0 * number, 2e6
