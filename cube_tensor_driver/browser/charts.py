@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -84,39 +85,23 @@ FIRST_GROUPS = ("normal stress", "gradient of σzz")
 """Names, in `GROUPS`, of the values that the two charts show when the page opens."""
 
 
-class ChartLine(NamedTuple):
-    """One line of a chart: one value of one cube.
-
-    Attributes:
-        cube: Index of the cube in the skin.
-        column: Index of the value in `History.COLUMNS`.
-        label: Name of the line in the legend, such as "c05 σzz".
-    """
-
-    cube: int
-    column: int
-    label: str
-
-
 class Chart(NamedTuple):
     """What one chart shows.
 
     Attributes:
         axis: Label of the value axis, with the unit.
         unit: Size of this unit, in SI units.
-        lines: The lines of the chart.
+        lines: Name of each line in the legend, such as "c05 σzz" -> index of the cube, and index
+            of the value in `History.COLUMNS`.
     """
 
     axis: str
     unit: float
-    lines: tuple[ChartLine, ...]
+    lines: dict[str, tuple[int, int]]
 
     def values(self, history: History) -> dict[str, Array]:
         """Return label -> values (M,) of each line at the M instants of a history, in `unit`."""
-        values = {}
-        for line in self.lines:
-            values[line.label] = history.of(line.cube, line.column) / self.unit
-        return values
+        return {label: history.of(*place) / self.unit for label, place in self.lines.items()}
 
 
 class Charts:
@@ -138,7 +123,7 @@ class Charts:
         self._gui, self._tab, self._names = gui, tab, list(names)
         self._history: History | None = None
         self._cubes = [0]
-        self._charts = [Chart("", 1.0, ())] * len(FIRST_GROUPS)
+        self._charts = [Chart("", 1.0, {})] * len(FIRST_GROUPS)
         with tab:
             self._text = gui.add_text(
                 "more cubes",
@@ -205,8 +190,7 @@ class Charts:
             plot = self._plots[number]
             # A plot is made only when its chart has lines; until then both lists are empty.
             plotted = [one["label"] for one in plot.series[1:]] if plot is not None else []
-            wanted = [line.label for line in chart.lines]
-            if plotted == wanted:
+            if plotted == list(chart.lines):
                 continue
             if plot is not None:
                 plot.remove()
@@ -228,12 +212,12 @@ class Charts:
         )
         series = [
             uplot.Series(
-                label=line.label,
+                label=label,
                 stroke=COLOURS[number % len(COLOURS)],
                 width=1.8,
                 dash=DASHES[number // len(COLOURS) % len(DASHES)],
             )
-            for number, line in enumerate(chart.lines)
+            for number, label in enumerate(chart.lines)
         ]
         with self._tab:
             return self._gui.add_uplot(
@@ -282,12 +266,11 @@ def make_chart(history: History, names: Sequence[str], cubes: Sequence[int], gro
     """
     size, unit = markup.unit(GROUPS[group][0])
     observed = [name for name in GROUPS[group] if name in history.observed_names]
-    lines = [
-        ChartLine(cube, History.COLUMNS.index(name), f"{names[cube]} {markup.label(name)}")
-        for cube in cubes
-        for name in observed
-    ]
-    return Chart(f"{group} / {unit}", size, tuple(lines[:MAX_LINES]))
+    lines = {
+        f"{names[cube]} {markup.label(name)}": (cube, History.COLUMNS.index(name))
+        for cube, name in list(product(cubes, observed))[:MAX_LINES]
+    }
+    return Chart(f"{group} / {unit}", size, lines)
 
 
 def chart_properties(history: History, chart: Chart) -> dict[str, Any]:

@@ -72,7 +72,3 @@ class Colouring(NamedTuple):
             last_top,
         )
         return cls(quantity, cubes, field, top, above)
-
-    def colours(self, values: Array) -> Array:
-        """Return the colours (N, 3), from 0 to 1, of values (N,) in SI units; NaN is grey."""
-        return scene.colours(self.quantity, values, self.top)

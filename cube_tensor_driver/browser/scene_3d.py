@@ -10,7 +10,6 @@ which are joined to one mesh for each colour, and arrows, crosses and rings cons
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,12 +22,12 @@ from ..touch.surface import Contact, Surface
 from ..views import scene
 from ..views.meshes import (
     COLOUR_STEPS,
-    CUBE,
     CUBE_EDGES,
     NO_MESH,
     SquareLayer,
     corner_lines,
     find_hit_cube,
+    make_cube,
     step_colours,
 )
 from ..views.round_numbers import round_down
@@ -153,7 +152,6 @@ NO_SHADOWS: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
 """Arguments of viser for an object that neither casts nor receives shadows."""
 
 
-@dataclass(frozen=True)
 class Placement:
     """Transformation of the skin from its parent frame to the 3-D scene, and lengths in the scene.
 
@@ -165,14 +163,7 @@ class Placement:
         arrow: Unit length to which the sizes of arrows are relative, in units of the scene.
     """
 
-    poses: CubePoses
-    centre: Array
-    unit: float
-    pitch: float
-    arrow: float
-
-    @classmethod
-    def of(cls, poses: CubePoses) -> Placement:
+    def __init__(self, poses: CubePoses) -> None:
         """Compute the transformation that gives the longest side of a skin the length `SPAN`.
 
         Args:
@@ -180,15 +171,15 @@ class Placement:
         """
         # The skin ends half a pitch outside of the centres of its outer cubes.
         low, high = poses.position.min(axis=0), poses.position.max(axis=0)
-        centre = (low + high) / 2
-        unit = SPAN / ((high - low).max() + poses.pitch)
-        pitch = poses.pitch * unit
-        scaled = CubePoses(
-            (poses.position - centre) * unit,
+        self.centre: Array = (low + high) / 2
+        self.unit = float(SPAN / ((high - low).max() + poses.pitch))
+        self.pitch = poses.pitch * self.unit
+        self.arrow = max(self.pitch, MIN_ARROW_UNIT)
+        self.poses = CubePoses(
+            self.point(poses.position),
             poses.rotation,
-            poses.half_side * unit,
+            poses.half_side * self.unit,
         )
-        return cls(scaled, centre, unit, pitch, max(pitch, MIN_ARROW_UNIT))
 
     def point(self, position: Array) -> Array:
         """Transform positions (..., 3) from the parent frame, in metres, to units of the scene."""
@@ -218,7 +209,7 @@ class Scene:
             surface: Grid of points around the cubes at which the field (pressure and shear) is
                 drawn.
         """
-        placement = Placement.of(poses)
+        placement = Placement(poses)
         self._names, self._placement = names, placement
         self._is_solid = len(names) <= MAX_SOLID_CUBES
         self._squares = _make_squares(
@@ -297,12 +288,11 @@ class Scene:
         update = self._colours(colouring, "field" in parts)
         update["names"] = {"visible": "names" in parts}
         lines = dict.fromkeys(LINES, NO_LINES)
+        traction, gradient = self._arrow_lengths(ranges)
         if "traction" in parts:
-            length = self._traction(ranges)
-            lines["traction"] = self._arrows(scene.traction_arrows, scan.values, length)
+            lines["traction"] = self._arrows(scene.traction_arrows, scan.values, traction)
         if "gradient" in parts:
-            length = self._gradient(ranges)
-            lines["gradient"] = self._arrows(scene.gradient_arrows, scan.values, length)
+            lines["gradient"] = self._arrows(scene.gradient_arrows, scan.values, gradient)
         if "principal" in parts:
             lines |= self._crosses(scan.values, ranges.traction)
         crosses = scene.fault_crosses(self._placement.poses, scan.health)
@@ -326,15 +316,14 @@ class Scene:
             along the skin, in Pa/m.
         """
         bar = self.bar * self._placement.unit
-        return bar / self._traction(ranges), bar / self._gradient(ranges)
+        traction, gradient = self._arrow_lengths(ranges)
+        return bar / traction, bar / gradient
 
-    def _traction(self, ranges: scene.Ranges) -> float:
-        """Return the length of the arrows of traction, in units of the scene per Pa."""
-        return TRACTION_LENGTH * self._placement.arrow / ranges.traction
-
-    def _gradient(self, ranges: scene.Ranges) -> float:
-        """Return the length of the arrows of the gradient, in units of the scene per Pa/m."""
-        return GRADIENT_LENGTH * self._placement.arrow / ranges.gradient
+    def _arrow_lengths(self, ranges: scene.Ranges) -> tuple[float, float]:
+        """Return the lengths of the arrows of traction, in units of the scene per Pa, and of those
+        of the gradient, in units of the scene per Pa/m."""
+        unit = self._placement.arrow
+        return TRACTION_LENGTH * unit / ranges.traction, GRADIENT_LENGTH * unit / ranges.gradient
 
     def _colours(self, colouring: Colouring, with_field: bool) -> Update:
         """Return the properties of the cubes and of the field."""
@@ -342,7 +331,7 @@ class Scene:
         values, visible = colouring.field, np.full(len(colouring.field), with_field)
         update: Update = {}
         if self._is_solid:
-            colours = scene.linear_light(colouring.colours(colouring.cubes))
+            colours = scene.linear_light(scene.colours(quantity, colouring.cubes, top))
             update["cubes"] = {"batched_colors": colours}
         else:
             values = np.append(values, colouring.cubes)
@@ -455,7 +444,7 @@ class Scene:
         poses = self._placement.poses
         return api.add_batched_meshes_simple(
             "/cubes",
-            *CUBE,
+            *make_cube(),
             quaternions(poses.rotation),
             poses.position,
             batched_scales=poses.half_side,

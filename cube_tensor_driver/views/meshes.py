@@ -20,25 +20,12 @@ Mesh = tuple[NDArray[Any], NDArray[Any]]
 NO_MESH: Mesh = (np.zeros((3, 3)), np.array([[0, 1, 2]]))
 """An invisible mesh: one triangle without area, because viser refuses a mesh without triangles."""
 
-CUBE: Mesh = (
-    np.array(list(product((-1.0, 1.0), repeat=3))),
-    np.array(
-        [
-            *([0, 1, 3], [0, 3, 2]),
-            *([4, 6, 7], [4, 7, 5]),
-            *([0, 4, 5], [0, 5, 1]),
-            *([2, 3, 7], [2, 7, 6]),
-            *([0, 2, 6], [0, 6, 4]),
-            *([1, 5, 7], [1, 7, 3]),
-        ]
-    ),
-)
-"""Triangle mesh of a cube with its centre at the origin and half a side of 1."""
-
-_CORNER_PAIRS = np.array(list(combinations(CUBE[0], 2)))
+_CORNERS = product((-1.0, 1.0), repeat=3)
+_CORNER_PAIRS = np.array(list(combinations(_CORNERS, 2)))
 _N_DIFFERENT = np.count_nonzero(_CORNER_PAIRS[:, 0] != _CORNER_PAIRS[:, 1], axis=1)
 CUBE_EDGES = _CORNER_PAIRS[_N_DIFFERENT == 1]
-"""Edges (12, 2, 3) of `CUBE`: the positions of both ends of each edge."""
+"""Edges (12, 2, 3) of a cube with its centre at the origin and half a side of 1: the positions of
+both ends of each edge."""
 
 COLOUR_STEPS = 32
 """Number of colours in which a `SquareLayer` (coloured squares of a skin) is drawn.
@@ -49,6 +36,23 @@ The squares of each colour are a mesh of their own, so more colours take the bro
 # Corners of a square with sides of 1 around the origin, and its two triangles.
 _SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
 _SQUARE_FACES = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
+
+
+def join_squares(corners: Array) -> Mesh:
+    """Return one mesh of N squares, from their corners (N, 4, 3)."""
+    first_vertex = 4 * np.arange(len(corners), dtype=np.uint32)
+    faces = first_vertex[:, None, None] + _SQUARE_FACES
+    return corners.reshape(-1, 3), faces.reshape(-1, 3)
+
+
+def make_cube() -> Mesh:
+    """Return the mesh of a cube with its centre at the origin and half a side of 1."""
+    # The corners of each face follow each other counterclockwise, seen from outside: exchanging the
+    # axes cyclically keeps this direction, and a reflection in the centre reverses it.
+    upper = np.column_stack([2 * _SQUARE, np.ones(4)])
+    lower = -upper[::-1]
+    faces = [np.roll(face, axis, axis=1) for face in (upper, lower) for axis in range(3)]
+    return join_squares(np.array(faces))
 
 
 def corner_lines(rotation: Array, side: float) -> Array:
@@ -148,15 +152,8 @@ class SquareLayer:
         meshes = []
         for step in range(COLOUR_STEPS + 1):
             chosen = np.flatnonzero(visible & (steps == step))
-            meshes.append(self._mesh(chosen))
+            meshes.append(join_squares(self._corners[chosen]) if len(chosen) else NO_MESH)
         return meshes
-
-    def _mesh(self, chosen: Index) -> Mesh:
-        if not len(chosen):
-            return NO_MESH
-        first_vertex = 4 * np.arange(len(chosen), dtype=np.uint32)
-        faces = first_vertex[:, None, None] + _SQUARE_FACES
-        return self._corners[chosen].reshape(-1, 3), faces.reshape(-1, 3)
 
 
 def colour_steps(
