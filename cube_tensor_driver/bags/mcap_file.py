@@ -161,7 +161,7 @@ class McapReader:
         # Several channels can stand for the same topic, for example after a recorder was restarted.
         channels = [number for number, one in self.connections.items() if one.topic in topics]
         if not self._index.chunk_indexes:
-            yield from self._unindexed_messages(channels, start_ns, stop_ns)
+            yield from self._unindexed_messages(topics, start_ns, stop_ns)
             return
         chunks = [
             chunk
@@ -244,7 +244,7 @@ class McapReader:
 
     def _unindexed_messages(
         self,
-        channels: Collection[int],
+        topics: Collection[str],
         start_ns: int,
         stop_ns: int,
     ) -> Iterator[StoredMessages]:
@@ -253,7 +253,7 @@ class McapReader:
         Messages are read in the order of writing, because sorting them requires an index.
 
         Args:
-            channels: Channels (numbers of topics in the file) that are read.
+            topics: Names of the topics to read.
             start_ns: Earliest time of recording that is read, in ns since the Unix epoch.
             stop_ns: Time of recording, in ns since the Unix epoch, before which messages are read.
         """
@@ -265,8 +265,12 @@ class McapReader:
         )
         return join_in_blocks(
             (channel.id, message.log_time, message.data)
-            for _, channel, message in reader.iter_messages(log_time_order=False)
-            if channel.id in channels and start_ns <= message.log_time < stop_ns
+            for _, channel, message in reader.iter_messages(
+                topics,
+                log_time_order=False,
+                starting_at=start_ns,
+                ending_before=stop_ns,
+            )
         )
 
 

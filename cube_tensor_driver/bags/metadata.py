@@ -107,20 +107,6 @@ class FileSummary:
         return sum(connection.msgcount for connection in self.connections)
 
 
-@dataclass(frozen=True)
-class BagFiles:
-    """The storage files that a metadata.yaml names.
-
-    Attributes:
-        paths: The files in the order of recording.
-        compression: "file" or "message" where rosbag2 compressed whole files or single messages
-            (zstd), else "".
-    """
-
-    paths: Sequence[Path]
-    compression: str
-
-
 def quality(
     *,
     latched: bool = False,
@@ -197,8 +183,12 @@ def type_hash(msgtype: str, definition: str) -> str:
         return ""
 
 
-def read_metadata(folder: Path) -> BagFiles:
+def read_metadata(folder: Path) -> tuple[list[Path], str]:
     """Read the names of the storage files from metadata.yaml in a bag's folder.
+
+    Returns:
+        The files in the order of recording; "file" or "message" where rosbag2 compressed whole
+        files or single messages (zstd), else another text.
 
     Raises:
         BagError: There is no metadata.yaml in the folder, it is damaged, or it has a newer version
@@ -227,7 +217,7 @@ def read_metadata(folder: Path) -> BagFiles:
         raise BagError(
             f"{path}: {reason} ({error}); ./cube bag repair {folder} writes it again"
         ) from None
-    return BagFiles(paths, "" if mode == "none" else mode)
+    return paths, mode
 
 
 def write_metadata(

@@ -31,7 +31,7 @@ from ..core.rows import FrequencyRows, StressRows
 from ..messages.codec import SECOND, Decoded, MessageCodec, frequency_codec, stress_codec
 from ..messages.types import FREQUENCIES, PACKAGE
 from .mcap_file import McapReader
-from .metadata import SUFFIXES, BagFiles, Connection, merge_connections, read_metadata, typestore
+from .metadata import SUFFIXES, merge_connections, read_metadata, typestore
 from .sqlite_file import SqliteReader
 from .stored_messages import StoredMessages, join_in_blocks
 
@@ -200,71 +200,65 @@ class Bag:
 
     Attributes:
         path: Folder or file of the bag.
-        connections: Topics of the bag, with types and numbers of messages; empty until `open`.
+        connections: Topics of the bag, with types and numbers of messages; empty after `close`.
         start_ns: Time at which the earliest message was recorded, in ns since the Unix epoch; 0
-            until `open`.
-        end_ns: Time at which the latest message was recorded, in ns since the Unix epoch; 0 until
-            `open`.
+            without messages.
+        end_ns: Time at which the latest message was recorded, in ns since the Unix epoch; 0
+            without messages.
         skipped: Topic -> number of its messages that were left out because they are damaged. A
             message counts each time that it is read.
     """
 
     def __init__(self, path: Path) -> None:
-        """Find the storage files of a bag without opening them.
+        """Open all storage files of a bag.
 
         Args:
             path: Folder of the bag with its metadata.yaml, or one storage file.
 
         Raises:
-            BagError: The folder has no readable metadata.yaml.
+            BagError: The folder has no readable metadata.yaml, a file is missing or damaged, or was
+                recorded with another version of this package's messages.
         """
         self.path = path
-        self.connections: list[Connection] = []
         self.start_ns = self.end_ns = 0
         self.skipped: Counter[str] = Counter()
         # A single storage file is also a bag. Only metadata.yaml could state that it is compressed.
-        self._bag_files = BagFiles([path], "")
+        paths, compression = [path], ""
         if path.is_dir():
-            self._bag_files = read_metadata(path)
+            paths, compression = read_metadata(path)
+        self._is_packed = compression == "message"
         self._files: list[McapReader | SqliteReader] = []
         self._opened = ExitStack()
-
-    def __repr__(self) -> str:
-        topics = ", ".join(f"{one.topic} ({one.msgcount})" for one in self.connections)
-        return f"Bag({str(self.path)!r}: {topics or 'closed'})"
-
-    def __enter__(self) -> Bag:
-        self.open()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def open(self) -> None:
-        """Open all storage files of the bag.
-
-        Raises:
-            BagError: A file is missing or damaged, or was recorded with another version of this
-                package's messages.
-        """
         # Freeing this block makes the allocator reuse the memory of each batch for the next one.
         np.empty(WORKING_BLOCK_BYTES, np.uint8)
         # If one file cannot be opened, the files that were opened before are closed again.
         try:
-            for path in self._unpacked_paths():
-                file = open_storage(path)
+            if compression == "file":
+                paths = self._unpack_files(paths)
+            for one in paths:
+                file = open_storage(one)
                 self._opened.callback(file.close)
                 self._files.append(file)
             summaries = [file.summary for file in self._files]
             self.connections = merge_connections(summary.connections for summary in summaries)
             self._check_definitions()
         except BaseException:
-            self.close()
+            self._opened.close()
             raise
         used = [summary for summary in summaries if summary.msgcount]
         if used:
             self.start_ns = min(summary.start_ns for summary in used)
             self.end_ns = max(summary.end_ns for summary in used)
+
+    def __repr__(self) -> str:
+        topics = ", ".join(f"{one.topic} ({one.msgcount})" for one in self.connections)
+        return f"Bag({str(self.path)!r}: {topics or 'closed'})"
+
+    def __enter__(self) -> Bag:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def close(self) -> None:
         """Close all storage files; calling it again does nothing."""
@@ -328,7 +322,6 @@ class Bag:
         wanted = {one.topic for one in self.connections}
         if topics is not None:
             wanted &= topics
-        is_packed = self._bag_files.compression == "message"
         count = 0
         with report_damage(self.path):
             # A recorder begins a new file after the last message of the one before, so messages of
@@ -337,7 +330,7 @@ class Bag:
                 for messages in file.messages(wanted, start_ns, stop_ns):
                     count += len(messages)
                     groups: Iterable[StoredMessages] = [messages]
-                    if is_packed:
+                    if self._is_packed:
                         groups = join_in_blocks(self._unpack(file, messages))
                     for group in groups:
                         yield file, group
@@ -528,17 +521,14 @@ class Bag:
         if waiting:
             yield from decode_waiting()
 
-    def _unpacked_paths(self) -> Sequence[Path]:
-        """Return the paths of the storage files.
+    def _unpack_files(self, paths: Sequence[Path]) -> list[Path]:
+        """Decompress storage files that rosbag2 compressed as a whole.
 
-        Files that rosbag2 compressed as a whole are first decompressed into a temporary folder,
-        which is removed when the bag is closed.
+        The results are in a temporary folder, which is removed when the bag is closed.
         """
-        if self._bag_files.compression != "file":
-            return self._bag_files.paths
         folder = Path(self._opened.enter_context(TemporaryDirectory()))
-        unpacked = []
-        for path in self._bag_files.paths:
+        unpacked: list[Path] = []
+        for path in paths:
             unpacked.append(folder / path.name.removesuffix(".zstd"))
             with (
                 # `copy_stream` decompresses in steps of some kB, because a recording can be larger

@@ -144,15 +144,16 @@ def _storage_files(folder: Path) -> list[Path]:
     """
     listed: list[str] = []
     with suppress(BagError):
-        listed = [path.name for path in read_metadata(folder).paths]
+        paths, _ = read_metadata(folder)
+        listed = [path.name for path in paths]
 
     def sort_key(path: Path) -> tuple[int, int, str]:
         """Return the position in metadata.yaml, the number in the name, and the name of a file."""
         position = listed.index(path.name) if path.name in listed else len(listed)
         return position, file_number(path.stem), path.name
 
-    paths = (path for path in folder.iterdir() if path.suffix in SUFFIXES.values())
-    return sorted(paths, key=sort_key)
+    existing = (path for path in folder.iterdir() if path.suffix in SUFFIXES.values())
+    return sorted(existing, key=sort_key)
 
 
 def file_number(stem: str) -> int:

@@ -220,7 +220,6 @@ def open_bag(path: Path | str, topic: str | None = None) -> BagSource:
     """
     # The returned source closes the bag. If an error occurs before, the bag is closed here.
     bag = Bag(Path(path))
-    bag.open()
     try:
         topics = bag.topics(FREQUENCIES)
         if topic is None:

@@ -450,7 +450,7 @@ def test_a_damaged_summary_is_noticed_and_written_again(bag, copy):
     data[-200] ^= 1
     path.write_bytes(data)
     with pytest.raises(BagError, match="the summary does not have its checksum"):
-        Bag(copy).open()
+        Bag(copy)
     assert repair(copy).damaged == 0
     assert all_differing_bits(stress(copy), stress(bag)) == 0
 
@@ -462,11 +462,11 @@ def test_a_mistake_of_the_program_is_not_called_damage(mistake):
 
 
 def test_a_person_sees_what_a_bag_is(bag):
-    assert repr(Bag(bag)) == f"Bag({str(bag)!r}: closed)"
     with open_bag(bag) as source:
         assert "/stress (300)" in repr(source.bag)
         assert "/frequencies" in repr(source) and "3.0 s" in repr(source)
         assert len(repr(source)) + len(repr(source.recording)) < 500
+    assert repr(source.bag) == f"Bag({str(bag)!r}: closed)"
 
 
 def said_of_itself(path: Path) -> dict:
@@ -588,7 +588,7 @@ def test_another_version_is_refused(tmp_path):
         library.add_message(library.register_channel("/frequencies", "cdr", schema), 1, b"", 1)
         library.finish()
     with pytest.raises(BagError, match=f"another definition of {FREQUENCIES}; this") as caught:
-        Bag(old).open()
+        Bag(old)
     assert "\n" not in str(caught.value)
 
 
@@ -842,7 +842,7 @@ def test_a_newer_metadata_version_is_one_line(copy, caplog):
     about = said["rosbag2_bagfile_information"]
     about["version"] = 10
     write_yaml(path, said)
-    Bag(copy)
+    Bag(copy).close()
     assert [record.getMessage() for record in caplog.records] == [
         f"{path}: its version 10 is newer than 9, the newest known one"
     ]
