@@ -56,7 +56,7 @@ class _StressBatch(NamedTuple):
 class RecordedHealthReader:
     """Reads the health of pads for rows of frequencies from the recorded stress of the same skin.
 
-    Calls of `health_at` in the order of recording are fastest. For rows that are more than
+    Calls of `at` in the order of recording are fastest. For rows that are more than
     `MAX_DISORDER_NS` older than those of the previous call, the bag is read again from its start.
     """
 
@@ -76,7 +76,7 @@ class RecordedHealthReader:
         self._batches: deque[_StressBatch] = deque()
         self._unread = self._read()
 
-    def health_at(self, rows: FrequencyRows) -> RecordedHealth:
+    def at(self, rows: FrequencyRows) -> RecordedHealth:
         """Return the recorded health (which pads were left out, and why) for rows of frequencies.
 
         The row of stress that belongs to a row of frequencies has the same cube, sequence number

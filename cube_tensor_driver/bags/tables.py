@@ -17,7 +17,7 @@ import pyarrow.parquet
 from ..core.arrays import AnyArray
 from ..core.errors import BagError, LayoutError
 from ..core.modes import GRADIENT, STRESS
-from ..core.rows import FrequencyRows, StressRows, concatenate
+from ..core.rows import COLUMN_TYPES, FrequencyRows, StressRows, concatenate
 
 ROWS_PER_GROUP = 1 << 16
 """Number of rows (samples of cubes) that are written together, as one row group (independent block)
@@ -28,6 +28,9 @@ _CUBE_NAME = pyarrow.dictionary(pyarrow.int32(), pyarrow.string())
 """Type of the column with the cubes' names. Dictionary encoding stores each name once, and only a
 number in each row."""
 
+_LAST_COLUMNS = ("residual", "status", "observed", "left_out")
+"""Names of the last columns of a table of stress, which are attributes of `StressRows`."""
+
 STRESS_SCHEMA = pyarrow.schema(
     pyarrow.field(name, kind, nullable=False)
     for name, kind in (
@@ -36,10 +39,7 @@ STRESS_SCHEMA = pyarrow.schema(
         ("sequence", pyarrow.uint32()),
         *((f"stress_{name}_Pa", pyarrow.float32()) for name in STRESS),
         *((f"gradient_{name}_Pa_per_m", pyarrow.float32()) for name in GRADIENT),
-        ("residual", pyarrow.float32()),
-        ("status", pyarrow.uint16()),
-        ("observed", pyarrow.uint16()),
-        ("left_out", pyarrow.uint32()),
+        *((name, pyarrow.from_numpy_dtype(COLUMN_TYPES[name])) for name in _LAST_COLUMNS),
     )
 )
 """Names and types of the columns of a table of stress; `StressRows` states what they contain.
@@ -107,10 +107,7 @@ def stress_batch(rows: StressRows, cubes: pyarrow.Array) -> pyarrow.RecordBatch:
         pyarrow.array(rows.sequence),
         *map(pyarrow.array, rows.stress.T),
         *map(pyarrow.array, rows.gradient.T),
-        pyarrow.array(rows.residual),
-        pyarrow.array(rows.status),
-        pyarrow.array(rows.observed),
-        pyarrow.array(rows.left_out),
+        *(pyarrow.array(getattr(rows, name)) for name in _LAST_COLUMNS),
     ]
     return pyarrow.RecordBatch.from_arrays(columns, schema=STRESS_SCHEMA)
 

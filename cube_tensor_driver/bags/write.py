@@ -9,10 +9,10 @@ this package.
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NoReturn
 
 from ..core.errors import BagError
 from .mcap_file import McapWriter
@@ -139,8 +139,9 @@ class BagWriter:
         self._part: _Part | None = None
         # Folder and file are created now, not with the first message, so that a folder that cannot
         # be written is reported before recording begins.
-        self._attempt(lambda: folder.mkdir(parents=True))
-        self._attempt(self._begin_part)
+        with self._report_failure():
+            folder.mkdir(parents=True)
+            self._begin_part()
 
     def __repr__(self) -> str:
         return f"BagWriter({str(self.folder)!r}: {self.messages} messages, {self.bytes} bytes)"
@@ -180,7 +181,8 @@ class BagWriter:
         definition, _ = store.generate_msgdef(msgtype, ros_version=2)
         one = Connection(topic, msgtype, definition, list(qos))
         self._topics.append(one)  # each storage file that begins later gets the topic, too
-        self._attempt(lambda: self._connect(self._open_part(), one))
+        with self._report_failure():
+            self._connect(self._open_part(), one)
 
     def write(
         self,
@@ -206,9 +208,11 @@ class BagWriter:
             # `close` also writes metadata.yaml, so that all complete files can be read while the
             # recording continues in the next one.
             self.close()
-            self._attempt(self._begin_part)
+            with self._report_failure():
+                self._begin_part()
             part = self._open_part()
-        self._attempt(lambda: part.file.write(part.channels[topic], time_ns, data))
+        with self._report_failure():
+            part.file.write(part.channels[topic], time_ns, data)
         part.count(topic, time_ns, len(data))
         self.messages += 1
         self.bytes += len(data)
@@ -219,12 +223,14 @@ class BagWriter:
         Until the bag is closed, reading them requires `repair`.
         """
         if self._part is not None:
-            self._attempt(self._part.file.flush)
+            with self._report_failure():
+                self._part.file.flush()
 
     def close(self) -> None:
         """Complete the storage file and metadata.yaml; a second call does nothing."""
         if self._part is not None:
-            self._attempt(self._finish_part)
+            with self._report_failure():
+                self._finish_part()
 
     def _open_part(self) -> _Part:
         """Return the current storage file.
@@ -272,26 +278,19 @@ class BagWriter:
         part.channels[one.topic] = channel
         part.counts[one.topic] = 0
 
-    def _attempt(self, work: Callable[[], object]) -> None:
-        """Call a function that writes; if it fails, close the file and raise a BagError.
-
-        Args:
-            work: Function without arguments, which raises one of `WRITE_ERRORS` if it fails.
-        """
-        try:
-            work()
-        except WRITE_ERRORS as error:
-            self._fail(error)
-
-    def _fail(self, error: Exception) -> NoReturn:
-        """Close the current file after an error of writing, and raise that error as a BagError.
+    @contextmanager
+    def _report_failure(self) -> Iterator[None]:
+        """Close the current file after one of `WRITE_ERRORS` in the `with` block; raise a BagError.
 
         Nothing can be written afterwards; otherwise messages would be missing within the bag.
         """
-        part, self._part = self._part, None
-        if part is not None:
-            part.file.abort()
-        reason = getattr(error, "strerror", None) or str(error)
-        raise BagError(
-            f"{self.folder}: {reason}; name a folder that can be written, on a disk with room"
-        ) from None
+        try:
+            yield
+        except WRITE_ERRORS as error:
+            part, self._part = self._part, None
+            if part is not None:
+                part.file.abort()
+            reason = getattr(error, "strerror", None) or str(error)
+            raise BagError(
+                f"{self.folder}: {reason}; name a folder that can be written, on a disk with room"
+            ) from None

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import zarr
 
 from ..core.errors import BagError
 from ..core.modes import GRADIENT, STRESS
-from ..core.rows import StressRows
+from ..core.rows import COLUMN_TYPES, StressRows
 from .tables import ROWS_PER_GROUP, BufferedTable
 
 _UNITS = {
@@ -26,19 +27,8 @@ _COMPONENTS = {"stress": STRESS, "gradient": GRADIENT}
 """Names of the components of each column with several numbers per row, such as xx, yy, … of
 stress."""
 
-_COLUMNS: dict[str, Any] = {
-    "stamp_ns": np.int64,
-    "cube": np.uint16,
-    "sequence": np.uint32,
-    "stress": np.float32,
-    "gradient": np.float32,
-    "residual": np.float32,
-    "status": np.uint16,
-    "observed": np.uint16,
-    "left_out": np.uint32,
-}
-"""Type of each column of a table of stress, by its name; the columns contain the attributes of
-`StressRows` with these names."""
+_TYPES: dict[str, Any] = {"cube": np.uint16, "stress": np.float32, "gradient": np.float32}
+"""Type of each column that is not in `COLUMN_TYPES`."""
 
 
 class ZarrWriter(BufferedTable):
@@ -66,7 +56,8 @@ class ZarrWriter(BufferedTable):
         super().__init__(path)
         self._last_cube = len(cubes) - 1
         group = zarr.open_group(str(path), mode="w")
-        self._arrays = {name: _create_column(group, name, cubes) for name in _COLUMNS}
+        names = [field.name for field in fields(StressRows)]
+        self._arrays = {name: _create_column(group, name, cubes) for name in names}
 
     def __enter__(self) -> ZarrWriter:
         return self
@@ -90,7 +81,7 @@ def _create_column(
 
     Args:
         group: Zarr group of the table.
-        name: Name of the column, a key of `_COLUMNS`.
+        name: Name of the column, an attribute of `StressRows`.
         cubes: Names of the cubes, an attribute of the column `cube`.
     """
     components = _COMPONENTS.get(name, ())
@@ -106,7 +97,7 @@ def _create_column(
         name,
         shape=(0, *width),
         chunks=(ROWS_PER_GROUP, *width),
-        dtype=np.dtype(_COLUMNS[name]),
+        dtype=np.dtype((COLUMN_TYPES | _TYPES)[name]),
         dimension_names=["row", f"{name}_component"] if components else ["row"],
         attributes=attributes,
     )

@@ -17,6 +17,7 @@ import numpy as np
 from ..bags.read import Bag
 from ..bags.reprocess.job import choose_settings, reconstruct
 from ..bags.source import open_bag
+from ..bags.tables import report_write_errors
 from ..config.skin import Skin
 from ..core.arrays import AnyArray
 from ..core.errors import BagError
@@ -96,23 +97,20 @@ def export_lerobot(
         # An export that was killed may have left an incomplete data set here. It cannot be
         # continued, so it is removed.
         shutil.rmtree(partial, ignore_errors=True)
-        data_set = DataSet(
-            partial,
-            skin,
-            topics,
-            fps=choices.fps,
-            depth=depth,
-            frames=frames,
-        )
-        with data_set:
-            for plan in plans:
-                _write_bag(data_set, plan, topics, choices, report)
-        data_set.write_meta()
-        partial.replace(folder)
-    except OSError as error:
-        raise BagError(
-            f"{folder}: {error.strerror or error}; name a folder on a disk with room"
-        ) from None
+        with report_write_errors(folder):
+            data_set = DataSet(
+                partial,
+                skin,
+                topics,
+                fps=choices.fps,
+                depth=depth,
+                frames=frames,
+            )
+            with data_set:
+                for plan in plans:
+                    _write_bag(data_set, plan, topics, choices, report)
+            data_set.write_meta()
+            partial.replace(folder)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     rate = max(plan.rate for plan in plans)

@@ -11,18 +11,14 @@ import numpy as np
 
 from ..core.arrays import AnyArray, Index
 from ..core.modes import COMPONENTS
-from ..core.rows import StressRows, concatenate
+from ..core.rows import COLUMN_TYPES, StressRows, concatenate
 
 TACTILE = "observation.tactile"
 """Name of the feature (column of a data set) that contains the stress of all cubes."""
 
 WINDOW_COLUMNS: dict[str, Any] = {
-    "stamp_ns": np.int64,
-    "sequence": np.uint32,
-    "residual": np.float32,
-    "status": np.uint16,
-    "observed": np.uint16,
-    "left_out": np.uint32,
+    name: COLUMN_TYPES[name]
+    for name in ("stamp_ns", "sequence", "residual", "status", "observed", "left_out")
 }
 """Columns of `StressRows` that a data set contains beside stress and gradient, with their types."""
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...config.yaml import read_yaml, write_yaml
 from ...core.errors import BagError, CubeError
+from ..tables import report_write_errors
 from .job import PARTIAL_PREFIX, Overrides, ReprocessJob, ReprocessResult, reprocess
 
 if TYPE_CHECKING:
@@ -106,10 +107,8 @@ def write_recipe(
                 f"{folder} was made with other options ({path} says which); name another folder"
             )
         return
-    try:
+    with report_write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise BagError(f"{folder}: {error.strerror}; name a folder that can be written") from None
     write_yaml(path, recipe, "How the bags of this folder were reprocessed.")
 
 

@@ -31,7 +31,7 @@ from ..metadata import quality
 from ..read import Bag, serialise, stamp_ns
 from ..recording import Settings, reconstruct_rows
 from ..source import BagSource, Segment
-from ..tables import TableWriter
+from ..tables import TableWriter, report_write_errors
 from ..write import BagWriter
 
 if TYPE_CHECKING:
@@ -122,17 +122,13 @@ def reprocess(job: ReprocessJob) -> ReprocessResult:
     # has a folder of its own, because jobs in other processes create and remove theirs meanwhile.
     folder = job.output.parent / f"{PARTIAL_PREFIX}{job.output.name}"
     partial = folder / job.output.name
-    try:
+    with report_write_errors(job.output):
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         with Bag(job.bag) as bag:
             result = _reprocess(bag, job, partial)
         partial.replace(job.output)
         folder.rmdir()
-    except OSError as error:
-        raise BagError(
-            f"{job.output}: {error.strerror}; name a folder that can be written"
-        ) from None
     return result
 
 
