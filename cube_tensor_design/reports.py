@@ -25,7 +25,7 @@ from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.core.layout import Layout
 from cube_tensor_driver.core.modes import COMPONENTS, STRESS
 from cube_tensor_driver.core.pipeline import Pipeline
-from cube_tensor_driver.mechanics.influence_file import write_influence
+from cube_tensor_driver.mechanics.influence import write_influence
 from cube_tensor_driver.views.terminal.output import print_table, say
 
 from .fem.body import Body

@@ -69,7 +69,6 @@ def arguments(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     from cube_tensor_driver.config.output_files import write_json
-    from cube_tensor_driver.views.terminal.interrupt import ends_at_once
     from cube_tensor_driver.views.terminal.output import progress_bar
 
     from .. import reports
@@ -77,6 +76,7 @@ def run(options: argparse.Namespace) -> int:
     from ..fem.model import read_model
     from ..fem.volume_loads import compute_thermal_stress, compute_weight
     from ..studies.surface_study import study_surface
+    from .interrupt import ends_at_once
 
     model = read_model(options.model)
     _check_options(options, model)

@@ -17,8 +17,7 @@ import numpy as np
 from cube_tensor_driver.config.influence import find_influence
 from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.layout import LAYOUTS
-from cube_tensor_driver.mechanics.influence import Influence
-from cube_tensor_driver.mechanics.influence_file import read_influence
+from cube_tensor_driver.mechanics.influence import Influence, read_influence
 
 from ..fem.body import Body
 from ..fem.reciprocity import compute_influence

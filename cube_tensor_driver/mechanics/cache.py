@@ -31,25 +31,8 @@ _CONTENT = "content"
 """Name of the array in each cached file that lists the file's other arrays with their types and
 shapes, by which a file that has lost an array is recognised."""
 
-_CODE = (
-    "mechanics/layer.py",
-    "mechanics/circular.py",
-    "mechanics/spectra.py",
-    "mechanics/sensitivity.py",
-    "mechanics/distance_table.py",
-    "mechanics/influence.py",
-    "mechanics/measurement_model.py",
-    "mechanics/contact_response.py",
-    "mechanics/traction_prior.py",
-    "mechanics/load_response.py",
-    "mechanics/contact_tables.py",
-    "mechanics/cache.py",
-    "touch/pad_measurement.py",
-    "touch/prior.py",
-    "touch/unrolled_skin.py",
-    "touch/posterior.py",
-)
-"""Source files, relative to the package, whose change makes all cached arrays invalid."""
+_CODE = ("mechanics", "touch")
+"""Folders of the package with source files whose change makes all cached arrays invalid."""
 
 Arrays = dict[str, AnyArray]
 """Arrays by name, as in one .npz file."""
@@ -94,13 +77,13 @@ def _hash_inputs(inputs: Iterable[Any]) -> str:
 
     Args:
         inputs: Numbers and arrays; their values, types and shapes enter the hash, together with the
-            source files `_CODE`.
+            source files in `_CODE`.
     """
     digest = hashlib.sha256()
     package = Path(__file__).parents[1]
-    for name in _CODE:
-        with suppress(OSError):
-            digest.update((package / name).read_bytes())
+    for folder in _CODE:
+        for path in sorted((package / folder).rglob("*.py")):
+            digest.update(path.read_bytes())
 
     for value in inputs:
         array = np.ascontiguousarray(value)

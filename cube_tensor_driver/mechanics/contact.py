@@ -400,31 +400,7 @@ def _place_rings(
     x = radius * np.outer(rings, np.cos(angle))
     y = radius * np.outer(rings, np.sin(angle))
     per_force = np.repeat(fractions / n, n)
-    return _place_forces(x.ravel(), y.ravel(), per_force, force, centre)
-
-
-def _place_forces(
-    x: Array,
-    y: Array,
-    fractions: Array,
-    force: ArrayLike,
-    centre: ArrayLike,
-) -> tuple[Array, Array]:
-    """Return L point forces around a centre.
-
-    Args:
-        x: Coordinates x (L,) of the point forces relative to the centre, in m.
-        y: Coordinates y (L,) of the point forces relative to the centre, in m.
-        fractions: Fraction (L,) of the total force that acts at each position.
-        force: Total force (3,) in N.
-        centre: Centre (2,) on the surface, in m.
-
-    Returns:
-        Sources (L, 3) in m, with z = 0, and forces (L, 3) in N.
-    """
     cx, cy = np.asarray(centre, dtype=np.float64)[:2]
-    z = np.zeros_like(x)
-    sources = np.stack([cx + x, cy + y, z], axis=-1)
+    sources = np.stack([cx + x.ravel(), cy + y.ravel(), np.zeros(x.size)], axis=-1)
     total = np.asarray(force, dtype=np.float64)
-    forces = fractions[:, None] * total
-    return sources, forces
+    return sources, per_force[:, None] * total

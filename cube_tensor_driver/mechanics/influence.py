@@ -1,18 +1,46 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Influence functions: stress of each pad of a cube under a unit force, by the force's position."""
+"""Influence functions: stress of each pad of a cube under a unit force, by the force's position.
+
+They are stored in files (.npz).
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
+from ..config.input_files import read_arrays
+from ..config.output_files import atomic_write
 from ..core.arrays import Array
+from ..core.errors import ConfigError, CubeError
 from ..core.layout import Layout
+from .cache import Arrays
 from .layer import Layer
+
+SCHEMA = 1
+"""Version of the format of influence files; a file with another version is refused."""
+
+MAX_FILE_BYTES = 64 << 20
+"""Maximum size in bytes of a file of influence functions, also after decompression. The limit
+protects against damaged or malicious files."""
+
+MAX_INTEGER = 30_000
+"""Integer as which the largest absolute stress of a file is stored. Stresses are stored as 16-bit
+integers; their rounding error is a tenth of the error of the finite elements."""
+
+_NUMBERS = ("pad_size", "side", "depth", "thickness", "poisson", "step")
+"""Names of the arrays of a file of influence functions that hold one number each."""
+_TABLES = ("positions", "normals", "place", "pads")
+"""Names of the arrays of a file of influence functions that hold tables of numbers."""
+
+_PARSE_ERRORS = (OSError, KeyError, TypeError, ValueError)
+"""Errors of a file of influence functions that cannot be read, lacks an array, or has an array of
+another type or shape."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,3 +100,135 @@ class Influence:
         return RegularGridInterpolator(
             tuple(axes), grid, "cubic", bounds_error=False, fill_value=0.0
         )
+
+
+def write_influence(
+    path: Path,
+    influence: Influence,
+    made_by: str,
+) -> None:
+    """Write influence functions to a file. If writing fails, an existing file stays unchanged.
+
+    Args:
+        path: File to write.
+        influence: Influence functions.
+        made_by: Command that computed them; it is stored in the file.
+
+    Raises:
+        ConfigError: The file cannot be written.
+    """
+    # Stresses are stored as 16-bit integers instead of floats, because such a file is part of the
+    # package and should be small.
+    step = np.abs(influence.pads).max() / MAX_INTEGER
+    layout = influence.layout
+    with atomic_write(path) as partial, partial.open("wb") as file:
+        np.savez_compressed(
+            file,
+            schema=SCHEMA,
+            made_by=made_by,
+            layout=layout.name,
+            positions=layout.positions,
+            normals=layout.normals,
+            pad_size=layout.pad_size,
+            side=influence.side,
+            depth=influence.depth,
+            thickness=influence.layer.thickness,
+            poisson=influence.layer.poisson,
+            place=influence.place,
+            step=step,
+            pads=np.round(influence.pads / step).astype(np.int16),
+        )
+
+
+def read_influence(path: Path) -> Influence:
+    """Read and check influence functions that were computed in space (three force components).
+
+    Args:
+        path: File (.npz) as from `write_influence`.
+
+    Raises:
+        ConfigError: The file is missing, damaged or inconsistent.
+    """
+    try:
+        influence = _parse(read_arrays(path, MAX_FILE_BYTES))
+        _check(influence)
+    except FileNotFoundError:
+        raise ConfigError(
+            f"{path}: no such file; make it with ./cube fem MODEL --surface"
+        ) from None
+    except (CubeError, *_PARSE_ERRORS) as error:
+        # A KeyError contains only the name of the missing array.
+        reason = f"no {error}" if isinstance(error, KeyError) else error
+        raise ConfigError(
+            f"{path}: {reason}; make the file again with ./cube fem MODEL --surface -o FILE.npz"
+        ) from None
+    return influence
+
+
+def _parse(arrays: Arrays) -> Influence:
+    """Build the influence functions from the arrays of a file.
+
+    Args:
+        arrays: Arrays by the names under which `write_influence` stores them.
+
+    Raises:
+        ConfigError: The file has another version of the format (`SCHEMA`).
+        ElasticError: The layer's thickness or Poisson's ratio is out of range.
+        KeyError: An array is missing.
+        TypeError, ValueError: An array has another type or shape.
+    """
+    schema = arrays["schema"].item()
+    if schema != SCHEMA:
+        raise ConfigError(f"schema is {schema}, this package reads {SCHEMA}")
+    number = {name: float(arrays[name].item()) for name in _NUMBERS}
+    # Complex numbers and texts cannot be cast safely, so they are refused here.
+    table = {name: arrays[name].astype(float, casting="safe") for name in _TABLES}
+    layout = Layout(
+        str(arrays["layout"]),
+        table["positions"],
+        table["normals"],
+        number["pad_size"],
+    )
+    return Influence(
+        layout=layout,
+        side=number["side"],
+        layer=Layer(number["thickness"], number["poisson"]),
+        depth=number["depth"],
+        place=table["place"],
+        pads=table["pads"] * number["step"],
+    )
+
+
+def _check(influence: Influence) -> None:
+    """Check that the quantities of a file of influence functions do not contradict each other.
+
+    Raises:
+        ElasticError: The depth is not within the layer.
+        ConfigError: The cube reaches the surface, an array has a wrong shape or is not finite, or
+            the positions of the forces are no rectangular grid around the cube.
+    """
+    influence.layer.check_depth(influence.depth)
+    if not 0 < influence.side < 2 * influence.depth:
+        raise ConfigError(
+            f"the cube has a side of {influence.side} m at a depth of {influence.depth} m; it must "
+            "lie below the surface"
+        )
+
+    place = influence.place
+    if place.ndim != 2 or place.shape[1] != 2:
+        raise ConfigError(f"place has shape {place.shape}, needed is (n, 2)")
+    shape = (influence.layout.n_pads, len(place), 3)
+    if influence.pads.shape != shape:
+        raise ConfigError(f"pads have shape {influence.pads.shape}, needed is {shape}")
+    has_places = np.isfinite(place).all()
+    has_stresses = np.isfinite(influence.pads).all()
+    if not (has_places and has_stresses):
+        raise ConfigError("a position or a stress is not finite")
+
+    axes = [np.unique(column) for column in place.T]
+    x, y = np.meshgrid(*axes, indexing="ij")
+    grid = np.column_stack([x.ravel(), y.ravel()])
+    is_grid = np.array_equal(place, grid)
+    # Cubic interpolation needs four nodes per axis.
+    if min(x.shape) < 4 or not is_grid or not influence.reach > 0:
+        raise ConfigError("the positions are no grid of at least 4 x 4 points around the cube")

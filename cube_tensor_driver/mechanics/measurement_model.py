@@ -45,26 +45,6 @@ class MeasurementModel(NamedTuple):
     pads: Array | None = None
 
 
-def model_points(
-    layer: Layer,
-    depth: float,
-    cubes: int,
-) -> MeasurementModel:
-    """Return the measurement model of points: cubes measure stress and gradient at their centres.
-
-    Args:
-        layer: Elastic layer that contains the cubes.
-        depth: Distance from the centres of the cubes to the surface, in m.
-        cubes: Number of cubes.
-
-    Raises:
-        ElasticError: The layer does not contain this depth.
-    """
-    spectra = layer_spectra(layer, depth)
-    components = FIELD_FROM_CIRCULAR[None, :, MEASURED]
-    return MeasurementModel(spectra, components, np.zeros(cubes, np.intp))
-
-
 class CubeMeasurement:
     """Conversion of circular components to the values that cubes at one depth in a layer measure.
 
@@ -104,20 +84,21 @@ class CubeMeasurement:
         Raises:
             ElasticError: The layer does not contain this depth.
         """
-        points = model_points(layer, depth, 1)
-        model = model or points
         self.layer = layer
         self.depth = depth
-        self.spectra = model.spectra
-        self.point_spectra = points.spectra
         self._unit_factors = np.where(_IS_GRADIENT, scale, 1.0)
-        self.point_matrix = points.components[0] * self._unit_factors
-        self.matrices = model.components * self._unit_factors
+        self.point_spectra = layer_spectra(layer, depth)
+        self.point_matrix: Array = FIELD_FROM_CIRCULAR[:, MEASURED] * self._unit_factors
+        self.spectra = self.point_spectra
+        self.matrices = self.point_matrix[None]
+        if model is not None:
+            self.spectra = model.spectra
+            self.matrices = model.components * self._unit_factors
         self.layer_inputs = [
             layer.thickness,
             layer.poisson,
             depth,
-            *vars(model.spectra).values(),
+            *vars(self.spectra).values(),
         ]
 
     def add_variant(self, components: Array) -> int:

@@ -18,7 +18,7 @@ from ..core.defaults import CONTACT_METHODS, CONTACT_PRESSURE, SURFACE_DEPTH
 from ..core.pipeline import Pipeline
 from ..core.poses import CubePoses
 from ..core.status import COMPENSATION
-from ..mechanics.influence_file import read_influence
+from ..mechanics.influence import read_influence
 from ..mechanics.layer import Layer
 from .inverse import SurfaceInverse
 from .pad_measurement import model_pads
@@ -46,7 +46,7 @@ class ContactSettings:
             else a half space. Only the method inverse uses it.
         poisson: Poisson's ratio of the elastomer; 0: as the skin file states, or else
             `POISSONS_RATIO`. Only the method inverse uses it.
-        influence: Name of the file with the influence functions of the pads (influence_file.py),
+        influence: Name of the file with the influence functions of the pads (influence.py),
             whose depth, thickness and Poisson's ratio replace those of these settings. Empty: cubes
             are modelled as points. Only the method inverse uses it.
     """

@@ -35,7 +35,7 @@ from cube_tensor_driver.config.yaml import read_yaml
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.core.pipeline import Pipeline
-from cube_tensor_driver.mechanics.influence_file import read_influence
+from cube_tensor_driver.mechanics.influence import read_influence
 from cube_tensor_driver.views.terminal.output import progress_bar
 
 NARROW = bodies.Body(width=20e-3)
@@ -397,7 +397,7 @@ def test_control_c_ends_work_in_c():
     """A lock that C code waits for without end, as a factorisation that no signal interrupts."""
     code = """
 import ctypes, signal
-from cube_tensor_driver.views.terminal.interrupt import ends_at_once
+from cube_tensor_design.cli.interrupt import ends_at_once
 
 signal.signal(signal.SIGINT, lambda *_: None)  # also where the signal comes before the wait
 libc, lock = ctypes.CDLL(None), ctypes.create_string_buffer(64)

@@ -35,7 +35,7 @@ from cube_tensor_driver.core.oscillator import pad_frequency
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rows import FrequencyRows, StressRows
 from cube_tensor_driver.mechanics import contact
-from cube_tensor_driver.mechanics.influence_file import read_influence
+from cube_tensor_driver.mechanics.influence import read_influence
 from cube_tensor_driver.messages.codec import frequency_codec, stress_codec
 from cube_tensor_driver.messages.contacts import CLOUD
 from cube_tensor_driver.messages.types import FREQUENCIES, INFO

@@ -22,7 +22,7 @@ from cube_tensor_driver.core.modes import COMPONENTS, STRESS
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.mechanics import contact
 from cube_tensor_driver.mechanics.contact_response import ContactResponse
-from cube_tensor_driver.mechanics.influence_file import read_influence, write_influence
+from cube_tensor_driver.mechanics.influence import read_influence, write_influence
 from cube_tensor_driver.mechanics.measurement_model import CubeMeasurement
 from cube_tensor_driver.mechanics.traction_prior import PRIOR_LENGTHS, SHEAR_RATIO, TractionPrior
 from cube_tensor_driver.touch.contact_finder import ContactSettings, contact_finder

@@ -17,7 +17,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from ...processes.stop_signals import INTERRUPTED
+from cube_tensor_driver.processes.stop_signals import INTERRUPTED
 
 GRACE_S = 0.3
 """Time, in seconds, from Ctrl-C until the process is ended without running `finally` blocks.
