@@ -445,18 +445,20 @@ class Bag:
         """
         return self._decoded(topic, stress_codec, stress_codec.decode)
 
-    def stress_columns(self, topic: str, names: Sequence[str]) -> Iterator[list[AnyArray]]:
-        """Read some columns of recorded stress, which is faster than reading all with `stress`.
+    def columns(
+        self, topic: str, codec: MessageCodec[Any], names: Sequence[str]
+    ) -> Iterator[list[AnyArray]]:
+        """Read some columns of frequencies or stress, which is faster than reading all.
 
         Args:
-            topic: Topic of the stress.
-            names: Names of the columns, which are attributes of `StressRows`.
+            topic: Topic of the messages.
+            codec: Codec of the message type.
+            names: Names of the columns, which are attributes of the rows.
 
         Yields:
             For each batch of N rows: `stamp_ns` (N,), then the named columns in their order.
         """
-        decode = partial(stress_codec.decode_columns, names)
-        for columns, _ in self._decoded(topic, stress_codec, decode):
+        for columns, _ in self._decoded(topic, codec, partial(codec.decode_columns, names)):
             yield columns
 
     def _decoded(

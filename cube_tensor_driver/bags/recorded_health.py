@@ -21,6 +21,7 @@ from ..core.matching import NO_MATCH, match_rows
 from ..core.reconstructor import RecordedHealth
 from ..core.rows import FrequencyRows
 from ..core.status import WORDS
+from ..messages.codec import stress_codec
 from ..messages.types import STRESS
 from .read import MAX_DISORDER_NS, Bag
 
@@ -148,7 +149,7 @@ class RecordedHealthReader:
         The bag is read from its beginning.
         """
         names = ("cube", "sequence", "left_out", "status")
-        for columns in self._bag.stress_columns(self._topic, names):
+        for columns in self._bag.columns(self._topic, stress_codec, names):
             stamp_ns, cube, sequence, left_out, status = columns
             if len(cube):
                 yield _StressBatch(

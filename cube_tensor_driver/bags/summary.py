@@ -12,6 +12,7 @@ import numpy as np
 
 from ..core.arrays import AnyArray, Times
 from ..core.rows import COUNTER_RANGE
+from ..messages.codec import frequency_codec
 from .read import Bag
 
 DIAGNOSTICS_TYPE = "diagnostic_msgs/msg/DiagnosticArray"
@@ -58,7 +59,10 @@ def cube_summaries(
         topic: Topic of the skin's frequencies.
         info: SkinInfo message of the skin, which lists the cubes.
     """
-    cube, sequence, stamp_ns = _columns(bag, topic)
+    # The empty first part stands for a topic without messages.
+    parts = [[np.empty(0, np.int64)] * 3]
+    parts += bag.columns(topic, frequency_codec, ("cube", "sequence"))
+    stamp_ns, cube, sequence = (np.concatenate(column) for column in zip(*parts, strict=True))
     for number, one in enumerate(info.cubes):
         rows = cube == number
         yield _summarise(
@@ -96,8 +100,7 @@ def _summarise(
     """
     if len(sequence) < 2:
         return CubeSummary(name, uid, len(sequence))
-    differences = np.diff(sequence.astype(np.int64))
-    steps = np.mod(differences, COUNTER_RANGE)
+    steps = np.mod(np.diff(sequence), COUNTER_RANGE)
     # A forward step of at least half the range is in fact a step back: the hub restarted and
     # counts from 0 again, so no samples were lost.
     is_forward = (steps > 0) & (steps < COUNTER_RANGE // 2)
@@ -114,24 +117,3 @@ def _summarise(
         rate=1e9 / median_ns if median_ns > 0 else np.nan,
         longest_gap=1e-9 * float(periods_ns.max()),
     )
-
-
-def _columns(bag: Bag, topic: str) -> tuple[AnyArray, AnyArray, Times]:
-    """Return cube index, sequence number and stamp of all recorded samples of frequencies.
-
-    Args:
-        bag: Open bag.
-        topic: Topic of the skin's frequencies.
-
-    Returns:
-        Three arrays (N,); the stamps are in ns since the Unix epoch.
-    """
-    # The empty first parts give the arrays their types even if the topic has no message.
-    cube = [np.empty(0, np.uint16)]
-    sequence = [np.empty(0, np.uint32)]
-    stamp_ns = [np.empty(0, np.int64)]
-    for messages, _ in bag.frequencies(topic):
-        cube.append(messages.rows.cube)
-        sequence.append(messages.rows.sequence)
-        stamp_ns.append(messages.rows.stamp_ns)
-    return np.concatenate(cube), np.concatenate(sequence), np.concatenate(stamp_ns)

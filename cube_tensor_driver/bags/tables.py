@@ -133,6 +133,12 @@ class BufferedTable:
         self._waiting: list[StressRows] = []
         self._waiting_rows = 0
 
+    def __enter__(self) -> BufferedTable:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._flush()
+
     def write(self, rows: StressRows) -> None:
         """Add rows to the table.
 
@@ -192,9 +198,6 @@ class TableWriter(BufferedTable):
                     use_dictionary=["cube"],
                     write_batch_size=ROWS_PER_GROUP,
                 )
-
-    def __enter__(self) -> TableWriter:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self._flush()

@@ -59,12 +59,6 @@ class ZarrWriter(BufferedTable):
         names = [field.name for field in fields(StressRows)]
         self._arrays = {name: _create_column(group, name, cubes) for name in names}
 
-    def __enter__(self) -> ZarrWriter:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._flush()
-
     def _append(self, rows: StressRows) -> None:
         columns = {name: getattr(rows, name) for name in self._arrays}
         columns["cube"] = np.minimum(rows.cube, self._last_cube)

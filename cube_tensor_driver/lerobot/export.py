@@ -114,9 +114,6 @@ def export_lerobot(
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     rate = max(plan.rate for plan in plans)
-    left_out: Counter[str] = Counter()
-    for plan in plans:
-        left_out.update(plan.left_out)
     return Exported(
         episodes=len(counts),
         frames=data_set.frames,
@@ -124,7 +121,7 @@ def export_lerobot(
         depth=data_set.depth,
         usual=math.ceil(rate / choices.fps),
         features=[topic.key for topic in topics],
-        left_out=left_out,
+        left_out=sum((plan.left_out for plan in plans), Counter()),
     )
 
 
@@ -327,7 +324,7 @@ def _stress_rows(
     noted = data_set.calibrations
     with open_bag(plan.path, choices.frequencies) as source:
         settings = choose_settings(source, choices.overrides)
-        for segment, rows in reconstruct(source, choices.overrides):
+        for segment, rows in reconstruct(source, settings):
             is_known = rows.cube < len(source.skin.cubes)
             known = rows.select(is_known)
             if not len(known):

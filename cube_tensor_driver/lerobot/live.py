@@ -26,7 +26,7 @@ from ..core.errors import BagError, ConfigError, CubeError
 from ..core.reconstructor import Reconstructor
 from ..core.rows import StressRows, concatenate
 from ..device.live import LinkSource
-from .windows import Windows
+from .windows import arrange_windows
 
 NUMBER_COLUMN = "frame_number"
 """Name of the column with the number of a frame.
@@ -195,10 +195,8 @@ class LiveWindows:
     def _write(self, rows: StressRows) -> None:
         """Write the rows (samples of cubes) of one frame as one batch of the Arrow stream."""
         counts = np.bincount(rows.cube, minlength=self._cubes)
-        windows = Windows(counts[np.newaxis], depth=int(counts.max()))
         first_frame = np.zeros(len(rows), np.intp)
-        windows.add(first_frame, rows)
-        (columns,) = windows.complete()
+        columns = arrange_windows(counts[np.newaxis], int(counts.max()), first_frame, rows)
         arrays = {name: as_column(values) for name, values in columns.items()}
         batch = pyarrow.record_batch({NUMBER_COLUMN: pyarrow.array([self._number])} | arrays)
         if self._writer is None:

@@ -91,8 +91,9 @@ class Windows:
             frame = np.concatenate(frames)
             rows = concatenate([rows for _, rows in self._waiting])
             inside = frame < end
-            windows = self._arrange(
+            windows = arrange_windows(
                 block,
+                self._depth,
                 frame[inside] - self.done,
                 rows.select(inside),
             )
@@ -102,49 +103,50 @@ class Windows:
             self.done = end
             yield windows
 
-    def _arrange(
-        self,
-        counts: AnyArray,
-        frame: Index,
-        rows: StressRows,
-    ) -> dict[str, AnyArray]:
-        """Arrange all rows of n successive frames in windows (samples of all cubes in one frame).
 
-        Args:
-            counts: (n, cubes) number of samples of each cube in each frame.
-            frame: (N,) index of each row's frame, 0 for the first of the n frames.
-            rows: The N rows (one sample of one cube each).
+def arrange_windows(
+    counts: AnyArray,
+    depth: int,
+    frame: Index,
+    rows: StressRows,
+) -> dict[str, AnyArray]:
+    """Arrange all rows of n successive frames in windows (samples of all cubes in one frame).
 
-        Returns:
-            Arrays (n, depth, cubes, …) by the names of the features, where depth is the number of
-            samples that a window has room for.
-        """
-        n_frames, n_cubes = counts.shape
-        # A cell is one cube in one frame. Stable sorting keeps its samples in the order of
-        # recording.
-        cell = frame * n_cubes + rows.cube
-        order = np.argsort(cell, kind="stable")
-        cell = cell[order]
-        # The last row of each cell gets the last entry of the window, so that the newest sample is
-        # always there. The rows before the last one get the entries before it.
-        ends = np.cumsum(counts, dtype=np.intp)
-        to_end = ends[cell] - np.arange(len(cell))
-        place = (
-            cell // n_cubes,
-            self._depth - to_end,
-            cell % n_cubes,
-        )
+    Args:
+        counts: (n, cubes) number of samples of each cube in each frame.
+        depth: Number of samples of a cube that a window has room for.
+        frame: (N,) index of each row's frame, 0 for the first of the n frames.
+        rows: The N rows (one sample of one cube each).
 
-        shape = (n_frames, self._depth, n_cubes)
-        components = np.hstack([rows.stress, rows.gradient])
-        tactile_shape = (*shape, len(COMPONENTS))
-        tactile = np.full(tactile_shape, np.nan, np.float32)
-        tactile[place] = components[order]
-        windows: dict[str, AnyArray] = {TACTILE: tactile}
-        for name, kind in WINDOW_COLUMNS.items():
-            empty = np.nan if kind is np.float32 else 0
-            column = np.full(shape, empty, kind)
-            column[place] = getattr(rows, name)[order]
-            windows[f"{TACTILE}.{name}"] = column
-        windows[f"{TACTILE}.count"] = counts.astype(np.int64)
-        return windows
+    Returns:
+        Arrays (n, depth, cubes, …) by the names of the features.
+    """
+    n_frames, n_cubes = counts.shape
+    # A cell is one cube in one frame. Stable sorting keeps its samples in the order of
+    # recording.
+    cell = frame * n_cubes + rows.cube
+    order = np.argsort(cell, kind="stable")
+    cell = cell[order]
+    # The last row of each cell gets the last entry of the window, so that the newest sample is
+    # always there. The rows before the last one get the entries before it.
+    ends = np.cumsum(counts, dtype=np.intp)
+    to_end = ends[cell] - np.arange(len(cell))
+    place = (
+        cell // n_cubes,
+        depth - to_end,
+        cell % n_cubes,
+    )
+
+    shape = (n_frames, depth, n_cubes)
+    components = np.hstack([rows.stress, rows.gradient])
+    tactile_shape = (*shape, len(COMPONENTS))
+    tactile = np.full(tactile_shape, np.nan, np.float32)
+    tactile[place] = components[order]
+    windows: dict[str, AnyArray] = {TACTILE: tactile}
+    for name, kind in WINDOW_COLUMNS.items():
+        empty = np.nan if kind is np.float32 else 0
+        column = np.full(shape, empty, kind)
+        column[place] = getattr(rows, name)[order]
+        windows[f"{TACTILE}.{name}"] = column
+    windows[f"{TACTILE}.count"] = counts.astype(np.int64)
+    return windows

@@ -35,7 +35,13 @@ from cube_tensor_driver.bags.metadata import typestore
 from cube_tensor_driver.bags.read import Bag, report_damage
 from cube_tensor_driver.bags.repair import repair
 from cube_tensor_driver.bags.reprocess import job as job_module
-from cube_tensor_driver.bags.reprocess.job import Overrides, ReprocessJob, reconstruct, reprocess
+from cube_tensor_driver.bags.reprocess.job import (
+    Overrides,
+    ReprocessJob,
+    choose_settings,
+    reconstruct,
+    reprocess,
+)
 from cube_tensor_driver.bags.source import open_bag
 from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.cli.main import main
@@ -298,7 +304,7 @@ def test_what_was_found_before_the_recording_began_is_taken_from_it(tmp_path):
     assert table["left_out"].to_numpy()[:16].tolist() == [0, 0, 0, 4] + [0] * 12
     # another tare judges anew, and does not find it
     with open_bag(path) as source:
-        ((_, rows), *_) = reconstruct(source, Overrides(tare=(0.0, 0.1)))
+        ((_, rows), *_) = reconstruct(source, choose_settings(source, Overrides(tare=(0.0, 0.1))))
     assert not rows.left_out.any() and (rows.status & STUCK == 0).all()
 
 

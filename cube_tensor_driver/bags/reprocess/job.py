@@ -31,11 +31,10 @@ from ..metadata import quality
 from ..read import Bag, serialise, stamp_ns
 from ..recording import Settings, reconstruct_rows
 from ..source import BagSource, Segment
-from ..tables import TableWriter, report_write_errors
+from ..tables import BufferedTable, TableWriter, report_write_errors
 from ..write import BagWriter
 
 if TYPE_CHECKING:
-    from ..zarr_table import ZarrWriter
     from .contacts import ContactOptions
 
 PARTIAL_PREFIX = ".partial-"
@@ -62,12 +61,6 @@ class Overrides:
     calibration: Calibration | None = None
     skin: Skin | None = None
     tare: tuple[float, float] | None = None
-
-    @property
-    def any(self) -> bool:
-        """Whether a calibration, a skin or a tare replaces what was recorded."""
-        values = (self.calibration, self.skin, self.tare)
-        return any(value is not None for value in values)
 
 
 AS_RECORDED = Overrides()
@@ -132,7 +125,7 @@ def reprocess(job: ReprocessJob) -> ReprocessResult:
     return result
 
 
-def make_table(path: Path, cubes: list[str]) -> TableWriter | ZarrWriter:
+def make_table(path: Path, cubes: list[str]) -> BufferedTable:
     """Create a table of stress; the suffix of its path decides the format.
 
     Args:
@@ -150,26 +143,6 @@ def make_table(path: Path, cubes: list[str]) -> TableWriter | ZarrWriter:
     return TableWriter(path, cubes)
 
 
-def reconstruct(
-    source: BagSource,
-    overrides: Overrides = AS_RECORDED,
-) -> Iterator[tuple[Segment, StressRows]]:
-    """Compute the stress of a bag from its recorded frequencies again.
-
-    Args:
-        source: The recorded frequencies.
-        overrides: Calibrations and tare (frequencies without load) that replace the recorded ones.
-
-    Yields:
-        Each segment (consecutive messages of frequencies with the same cubes) and its stress.
-
-    Raises:
-        BagError: The bag is damaged, or the overrides do not fit its cubes.
-    """
-    settings = choose_settings(source, overrides)
-    return _reconstruct(source, settings, use_health=not overrides.any)
-
-
 def choose_settings(source: BagSource, overrides: Overrides) -> list[Settings]:
     """Return the calibrations and rest frequencies to use for each SkinInfo message of a bag.
 
@@ -178,6 +151,9 @@ def choose_settings(source: BagSource, overrides: Overrides) -> list[Settings]:
     Args:
         source: The recorded frequencies with their SkinInfo messages.
         overrides: Calibrations and tare that replace those of the recording.
+
+    Returns:
+        The settings; without overrides, the list of the recorded ones itself.
 
     Raises:
         BagError: The overrides do not fit the cubes of the bag.
@@ -224,7 +200,8 @@ def _reprocess(
     else:
         names = [cube.name for cube in sources[0].skin.cubes]
         with make_table(output, [*names, "unknown"]) as table:
-            for _, stress in reconstruct(sources[0], job.overrides):
+            settings = choose_settings(sources[0], job.overrides)
+            for _, stress in reconstruct(sources[0], settings):
                 table.write(stress)
     return ReprocessResult(
         messages=sum(source.messages for source in sources),
@@ -265,8 +242,7 @@ def _write_skin(
         from .contacts import ContactWriter
 
         contacts = ContactWriter(writer, skin, job.contacts)
-    use_health = not job.overrides.any
-    for segment, stress in _reconstruct(source, settings, use_health=use_health):
+    for segment, stress in reconstruct(source, settings):
         messages = segment.messages
         encoded = stress_codec.encode_many(stress, messages.stamp_ns, messages.frame_id)
         times_ns = segment.recorded_ns.tolist()
@@ -277,21 +253,28 @@ def _write_skin(
             contacts.write(stress, messages, segment.recorded_ns)
 
 
-def _reconstruct(
+def reconstruct(
     source: BagSource,
-    settings: list[Settings],
-    *,
-    use_health: bool,
+    settings: list[Settings] | None = None,
 ) -> Iterator[tuple[Segment, StressRows]]:
-    """Reconstruct the stress of each segment (consecutive messages with the same cubes) of a bag.
+    """Compute the stress of a bag from its recorded frequencies again.
 
     Args:
         source: The recorded frequencies.
-        settings: Calibrations and rest frequencies for each SkinInfo message of the bag.
-        use_health: Whether the pads that were left out as faulty in the recording are left out
-            again. With other settings than the recorded ones, other pads can be faulty, so the
-            health is then determined anew.
+        settings: Calibrations and rest frequencies for each SkinInfo message of the bag, as
+            `choose_settings` returns them; None: the recorded ones.
+
+    Yields:
+        Each segment (consecutive messages of frequencies with the same cubes) and its stress.
+
+    Raises:
+        BagError: The bag is damaged.
     """
+    recorded = source.recording.settings
+    settings = settings or recorded
+    # With other settings than the recorded ones, other pads can be faulty, so the health of the
+    # pads is determined anew.
+    use_health = settings is recorded
     number = -1
     ids: list[str] = []
     refused: CubeError | None = None
