@@ -171,11 +171,26 @@ def _read_states(
 def _read_cells(path: Path) -> tuple[list[str], Array]:
     """Return the names of the columns, and the numbers below them (loads, columns).
 
+    Lines without text are ignored.
+
     Raises:
-        FitError: The file cannot be read, a line has the wrong number of cells, or a cell is no
-            number.
+        FitError: The file cannot be read or is no CSV file in UTF-8, a line has the wrong number of
+            cells, or a cell is no number.
     """
-    lines = _read_lines(path)
+    try:
+        # Spreadsheet programs begin a file with a byte order mark, which this encoding removes.
+        text = read_bounded(path, MAX_BYTES, "table of loads").decode("utf-8-sig")
+        # The csv module must get the ends of lines unchanged, because a cell in quotation marks may
+        # contain some.
+        file = io.StringIO(text, newline="")
+        stripped = [[cell.strip() for cell in line] for line in csv.reader(file)]
+    except ConfigError as error:
+        raise FitError(str(error)) from None
+    except OSError as error:
+        raise FitError(f"{path}: {error.strerror}; name a CSV file that can be read") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise FitError(f"{path}: not a CSV file ({error})") from None
+    lines = [cells for cells in stripped if any(cells)]
     if len(lines) < 2:
         raise FitError(
             f"{path}: found {len(lines)} lines; needed are one with column names and one per load"
@@ -196,30 +211,3 @@ def _read_cells(path: Path) -> tuple[list[str], Array]:
                     f"{path}: load {number + 1}, column {header[column]}: {cell!r} is no number"
                 ) from None
     return header, values
-
-
-def _read_lines(path: Path) -> list[list[str]]:
-    """Return the cells of each line that is not empty, without spaces around them.
-
-    Raises:
-        FitError: The file cannot be read, or is no CSV file in UTF-8.
-    """
-    try:
-        # Spreadsheet programs begin a file with a byte order mark, which this encoding removes.
-        text = read_bounded(path, MAX_BYTES, "table of loads").decode("utf-8-sig")
-        # The csv module must get the ends of lines unchanged, because a cell in quotation marks may
-        # contain some.
-        file = io.StringIO(text, newline="")
-        lines = list(csv.reader(file))
-    except ConfigError as error:
-        raise FitError(str(error)) from None
-    except OSError as error:
-        raise FitError(f"{path}: {error.strerror}; name a CSV file that can be read") from None
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise FitError(f"{path}: not a CSV file ({error})") from None
-    stripped = []
-    for line in lines:
-        cells = [cell.strip() for cell in line]
-        if any(cells):
-            stripped.append(cells)
-    return stripped

@@ -91,13 +91,9 @@ def measure_pads_at_rest(frequency: Array, seconds: Array) -> PadsAtRest:
     has_frequency = ~silent & (mean > 0)
     scale = np.where(has_frequency, mean, np.nan)
     relative_noise = noise / scale
-    usual = np.full(len(relative_noise), np.inf)
-    cubes = np.flatnonzero(varies.any(axis=1))
-    for cube in cubes:
-        of_varying = relative_noise[cube, varies[cube]]
-        usual[cube] = np.median(of_varying)
-    limit = NOISY_ENTER * usual[:, None]
-    noisy = varies & (relative_noise > limit)
+    of_varying = np.ma.array(relative_noise, mask=~varies)
+    usual = np.ma.median(of_varying, axis=1, keepdims=True).filled(np.inf)
+    noisy = varies & (relative_noise > NOISY_ENTER * usual)
     return PadsAtRest(
         frequency=scale,
         noise=relative_noise,
