@@ -48,7 +48,18 @@ from .clients import BagRecorder, ReplayClient, ServiceCalls
 from .gate import LOCAL_HOSTS, check_host, guarded_server
 from .history import History
 from .markup import PageStatus
-from .page import CLEAR_TARE, HOLD, TARE, Page, PageLayout, clear, show_waiting
+from .page import (
+    CLEAR_TARE,
+    HOLD,
+    JUMP,
+    RECORD,
+    STOP,
+    TARE,
+    Page,
+    PageLayout,
+    clear,
+    show_waiting,
+)
 from .scan import Links, Scan, ScanSynchronizer
 from .update import ShownSkin
 
@@ -122,12 +133,22 @@ class Viewer:
         ):
             receive_safely = self._callback_errors.catch(receive)
             node.create_subscription(kind, topic, receive_safely, 10)
-        self._tare = node.create_client(Tare, "reconstruction/tare")
-        self._clear_tare = node.create_client(Trigger, "reconstruction/clear_tare")
         self._status = PageStatus()
         self._services = ServiceCalls(self._status.say)
         self._replay = ReplayClient(node, self._services, self._status.say)
         self._recorder = BagRecorder(recordings)
+        ask = self._services.ask
+        tare = node.create_client(Tare, "reconstruction/tare")
+        clear_tare = node.create_client(Trigger, "reconstruction/clear_tare")
+        # What is done for each action of a user; the arguments are those of `Act`.
+        self._commands: dict[str, Callable[..., None]] = {
+            TARE: partial(ask, "tare", tare, Tare.Request()),
+            CLEAR_TARE: partial(ask, "undo tare", clear_tare, Trigger.Request()),
+            HOLD: self._replay.toggle_hold,
+            JUMP: lambda take_position: self._replay.jump_to(take_position()),
+            RECORD: self._toggle_recording,
+            STOP: self._toggle_recording,
+        }
         self._links: dict[str, tuple[str, int]] = {}
         self._actions: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._shown: ShownSkin | None = None
@@ -215,8 +236,10 @@ class Viewer:
             show_waiting(client, layout, markup.waiting(domain_text()))
             return
 
-        def act(*arguments: Any) -> None:
-            self._actions.put(partial(self._act, *arguments))
+        def act(action: str, *arguments: Any) -> None:
+            # A browser may send any text, and unknown ones do nothing.
+            if action in self._commands:
+                self._actions.put(partial(self._commands[action], *arguments))
 
         page = Page(client, layout, self._shown, act)
         page.replay.show(self._replay.state)
@@ -225,23 +248,6 @@ class Viewer:
     def _forget_page(self, client_id: int) -> None:
         self._pages.pop(client_id, None)
         self._layouts.pop(client_id, None)
-
-    def _act(self, action: str, take_position: Callable[[], float] | None = None) -> None:
-        """Do what the user of a page wants; the arguments are those of `Act`."""
-        if action == TARE:
-            self._services.ask("tare", self._tare, Tare.Request())
-        elif action == CLEAR_TARE:
-            self._services.ask(
-                "undo tare",
-                self._clear_tare,
-                Trigger.Request(),
-            )
-        elif action == HOLD:
-            self._replay.toggle_hold()
-        elif take_position is not None:
-            self._replay.jump_to(take_position())
-        else:
-            self._toggle_recording()
 
     def _update(self, skin: ShownSkin) -> None:
         """Show the newest scan (the values of all cubes at one instant) in all browsers."""
