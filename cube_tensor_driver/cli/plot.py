@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 
 from .parser import Parser, number
 
@@ -16,6 +17,7 @@ def arguments(parser: Parser) -> None:
         "--from",
         dest="start",
         type=number,
+        default=0.0,
         metavar="S",
         help="begin S seconds after the start of the bag",
     )
@@ -23,6 +25,7 @@ def arguments(parser: Parser) -> None:
         "--to",
         dest="end",
         type=number,
+        default=math.inf,
         metavar="S",
         help="end S seconds after the start of the bag",
     )

@@ -16,11 +16,9 @@ If the values on one side of zero are all noise, the axis ends at zero on that s
 def round_down(length: float) -> float:
     """Return the largest number of the form 1, 2 or 5 times a power of ten that is at most
     `length`, which must be positive."""
-    power = 10.0 ** np.floor(np.log10(length))
     # Without the tolerance, rounding could reduce a length of exactly 1, 2 or 5.
     limit = length * (1 + 1e-9)
-    candidates = [power, 2 * power, 5 * power]
-    return float(max(number for number in candidates if number <= limit))
+    return max(number for number in _round_numbers(length) if number <= limit)
 
 
 def round_range(low: float, high: float) -> tuple[float, float]:
@@ -37,11 +35,15 @@ def round_range(low: float, high: float) -> tuple[float, float]:
         low = 0.0
     if abs(high) <= noise:
         high = 0.0
-    power = 10.0 ** np.floor(np.log10(size))
     # Without the tolerance, rounding could give a size of exactly 1, 2 or 5 the next larger step.
     min_step = size * (1 - 1e-9)
-    candidates = [power, 2 * power, 5 * power, 10 * power]
-    step = min(number for number in candidates if number >= min_step) / 2
+    step = min(number for number in _round_numbers(size) if number >= min_step) / 2
     n_below = np.floor(min(low, 0) / step)
     n_above = np.ceil(max(high, 0) / step)
     return float(n_below * step), float(n_above * step)
+
+
+def _round_numbers(size: float) -> list[float]:
+    """Return 1, 2, 5 and 10 times the largest power of ten that is at most `size`."""
+    power = float(10.0 ** np.floor(np.log10(size)))
+    return [power, 2 * power, 5 * power, 10 * power]

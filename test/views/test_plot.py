@@ -14,6 +14,7 @@ pytest.importorskip("pyarrow", reason="needs pyarrow: pip install pyarrow")
 pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 
 from conftest import ROOT
+from cube_tensor_driver.core.rows import StressRows
 from cube_tensor_driver.views.figures.time_series import TimeSeries, draw_series
 
 PROGRAM = """
@@ -51,9 +52,9 @@ def test_no_line_bridges_a_gap():
         seconds=seconds,
         frequency=np.full((n, 2), 1e5),
         rest=np.full(2, 1e5),
-        values=np.zeros((n, 15)),
-        residual=np.ones(n),
-        status=np.zeros(n, np.uint16),
+        rows=StressRows.of(
+            np.zeros(n, np.uint16), np.zeros((n, 6)), np.zeros((n, 9)), residual=1.0
+        ),
     )
     lines = [line for axes in draw_series(series, "bag").axes for line in axes.lines]
     assert len(lines) == 2 + 15 + 1
