@@ -16,7 +16,6 @@ import numpy as np
 from rclpy.client import Client
 from rclpy.node import Node
 
-from ..core.errors import ConfigError
 from ..core.latest_stress import STALE_S
 from ..msg import ReplayState
 from ..processes.children import end_with_parent
@@ -219,29 +218,28 @@ class BagRecorder:
         path: Folder of the bag that was begun last; before the first one, the folder for all bags.
     """
 
-    def __init__(self, folder: Path) -> None:
-        """Set the parent folder of all bags; `start` makes it if it does not exist."""
+    def __init__(self, folder: Path, say: Say) -> None:
+        """Set the parent folder of all bags, which is made if it does not exist."""
         self._folder = folder
+        self._say = say
         self.path = folder
         self._process: subprocess.Popen[bytes] | None = None
 
-    @property
-    def recording(self) -> bool:
-        """Whether the child process that records has been started and not yet been ended."""
-        return self._process is not None
+    def toggle(self) -> None:
+        """End the recording that runs, or start to record into a new folder.
 
-    def start(self) -> None:
-        """Start to record into a new folder whose name contains the local time.
-
-        Raises:
-            ConfigError: The parent folder of the bags does not exist and cannot be made.
+        The name of the folder contains the local time.
         """
+        if self._process is not None:
+            self.end()
+            self._say("Recorded", f"recorded to {self.path}", "green")
+            return
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise ConfigError(
-                f"{self._folder}: {error.strerror}; name another folder with --recordings"
-            ) from None
+            text = f"{self._folder}: {error.strerror}; name another folder with --recordings"
+            self._say("The recording did not start", text, "red")
+            return
         self.path = self._folder / time.strftime("skin_%Y%m%d_%H%M%S")
         record = ["-m", "cube_tensor_driver.cli", "record", "-o", str(self.path)]
         self._process = subprocess.Popen(
@@ -252,6 +250,7 @@ class BagRecorder:
             # the recorder does not get it and can finish its file when `end` asks for that.
             start_new_session=True,
         )
+        self._say("Recording", f"recording to {self.path}", "blue")
 
     def end(self) -> None:
         """Ask the recorder to finish its bag, and wait up to `MAX_END_S` for it.
@@ -269,13 +268,10 @@ class BagRecorder:
             self._process.wait()
         self._process = None
 
-    def ended_by_itself(self) -> int | None:
-        """Check whether the recorder has ended although `end` was not called.
-
-        Returns:
-            Its exit code, in the first call after it has ended; otherwise None.
-        """
-        code = None if self._process is None else self._process.poll()
-        if code is not None:
+    def is_recording(self) -> bool:
+        """Return whether a bag is being recorded; show a note if the recorder ended by itself."""
+        if self._process is not None and self._process.poll() is not None:
+            text = f"recording ended by itself with code {self._process.returncode}"
+            self._say("The recording ended", text, "red")
             self._process = None
-        return code
+        return self._process is not None

@@ -77,11 +77,6 @@ class ColourControls:
         return value * self.quantity.size if math.isfinite(value) and value > 0 else 0.0
 
 
-def add_part_controls(gui: viser.GuiApi) -> dict[str, viser.GuiCheckboxHandle]:
-    """Add a check box for each of `PARTS`, and return them by the name of the part."""
-    return {name: gui.add_checkbox(text, name in FIRST_PARTS) for name, text in PARTS.items()}
-
-
 class ReplayControls:
     """A slider for the time within a replay, and a button to stop it; hidden without a replay."""
 

@@ -8,7 +8,7 @@ from collections import deque
 
 import numpy as np
 
-from ..core.arrays import Array
+from ..core.arrays import Array, Single
 from ..core.modes import COMPONENTS
 from ..core.rows import StressRows
 
@@ -47,7 +47,7 @@ class History:
             length: Maximum number of instants that are kept.
         """
         # Time of each instant in s, and values (cubes, 16); the newest instant is the last.
-        self._instants: deque[tuple[float, Array]] = deque(maxlen=length)
+        self._instants: deque[tuple[float, Single]] = deque(maxlen=length)
         self._is_observed = np.zeros(len(self.COLUMNS), bool)
         self.count = 0
 

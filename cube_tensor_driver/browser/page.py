@@ -19,7 +19,7 @@ import viser
 from ..views.scene import Quantity, Ranges
 from . import markup
 from .charts import Charts
-from .controls import ColourControls, ReplayControls, add_part_controls
+from .controls import FIRST_PARTS, PARTS, ColourControls, ReplayControls
 from .history import History
 from .markup import PageStatus
 from .scan import Scan
@@ -288,7 +288,9 @@ class Page:
             objects["contact list"] = gui.add_html("")
         with gui.add_folder("what is drawn"):
             objects["meaning"] = gui.add_html("")
-            self._parts = add_part_controls(gui)
+            self._parts = {
+                name: gui.add_checkbox(text, name in FIRST_PARTS) for name, text in PARTS.items()
+            }
             view = gui.add_button_group("camera", tuple(CAMERA_DIRECTIONS))
 
         @view.on_click

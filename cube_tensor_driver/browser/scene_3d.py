@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import viser
 
-from ..core.arrays import Array
+from ..core.arrays import Array, Single
 from ..core.latest_stress import DOUBTFUL, FAULTY, STALE
 from ..core.poses import CubePoses, quaternions
 from ..touch.surface import Contact, Surface
@@ -24,10 +24,11 @@ from ..views.meshes import (
     COLOUR_STEPS,
     CUBE_EDGES,
     NO_MESH,
-    SquareLayer,
     corner_lines,
     find_hit_cube,
     make_cube,
+    paint_squares,
+    square_corners,
     step_colours,
 )
 from ..views.round_numbers import round_down
@@ -337,7 +338,7 @@ class Scene:
             values = np.append(values, colouring.cubes)
             visible = np.append(visible, np.full(len(colouring.cubes), True))
 
-        meshes = self._squares.paint(quantity, values, top, visible)
+        meshes = paint_squares(self._squares, quantity, values, top, visible)
         colours_of_steps = step_colours(quantity).tolist()
         for step, mesh in enumerate(meshes):
             colour = tuple(colours_of_steps[step])
@@ -494,8 +495,8 @@ def _make_squares(
     placement: Placement,
     surface: Surface,
     with_cubes: bool,
-) -> SquareLayer:
-    """Return the squares that draw the field and, on a large skin, the upper faces of the cubes.
+) -> Single:
+    """Return the corners (M, 4, 3) of the squares that draw the field and, on a large skin, cubes.
 
     Args:
         placement: Poses of the cubes in the scene.
@@ -512,7 +513,7 @@ def _make_squares(
         points = np.concatenate([points, scene.above(poses, 1.0)])
         rotation = np.concatenate([rotation, poses.rotation])
         side = np.append(side, 2 * poses.half_side)
-    return SquareLayer(points, rotation, side)
+    return square_corners(points, rotation, side)
 
 
 def _set_up_lights(api: viser.SceneApi) -> None:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..core.arrays import Array
+from ..core.arrays import Array, Index
 from ..core.calibration import Calibration
 from ..core.defaults import POISSONS_RATIO
 from ..mechanics.layer import Layer
@@ -77,7 +77,10 @@ class FieldModel:
             calibrations: Calibration of each cube.
         """
         self._surface = surface
-        self._interpolation: _Interpolation | None = None
+        # Points of the last interpolation, and its weights (see `_interpolation_weights`).
+        self._points: Array = np.empty((0, 3))
+        self._nearest: Index = np.empty((0, 1), np.intp)
+        self._weight: Array = np.empty((0, 1))
         worker = ThreadPoolExecutor(1)
         self.prepared: Future[SurfaceInverse] = worker.submit(_make_inverse, surface, calibrations)
         # The thread ends when the preparation is done.
@@ -116,10 +119,15 @@ class FieldModel:
         return SurfaceField(between.pressure, shear, "between the cubes, at their depth")
 
     def _interpolate(self, points: Array, columns: Array) -> Array:
+        """Interpolate C quantities, given at M points (M, C), to the points of the surface.
+
+        The result is NaN where one of the nearest values is NaN.
+        """
         # The points of a skin do not move, so the weights of the interpolation are computed once.
-        if self._interpolation is None or not np.array_equal(points, self._interpolation.points):
-            self._interpolation = _Interpolation(self._surface, points)
-        return self._interpolation.values(columns)
+        if not np.array_equal(points, self._points):
+            self._points = points
+            self._nearest, self._weight = _interpolation_weights(self._surface, points)
+        return np.asarray(np.einsum("pk,pkc->pc", self._weight, columns[self._nearest]))
 
 
 def _make_inverse(surface: Surface, calibrations: Sequence[Calibration]) -> SurfaceInverse:
@@ -133,37 +141,24 @@ def _make_inverse(surface: Surface, calibrations: Sequence[Calibration]) -> Surf
     )
 
 
-class _Interpolation:
-    """Interpolates from points on the surface of the skin to all points of a `Surface`.
+def _interpolation_weights(surface: Surface, points: Array) -> tuple[Index, Array]:
+    """Return the weights of an interpolation to all N points of a surface.
 
-    The weights are the inverse squared distances to the nearest `INTERPOLATION_POINTS` points
-    (Shepard's method).
+    They are the inverse squared distances to the nearest `INTERPOLATION_POINTS` points (Shepard's
+    method).
 
-    Attributes:
+    Args:
+        surface: The surface.
         points: (M, 3) points with known values, in m, in the parent frame of the skin.
+
+    Returns:
+        Indices (N, k) of the k nearest points with known values, and their weights (N, k).
     """
-
-    def __init__(self, surface: Surface, points: Array) -> None:
-        self.points = points
-        shape = len(surface.points), min(INTERPOLATION_POINTS, len(points))
-        # `surface.points` lie in the plane of the cubes' centres, so they are moved up to the
-        # surface by the depth of the cubes.
-        up = surface.depth * surface.poses.rotation[surface.cube, :, 2]
-        distance, nearest = cKDTree(points).query(surface.points + up, shape[1])
-        self._nearest = nearest.reshape(shape)
-        # The lower limit of the distance avoids a division by zero where two points coincide.
-        weight = 1 / np.maximum(distance.reshape(shape), 1e-3 * surface.spacing) ** 2
-        self._weight = weight / weight.sum(axis=1, keepdims=True)
-
-    def values(self, columns: Array) -> Array:
-        """Interpolate C quantities, given at the M points (M, C), to the points of the surface.
-
-        The result is NaN where one of the nearest values is NaN.
-        """
-        return np.asarray(
-            np.einsum(
-                "pk,pkc->pc",
-                self._weight,
-                columns[self._nearest],
-            )
-        )
+    shape = len(surface.points), min(INTERPOLATION_POINTS, len(points))
+    # `surface.points` lie in the plane of the cubes' centres, so they are moved up to the surface
+    # by the depth of the cubes.
+    up = surface.depth * surface.poses.rotation[surface.cube, :, 2]
+    distance, nearest = cKDTree(points).query(surface.points + up, shape[1])
+    # The lower limit of the distance avoids a division by zero where two points coincide.
+    weight = 1 / np.maximum(distance.reshape(shape), 1e-3 * surface.spacing) ** 2
+    return nearest.reshape(shape), weight / weight.sum(axis=1, keepdims=True)

@@ -136,7 +136,7 @@ class Viewer:
         self._status = PageStatus()
         self._services = ServiceCalls(self._status.say)
         self._replay = ReplayClient(node, self._services, self._status.say)
-        self._recorder = BagRecorder(recordings)
+        self._recorder = BagRecorder(recordings, self._status.say)
         ask = self._services.ask
         tare = node.create_client(Tare, "reconstruction/tare")
         clear_tare = node.create_client(Trigger, "reconstruction/clear_tare")
@@ -146,8 +146,8 @@ class Viewer:
             CLEAR_TARE: partial(ask, "undo tare", clear_tare, Trigger.Request()),
             HOLD: self._replay.toggle_hold,
             JUMP: lambda take_position: self._replay.jump_to(take_position()),
-            RECORD: self._toggle_recording,
-            STOP: self._toggle_recording,
+            RECORD: self._recorder.toggle,
+            STOP: self._recorder.toggle,
         }
         self._links: dict[str, tuple[str, int]] = {}
         self._actions: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
@@ -255,7 +255,7 @@ class Viewer:
             # After a jump of the replay, the plots would connect values of two different times.
             self._history.clear()
         self._replay.forget_if_silent()
-        self._update_recording()
+        self._status.recording = self._recorder.is_recording()
 
         scans = self._scans
         has_advanced = scans.advance()
@@ -274,37 +274,6 @@ class Viewer:
                 if not self._replay.is_jumping:
                     page.replay.show(self._replay.state)
                 page.show(scan, self._history, self._status)
-
-    def _update_recording(self) -> None:
-        status = self._status
-        code = self._recorder.ended_by_itself()
-        if code is not None:
-            status.say(
-                "The recording ended",
-                f"recording ended by itself with code {code}",
-                "red",
-            )
-        status.recording = self._recorder.recording
-
-    def _toggle_recording(self) -> None:
-        if self._recorder.recording:
-            self._recorder.end()
-            self._status.say(
-                "Recorded",
-                f"recorded to {self._recorder.path}",
-                "green",
-            )
-            return
-        try:
-            self._recorder.start()
-        except ConfigError as error:
-            self._status.say(
-                "The recording did not start",
-                str(error),
-                "red",
-            )
-            return
-        self._status.say("Recording", f"recording to {self._recorder.path}")
 
     def _receive_stress(self, stamp_ns: int, rows: StressRows) -> None:
         self._scans.add_rows(stamp_ns, rows, self._subscriber.now())

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import Array, Index, Mask
+from ..core.arrays import Array, Index, Mask, Single
 from . import scene
 from .scene import Quantity
 
@@ -28,7 +28,7 @@ CUBE_EDGES = _CORNER_PAIRS[_N_DIFFERENT == 1]
 both ends of each edge."""
 
 COLOUR_STEPS = 32
-"""Number of colours in which a `SquareLayer` (coloured squares of a skin) is drawn.
+"""Number of colours in which the coloured squares of a skin are drawn.
 
 The squares of each colour are a mesh of their own, so more colours take the browser more time.
 """
@@ -104,56 +104,48 @@ def find_hit_cube(
     return int(distance.argmin())
 
 
-class SquareLayer:
-    """Squares whose colours change: the field of a skin, and the cubes of a large skin.
+def square_corners(points: Array, rotation: Array, side: Array) -> Single:
+    """Return the corners (M, 4, 3) of M squares, in units of the scene.
 
-    The squares of one colour are one mesh. A skin then consists of few objects, and a computer
-    without a graphics card can draw it often enough. An image would be less data, but browsers
-    decode images asynchronously: a slow browser would show the field of one instant together with
-    the cubes of a later one.
+    Args:
+        points: (M, 3) centres of the squares, in units of the scene.
+        rotation: (M, 3, 3) rotations from the frame of each square, in whose x-y plane it lies, to
+            the scene.
+        side: (M,) length of the sides of each square, in units of the scene.
     """
+    offset = side[:, None, None] * _SQUARE
+    rotated = np.einsum("mij,mqj->mqi", rotation[:, :, :2], offset)
+    corners = points[:, None] + rotated
+    return corners.astype(np.float32)
 
-    def __init__(
-        self,
-        points: Array,
-        rotation: Array,
-        side: Array,
-    ) -> None:
-        """Compute the corners of the squares.
 
-        Args:
-            points: (M, 3) centres of the squares, in units of the scene.
-            rotation: (M, 3, 3) rotations from the frame of each square, in whose x-y plane it
-                lies, to the scene.
-            side: (M,) length of the sides of each square, in units of the scene.
-        """
-        # The corners are computed once, because squares change only their colours.
-        offset = side[:, None, None] * _SQUARE
-        rotated = np.einsum("mij,mqj->mqi", rotation[:, :, :2], offset)
-        corners = points[:, None] + rotated
-        self._corners = corners.astype(np.float32)
+def paint_squares(
+    corners: Single,
+    quantity: Quantity,
+    values: Array,
+    top: float,
+    visible: Mask,
+) -> list[Mesh]:
+    """Return one mesh for each colour of `step_colours`, with the squares of this colour.
 
-    def paint(
-        self,
-        quantity: Quantity,
-        values: Array,
-        top: float,
-        visible: Mask,
-    ) -> list[Mesh]:
-        """Return one mesh for each colour of `step_colours`, with the squares of this colour.
+    The squares are the field of a skin, and the cubes of a large skin. With one mesh for each
+    colour, a skin consists of few objects, and a computer without a graphics card can draw it often
+    enough. An image would be less data, but browsers decode images asynchronously: a slow browser
+    would show the field of one instant together with the cubes of a later one.
 
-        Args:
-            quantity: The quantity that the colours show.
-            values: (M,) its values at the squares, in SI units.
-            top: Value at the upper end of the colour scale, in SI units.
-            visible: (M,) whether each square is drawn.
-        """
-        steps = colour_steps(quantity, values, top)
-        meshes = []
-        for step in range(COLOUR_STEPS + 1):
-            chosen = np.flatnonzero(visible & (steps == step))
-            meshes.append(join_squares(self._corners[chosen]) if len(chosen) else NO_MESH)
-        return meshes
+    Args:
+        corners: (M, 4, 3) corners of the squares.
+        quantity: The quantity that the colours show.
+        values: (M,) its values at the squares, in SI units.
+        top: Value at the upper end of the colour scale, in SI units.
+        visible: (M,) whether each square is drawn.
+    """
+    steps = colour_steps(quantity, values, top)
+    meshes = []
+    for step in range(COLOUR_STEPS + 1):
+        chosen = np.flatnonzero(visible & (steps == step))
+        meshes.append(join_squares(corners[chosen]) if len(chosen) else NO_MESH)
+    return meshes
 
 
 def colour_steps(
@@ -175,7 +167,7 @@ def colour_steps(
 
 
 def step_colours(quantity: Quantity) -> NDArray[np.uint8]:
-    """Return the colours of a `SquareLayer` (COLOUR_STEPS + 1, 3) in sRGB; the last is for NaN."""
+    """Return the colours of `paint_squares` (COLOUR_STEPS + 1, 3) in sRGB; the last is for NaN."""
     values = (np.arange(COLOUR_STEPS) + 0.5) / COLOUR_STEPS
     if quantity.signed:
         values = 2 * values - 1
