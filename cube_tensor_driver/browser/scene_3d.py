@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import viser
 
-from ..core.arrays import Array, Single
+from ..core.arrays import AnyArray, Array
 from ..core.latest_stress import DOUBTFUL, FAULTY, STALE
 from ..core.poses import CubePoses, quaternions
 from ..touch.surface import Contact, Surface
@@ -495,7 +495,7 @@ def _make_squares(
     placement: Placement,
     surface: Surface,
     with_cubes: bool,
-) -> Single:
+) -> AnyArray:
     """Return the corners (M, 4, 3) of the squares that draw the field and, on a large skin, cubes.
 
     Args:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import Array, Index, Mask, Single
+from ..core.arrays import AnyArray, Array, Index, Mask
 from . import scene
 from .scene import Quantity
 
@@ -38,7 +38,7 @@ _SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
 _SQUARE_FACES = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
 
 
-def join_squares(corners: Array) -> Mesh:
+def join_squares(corners: AnyArray) -> Mesh:
     """Return one mesh of N squares, from their corners (N, 4, 3)."""
     first_vertex = 4 * np.arange(len(corners), dtype=np.uint32)
     faces = first_vertex[:, None, None] + _SQUARE_FACES
@@ -104,7 +104,7 @@ def find_hit_cube(
     return int(distance.argmin())
 
 
-def square_corners(points: Array, rotation: Array, side: Array) -> Single:
+def square_corners(points: Array, rotation: Array, side: Array) -> AnyArray:
     """Return the corners (M, 4, 3) of M squares, in units of the scene.
 
     Args:
@@ -120,7 +120,7 @@ def square_corners(points: Array, rotation: Array, side: Array) -> Single:
 
 
 def paint_squares(
-    corners: Single,
+    corners: AnyArray,
     quantity: Quantity,
     values: Array,
     top: float,

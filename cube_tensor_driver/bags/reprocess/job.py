@@ -171,6 +171,57 @@ def choose_settings(source: BagSource, overrides: Overrides) -> list[Settings]:
     return settings
 
 
+def reconstruct(
+    source: BagSource,
+    settings: list[Settings] | None = None,
+) -> Iterator[tuple[Segment, StressRows]]:
+    """Compute the stress of a bag from its recorded frequencies again.
+
+    Args:
+        source: The recorded frequencies.
+        settings: Calibrations and rest frequencies for each SkinInfo message of the bag, as
+            `choose_settings` returns them; None: the recorded ones.
+
+    Yields:
+        Each segment (consecutive messages of frequencies with the same cubes) and its stress.
+
+    Raises:
+        BagError: The bag is damaged.
+    """
+    recorded = source.recording.settings
+    settings = settings or recorded
+    # With other settings than the recorded ones, other pads can be faulty, so the health of the
+    # pads is determined anew.
+    use_health = settings is recorded
+    number = -1
+    ids: list[str] = []
+    refused: CubeError | None = None
+    for segment in source.segments(use_health=use_health):
+        if segment.number != number:
+            number = segment.number
+            current = settings[number]
+            new_ids = [one.id for one in current.calibrations]
+            # A tare changes only rest frequencies and must not reset the tracked health of the
+            # pads. Therefore only other calibrations require a new reconstructor.
+            if new_ids != ids:
+                ids = new_ids
+                reconstructor = Reconstructor(current.calibrations)
+            reconstructor.rest_frequency = current.rest_frequency
+        if use_health:
+            reconstructor.compensation.restore(segment.states)
+        try:
+            stress = reconstruct_rows(reconstructor, segment.messages.rows, segment.health)
+        except CubeError as error:
+            # These messages do not fit the skin, for example in the number of pads. The ROS node
+            # leaves them out, too.
+            refused = error
+            source.skip(segment, error)
+            continue
+        yield segment, stress
+    if refused is not None and not source.messages:
+        raise BagError(f"{source.bag.path}: {source.topic}: {refused}")
+
+
 def _reprocess(
     bag: Bag,
     job: ReprocessJob,
@@ -251,57 +302,6 @@ def _write_skin(
         if contacts is not None:
             contacts.set_up(infos[segment.number])
             contacts.write(stress, messages, segment.recorded_ns)
-
-
-def reconstruct(
-    source: BagSource,
-    settings: list[Settings] | None = None,
-) -> Iterator[tuple[Segment, StressRows]]:
-    """Compute the stress of a bag from its recorded frequencies again.
-
-    Args:
-        source: The recorded frequencies.
-        settings: Calibrations and rest frequencies for each SkinInfo message of the bag, as
-            `choose_settings` returns them; None: the recorded ones.
-
-    Yields:
-        Each segment (consecutive messages of frequencies with the same cubes) and its stress.
-
-    Raises:
-        BagError: The bag is damaged.
-    """
-    recorded = source.recording.settings
-    settings = settings or recorded
-    # With other settings than the recorded ones, other pads can be faulty, so the health of the
-    # pads is determined anew.
-    use_health = settings is recorded
-    number = -1
-    ids: list[str] = []
-    refused: CubeError | None = None
-    for segment in source.segments(use_health=use_health):
-        if segment.number != number:
-            number = segment.number
-            current = settings[number]
-            new_ids = [one.id for one in current.calibrations]
-            # A tare changes only rest frequencies and must not reset the tracked health of the
-            # pads. Therefore only other calibrations require a new reconstructor.
-            if new_ids != ids:
-                ids = new_ids
-                reconstructor = Reconstructor(current.calibrations)
-            reconstructor.rest_frequency = current.rest_frequency
-        if use_health:
-            reconstructor.compensation.restore(segment.states)
-        try:
-            stress = reconstruct_rows(reconstructor, segment.messages.rows, segment.health)
-        except CubeError as error:
-            # These messages do not fit the skin, for example in the number of pads. The ROS node
-            # leaves them out, too.
-            refused = error
-            source.skip(segment, error)
-            continue
-        yield segment, stress
-    if refused is not None and not source.messages:
-        raise BagError(f"{source.bag.path}: {source.topic}: {refused}")
 
 
 def _recalibrate(

@@ -9,10 +9,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from ...core.arrays import Array
+from ...core.arrays import AnyArray, Array
 from .style import curve_style, print_style
 
-Panel = tuple[str, Mapping[str, Array]]
+Panel = tuple[str, Mapping[str, AnyArray]]
 """A panel: label of its value axis; name of each line -> its values (M,), in the unit of the label.
 """
 

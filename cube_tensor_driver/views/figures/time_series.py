@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from ...bags.reprocess.job import reconstruct
 from ...bags.source import BagSource
 from ...calibrate.recorded_loads import find_cubes
-from ...core.arrays import AnyArray, Array
+from ...core.arrays import AnyArray
 from ...core.errors import BagError
 from ...core.modes import GRADIENT, STRESS
 from ...core.rows import StressRows, concatenate
@@ -103,7 +103,7 @@ def draw_series(series: TimeSeries, title: str) -> Figure:
         series: The samples of the cube.
         title: First part of the title, such as the name of the bag.
     """
-    change_percent: Array = 100 * (series.frequency / series.rest - 1)
+    change_percent = 100 * (series.frequency / series.rest - 1)
     rows = series.rows
     stress = zip(map(symbol, STRESS), 1e-3 * rows.stress.T, strict=True)
     gradient = zip(map(symbol, GRADIENT), 1e-6 * rows.gradient.T, strict=True)
