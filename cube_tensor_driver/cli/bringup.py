@@ -79,9 +79,9 @@ def run(options: argparse.Namespace) -> int:
     data, skin = skin_of_hub(options)
     names = [cube.name for cube in skin.cubes]
     pads = skin.cubes[0].calibration.layout.pads
-    with open_links(skin) as source, PadScreen(names, pads) as screen:
+    with open_links(skin) as source:
         say("leave the skin alone")
-        rest = watch_rest(source, screen)
+        rest = watch_rest(source)
         explanations = press_cubes(source, rest)
 
     # The results of all cubes are printed, even if one of them prevents that the file is written.
@@ -165,42 +165,49 @@ def skin_of_hub(options: argparse.Namespace) -> tuple[dict[str, Any], Skin]:
     return data, skin
 
 
-def watch_rest(source: LinkSource, screen: PadScreen) -> PadsAtRest:
-    """Measure the pads for `REST_S` while nothing touches them, and show them in the live table.
+def watch_rest(source: LinkSource) -> PadsAtRest:
+    """Measure the pads for `REST_S` while nothing touches them, and show them in a table.
+
+    The table is updated live if stdout is a terminal.
 
     Args:
         source: Connection to the hub.
-        screen: The live table of the pads.
 
     Returns:
         Rest frequency, noise, drift and state of each pad.
     """
     import numpy as np
+    from rich.console import Console
+    from rich.live import Live
 
     from ..calibrate.averages import split_into_scans
     from ..calibrate.pad_rest import MIN_SAMPLES, measure_pads_at_rest
 
     parts: list[tuple[np.ndarray, np.ndarray]] = []
     next_shown_s = 0.0
-    for rows in source:
-        parts.append(split_into_scans(rows, len(source.skin.cubes)))
-        _, first_times = parts[0]
-        _, last_times = parts[-1]
-        # The duration is measured by the stamps of the samples and not by the computer's clock, so
-        # that a slow computer collects as many samples as a fast one.
-        now_s = float(last_times[-1] - first_times[0])
-        is_over = now_s >= REST_S
-        is_due = is_over or now_s >= next_shown_s
-        n_samples = sum(len(each) for each, _ in parts)
-        if n_samples < MIN_SAMPLES or not is_due:
-            continue
-        next_shown_s = now_s + AVERAGE_S
-        frequency, seconds = (np.concatenate(each) for each in zip(*parts, strict=True))
-        rest = measure_pads_at_rest(frequency, seconds)
-        screen.show(rest)
-        if is_over:
-            break
-    screen.finish(rest)
+    console = Console(highlight=False)
+    with Live(console=console, transient=True, auto_refresh=False) as live:
+        for rows in source:
+            parts.append(split_into_scans(rows, len(source.skin.cubes)))
+            _, first_times = parts[0]
+            _, last_times = parts[-1]
+            # The duration is measured by the stamps of the samples and not by the computer's clock,
+            # so that a slow computer collects as many samples as a fast one.
+            now_s = float(last_times[-1] - first_times[0])
+            is_over = now_s >= REST_S
+            is_due = is_over or now_s >= next_shown_s
+            n_samples = sum(len(each) for each, _ in parts)
+            if n_samples < MIN_SAMPLES or not is_due:
+                continue
+            next_shown_s = now_s + AVERAGE_S
+            frequency, seconds = (np.concatenate(each) for each in zip(*parts, strict=True))
+            rest = measure_pads_at_rest(frequency, seconds)
+            table = pad_table(rest, source.skin)
+            live.update(table, refresh=True)
+            if is_over:
+                break
+    # The live table is erased; this one stays on the screen, also if stdout is no terminal.
+    console.print(table)
     return rest
 
 
@@ -267,70 +274,34 @@ def press_cubes(source: LinkSource, rest: PadsAtRest) -> dict[int, Explanation]:
     return explanations
 
 
-class PadScreen:
-    """Shows a table of the pads on stdout, which is updated live if stdout is a terminal.
+def pad_table(rest: PadsAtRest, skin: Skin) -> Table:
+    """Return the table of the pads of a skin.
 
-    It is a context manager, which restores the terminal at its exit.
+    Args:
+        rest: The pads, as measured without load until now.
+        skin: The skin, whose cubes have the same pads.
     """
+    import numpy as np
 
-    def __init__(self, cubes: Sequence[str], pads: Sequence[str]) -> None:
-        """Prepare the table.
+    from ..views.terminal.output import make_table
 
-        Args:
-            cubes: Names of the cubes.
-            pads: Names of the pads, which are the same for all cubes.
-        """
-        from rich.console import Console
-        from rich.live import Live
-
-        self._cubes, self._pads = cubes, pads
-        self._console = Console(highlight=False)
-        self._live = Live(console=self._console, transient=True, auto_refresh=False)
-
-    def __enter__(self) -> PadScreen:
-        if self._console.is_terminal:
-            self._live.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._live.stop()
-
-    def show(self, rest: PadsAtRest) -> None:
-        """Draw the live table with the pads as measured until now; nothing is drawn if stdout is
-        no terminal."""
-        if self._live.is_started:
-            self._live.update(self._table(rest), refresh=True)
-
-    def finish(self, rest: PadsAtRest) -> None:
-        """End the live table, and print it once more as text that stays on the screen.
-
-        Args:
-            rest: The pads, as measured without load until the end.
-        """
-        self._live.stop()
-        self._console.print(self._table(rest))
-
-    def _table(self, rest: PadsAtRest) -> Table:
-        import numpy as np
-
-        from ..views.terminal.output import make_table
-
-        table = make_table(("cube", "pad"), ("f / Hz", "noise / ppm", "drift / (ppm/min)"))
-        table.add_column("state")
-        for cube, pad in np.ndindex(rest.frequency.shape):
-            # A silent pad (no frequency measured) has empty cells.
-            numbers = ("", "", "")
-            if np.isfinite(rest.frequency[cube, pad]):
-                numbers = (
-                    f"{rest.frequency[cube, pad]:.1f}",
-                    f"{PPM * rest.noise[cube, pad]:.1f}",
-                    f"{PPM * rest.drift[cube, pad]:+.0f}",
-                )
-            name = self._cubes[cube] if pad == 0 else ""
-            fault = pad_fault(rest, cube, pad)
-            style = "red" if fault else ""
-            table.add_row(name, self._pads[pad], *numbers, fault or "ok", style=style)
-        return table
+    pads = skin.cubes[0].calibration.layout.pads
+    table = make_table(("cube", "pad"), ("f / Hz", "noise / ppm", "drift / (ppm/min)"))
+    table.add_column("state")
+    for cube, pad in np.ndindex(rest.frequency.shape):
+        # A silent pad (no frequency measured) has empty cells.
+        numbers = ("", "", "")
+        if np.isfinite(rest.frequency[cube, pad]):
+            numbers = (
+                f"{rest.frequency[cube, pad]:.1f}",
+                f"{PPM * rest.noise[cube, pad]:.1f}",
+                f"{PPM * rest.drift[cube, pad]:+.0f}",
+            )
+        name = skin.names[cube] if pad == 0 else ""
+        fault = pad_fault(rest, cube, pad)
+        style = "red" if fault else ""
+        table.add_row(name, pads[pad], *numbers, fault or "ok", style=style)
+    return table
 
 
 def pad_fault(rest: PadsAtRest, cube: int, pad: int) -> str:

@@ -211,6 +211,7 @@ def test_a_turned_cube_is_found_and_written(tmp_path):
     with played(tmp_path, [planar, planar], person):
         code, output = bring_up(tmp_path, person, [1, 0])
     assert code == 0, output
+    assert output.count("noise / ppm") == 1
     assert "c0: as it should be" in output and "c1: turned, rpy 0° 0° 180°" in output
     found = read_skin(tmp_path / "skin.yaml").cubes
     assert [cube.rpy for cube in found] == [(0, 0, 0), (0, 0, pytest.approx(np.pi))]
