@@ -49,13 +49,13 @@ nothing. Below the limit the message is that several rotations fit, above it tha
 
 
 def arguments(parser: Parser) -> None:
-    parser.add_argument("port", metavar="PORT", help="device path, or socket://host:port")
+    parser.add_text("port", "PORT", "device path, or socket://host:port")
     parser.add_output("-o", "--output", kind="skin", required=True, help="skin file to write")
     parser.add_argument("--name", default="skin", help="name of the skin (default: %(default)s)")
-    parser.add_argument(
+    parser.add_text(
         "--calibration",
-        metavar="FILE",
-        help="calibration file or name (default: the shipped one for the number of pads)",
+        "FILE",
+        "calibration file or name (default: the shipped one for the number of pads)",
     )
     parser.add_rate()
     parser.epilog = (

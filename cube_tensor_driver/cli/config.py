@@ -15,21 +15,17 @@ from .parser import Parser, count, positive
 
 def arguments(parser: Parser) -> None:
     grid = parser.add_subcommand("grid", "write the skin file of a flat grid of cubes")
-    grid.add_argument("--nx", type=count, required=True, metavar="N", help="cubes along x")
-    grid.add_argument("--ny", type=count, required=True, metavar="N", help="cubes along y")
-    grid.add_argument(
+    grid.add_number("--nx", count, "N", "cubes along x", required=True)
+    grid.add_number("--ny", count, "N", "cubes along y", required=True)
+    grid.add_number(
         "--pitch",
-        type=positive,
+        positive,
+        "M",
+        "distance from cube to cube, m (default: %(default)s)",
         default=DEFAULT_PITCH,
-        metavar="M",
-        help="distance from cube to cube, m (default: %(default)s)",
     )
-    grid.add_argument(
-        "--links",
-        type=count,
-        default=1,
-        metavar="N",
-        help="hubs that share the cubes (default: %(default)s)",
+    grid.add_number(
+        "--links", count, "N", "hubs that share the cubes (default: %(default)s)", default=1
     )
     grid.add_rate()
     grid.add_argument("--name", default="skin", help="name of the skin (default: %(default)s)")
@@ -38,20 +34,17 @@ def arguments(parser: Parser) -> None:
         default="/dev/ttyACM{}",
         help="ports; {} is the number of the link (default: %(default)s)",
     )
-    grid.add_argument(
-        "--layout",
-        default="planar",
-        metavar="NAME",
-        help="layout of the cubes (default: %(default)s)",
+    grid.add_text(
+        "--layout", "NAME", "layout of the cubes (default: %(default)s)", default="planar"
     )
-    grid.add_argument(
+    grid.add_text(
         "--calibration",
-        metavar="FILE",
-        help="calibration file or name (default: that of the package for the layout)",
+        "FILE",
+        "calibration file or name (default: that of the package for the layout)",
     )
     grid.add_output("-o", "--output", kind="skin", required=True, help="skin file to write")
     check = parser.add_subcommand("check", "list what is wrong with a skin file, or what it holds")
-    check.add_argument("file", type=Path, metavar="FILE", help="skin file")
+    check.add_path("file", "FILE", "skin file")
 
 
 def run(options: argparse.Namespace) -> int:

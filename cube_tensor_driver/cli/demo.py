@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from .parser import Parser, count, not_negative, positive, sample_rate
 
@@ -14,58 +13,42 @@ DEFAULT_DURATION_S = 10.0
 
 
 def arguments(parser: Parser) -> None:
-    parser.add_argument(
-        "--config",
-        type=Path,
-        metavar="FILE",
-        help="skin file to simulate (default: sixteen planar cubes)",
-    )
-    parser.add_argument(
-        "--cubes", type=count, metavar="N", help="simulate a grid of N planar cubes instead"
-    )
-    parser.add_argument(
-        "--load",
-        type=Path,
-        metavar="FILE",
-        help="load script (default: a contact that wanders over the skin)",
-    )
-    parser.add_argument(
+    parser.add_path("--config", "FILE", "skin file to simulate (default: sixteen planar cubes)")
+    parser.add_number("--cubes", count, "N", "simulate a grid of N planar cubes instead")
+    parser.add_path("--load", "FILE", "load script (default: a contact that wanders over the skin)")
+    parser.add_path(
         "--mujoco",
-        type=Path,
-        metavar="SCENE",
-        help="MuJoCo scene (.xml) that touches the skin, instead of a load script; it names its "
+        "SCENE",
+        "MuJoCo scene (.xml) that touches the skin, instead of a load script; it names its "
         "skin file itself (docs/simulation.md; scenes: config/mujoco)",
     )
-    parser.add_argument(
+    parser.add_number(
         "--rate",
-        type=sample_rate,
-        metavar="HZ",
-        help="samples per second (default: those of the skin file, else 100)",
+        sample_rate,
+        "HZ",
+        "samples per second (default: those of the skin file, else 100)",
     )
-    parser.add_argument(
+    parser.add_number(
         "--noise",
-        type=not_negative,
-        metavar="X",
-        help="noise of the pads relative to their frequencies, 0 for none "
+        not_negative,
+        "X",
+        "noise of the pads relative to their frequencies, 0 for none "
         "(default: as the calibrations state)",
     )
-    parser.add_argument(
+    parser.add_path(
         "--imperfections",
-        type=Path,
-        metavar="FILE",
-        help="spread of the gains, dead pads and creep (docs/simulation.md; default: none)",
+        "FILE",
+        "spread of the gains, dead pads and creep (docs/simulation.md; default: none)",
     )
-    parser.add_argument(
+    parser.add_number(
         "--duration",
-        type=positive,
-        metavar="S",
-        help="end after S seconds and print the figures (default: until Ctrl-C; "
+        positive,
+        "S",
+        "end after S seconds and print the figures (default: until Ctrl-C; "
         f"{DEFAULT_DURATION_S:g} with --headless, --json or --figure)",
     )
-    parser.add_argument("--headless", action="store_true", help="show no live table")
-    parser.add_argument(
-        "--view", action="store_true", help="show the skin in the browser too, as ./cube view does"
-    )
+    parser.add_switch("--headless", "show no live table")
+    parser.add_switch("--view", "show the skin in the browser too, as ./cube view does")
     parser.add_output(
         "--figure",
         kind="picture",

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
 
 def arguments(parser: Parser) -> None:
-    parser.add_argument("topic", metavar="TOPIC", help="as in stress or cubes/c05/stress")
-    parser.add_argument("--once", action="store_true", help="end after the first message")
-    parser.add_argument("--json", action="store_true", help="print one JSON object per line")
+    parser.add_text("topic", "TOPIC", "as in stress or cubes/c05/stress")
+    parser.add_switch("--once", "end after the first message")
+    parser.add_switch("--json", "print one JSON object per line")
 
 
 def run(options: argparse.Namespace) -> int:

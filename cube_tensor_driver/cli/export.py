@@ -32,33 +32,25 @@ TABLES = {
 def arguments(parser: Parser) -> None:
     lerobot = parser.add_subcommand("lerobot", "one LeRobot data set (v3.0) of all bags")
     _add_common(lerobot)
-    lerobot.add_argument(
-        "--fps", type=count, required=True, metavar="N", help="frames per second of the data set"
-    )
-    lerobot.add_argument(
-        "--task", default="touch", metavar="TEXT", help="what was done (default: %(default)s)"
-    )
-    lerobot.add_argument(
+    lerobot.add_number("--fps", count, "N", "frames per second of the data set", required=True)
+    lerobot.add_text("--task", "TEXT", "what was done (default: %(default)s)", default="touch")
+    lerobot.add_text(
         "--marks",
-        metavar="TOPIC",
-        help="topic of texts (std_msgs/String): each begins an episode with this task, an empty "
+        "TOPIC",
+        "topic of texts (std_msgs/String): each begins an episode with this task, an empty "
         "one only ends it (default: each bag is one episode)",
     )
-    lerobot.add_argument(
+    lerobot.add_text(
         "--topics",
+        "T",
+        "other topics to add: images and numbers with a stamp (default: all)",
         nargs="*",
-        metavar="T",
-        help="other topics to add: images and numbers with a stamp (default: all)",
     )
-    lerobot.add_argument(
-        "--state",
-        metavar="TOPIC",
-        help="topic of observation.state (default: the only topic of joint states)",
+    lerobot.add_text(
+        "--state", "TOPIC", "topic of observation.state (default: the only topic of joint states)"
     )
-    lerobot.add_argument("--action", metavar="TOPIC", help="topic of action (default: none)")
-    lerobot.add_argument(
-        "--frequencies", metavar="TOPIC", help="frequencies to export, of several skins in a bag"
-    )
+    lerobot.add_text("--action", "TOPIC", "topic of action (default: none)")
+    lerobot.add_text("--frequencies", "TOPIC", "frequencies to export, of several skins in a bag")
     for name, text in TABLES.items():
         table = parser.add_subcommand(name, text)
         _add_common(table)

@@ -27,63 +27,48 @@ FIGURES = (
 
 
 def arguments(parser: Parser) -> None:
-    parser.add_argument(
+    parser.add_path(
         "loads",
-        type=Path,
+        "LOADS",
+        "CSV with columns of pads (Hz) and of modes (Pa) or fx fy fz (N); or a bag",
         nargs="?",
-        metavar="LOADS",
-        help="CSV with columns of pads (Hz) and of modes (Pa) or fx fy fz (N); or a bag",
     )
-    parser.add_argument(
-        "--reference",
-        metavar="TOPIC",
-        help="topic of the bag to fit to: WrenchStamped (with --area) or stress",
+    parser.add_text(
+        "--reference", "TOPIC", "topic of the bag to fit to: WrenchStamped (with --area) or stress"
     )
-    parser.add_argument(
-        "--cube", metavar="NAME", help="cube of the bag, if there are several in it"
-    )
-    parser.add_argument("--layout", metavar="NAME", help="quad, planar, cube, or a YAML file")
-    parser.add_argument(
+    parser.add_text("--cube", "NAME", "cube of the bag, if there are several in it")
+    parser.add_text("--layout", "NAME", "quad, planar, cube, or a YAML file")
+    parser.add_path(
         "--weight",
-        type=Path,
-        metavar="BAG",
-        help="instead of a table, fit the response to weight and inertia to a bag in which an "
+        "BAG",
+        "instead of a table, fit the response to weight and inertia to a bag in which an "
         "unloaded arm is turned through a few poses",
     )
-    parser.add_argument(
+    parser.add_path(
         "--creep",
-        type=Path,
-        metavar="BAG",
-        help="instead of a table, fit the creep of the foam to a bag with one press that is held",
+        "BAG",
+        "instead of a table, fit the creep of the foam to a bag with one press that is held",
     )
-    parser.add_argument(
+    parser.add_path(
         "--rest",
-        type=Path,
-        nargs="+",
-        metavar="BAG",
-        help="instead of a table, fit the pads' drift and thermal stress over temperature to bags "
+        "BAG",
+        "instead of a table, fit the pads' drift and thermal stress over temperature to bags "
         "in which the unloaded skin warms or cools; several cubes become -o FILE_CUBE.yaml",
+        nargs="+",
     )
-    parser.add_argument(
-        "--symmetry",
-        default="full",
-        metavar="G",
-        help="full, slab, mirrors or none (default: %(default)s)",
+    parser.add_text(
+        "--symmetry", "G", "full, slab, mirrors or none (default: %(default)s)", default="full"
     )
     parser.add_output(
         "-o", "--output", kind="yaml", required=True, help="calibration file to write"
     )
-    parser.add_argument(
+    parser.add_text(
         "--base",
-        metavar="FILE",
-        help="calibration that gives beta, modulus and half side (default: the shipped one)",
+        "FILE",
+        "calibration that gives beta, modulus and half side (default: the shipped one)",
     )
-    parser.add_argument(
-        "--area", type=positive, metavar="M2", help="area that fx fy fz act on, square metres"
-    )
-    parser.add_argument(
-        "--uid", type=uid, metavar="UID", help="uid of the only cube that the calibration is for"
-    )
+    parser.add_number("--area", positive, "M2", "area that fx fy fz act on, square metres")
+    parser.add_number("--uid", uid, "UID", "uid of the only cube that the calibration is for")
     parser.add_output(
         "--figure",
         kind="picture",

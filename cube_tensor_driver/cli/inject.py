@@ -5,24 +5,20 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from .parser import Parser
 
 
 def arguments(parser: Parser) -> None:
-    parser.add_argument(
+    parser.add_text(
         "fault",
-        nargs="+",
-        metavar="KEY=VALUE",
-        help="kind=... and what it needs, as in kind=unplug link=hub0 seconds=2; "
+        "KEY=VALUE",
+        "kind=... and what it needs, as in kind=unplug link=hub0 seconds=2; "
         "docs/reliability.md lists them",
+        nargs="+",
     )
-    parser.add_argument(
-        "--ports",
-        type=Path,
-        metavar="DIR",
-        help="folder of the simulated ports (default: that of the newest demo)",
+    parser.add_path(
+        "--ports", "DIR", "folder of the simulated ports (default: that of the newest demo)"
     )
 
 

@@ -15,17 +15,11 @@ if TYPE_CHECKING:
 
 
 def arguments(parser: Parser) -> None:
-    parser.add_argument(
-        "name", metavar="NAME", help="quad, planar, cube, or a YAML file with a layout"
+    parser.add_text("name", "NAME", "quad, planar, cube, or a YAML file with a layout")
+    parser.add_text(
+        "--symmetry", "G", "full, slab, mirrors or none (default: that of the calibration)"
     )
-    parser.add_argument(
-        "--symmetry",
-        metavar="G",
-        help="full, slab, mirrors or none (default: that of the calibration)",
-    )
-    parser.add_argument(
-        "--calibration", metavar="FILE", help="calibration file or name (default: the computed one)"
-    )
+    parser.add_text("--calibration", "FILE", "calibration file or name (default: the computed one)")
     parser.add_json()
     parser.add_output(
         "--figure",

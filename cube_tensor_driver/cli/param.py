@@ -10,9 +10,9 @@ from .parser import Parser
 
 
 def arguments(parser: Parser) -> None:
-    parser.add_argument("node", nargs="?", metavar="NODE", help="as in reconstruction")
-    parser.add_argument("name", nargs="?", metavar="NAME", help="the parameter (default: all)")
-    parser.add_argument("value", nargs="?", metavar="VALUE", help="set it to this, as in YAML")
+    parser.add_text("node", "NODE", "as in reconstruction", nargs="?")
+    parser.add_text("name", "NAME", "the parameter (default: all)", nargs="?")
+    parser.add_text("value", "VALUE", "set it to this, as in YAML", nargs="?")
 
 
 def run(options: argparse.Namespace) -> int:

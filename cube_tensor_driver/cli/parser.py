@@ -68,34 +68,64 @@ class Parser(argparse.ArgumentParser):
         self._outputs.append(Output(flags[0], action.dest, kind))
         self.set_defaults(outputs=self._outputs)
 
+    def add_path(self, name: str, metavar: str, text: str, **settings: Any) -> None:
+        """Add an argument or option that names a file or folder to read.
+
+        Args:
+            name: Name of the argument or option.
+            metavar: Name of its value in the help text.
+            text: Help text.
+            settings: Further arguments of `add_argument`.
+        """
+        self.add_argument(name, type=Path, metavar=metavar, help=text, **settings)
+
+    def add_text(self, name: str, metavar: str, text: str, **settings: Any) -> None:
+        """Add an argument or option whose value is a text; `add_path` describes the arguments."""
+        self.add_argument(name, metavar=metavar, help=text, **settings)
+
+    def add_number(
+        self,
+        name: str,
+        kind: Callable[[str], float],
+        metavar: str,
+        text: str,
+        **settings: Any,
+    ) -> None:
+        """Add an argument or option whose value is a number.
+
+        Args:
+            name: Name of the argument or option.
+            kind: Function that converts a text and checks the range, such as `positive`.
+            metavar: Name of its value in the help text.
+            text: Help text.
+            settings: Further arguments of `add_argument`.
+        """
+        self.add_argument(name, type=kind, metavar=metavar, help=text, **settings)
+
+    def add_switch(self, flag: str, text: str) -> None:
+        """Add an option without a value, which is true if it is given; `text` is its help text."""
+        self.add_argument(flag, action="store_true", help=text)
+
     def add_json(self) -> None:
         """Add the option --json FILE, which writes the printed results to a file as JSON."""
         self.add_output("--json", help="write the figures to FILE as well")
 
     def add_bag(self) -> None:
         """Add the argument BAG, a bag (recording) to read."""
-        self.add_argument("bag", type=Path, metavar="BAG", help="folder or file of the bag")
+        self.add_path("bag", "BAG", "folder or file of the bag")
 
     def add_bags(self) -> None:
         """Add the argument BAG ..., several bags to read."""
-        self.add_argument(
-            "bags", type=Path, nargs="+", metavar="BAG", help="folders or files of bags"
-        )
+        self.add_path("bags", "BAG", "folders or files of bags", nargs="+")
 
     def add_jobs(self) -> None:
         """Add the option --jobs N, the number of processes that work at the same time."""
-        self.add_argument(
-            "--jobs", type=count, metavar="N", help="number of processes (default: one per core)"
-        )
+        self.add_number("--jobs", count, "N", "number of processes (default: one per core)")
 
     def add_rate(self) -> None:
         """Add the option --rate HZ, the sample rate in a skin file."""
-        self.add_argument(
-            "--rate",
-            type=sample_rate,
-            default=100.0,
-            metavar="HZ",
-            help="samples per second (default: %(default)g)",
+        self.add_number(
+            "--rate", sample_rate, "HZ", "samples per second (default: %(default)g)", default=100.0
         )
 
     def add_subcommand(self, name: str, text: str) -> Parser:

@@ -12,22 +12,22 @@ from .parser import Parser, number
 
 def arguments(parser: Parser) -> None:
     parser.add_bag()
-    parser.add_argument("--cube", metavar="NAME", help="which cube (default: the first)")
-    parser.add_argument(
+    parser.add_text("--cube", "NAME", "which cube (default: the first)")
+    parser.add_number(
         "--from",
+        number,
+        "S",
+        "begin S seconds after the start of the bag",
         dest="start",
-        type=number,
         default=0.0,
-        metavar="S",
-        help="begin S seconds after the start of the bag",
     )
-    parser.add_argument(
+    parser.add_number(
         "--to",
+        number,
+        "S",
+        "end S seconds after the start of the bag",
         dest="end",
-        type=number,
         default=math.inf,
-        metavar="S",
-        help="end S seconds after the start of the bag",
     )
     parser.add_output("-o", "--output", kind="picture", required=True, help="picture to write")
 

@@ -25,18 +25,15 @@ def arguments(parser: Parser) -> None:
         metavar="DIR",
         help="folder of the bag, which must not exist yet",
     )
-    parser.add_argument(
+    parser.add_text(
         "--topics",
+        "T",
+        f"topics to record (default: {' '.join(RECORDED)})",
         nargs="+",
         default=RECORDED,
-        metavar="T",
-        help=f"topics to record (default: {' '.join(RECORDED)})",
     )
-    parser.add_argument(
-        "--duration",
-        type=positive,
-        metavar="S",
-        help="end S seconds after the first message (default: Ctrl-C)",
+    parser.add_number(
+        "--duration", positive, "S", "end S seconds after the first message (default: Ctrl-C)"
     )
     parser.add_argument(
         "--storage",
@@ -44,12 +41,8 @@ def arguments(parser: Parser) -> None:
         default="mcap",
         help="format of the files (default: %(default)s)",
     )
-    parser.add_argument(
-        "--split-size", type=positive, metavar="MB", help="begin a new file after MB megabytes"
-    )
-    parser.add_argument(
-        "--split-time", type=positive, metavar="S", help="begin a new file after S seconds"
-    )
+    parser.add_number("--split-size", positive, "MB", "begin a new file after MB megabytes")
+    parser.add_number("--split-time", positive, "S", "begin a new file after S seconds")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -31,30 +31,20 @@ KEYS = "space: pause, s: step, q: quit"
 
 def arguments(parser: Parser) -> None:
     parser.add_bag()
-    parser.add_argument(
-        "--rate",
-        type=positive,
-        default=1.0,
-        metavar="R",
-        help="times the recorded speed (default: %(default)g)",
+    parser.add_number(
+        "--rate", positive, "R", "times the recorded speed (default: %(default)g)", default=1.0
     )
-    parser.add_argument("--loop", action="store_true", help="begin again at the end")
-    parser.add_argument(
+    parser.add_switch("--loop", "begin again at the end")
+    parser.add_number(
         "--start",
-        type=not_negative,
+        not_negative,
+        "S",
+        "begin S seconds after the start of the bag (default: %(default)g)",
         default=0.0,
-        metavar="S",
-        help="begin S seconds after the start of the bag (default: %(default)g)",
     )
-    parser.add_argument(
-        "--clock", action="store_true", help="publish /clock for nodes with use_sim_time"
-    )
-    parser.add_argument("--stress", action="store_true", help="publish the recorded stress too")
-    parser.add_argument(
-        "--view",
-        action="store_true",
-        help="show the recorded stress in the browser, with a time slider",
-    )
+    parser.add_switch("--clock", "publish /clock for nodes with use_sim_time")
+    parser.add_switch("--stress", "publish the recorded stress too")
+    parser.add_switch("--view", "show the recorded stress in the browser, with a time slider")
 
 
 def run(options: argparse.Namespace) -> int:

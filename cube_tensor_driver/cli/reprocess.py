@@ -55,14 +55,9 @@ def add_overrides(parser: Parser) -> None:
     Args:
         parser: The parser of a command that reprocesses bags.
     """
-    parser.add_argument(
-        "--calibration", metavar="FILE", help="calibration of all cubes (default: as recorded)"
-    )
-    parser.add_argument(
-        "--skin",
-        type=Path,
-        metavar="FILE",
-        help="skin file with the calibrations to use, for cubes of the same names",
+    parser.add_text("--calibration", "FILE", "calibration of all cubes (default: as recorded)")
+    parser.add_path(
+        "--skin", "FILE", "skin file with the calibrations to use, for cubes of the same names"
     )
     parser.add_argument(
         "--tare-from",

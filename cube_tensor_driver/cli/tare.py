@@ -11,13 +11,9 @@ from .parser import Parser
 
 
 def arguments(parser: Parser) -> None:
-    parser.add_argument(
-        "cubes", nargs="*", metavar="CUBE", help="names of cubes to tare (default: all)"
-    )
-    parser.add_argument(
-        "--clear",
-        action="store_true",
-        help="go back to the rest frequencies of the calibration, for all cubes",
+    parser.add_text("cubes", "CUBE", "names of cubes to tare (default: all)", nargs="*")
+    parser.add_switch(
+        "--clear", "go back to the rest frequencies of the calibration, for all cubes"
     )
 
 

@@ -5,18 +5,17 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from .parser import Parser
 
 
 def arguments(parser: Parser) -> None:
-    parser.add_argument("file", type=Path, metavar="FILE", help="skin file")
-    parser.add_argument(
+    parser.add_path("file", "FILE", "skin file")
+    parser.add_text(
         "--frame-prefix",
+        "TEXT",
+        "text in front of all frame ids, as in the launch file's frame_prefix:=left_",
         default="",
-        metavar="TEXT",
-        help="text in front of all frame ids, as in the launch file's frame_prefix:=left_",
     )
 
 

@@ -15,33 +15,32 @@ RECORDINGS = Path("~/cube_recordings")
 
 
 def arguments(parser: Parser) -> None:
-    parser.add_argument(
+    parser.add_text(
         "--host",
-        default="127.0.0.1",
-        metavar="ADDRESS",
-        help="where the page is served; on any other than this machine's own (0.0.0.0: on all) "
+        "ADDRESS",
+        "where the page is served; on any other than this machine's own (0.0.0.0: on all) "
         "browsers need the token in the printed address (default: %(default)s)",
+        default="127.0.0.1",
     )
-    parser.add_argument(
+    parser.add_number(
         "--port",
-        type=tcp_port,
+        tcp_port,
+        "N",
+        "TCP port of the page; the next free one if it is taken (default: %(default)s)",
         default=8080,
-        metavar="N",
-        help="TCP port of the page; the next free one if it is taken (default: %(default)s)",
     )
-    parser.add_argument(
+    parser.add_number(
         "--depth",
-        type=positive,
+        positive,
+        "M",
+        "depth of the cubes below the surface, m (default: %(default)s)",
         default=SURFACE_DEPTH,
-        metavar="M",
-        help="depth of the cubes below the surface, m (default: %(default)s)",
     )
-    parser.add_argument(
+    parser.add_path(
         "--recordings",
-        type=Path,
+        "DIR",
+        "folder for the bags that are recorded from the page (default: %(default)s)",
         default=RECORDINGS,
-        metavar="DIR",
-        help="folder for the bags that are recorded from the page (default: %(default)s)",
     )
 
 
