@@ -5,23 +5,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from .arguments import check_number, check_skin
 from .arrays import Array
+from .poses import CubePoses
 from .rows import StressRows
-from .tensor import TRACTION_COMPONENTS, face_force, rotation_from_rpy
+from .tensor import TRACTION_COMPONENTS, face_force
 
 
 class PlacedSkin(Protocol):
-    """A skin whose cubes have a position `xyz`, angles `rpy` (roll, pitch, yaw) and a
-    `calibration`."""
+    """A skin that knows the positions, rotations and half sides of its cubes."""
 
     @property
-    def cubes(self) -> Sequence[Any]: ...
+    def poses(self) -> CubePoses: ...
 
 
 class Forces:
@@ -53,17 +52,14 @@ class Forces:
         Raises:
             ConfigError: The argument `skin` is no skin, or the side is not above 0.
         """
-        check_skin(skin, "cubes")
+        check_skin(skin, "poses")
         if side is not None:
             allowed = "a number above 0, in m, or None"
             check_number("side", side, lambda x: 0 < x < math.inf, allowed)
-        cubes = skin.cubes
-        positions = [cube.xyz for cube in cubes]
-        sides = [side or 2 * cube.calibration.half_side for cube in cubes]
-        rotations = [rotation_from_rpy(*cube.rpy) for cube in cubes]
-        self.position = np.array(positions, float)
-        self.side = np.array(sides)
-        self._rotation = np.array(rotations)
+        self.position, self._rotation, half_side = skin.poses
+        self.side = 2 * half_side
+        if side is not None:
+            self.side[:] = side
 
     def __call__(self, rows: StressRows) -> Array:
         """Compute the force on the skin at the cube of each row.

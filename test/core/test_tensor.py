@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from cube_tensor_driver.core.errors import CubeError
 from cube_tensor_driver.core.forces import Forces
 from cube_tensor_driver.core.modes import SPACE, to_matrix, to_voigt
+from cube_tensor_driver.core.poses import CubePoses
 from cube_tensor_driver.core.rows import StressRows
 from cube_tensor_driver.core.symmetry import find_group
 from cube_tensor_driver.core.tensor import (
@@ -159,12 +160,8 @@ def test_forces_are_the_traction_of_the_parents_stress_on_each_turned_face():
     """One stress in the parent frame, seen by cubes that are turned in all ways."""
     angles = RNG.uniform(-3, 3, (20, 3))
     side = RNG.uniform(0.002, 0.006, 20)
-    cubes = [
-        SimpleNamespace(xyz=(k, 0, 0), rpy=tuple(rpy), calibration=SimpleNamespace(half_side=w / 2))
-        for k, (rpy, w) in enumerate(zip(angles, side, strict=True))
-    ]
-    skin = SimpleNamespace(cubes=cubes)
     turned = np.array([rotation_from_rpy(*rpy) for rpy in angles])
+    skin = SimpleNamespace(poses=CubePoses(RNG.normal(size=(20, 3)), turned, side / 2))
     parent = STRESS[0]
     seen = np.array([rotate_stress(parent, rotation.T) for rotation in turned])
     expected = side[:, None] ** 2 * traction(parent, turned[:, :, 2])
@@ -180,6 +177,6 @@ def test_forces_are_the_traction_of_the_parents_stress_on_each_turned_face():
     force = Forces(skin).of_skin(rows)
     assert np.flatnonzero(np.isnan(force).any(axis=1)).tolist() == [4, 19]
     np.testing.assert_allclose(force[0], expected[0], atol=1e-15)
-    flat = SimpleNamespace(cubes=[SimpleNamespace(**vars(cubes[0]) | {"rpy": (0, 0, 0)})])
+    flat = SimpleNamespace(poses=CubePoses(np.zeros((1, 3)), np.eye(3)[None], side[:1] / 2))
     planar = StressRows.of([0], [[1, np.nan, -3, np.nan, 2, np.nan]], np.zeros((1, 9)))
     np.testing.assert_allclose(Forces(flat)(planar), [np.array([2, 0, -3]) * side[0] ** 2])
