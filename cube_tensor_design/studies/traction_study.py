@@ -27,7 +27,7 @@ from cube_tensor_driver.core.defaults import (
     FREQUENCY_NOISE,
     POISSONS_RATIO,
 )
-from cube_tensor_driver.core.modes import to_matrix
+from cube_tensor_driver.core.modes import to_gradient_tensor
 from cube_tensor_driver.core.oscillator import pad_frequency
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.poses import CubePoses
@@ -265,9 +265,8 @@ class TractionBench:
         # Tensors of the skin's frame become those of each cube's frame.
         to_cube = self.poses.rotation.swapaxes(1, 2)
         stress = rotate_stress(field[:, :6], to_cube)
-        slopes = field[:, 6:].reshape(-1, 6, 3)
-        by_axis = to_matrix(slopes.swapaxes(1, 2))
-        gradient = rotate_gradient(np.moveaxis(by_axis, 1, -1), to_cube)
+        gradient = to_gradient_tensor(field[:, 6:].reshape(-1, 6, 3))
+        gradient = rotate_gradient(gradient, to_cube)
         state = calibration.modes.state(stress, calibration.half_side * gradient)
         return state @ calibration.response.T
 

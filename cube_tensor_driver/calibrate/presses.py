@@ -28,7 +28,7 @@ import numpy as np
 from ..core.arrays import Array, Index, Mask
 from ..core.calibration import Calibration
 from ..core.defaults import POISSONS_RATIO, SURFACE_DEPTH
-from ..core.modes import to_matrix
+from ..core.modes import to_gradient_tensor
 from ..core.symmetry import find_group
 from ..core.tensor import rotate_gradient, rotate_stress
 from ..mechanics.contact import disc, field
@@ -209,17 +209,12 @@ def expected_presses(
     centres = depth * places
     loaded = finger + centres[:, :, None, :]
     stress, slope = field(cube_position, loaded, force, POISSONS_RATIO)
-    # The slope (derivative of the stress along axis k) has the axes (..., k, component). A gradient
-    # is a matrix for each k and has the axes (..., i, j, k).
-    by_component = np.moveaxis(slope, -1, -2)
-    by_matrix = to_matrix(by_component)
-    gradient = np.moveaxis(by_matrix, -3, -1)
 
     # The inverse of each rotation takes the field of the skin into the frame of the cube.
     inverse = np.swapaxes(rotations, -1, -2)
     to_cube = inverse[:, None, None, None]
     rotated_stress = rotate_stress(stress, to_cube)
-    rotated_gradient = rotate_gradient(gradient, to_cube)
+    rotated_gradient = rotate_gradient(to_gradient_tensor(slope), to_cube)
     scaled_gradient = rotated_gradient * calibration.half_side
     state = calibration.modes.state(
         rotated_stress.reshape(-1, 6),

@@ -71,6 +71,16 @@ def to_voigt(matrix: NDArray[Float]) -> NDArray[Float]:
     return m[..., _ROWS, _COLUMNS]
 
 
+def to_gradient_tensor(gradient: NDArray[Float]) -> NDArray[Float]:
+    """Return gradients of stress tensors as G_ijk = d(sigma_ij)/dx_k (..., 3, 3, 3).
+
+    Args:
+        gradient: Derivatives (..., 6, 3) of xx, yy, zz, yz, zx, xy along x, y and z.
+    """
+    g = np.asarray(gradient)
+    return g[..., _COMPONENT_NUMBERS, :]
+
+
 @dataclass(frozen=True, eq=False)
 class Modes:
     """A set of M modes: linear stress fields sigma_ij(x) = S_ij + G_ijk x_k / d0.

@@ -19,7 +19,7 @@ from ..config.skin import Skin, SkinLink
 from ..core.arrays import Array, Index
 from ..core.calibration import Calibration
 from ..core.errors import ConfigError
-from ..core.modes import COMPONENTS, STRESS, to_matrix
+from ..core.modes import COMPONENTS, STRESS, to_gradient_tensor
 from ..core.oscillator import pad_frequency
 from ..core.poses import CubePoses
 from ..device.wire.protocol import NOT_MEASURED
@@ -296,14 +296,12 @@ def calibration_groups(
     Returns:
         Each different calibration, with the indices of the cubes that have it.
     """
-    cubes_by_id: dict[str, list[int]] = {}
-    for number, calibration in enumerate(calibrations):
-        cubes_by_id.setdefault(calibration.id, []).append(number)
-    groups = []
-    for cubes in cubes_by_id.values():
-        calibration = calibrations[cubes[0]]
-        groups.append((calibration, np.array(cubes)))
-    return groups
+    ids = [calibration.id for calibration in calibrations]
+    _, first, group = np.unique(ids, return_index=True, return_inverse=True)
+    return [
+        (calibrations[cube], np.flatnonzero(group == number))
+        for number, cube in enumerate(first.tolist())
+    ]
 
 
 def true_state(
@@ -324,9 +322,8 @@ def true_state(
     Returns:
         Amplitudes (N, modes) in Pa.
     """
-    by_axis = to_matrix(np.moveaxis(gradient, -1, -2))  # (N, axis, i, j)
     # The modes take gradients in Pa, as the change of the stress over half the side of a cube.
-    change = np.moveaxis(by_axis, -3, -1) * calibration.half_side
+    change = to_gradient_tensor(gradient) * calibration.half_side
     return calibration.modes.state(stress, change)
 
 
