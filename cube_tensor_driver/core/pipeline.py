@@ -150,12 +150,11 @@ class Pipeline:
         if not calibrations:
             raise CalibrationError("pipeline: no calibrations; give one per cube")
         # Cubes with equal calibrations form a group, which shares its matrices.
-        by_id = {c.id: c for c in reversed(calibrations)}
-        self.calibrations = tuple(by_id[c.id] for c in calibrations)
-        self.n_pads = max(c.layout.n_pads for c in self.calibrations)
-        numbers = {key: number for number, key in enumerate(by_id)}
-        self._groups = tuple(by_id.values())
-        group = np.array([numbers[c.id] for c in self.calibrations], np.int32)
+        ids = [calibration.id for calibration in calibrations]
+        _, first, group = np.unique(ids, return_index=True, return_inverse=True)
+        self._groups = tuple(calibrations[cube] for cube in first.tolist())
+        self.calibrations = tuple(self._groups[number] for number in group.tolist())
+        self.n_pads = max(calibration.layout.n_pads for calibration in self._groups)
         # For pads that a cube does not have, these values give a stiffness of 0 without a division
         # by 0.
         beta = tabulate_pads(self._groups, "beta", self.n_pads, fill=1)
@@ -166,7 +165,7 @@ class Pipeline:
         # Calibrations with no more pads than modes have no residual. Even if this holds for all,
         # the matrices have one column for the residual, which is NaN.
         self._n_residuals = max(estimator.dof for estimator in whole) or 1
-        self._tables = self._allocate_tables(group)
+        self._tables = self._allocate_tables(group.astype(np.int32))
         for number, estimator in enumerate(whole):
             self._store_table(number, number, estimator)
         self._n_extra = 0

@@ -96,7 +96,6 @@ def generate_group(generators: Sequence[Matrix]) -> Index:
     return np.array(list(found.values()))
 
 
-@lru_cache
 def find_group(name: str) -> Index:
     """Return the elements (G, 3, 3) of a symmetry group: its rotations and mirrors.
 
@@ -107,9 +106,7 @@ def find_group(name: str) -> Index:
     """
     if name not in GENERATORS:
         raise SymmetryError(f"unknown symmetry {name!r}; known are {', '.join(GENERATORS)}")
-    elements = generate_group(GENERATORS[name])
-    elements.flags.writeable = False
-    return elements
+    return generate_group(GENERATORS[name])
 
 
 def find_layout_group(layout: Layout, name: str) -> Index:

@@ -83,8 +83,7 @@ class DriftTracker:
         self._tared_rest = self._rest_in_use
         self._followed_windows = np.zeros(n_cubes, int)
         self._loaded_windows = np.zeros(n_cubes, int)
-        layouts = [calibration.layout.name for calibration in pipeline.calibrations]
-        names = np.array(layouts)
+        names = np.array([calibration.layout.name for calibration in pipeline.calibrations])
         self._layouts = [np.flatnonzero(names == name) for name in np.unique(names)]
         self.deviation = np.zeros(n_cubes)
 

@@ -128,9 +128,10 @@ class Health:
         modulus = tabulate_pads(calibrations, "modulus", n_pads, fill=1.0)
         noise = tabulate_pads(calibrations, "noise", n_pads, fill=1.0)
         rest = self.pipeline.rest_frequency
-        low = pad_frequency(MIN_STRAIN * modulus, rest, beta, modulus)
-        high = pad_frequency(MAX_STRAIN * modulus, rest, beta, modulus)
-        disconnected = pad_frequency(OPEN_STRAIN * modulus, rest, beta, modulus)
+        low, high, disconnected = (
+            pad_frequency(strain * modulus, rest, beta, modulus)
+            for strain in (MIN_STRAIN, MAX_STRAIN, OPEN_STRAIN)
+        )
         self.sums.pads("low")[:] = low
         self.sums.pads("high")[:] = high
         self._open = disconnected.astype(np.float32)

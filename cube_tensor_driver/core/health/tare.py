@@ -122,7 +122,7 @@ def measure_rest(
         raise TareError(f"cube {names[cube]}: no pad works; see the diagnostics")
 
     with np.errstate(invalid="ignore"):  # NaN where a cube has no such pad
-        means = _average(windows, chosen)
+        means = _average(windows)
         factor = pipeline.unloaded_factor(chosen, health.temperature[chosen])
         rest = means.frequency / factor
         _check_pads(health, chosen, used, rest, means, names)
@@ -135,8 +135,8 @@ def _select_windows(
     chosen: Index,
     duration: float,
     names: Sequence[str],
-) -> list[Window]:
-    """Return the windows to average.
+) -> Window:
+    """Return the statistics of the windows to average.
 
     Args:
         health: Health of the pads, with the statistics of the last windows.
@@ -145,7 +145,8 @@ def _select_windows(
         names: Names of all cubes, for messages.
 
     Returns:
-        The last windows that cover the duration, and the present one, which has not ended.
+        Statistics (windows, cubes, ...) of the last windows that cover the duration, and of the
+        present one, which has not ended, for the cubes to tare.
 
     Raises:
         TareError: The duration is outside its limits, or the data are too short, too few, or have
@@ -167,23 +168,21 @@ def _select_windows(
     if present.rows.any():
         windows.append(present)
 
-    rows = np.array([window.rows[chosen] for window in windows])
-    total = rows.sum(axis=0)
-    has_empty_window = (rows[:count] == 0).any(axis=0)
-    has_too_few = has_empty_window | (total < MIN_ROWS)
+    averaged = Window(*(np.array(values)[:, chosen] for values in zip(*windows, strict=True)))
+    has_empty_window = (averaged.rows[:count] == 0).any(axis=0)
+    has_too_few = has_empty_window | (averaged.rows.sum(axis=0) < MIN_ROWS)
     for cube in chosen[has_too_few].tolist():
         raise TareError(
             f"cube {names[cube]}: no data, or gaps in it, in the last {duration:g} s; see its link"
         )
-    _refuse_gaps(health, chosen, windows, total, names)
-    return windows
+    _refuse_gaps(health, chosen, averaged, names)
+    return averaged
 
 
 def _refuse_gaps(
     health: Health,
     chosen: Index,
-    windows: Sequence[Window],
-    rows: Index,
+    windows: Window,
     names: Sequence[str],
 ) -> None:
     """Raise TareError if the time between two rows of a cube is too long for a tare.
@@ -191,18 +190,16 @@ def _refuse_gaps(
     Args:
         health: Health of the pads, which states the age of the newest row of each cube.
         chosen: Numbers of the cubes to tare.
-        windows: Windows to average.
-        rows: Number of rows of each of these cubes in the windows.
+        windows: Statistics (windows, cubes, ...) to average.
         names: Names of all cubes, for messages.
     """
     # A gap before the first window does not matter, because no earlier row is averaged.
-    before = [window.gap_before[chosen] for window in windows[1:]]
-    within = [window.gap_within[chosen] for window in windows]
+    before = windows.gap_before[1:]
     # The time from the newest row of a cube to the newest row of any cube is a gap, too.
     age_ns = health.newest_ns - health.sums.cubes["time_ns"][chosen]
-    gaps_ns = [*before, *within, age_ns]
+    gaps_ns = [*before, *windows.gap_within, age_ns]
     gaps_s = 1e-9 * np.abs(gaps_ns)
-    mean_interval_s = len(windows) * WINDOW_S / rows
+    mean_interval_s = len(windows.rows) * WINDOW_S / windows.rows.sum(axis=0)
     limit_s = np.maximum(MAX_GAP_S, MAX_GAP_ROWS * mean_interval_s)
     longest_s = gaps_s.max(axis=0)
     for number in np.flatnonzero(longest_s > limit_s).tolist():
@@ -212,24 +209,13 @@ def _refuse_gaps(
         )
 
 
-def _average(windows: Sequence[Window], chosen: Index) -> _Means:
-    """Combine the statistics of several windows, each weighted with its number of rows.
-
-    Args:
-        windows: Statistics of the windows to average.
-        chosen: Numbers of the cubes to tare.
-    """
-    rows = np.array([window.rows[chosen] for window in windows])
-    rows = rows[:, :, None]
-    mean = np.array([window.mean[chosen] for window in windows])
-    noise = np.array([window.noise[chosen] for window in windows])
-    variance = noise**2
-    highest = [window.highest[chosen] for window in windows]
-    lowest = [window.lowest[chosen] for window in windows]
-
+def _average(windows: Window) -> _Means:
+    """Combine the statistics of windows (windows, cubes, ...), weighted with numbers of rows."""
+    rows = windows.rows[:, :, None]
+    variance = windows.noise**2
     # The mean frequency of a window without rows is NaN. It is replaced, because NaN times the
     # weight 0 of this window would still be NaN.
-    known_mean = np.where(rows > 0, mean, 0)
+    known_mean = np.where(rows > 0, windows.mean, 0)
     total = (known_mean * rows).sum(axis=0)
     # The noise of a window is NaN if it holds the first rows of a cube ever, because these have no
     # differences to rows before.
@@ -239,7 +225,7 @@ def _average(windows: Sequence[Window], chosen: Index) -> _Means:
     n_with_noise = np.maximum(rows_with_noise.sum(axis=0), 1)
     return _Means(
         frequency=total / rows.sum(axis=0),
-        span=np.fmax.reduce(highest) - np.fmin.reduce(lowest),
+        span=np.fmax.reduce(windows.highest) - np.fmin.reduce(windows.lowest),
         noise=np.sqrt(total_variance / n_with_noise),
     )
 
