@@ -13,12 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..config.skin import Skin
-from ..core.arrays import AnyArray, Array, Index
+from ..core.arrays import AnyArray, Array, Index, Mask
 from ..core.defaults import CONTACT_PRESSURE
 from ..core.errors import MessageError
 from ..core.modes import COMPONENTS
 from ..core.pipeline import Pipeline
-from ..core.rows import FrequencyRows, StressRows
+from ..core.rows import StressRows
 from ..simulation.cubes import skin_components
 from ..simulation.load import AnyLoad, total
 from ..simulation.sample_log import SampleLog
@@ -99,6 +99,10 @@ class LoadVerification:
     was simulated: the samples that the hubs took in a period, and the load on the skin.
 
     Call `set_sent_samples` when the simulator has ended, then `result` or `forces`.
+
+    Attributes:
+        load: The load on the skin.
+        frequencies: The rows of the topic `frequencies` that arrived.
     """
 
     def __init__(self, skin: Skin, load: AnyLoad) -> None:
@@ -109,18 +113,15 @@ class LoadVerification:
             load: The load on the skin over time, from which stress, force and contacts at any
                 simulated time can be computed, as the simulator does.
         """
-        self._skin, self._load = skin, load
+        self._skin = skin
+        self.load = load
         self._n_cubes = len(skin.cubes)
-        self._frequencies = Arrivals(skin)
+        self.frequencies = Arrivals(skin)
         self._stress = Arrivals(skin)
         self._components: list[AnyArray] = []
         self._newest_ns = np.zeros(self._n_cubes, np.int64)
         self._log = SampleLog(0, ())
         self._span_ns = (0, 0)
-
-    def add_frequencies(self, rows: FrequencyRows) -> None:
-        """Add the rows of one message of `frequencies`. A row is one cube at one sampling time."""
-        self._frequencies.add(rows)
 
     def add_stress(self, rows: StressRows, received_ns: int) -> None:
         """Add the rows of one message of the topic `stress`.
@@ -136,11 +137,6 @@ class LoadVerification:
         # be used here, too.
         components = np.hstack([rows.stress, rows.gradient])
         self._components.append(components)
-
-    @property
-    def sampled(self) -> bool:
-        """Whether at least one row of frequencies has arrived."""
-        return self._frequencies.rows > 0
 
     def is_beyond(self, end_ns: int) -> bool:
         """Return whether a tensor with a stamp after `end_ns` has arrived from each cube.
@@ -177,7 +173,7 @@ class LoadVerification:
         relative to the range that each component has under the load, and relative to the standard
         deviation that the noise of the pads causes.
         """
-        frequencies = self._comparison(self._frequencies)
+        frequencies = self._comparison(self.frequencies)
         stress = self._comparison(self._stress)
         return {
             "samples_sent": stress.sent,
@@ -196,12 +192,9 @@ class LoadVerification:
         Raises:
             MessageError: There is no time at which a tensor of every cube has arrived.
         """
-        comparison = self._comparison(self._stress)
-        cube, components, taken_ns = self._received(comparison)
-        times_ns, counts = np.unique(taken_ns, return_counts=True)
+        times_ns, values, is_complete = self._received(self._comparison(self._stress))
         # The force on the whole skin can be computed at times with a tensor of every cube.
-        is_complete = counts == self._n_cubes
-        times_ns = thin_out(times_ns[is_complete])
+        times_ns = times_ns[is_complete]
         if not len(times_ns):
             raise MessageError(
                 "no tensors of all cubes at one time have arrived: there are no forces to draw"
@@ -209,19 +202,13 @@ class LoadVerification:
 
         # The load is a function of simulated time, which is 0 at the start of the simulator.
         seconds = self._seconds(times_ns)
-        applied = map(self._load.total, seconds.tolist())
+        applied = map(self.load.total, seconds.tolist())
         force, centre, normal = map(np.array, zip(*applied, strict=True))
         # The contacts are found by interpolating the pressure between the cubes, as the node
         # `contacts` does with the method `interpolation`.
-        surface = Surface(self._load.poses, self._load.depth)
-        measured = []
-        for time_ns in times_ns:
-            rows = np.flatnonzero(taken_ns == time_ns)
-            # At these times there is a row of every cube, so all values are set.
-            values = np.empty((self._n_cubes, len(COMPONENTS)))
-            values[cube[rows]] = components[rows]
-            contacts = surface.contacts(values, CONTACT_PRESSURE)
-            measured.append(total(contacts))
+        surface = Surface(self.load.poses, self.load.depth)
+        contacts = [surface.contacts(one, CONTACT_PRESSURE) for one in values[is_complete]]
+        measured = map(total, contacts)
         measured_force, measured_centre, _ = map(np.array, zip(*measured, strict=True))
         return ForceHistory(
             seconds=seconds,
@@ -235,22 +222,27 @@ class LoadVerification:
     def _comparison(self, arrivals: Arrivals) -> Comparison:
         return compare(self._log.table, arrivals, *self._span_ns)
 
-    def _received(self, comparison: Comparison) -> tuple[Index, AnyArray, Index]:
-        """Return the K compared rows of stress that arrived.
+    def _received(self, comparison: Comparison) -> tuple[Index, Array, Mask]:
+        """Return the tensors that arrived, at every n-th sampling time of a long measurement.
 
         Args:
             comparison: The samples that the hubs took, and which rows of stress of them arrived.
 
         Returns:
-            Index of the cube (K,); components (K, 15) in Pa and Pa/m; sampling time (K,), in ns
-            since the Unix epoch.
+            T sampling times, in ns since the Unix epoch; components (T, cubes, 15) in Pa and Pa/m,
+            NaN where no tensor arrived; whether a tensor of every cube arrived (T,).
         """
-        first = comparison.first
-        cube = self._stress.columns()[0]
-        # `np.concatenate` needs at least one array, also if no message has arrived.
-        no_components = np.empty((0, len(COMPONENTS)))
-        components = np.concatenate([no_components, *self._components])
-        return cube[first], components[first], comparison.taken_ns
+        sampled_ns = np.unique(comparison.taken_ns)
+        times_ns = sampled_ns[:: max(1, len(sampled_ns) // MIN_TIMES_COMPARED)]
+        is_chosen = np.isin(comparison.taken_ns, times_ns)
+        time = np.searchsorted(times_ns, comparison.taken_ns[is_chosen])
+        rows = comparison.first[is_chosen]
+        cube = self._stress.columns()[0][rows]
+        values = np.full((len(times_ns), self._n_cubes, len(COMPONENTS)), np.nan)
+        if len(rows):
+            values[time, cube] = np.concatenate(self._components)[rows]
+        n_arrived = np.bincount(time, minlength=len(times_ns))
+        return times_ns, values, n_arrived == self._n_cubes
 
     def _seconds(self, times_ns: Index) -> Array:
         """Return the simulated times, in s after the start of the simulator, of times (T,) in ns
@@ -268,31 +260,23 @@ class LoadVerification:
             error relative to the standard deviation that the noise of the pads causes. All are NaN
             if no tensor arrived.
         """
-        cube, components, taken_ns = self._received(comparison)
-        if not len(cube):
+        times_ns, values, _ = self._received(comparison)
+        if not len(times_ns):
             return dict.fromkeys(("error_rel_rms", "error_rel_worst", "error_over_noise"), np.nan)
-        errors, allowed = [], []
-        noise = component_noise(self._skin)
-        times_ns = thin_out(np.unique(taken_ns))
-        for time_ns, seconds in zip(times_ns, self._seconds(times_ns), strict=True):
-            rows = np.flatnonzero(taken_ns == time_ns)
-            truth = self._truth(seconds)
-            errors.append(components[rows] - truth[cube[rows]])
-            allowed.append(noise[cube[rows]])
+        error = values - np.array([self._truth(time) for time in self._seconds(times_ns)])
 
-        times = np.linspace(0, self._load.period, RANGE_TIMES)
+        times = np.linspace(0, self.load.period, RANGE_TIMES)
         script = [self._truth(time) for time in times]
         highest = np.nanmax(script, axis=(0, 1))
         lowest = np.nanmin(script, axis=(0, 1))
         span = highest - lowest
         # A component that is constant under the load has a range of 0 and is left out.
         varies = span > 0
-        error = np.concatenate(errors)
-        relative = error[:, varies] / span[varies]
+        relative = error[..., varies] / span[varies]
         return {
             "error_rel_rms": rms(relative),
             "error_rel_worst": float(np.nanmax(np.abs(relative))),
-            "error_over_noise": rms(error / np.concatenate(allowed)),
+            "error_over_noise": rms(error / component_noise(self._skin)),
         }
 
     def _truth(self, seconds: float) -> Array:
@@ -301,7 +285,7 @@ class LoadVerification:
         Args:
             seconds: Time after the start of the simulator, in s.
         """
-        return skin_components(self._skin, *self._load.at(seconds))
+        return skin_components(self._skin, *self.load.at(seconds))
 
 
 def rms(values: AnyArray) -> float:
@@ -322,12 +306,3 @@ def component_noise(skin: Skin) -> Array:
     pipeline = Pipeline(skin.calibrations)
     variances = [np.diag(pipeline.covariance(cube)) for cube in range(len(skin.cubes))]
     return np.sqrt(np.array(variances))
-
-
-def thin_out(times_ns: Index) -> Index:
-    """Return every n-th time, so that at least `MIN_TIMES_COMPARED` are left, or all if fewer.
-
-    Args:
-        times_ns: (T,) sampling times, in ns, in ascending order.
-    """
-    return times_ns[:: max(1, len(times_ns) // MIN_TIMES_COMPARED)]

@@ -24,7 +24,7 @@ from ..ros.commands.services import ANNOUNCE_S
 from ..ros.qos import batch_profile
 from ..ros.session import domain_text, node_session, spin_until
 from ..simulation.imperfections import read_imperfections
-from ..simulation.load import AnyLoad, read_load
+from ..simulation.load import read_load
 from ..views.terminal.live_table import LiveTable
 from .running import Interrupted, Observer, end_simulator, observing
 
@@ -56,12 +56,10 @@ class DemoResult:
     Attributes:
         figures: Counts, latencies, errors and resources: the content of the JSON file.
         verification: The rows that arrived, from which the forces are computed.
-        load: The simulated load on the skin.
     """
 
     figures: dict[str, Any]
     verification: LoadVerification
-    load: AnyLoad
 
     def publish(self, settings: DemoSettings) -> None:
         """Draw the picture if the settings name one, and print the results or write them.
@@ -97,7 +95,7 @@ class DemoResult:
             measured_force=forces.measured_force,
             centre=forces.centre,
             measured_centre=forces.measured_centre,
-            cubes=self.load.poses.position,
+            cubes=self.verification.load.poses.position,
         )
         save(picture, path)
         return forces.figures()
@@ -156,7 +154,7 @@ def watch(
             watcher.run()
         figures = watcher.measure(verification, settings.duration, log)
     head = {"cubes": len(skin.cubes), "rate_hz": rate, "duration_s": settings.duration}
-    return DemoResult(head | figures, verification, load)
+    return DemoResult(head | figures, verification)
 
 
 def check_no_skin() -> None:
@@ -239,8 +237,8 @@ class SkinWatcher:
             return self._table.seen_all
         # DDS connects publishers and subscribers of each topic separately, which takes up to
         # seconds; so tensors may arrive before the first message of another topic.
-        has_samples = self._table.seen_all and self._verification.sampled
-        return has_samples and bool(self._crc_errors)
+        has_samples = self._verification.frequencies.rows > 0
+        return self._table.seen_all and has_samples and bool(self._crc_errors)
 
     def run(self) -> NoReturn:
         """Show the skin in the live table until Ctrl-C.
@@ -344,7 +342,7 @@ class SkinWatcher:
 
     def _on_frequencies(self, data: bytes) -> None:
         if self._verification is not None:
-            self._verification.add_frequencies(frequency_codec.decode(data).rows)
+            self._verification.frequencies.add(frequency_codec.decode(data).rows)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:

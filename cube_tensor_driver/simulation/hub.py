@@ -36,9 +36,8 @@ FIRMWARE = 0x00010000
 PERIOD_LIMITS_US = (100, 10_000_000)
 """Shortest and longest sample period in µs that a simulated hub accepts."""
 
-_BUFFER_SIZE = 5000
-"""Free size, in bytes, of the send buffer that a simulated hub reports in STATS (frame with the
-hub's counters); it is constant."""
+_SUPPLY_MV = 5000
+"""Supply voltage, in mV, that a simulated hub reports in STATS (frame with the hub's counters)."""
 
 _UINT32_MASK = 0xFFFFFFFF
 """Mask of the lowest 32 bits of a counter. Counters in the frames (messages of a hub) have 32 bits
@@ -110,7 +109,7 @@ class SimulatedHub:
         uptime_ms = self._positive_device_us(now_us) // 1000
         sequence = self.sequence & _UINT32_MASK
         dropped = self.dropped & _UINT32_MASK
-        return encode(Stats(uptime_ms, sequence, dropped, _BUFFER_SIZE), self.version)
+        return encode(Stats(uptime_ms, sequence, dropped, _SUPPLY_MV), self.version)
 
     def device_us(self, now_us: int) -> int:
         """Return the value of the hub's clock in µs at simulated time `now_us`."""

@@ -76,12 +76,6 @@ def _parser() -> argparse.ArgumentParser:
         "state)",
     )
     add(
-        "--drift",
-        type=float,
-        default=0.0,
-        help="relative drift of the rest frequencies per second",
-    )
-    add(
         "--imperfections",
         type=Path,
         help="deviations of the pads from their calibrations: YAML; docs/simulation.md",
@@ -105,7 +99,6 @@ def _parser() -> argparse.ArgumentParser:
         help="compute the load only at this number of times, and repeat them",
     )
     add("--faults", type=Path, help="faults to carry out: YAML, a list, see docs/reliability.md")
-    add("--seed", type=int, default=0, help="seed of what is random in the faults")
     return parser
 
 
@@ -134,10 +127,9 @@ def _create_simulator(
         skin,
         load,
         options.ports,
-        PadErrors(options.noise, options.drift, imperfections),
+        PadErrors(options.noise, imperfections=imperfections),
         instants=options.instants,
         faults=faults,
-        seed=options.seed,
     )
 
 

@@ -166,27 +166,21 @@ class SampleLog:
     @cached_property
     def table(self) -> SampleTable:
         """All samples of the log, link after link, in the order of time."""
-        # The empty array gives the columns their type even if there are no runs.
-        empty = np.empty(0, np.int64)
-        links = [empty]
-        numbers = [empty]
-        times_us = [empty]
-        rows_per_sample = []
+        # The empty table gives the columns their type even if there are no runs.
+        parts = [np.empty((3, 0), np.int64)]
         link_of_cube = np.full(CUBE_RANGE, NO_LINK, np.int64)
         for index, link in enumerate(self.links):
             link_of_cube[link.members] = index
-            rows_per_sample.append(len(link.members))
             for run in link.runs:
                 count = np.arange(len(run))
-                links.append(np.full(len(run), index))
-                numbers.append(run.first + count)
-                times_us.append(run.start_us + run.period_us * count)
+                time_us = run.start_us + run.period_us * count
+                parts.append(np.array([np.full(len(run), index), run.first + count, time_us]))
+        links, numbers, times_us = np.hstack(parts)
         return SampleTable(
-            start_time_ns=self.start_time_ns,
-            link=np.concatenate(links),
-            number=np.concatenate(numbers),
-            time_ns=self.start_time_ns + 1000 * np.concatenate(times_us),
-            rows_per_sample=np.array(rows_per_sample, int),
+            link=links,
+            number=numbers,
+            time_ns=self.start_time_ns + 1000 * times_us,
+            rows_per_sample=np.array([len(link.members) for link in self.links], int),
             link_of_cube=link_of_cube,
         )
 
@@ -196,7 +190,6 @@ class SampleTable:
     """Columns of all samples (S,) that the hubs of a skin took.
 
     Attributes:
-        start_time_ns: Wall clock at simulated time 0, in ns since the Unix epoch.
         link: Index of the link whose hub took each sample (S,).
         number: Number of each sample (S,), which does not wrap at 2^32.
         time_ns: Wall clock at which each sample was taken (S,), in ns since the Unix epoch.
@@ -204,7 +197,6 @@ class SampleTable:
         link_of_cube: Link of each possible index of a cube (`CUBE_RANGE`,), or `NO_LINK`.
     """
 
-    start_time_ns: int
     link: Index
     number: Times
     time_ns: Times

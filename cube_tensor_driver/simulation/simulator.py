@@ -104,7 +104,6 @@ class Simulator:
         *,
         instants: int = 0,
         faults: Sequence[Fault] = (),
-        seed: int = 0,
     ) -> None:
         """Create the hubs and their ports.
 
@@ -117,7 +116,6 @@ class Simulator:
                 is computed in advance; successive samples use successive times, again and again.
                 0: the load is computed for each sample.
             faults: Faults to carry out at their times.
-            seed: Seed of the random numbers in the faults.
 
         Raises:
             ConfigError: Cubes of one hub have different numbers of pads, the folder cannot be used,
@@ -144,7 +142,7 @@ class Simulator:
                 "ports"
             ) from None
 
-        self._injector = Injector(self._links, faults, seed)
+        self._injector = Injector(self._links, faults)
         self._prepare(load, instants)
         for link in self._links:
             link.line.send(link.hub.hello(), 0)

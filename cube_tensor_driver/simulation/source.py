@@ -16,7 +16,7 @@ from ..config.skin import Skin, as_skin
 from ..core.arguments import check_number
 from ..core.arrays import Array
 from ..core.rows import COUNTER_RANGE, FrequencyRows
-from ..device.wire.protocol import NOT_MEASURED, to_hertz
+from ..device.wire.protocol import to_hertz
 from .cubes import NO_ERRORS, PadErrors, hub_cubes
 from .hub import PERIOD_LIMITS_US, SimulatedHub
 from .imperfections import Imperfections
@@ -147,10 +147,10 @@ class SkinPads:
             ConfigError: Cubes of one hub have different numbers of pads.
         """
         self._hubs = hub_cubes(skin, errors)
+        # The rows are sorted link by link, as the driver delivers them.
         cubes = [hub.skin_cubes for hub in self._hubs]
         self._cube = np.concatenate(cubes).astype(np.uint16)
         self._n_pads = max(hub.cubes.n_pads for hub in self._hubs)
-        self._is_moving = any(hub.cubes.heavy for hub in self._hubs)
 
     def rows(
         self,
@@ -167,26 +167,27 @@ class SkinPads:
             number: Sequence number of the scan.
             time_us: Simulated time in µs.
         """
-        count = len(self._cube)
         seconds = 1e-6 * time_us
-        millihertz = np.full((count, self._n_pads), NOT_MEASURED, np.uint32)
-        temperature = np.empty(count, np.float32)
-        force = np.empty((count, 3), np.float32)
+        frequency = np.full((len(self._cube), self._n_pads), np.nan, np.float32)
+        temperature = np.empty(len(self._cube))
+        forces = []
+        start = 0
         for hub in self._hubs:
             cubes = hub.skin_cubes
-            own = hub.cubes.frequency(stress[cubes], gradient[cubes], seconds)
-            millihertz[cubes, : hub.cubes.n_pads] = own
-            temperature[cubes] = hub.cubes.temperature(seconds)
-            if hub.cubes.heavy is not None:
-                force[cubes] = hub.cubes.heavy.specific_force(seconds)
-        # The rows are sorted link by link, as the driver delivers them.
-        return FrequencyRows(
-            cube=self._cube,
-            sequence=np.full(count, number % COUNTER_RANGE, np.uint32),
-            stamp_ns=np.full(count, 1000 * time_us),
-            frequency=to_hertz(millihertz[self._cube]),
-            temperature=temperature[self._cube],
-            pad_fault=np.zeros(count, np.uint32),
-            status=np.zeros(count, np.uint16),
-            specific_force=force[self._cube] if self._is_moving else None,
+            pads = hub.cubes
+            rows = slice(start, start + len(cubes))
+            # Frequencies from a real hub are also whole mHz.
+            millihertz = pads.frequency(stress[cubes], gradient[cubes], seconds)
+            frequency[rows, : pads.n_pads] = to_hertz(millihertz)
+            temperature[rows] = pads.temperature(seconds)
+            if pads.heavy is not None:
+                forces.append(pads.heavy.specific_force(seconds))
+            start = rows.stop
+        return FrequencyRows.of(
+            self._cube,
+            frequency,
+            sequence=number % COUNTER_RANGE,
+            stamp_ns=1000 * time_us,
+            temperature=temperature,
+            specific_force=np.concatenate(forces) if forces else None,
         )

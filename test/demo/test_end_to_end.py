@@ -163,7 +163,7 @@ def test_a_demo_without_a_tensor_fails_and_its_figures_are_json(tmp_path):
     figures = {"samples_sent": 0, "tensors_received": 0, "lost": 0, "error": [math.nan]}
     settings = DemoSettings(json=tmp_path / "figures.json")
     with pytest.raises(CubeError, match="no tensor arrived"):
-        DemoResult(figures, None, None).publish(settings)
+        DemoResult(figures, None).publish(settings)
     assert json.loads(settings.json.read_text(), parse_constant=pytest.fail)["error"] == [None]
 
 

@@ -116,8 +116,8 @@ def test_values_are_those_of_a_live_link(tmp_path):
         assert process.wait(20) == 0
     finally:
         process.kill()
-    sampled = SampleLog.read(log).table
-    time_ns = sampled.time_ns[sampled.match(live)]
+    sampled = SampleLog.read(log)
+    time_ns = sampled.table.time_ns[sampled.table.match(live)]
     number = (time_ns - sampled.start_time_ns) // 10_000_000
     scans = [rows.frequency for rows in islice(simulate(SKIN), int(number.max()) + 1)]
     np.testing.assert_array_equal(live.frequency, np.array(scans)[number, live.cube])

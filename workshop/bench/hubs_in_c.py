@@ -126,7 +126,6 @@ def read_samples(path: Path, load: HubLoad) -> SampleTable:
     count = (len(data) - START_TIME_BYTES) // SAMPLE_RECORD.itemsize
     taken = np.frombuffer(data, SAMPLE_RECORD, count, START_TIME_BYTES)
     return SampleTable(
-        start_time_ns=start_ns,
         link=taken["hub"].astype(np.int64),
         # Hubs in C are not restarted, so their numbers do not begin again.
         number=taken["number"].astype(np.int64),

@@ -29,6 +29,7 @@ MuJoCo is the extra `mujoco` of this package. It is imported when a skin is crea
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -224,11 +225,11 @@ class MujocoSkin:
         # A contact causes stress only at the cubes of the body that is touched.
         for part in self._parts:
             own = [touch for touch in touches if touch.body == part.body]
-            round_loads = [touch.press for touch in own if touch.polygon is None]
+            discs = [touch.press for touch in own if touch.polygon is None]
             flat = [touch for touch in own if touch.polygon is not None]
             fields = []
-            if round_loads:
-                fields.append(_field_of_discs(part, round_loads, self._discs))
+            if discs:
+                fields.append(_field_of_discs(part, discs, self._discs))
             if flat:
                 fields.append(_field_of_polygons(part, flat, self._polygons))
             for part_stress, part_gradient in fields:
@@ -251,47 +252,29 @@ class MujocoSkin:
                 MuJoCo's contact forces act on the second one.
         """
         # MuJoCo's normal points from the first body to the second one.
-        data = self.data
-        contact = data.contact
         sign = 2 * side - 1
         place, force, outward = self._contact_points(part, rows, sign)
-        normal = surface_normal(
-            part.poses,
-            part.pitch,
-            place.mean(axis=0),
-        )
+        normal = surface_normal(part.poses, part.pitch, place.mean(axis=0))
         is_felt = (outward @ normal > 0) & (force @ normal < 0)
         if not is_felt.any():
             return None
 
         place, force = place[is_felt], force[is_felt]
         total = force.sum(axis=0)
+        pressing = -float(total @ normal)
         if len(place) > 1:
             # A round contact of the same area also describes the flat one, for uses that need only
             # its centre and force.
-            min_width = MIN_WIDTH_DEPTHS * self.depth
-            polygon = flat_contact(place, force, normal, min_width)
-            area = total @ normal / (polygon.traction @ normal)
-            load = ContactLoad(
-                "disc",
-                polygon.centre,
-                normal,
-                total,
-                radius=float(np.sqrt(area / np.pi)),
-            )
+            polygon = flat_contact(place, force, normal, MIN_WIDTH_DEPTHS * self.depth)
+            pressure = -float(polygon.traction @ normal)
+            radius = math.sqrt(pressing / pressure / math.pi)
+            load = ContactLoad("disc", polygon.centre, normal, total, radius)
             return BodyContact(part.body, load, polygon)
         # For a Hertz contact, the curvatures (1 / radius) of both bodies add up (Johnson 4.2).
-        geoms = contact.geom[rows[0]]
+        geoms = self.data.contact.geom[rows[0]]
         curvature = self._curvature[geoms].sum()
-        pressing = -float(total @ normal)
-        load = ContactLoad(
-            "sphere",
-            place[0],
-            normal,
-            total,
-            radius=hertz_radius(pressing, curvature, self._stiffness),
-        )
-        return BodyContact(part.body, load)
+        radius = hertz_radius(pressing, curvature, self._stiffness)
+        return BodyContact(part.body, ContactLoad("sphere", place[0], normal, total, radius))
 
     def _contact_points(
         self,
@@ -483,13 +466,9 @@ def _field_of_discs(
         tables: Stress under discs, for the layer and the depth of the cubes.
     """
     position, rotation, _ = part.poses
-    normals = np.stack([load.normal for load in loads], axis=1)
-    centres = np.array([load.position for load in loads])
-    forces = np.stack([load.force for load in loads])
-    radii = [load.radius for load in loads]
-
+    _, centres, normals, forces, radii = map(np.array, zip(*loads, strict=True))
     outward = rotation[:, :, 2]
-    facing = np.maximum(outward @ normals, 0.0)
+    facing = np.maximum(outward @ normals.T, 0.0)
     # `place` is the position of each cube relative to the centre of each contact, `force` the force
     # of each contact, both in the frame of the cube.
     place = (position[:, None] - centres) @ rotation
@@ -514,25 +493,23 @@ def _field_of_polygons(
     """
     position, rotation, _ = part.poses
     in_plane = rotation[..., :2]
+    normals = np.array([touch.press.normal for touch in touches])
     polygons = [touch.polygon for touch in touches if touch.polygon is not None]
-    normals = np.stack([touch.press.normal for touch in touches], axis=1)
+    corners, centres, tractions, twists = zip(*polygons, strict=True)
     # Each corner is the start of one edge, the next corner its end.
-    starts = np.concatenate([polygon.corners for polygon in polygons])
-    ends = np.concatenate([next_corners(polygon.corners) for polygon in polygons])
-    sizes = [len(polygon.corners) for polygon in polygons]
-    number = np.repeat(np.arange(len(polygons)), sizes)  # the polygon of each edge
+    starts = np.concatenate(corners)
+    ends = np.concatenate([next_corners(one) for one in corners])
+    number = np.repeat(np.arange(len(polygons)), [len(one) for one in corners])
 
     origin = position[:, None]
-    centres = np.stack([polygon.centre for polygon in polygons])
-    centre = (centres - origin) @ in_plane
+    centre = (np.array(centres) - origin) @ in_plane
 
     # The twist (circulating traction) of a polygon is given about its centroid. The tables need it
     # about the point of the surface above the cube.
     outward = rotation[:, :, 2]
-    facing = np.maximum(outward @ normals, 0.0)
-    twist = facing * [polygon.twist for polygon in polygons]
-    tractions = np.stack([polygon.traction for polygon in polygons])
-    traction = tractions @ rotation
+    facing = np.maximum(outward @ normals.T, 0.0)
+    twist = facing * twists
+    traction = np.array(tractions) @ rotation
     traction *= (facing > 0)[..., None]
     traction[..., 0] += twist * centre[..., 1]
     traction[..., 1] -= twist * centre[..., 0]
