@@ -21,7 +21,7 @@ from ..core.rows import FrequencyRows
 from ..core.status import STAMP
 from .clock.hub_clock import HubClock
 from .clock.steps import HostClockWatch
-from .links.intake import NativeSamples
+from .links.intake import NO_SAMPLES, NativeSamples
 from .links.link import Link, LinkConfig, LinkState
 from .links.link_log import LinkLogger, Log
 from .links.reader import LOGGED_ERRORS, LinkFrames, Reader
@@ -245,7 +245,7 @@ class LiveLinks:
     def receive(
         self,
         received: Sequence[LinkFrames],
-        native: NativeSamples | None = None,
+        native: NativeSamples = NO_SAMPLES,
     ) -> None:
         """Handle what the links have sent, and call `on_rows` with the rows of complete scans.
 
@@ -256,14 +256,13 @@ class LiveLinks:
         Args:
             received: Frames of the links.
             native: Samples that came before these frames and that the module in C has counted and
-                stamped already; None if there are none.
+                stamped already.
         """
-        if native is not None:
-            samples = unpack_all(native.raws)
-            for link, sample, stamp_ns in zip(native.links, samples, native.stamps_ns, strict=True):
-                if isinstance(sample, Sample):
-                    self._rows.received += sample.n_cubes
-                    self._scans.add(link, sample, stamp_ns)
+        samples = unpack_all(native.raws)
+        for link, sample, stamp_ns in zip(native.links, samples, native.stamps_ns, strict=True):
+            if isinstance(sample, Sample):
+                self._rows.received += sample.n_cubes
+                self._scans.add(link, sample, stamp_ns)
         if received:
             self._handle_received(received)
         self._was_clock_set = False

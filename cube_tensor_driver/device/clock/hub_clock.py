@@ -68,7 +68,7 @@ class HubClock:
     # float would round absolute times to 256 ns.
 
     def __init__(self, track: LinkTrack | None = None) -> None:
-        self.track = LinkTrack() if track is None else track
+        self.track = track or LinkTrack()
         self.resets = 0
         self.in_doubt = False
         self.problems: set[str] = set()

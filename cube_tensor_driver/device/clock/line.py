@@ -103,7 +103,7 @@ class ClockLine:
     """
 
     def __init__(self, track: LinkTrack | None = None) -> None:
-        self._track = LinkTrack() if track is None else track
+        self._track = track or LinkTrack()
         self.restart()
 
     def restart(self) -> None:

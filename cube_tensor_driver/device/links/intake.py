@@ -41,6 +41,10 @@ class NativeSamples(NamedTuple):
     stamps_ns: list[int]
 
 
+NO_SAMPLES = NativeSamples([], [], [])
+"""Result of reading where the module in C has counted and stamped no samples."""
+
+
 class LinkRead(NamedTuple):
     """Frames or error from reading one link once, unless the module in C has handled all frames.
 
@@ -128,7 +132,7 @@ class Intake:
             is_open = [i for i, link in enumerate(self._links) if link.is_open]
             reads = [read for read in self._read_ready(is_open) if read.result]
             if reads or time.monotonic() >= until:
-                return False, NativeSamples([], [], []), reads
+                return False, NO_SAMPLES, reads
             # There is no call on Windows that waits for serial ports and sockets together.
             time.sleep(ASK_PERIOD_S)
 
@@ -145,7 +149,7 @@ class Intake:
         is_late = bool(ready)
         ready = ready or poll.poll(1000 * timeout_s)
         indices = [index_of[fd] for fd, _ in ready if fd in index_of]
-        return is_late, NativeSamples([], [], []), self._read_ready(indices)
+        return is_late, NO_SAMPLES, self._read_ready(indices)
 
     def _read_ready(self, ready: Sequence[int]) -> list[LinkRead]:
         """Read the links with these indices once each, and decode their bytes in Python."""

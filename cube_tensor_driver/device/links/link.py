@@ -55,24 +55,25 @@ END_OF_STREAM = OSError(errno.EIO, "end of stream")
 or has closed the connection."""
 
 _NO_PERMISSION = (
-    "add yourself to the group dialout (sudo usermod -aG dialout $USER) and log in again"
+    "no_permission",
+    "add yourself to the group dialout (sudo usermod -aG dialout $USER) and log in again",
 )
-_NO_DEVICE = "nothing is behind this port: plug the hub in or correct the port"
-_IN_USE = "another program has it open: end that one (fuser -v shows which)"
-_NOT_SERIAL = "this is no serial port: correct the port"
+_NO_DEVICE = "no_port", "nothing is behind this port: plug the hub in or correct the port"
+_IN_USE = "busy", "another program has it open: end that one (fuser -v shows which)"
+_NOT_SERIAL = "not_serial", "this is no serial port: correct the port"
 _OPEN_ERRORS = {
     errno.ENOENT: ("no_port", "plug the hub in or correct the port"),
-    errno.ENXIO: ("no_port", _NO_DEVICE),
-    errno.ENODEV: ("no_port", _NO_DEVICE),
-    errno.EIO: ("no_port", _NO_DEVICE),
-    errno.EACCES: ("no_permission", _NO_PERMISSION),
-    errno.EPERM: ("no_permission", _NO_PERMISSION),
-    errno.EBUSY: ("busy", _IN_USE),
-    errno.EAGAIN: ("busy", _IN_USE),
-    errno.ENOTTY: ("not_serial", _NOT_SERIAL),
-    errno.EINVAL: ("not_serial", _NOT_SERIAL),
-    errno.EISDIR: ("not_serial", _NOT_SERIAL),
-    errno.ENOTDIR: ("not_serial", _NOT_SERIAL),
+    errno.ENXIO: _NO_DEVICE,
+    errno.ENODEV: _NO_DEVICE,
+    errno.EIO: _NO_DEVICE,
+    errno.EACCES: _NO_PERMISSION,
+    errno.EPERM: _NO_PERMISSION,
+    errno.EBUSY: _IN_USE,
+    errno.EAGAIN: _IN_USE,
+    errno.ENOTTY: _NOT_SERIAL,
+    errno.EINVAL: _NOT_SERIAL,
+    errno.EISDIR: _NOT_SERIAL,
+    errno.ENOTDIR: _NOT_SERIAL,
 }
 """Kind of the LinkError and text of the fix for each errno with which opening a serial port
 fails."""
@@ -146,7 +147,7 @@ class Link:
 
     def __init__(self, config: LinkConfig, track: LinkTrack | None = None) -> None:
         self.config = config
-        self.track = LinkTrack() if track is None else track
+        self.track = track or LinkTrack()
         self.state = LinkState.CLOSED
         self.error: LinkError | None = None
         self.decoder = Decoder()

@@ -111,8 +111,7 @@ class Reader:
         on_end: Callable[[], None] = lambda: None,
         tracks: Sequence[LinkTrack] | None = None,
     ) -> None:
-        if tracks is None:
-            tracks = [LinkTrack() for _ in links]
+        tracks = tracks or [LinkTrack() for _ in links]
         self.links = [Link(*pair) for pair in zip(links, tracks, strict=True)]
         self.callback_errors = 0
         self.behind_s = 0.0

@@ -210,10 +210,12 @@ class CubeTable:
         index_of_uid: dict[int, int] = {}
         for index, uid in enumerate(uids):
             index_of_uid.setdefault(uid, index)
-        claimed: set[int] = set()
-        for other, hub in enumerate(self._hubs):
-            if other != link and hub.is_present:
-                claimed.update(hub.cubes.tolist())
+        claimed = {
+            cube
+            for other, hub in enumerate(self._hubs)
+            if other != link and hub.is_present
+            for cube in hub.cubes.tolist()
+        }
 
         cubes = np.full(hello.n_cubes, ABSENT, np.int32)
         # Cubes with the same problem share one line of the log. This dictionary holds their names

@@ -86,7 +86,7 @@ class SequenceTracker:
     def __init__(self, track: LinkTrack | None = None) -> None:
         self.counters = SequenceCounters()
         self.n_cubes = -1
-        self._track = LinkTrack() if track is None else track
+        self._track = track or LinkTrack()
         self._is_begun = False
         self.first = 0
         self._first_us = 0
@@ -273,7 +273,7 @@ class SampleAccount:
     """
 
     def __init__(self, track: LinkTrack | None = None) -> None:
-        self._track = LinkTrack() if track is None else track
+        self._track = track or LinkTrack()
         self._track.n_cubes = _MAX_CUBES  # until HELLO states the number
         self.stats_frame: Stats | None = None
         # Trackers by the first cube of the frame: a sample of many cubes comes in several frames.
