@@ -122,7 +122,7 @@ def _check_options(options: argparse.Namespace, model: Model) -> None:
     if options.figures is not None and (options.temperature or options.weight):
         raise ConfigError(f"--figures: there are no pictures of {chosen[0]}; leave it out")
     path = options.output
-    if not options.surface:
+    if path is not None and not options.surface:
         check_yaml("-o", path)
     elif path is not None and path.suffix != ".npz":
         raise ConfigError(

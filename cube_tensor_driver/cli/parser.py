@@ -257,14 +257,19 @@ def check_outputs(options: argparse.Namespace) -> None:
     from ..config.output_files import check_folder, check_outputs, check_yaml
     from ..core.errors import ConfigError
 
-    files: dict[str, Path | None] = {}
-    pictures: list[Path] = []
+    files: dict[str, Path] = {}
     for output in getattr(options, "outputs", ()):
         value = getattr(options, output.name)
         # A default that depends on other options is a function, see `Parser.add_output`.
         if callable(value):
             value = value(options)
             setattr(options, output.name, value)
+        if value is None:
+            continue
+        if output.kind == "folder":
+            check_folder(output.flag, value)
+            continue
+        files[output.flag] = value
         if output.kind in ("yaml", "skin"):
             check_yaml(output.flag, value)
         # Users edit skin files, so none is overwritten.
@@ -272,19 +277,12 @@ def check_outputs(options: argparse.Namespace) -> None:
             raise ConfigError(
                 f"{output.flag} {value}: the file exists; remove it, or name another one"
             )
-        if output.kind == "folder":
-            check_folder(output.flag, value)
-        else:
-            files[output.flag] = value
-        if output.kind == "picture" and value is not None:
-            pictures.append(value)
-    check_outputs(files)
-    # Checking a picture format needs matplotlib, whose import is slow.
-    if pictures:
-        from ..views.figures.style import check_picture
+        if output.kind == "picture":
+            # Checking a picture format needs matplotlib, whose import is slow.
+            from ..views.figures.style import check_picture
 
-        for picture in pictures:
-            check_picture(picture)
+            check_picture(value)
+    check_outputs(files)
 
 
 def _number_type(

@@ -50,19 +50,18 @@ def check_writable(path: Path) -> None:
         pass
 
 
-def check_outputs(paths: dict[str, Path | None]) -> None:
+def check_outputs(paths: dict[str, Path]) -> None:
     """Check that all output files of a command can be written, before it starts its work.
 
     Args:
-        paths: Option of the command -> the file that the option names; None: it was not given.
+        paths: Option of the command -> the file that the option names.
 
     Raises:
         ConfigError: A file cannot be written, or two options name the same file.
     """
-    given = {option: path for option, path in paths.items() if path is not None}
-    for option, path in given.items():
+    for option, path in paths.items():
         # If two options named one file, the output written last would replace the other.
-        for other, other_path in given.items():
+        for other, other_path in paths.items():
             if other != option and other_path.resolve() == path.resolve():
                 raise ConfigError(f"{option} and {other} both name {path}; name two files")
         try:
@@ -71,18 +70,16 @@ def check_outputs(paths: dict[str, Path | None]) -> None:
             raise ConfigError(f"{option} {error}") from None
 
 
-def check_folder(option: str, path: Path | None) -> None:
+def check_folder(option: str, path: Path) -> None:
     """Check that a folder can be made and files be made in it, without making the folder.
 
     Args:
         option: Option of the command that names the folder, for the error message.
-        path: The folder, which need not exist; None: the option was not given.
+        path: The folder, which need not exist.
 
     Raises:
         ConfigError: The folder cannot be made, or no file can be made in it.
     """
-    if path is None:
-        return
     # The test file is made in the closest parent that exists.
     candidates = (path, *path.absolute().parents)
     existing = next(folder for folder in candidates if folder.exists())
@@ -97,17 +94,17 @@ def check_folder(option: str, path: Path | None) -> None:
     raise ConfigError(f"{option} {path}: {problem}; name a folder that can be made and written")
 
 
-def check_yaml(option: str, path: Path | None) -> None:
+def check_yaml(option: str, path: Path) -> None:
     """Check that an output file that is written as YAML has a suffix of YAML files.
 
     Args:
         option: Option of the command that names the file, for the error message.
-        path: The file; None: the option was not given, and nothing is checked.
+        path: The file.
 
     Raises:
         ConfigError: The file has another suffix.
     """
-    if path is not None and path.suffix not in YAML_SUFFIXES:
+    if path.suffix not in YAML_SUFFIXES:
         suffixes = " or ".join(YAML_SUFFIXES)
         raise ConfigError(f"{option} {path}: a YAML file ends in {suffixes}; name one")
 
