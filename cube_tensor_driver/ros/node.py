@@ -139,6 +139,10 @@ class CubeNode(LifecycleNode):
         there was no such error."""
         return None
 
+    def count_errors(self) -> int:
+        """Return the number of calls of callbacks that have raised an exception so far."""
+        return self.callback_errors.count
+
     # The following methods are called by subclasses.
 
     def own(self, entity: Entity) -> Entity:

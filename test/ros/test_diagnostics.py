@@ -196,18 +196,14 @@ def test_errors_of_callbacks_are_counted_in_the_first_status():
     """Those in both threads of the driver. Only new ones are a problem now."""
     errors = CallbackErrors(SimpleNamespace(get_logger=lambda: Mock()))
     links = SimpleNamespace(callback_errors=0)
-    driver = SimpleNamespace(callback_errors=errors, is_configured=True, _links=links)
     published = []
-    node = Mock()
+    node = Mock(spec=Driver, callback_errors=errors, is_configured=True, _links=links)
+    node.count_errors = lambda: Driver.count_errors(node)
     node.create_publisher.return_value = SimpleNamespace(publish=published.append)
     node.resolve_topic_name.return_value = "/diagnostics"
     node.get_fully_qualified_name.return_value = "/driver"
     node.get_clock.return_value.now.return_value.to_msg.return_value = Time()
-    Diagnostics(
-        node,
-        lambda: [DiagnosticStatus(name="rows"), DiagnosticStatus(name="link")],
-        lambda: Driver._count_errors(driver),
-    )
+    Diagnostics(node, lambda: [DiagnosticStatus(name="rows"), DiagnosticStatus(name="link")])
     _, publish = node.create_timer.call_args.args
 
     def report():

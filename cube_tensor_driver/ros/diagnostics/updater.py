@@ -14,7 +14,8 @@ from diagnostic_msgs.msg import (
     DiagnosticStatus,
     KeyValue,
 )
-from rclpy.node import Node
+
+from ..node import CubeNode
 
 TOPICS = ("/diagnostics", "diagnostics")
 """Topics on which each node publishes its diagnostics.
@@ -36,21 +37,17 @@ class Diagnostics:
 
     def __init__(
         self,
-        node: Node,
+        node: CubeNode,
         statuses: Callable[[], list[DiagnosticStatus]],
-        count_errors: Callable[[], int],
     ) -> None:
         """Begin to publish.
 
         Args:
-            node: The node.
+            node: The node. The number of its callbacks' errors is added to the first status.
             statuses: Returns the statuses to publish. If the list is empty, nothing is published.
-            count_errors: Returns the number of calls of the node's callbacks that have raised an
-                exception so far. It is added to the first status.
         """
         self._node = node
         self._statuses = statuses
-        self._count_errors = count_errors
         self._errors_before = 0
         # In a node without a namespace both names resolve to the same topic, which then gets only
         # one publisher.
@@ -76,7 +73,7 @@ class Diagnostics:
             publisher.publish(message)
 
     def _add_errors(self, status: DiagnosticStatus) -> None:
-        errors = self._count_errors()
+        errors = self._node.count_errors()
         pair = KeyValue(key="callback errors", value=str(errors))
         status.values = [*status.values, pair]
         if errors > self._errors_before:

@@ -48,7 +48,7 @@ class Contacts(SkinSubscriberNode):
         self._finder: ContactFinder | None = None
         self._future_finder: Future[ContactFinder] | None = None
         self._problem = ""
-        self._updater = Diagnostics(self, self._statuses, lambda: self.callback_errors.count)
+        self._updater = Diagnostics(self, self._statuses)
 
     def configure(self) -> None:
         self._traction = self.own(self.create_lifecycle_publisher(PointCloud2, "traction", 2))

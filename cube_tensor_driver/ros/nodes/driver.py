@@ -48,7 +48,7 @@ class Driver(CubeNode):
         super().__init__("driver", DRIVER)
         self._on_rows = on_rows
         self._node_clock = NodeClock(self)
-        self._diagnostics = Diagnostics(self, self._statuses, self._count_errors)
+        self._diagnostics = Diagnostics(self, self._statuses)
 
     @property
     def failure(self) -> Exception | None:
@@ -106,12 +106,10 @@ class Driver(CubeNode):
         if self._on_rows is not None:
             self._on_rows(rows)
 
-    def _count_errors(self) -> int:
+    def count_errors(self) -> int:
         """Return the number of exceptions in callbacks in both threads: main thread and reader."""
-        # `callback_errors` counts exceptions in the main thread only. The links count those in the
-        # thread that reads them.
         in_reader = self._links.callback_errors if self.is_configured else 0
-        return self.callback_errors.count + in_reader
+        return super().count_errors() + in_reader
 
     def _publish_info(self) -> None:
         now_ns = self.get_clock().now().nanoseconds

@@ -83,7 +83,7 @@ class Reconstruction(CubeNode):
         # thread, and a driver node in this process calls `on_rows` in another thread.
         self._lock = threading.Lock()
         self._lost = LostMessages()
-        self._updater = Diagnostics(self, self._statuses, lambda: self.callback_errors.count)
+        self._updater = Diagnostics(self, self._statuses)
 
     def configure(self) -> None:
         recorded = self._recorded = self._open_recording()
