@@ -72,10 +72,13 @@ class _Field(NamedTuple):
     width: int
 
 
-_FREQUENCIES = (
+_FIRST_FIELDS = (
     _Field("cube", "<u2", 1),
     _Field("sequence", "<u4", 1),
     _Field("time_offset", "<i4", 1),
+)
+_FREQUENCIES = (
+    *_FIRST_FIELDS,
     _Field("n_pads", "<u1", PER_MESSAGE),
     _Field("frequency", "<f4", PER_PAD),
     _Field("temperature", "<f4", 1),
@@ -83,9 +86,7 @@ _FREQUENCIES = (
     _Field("status", "<u2", 1),
 )
 _STRESS = (
-    _Field("cube", "<u2", 1),
-    _Field("sequence", "<u4", 1),
-    _Field("time_offset", "<i4", 1),
+    *_FIRST_FIELDS,
     _Field("stress", "<f4", len(STRESS)),
     _Field("gradient", "<f4", len(GRADIENT)),
     _Field("residual", "<f4", 1),

@@ -21,6 +21,7 @@ from geometry_msgs.msg import (
     Pose,
     Quaternion,
     Vector3,
+    Wrench,
     WrenchStamped,
 )
 from rclpy.node import Node
@@ -30,7 +31,7 @@ from std_msgs.msg import Header
 
 from ..config.calibration import calibration_text
 from ..config.skin import Elastomer, Skin, SkinCube
-from ..core.arrays import AnyArray, Array
+from ..core.arrays import AnyArray, Array, Real
 from ..core.compensation.motion import UNKNOWN_MOTION, Motion
 from ..core.errors import BagError
 from ..core.pipeline import Pipeline
@@ -236,18 +237,10 @@ def tensor_message(
         row: Index of the row that the message is to contain.
         covariance: Covariance of the 6 stress components and 9 gradients, (15, 15), in SI units.
     """
-    xx, yy, zz, yz, zx, xy = rows.stress[row].tolist()
+    stress = rows.stress[row]
     tensor = StressTensor(
-        normal=Vector3(
-            x=xx,
-            y=yy,
-            z=zz,
-        ),
-        shear=Vector3(
-            x=yz,
-            y=zx,
-            z=xy,
-        ),
+        normal=_make_vector(Vector3, stress[:3]),
+        shear=_make_vector(Vector3, stress[3:]),
         normal_gradient=rows.gradient[row].astype(float),
         covariance=covariance.ravel(),
         residual=float(rows.residual[row]),
@@ -269,12 +262,14 @@ def wrench_message(
         force_n: Force (3,), in N.
         torque_nm: Torque (3,), in N m.
     """
-    message = WrenchStamped(header=header)
-    force = message.wrench.force
-    torque = message.wrench.torque
-    force.x, force.y, force.z = force_n.tolist()
-    torque.x, torque.y, torque.z = torque_nm.tolist()
-    return message
+    force = _make_vector(Vector3, force_n)
+    torque = _make_vector(Vector3, torque_nm)
+    return WrenchStamped(header=header, wrench=Wrench(force=force, torque=torque))
+
+
+def _make_vector(kind: type, values: Real) -> Any:
+    """Return a message with the fields x, y, z, or x, y, z, w if there are four values."""
+    return kind(**dict(zip("xyzw", values.tolist(), strict=False)))
 
 
 def info_message(
@@ -328,15 +323,8 @@ def _cube_info(cube: SkinCube, frame_id: str) -> CubeInfo:
     """Return the part of a SkinInfo message about one cube (name, pose, layout, hub), as stated in
     the skin file."""
     calibration = cube.calibration
-    px, py, pz = cube.xyz
-    position = Point(x=px, y=py, z=pz)
-    x, y, z, w = quaternion_from_rpy(*cube.rpy).tolist()
-    orientation = Quaternion(
-        x=x,
-        y=y,
-        z=z,
-        w=w,
-    )
+    position = _make_vector(Point, np.array(cube.xyz))
+    orientation = _make_vector(Quaternion, quaternion_from_rpy(*cube.rpy))
     # Fields of a message cannot be None, so a link that the skin file leaves out is sent as an
     # empty text, and an index as 0.
     return CubeInfo(
