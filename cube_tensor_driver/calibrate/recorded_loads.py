@@ -324,8 +324,7 @@ def _read_batches(
     for messages, _ in bag.stress(topic):
         parts.append(messages.rows.select(messages.rows.cube == number))
     rows = concatenate(parts)
-    components = np.hstack([rows.stress, rows.gradient])
-    return rows.stamp_ns, components.astype(float)
+    return rows.stamp_ns, rows.components.astype(float)
 
 
 def _axes(vector: Any) -> list[float]:

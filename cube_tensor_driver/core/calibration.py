@@ -19,7 +19,7 @@ from .compensation.models import CreepModel, EffectModel, ThermalModel, WeightMo
 from .defaults import BETA, FOAM_MODULUS, FREQUENCY_NOISE, HALF_SIDE, REST_FREQUENCY
 from .errors import CalibrationError, LayoutError, SymmetryError
 from .layout import LAYOUTS, Layout, find_layout
-from .modes import Modes
+from .modes import COMPONENTS, STRESS, Modes
 from .oscillator import TemperatureModel
 from .response import illustrative_coefficients, response
 from .symmetry import Structure, default_modes, find_structure, largest_symmetry
@@ -222,6 +222,13 @@ class Calibration:
         result: Array = self.gain[:, None] * matrix
         result.flags.writeable = False
         return result
+
+    @property
+    def component_scale(self) -> Array:
+        """Factors (15,) that take components with gradients times the half side, in Pa, to the
+        published components, in Pa and Pa/m."""
+        is_stress = np.arange(len(COMPONENTS)) < len(STRESS)
+        return np.where(is_stress, 1.0, 1 / self.half_side)
 
     @cached_property
     def id(self) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from .arrays import Array, Index, Mask
 from .health.diagnosis import has_high_residual
 from .health.statistics import WINDOW_S
-from .modes import COMPONENTS, STRESS
+from .modes import COMPONENTS
 from .rows import StressRows
 from .status import INVALID, RESIDUAL
 
@@ -76,9 +76,7 @@ class LatestStress:
         if not is_known.all():
             rows = rows.select(is_known)
         cube = rows.cube
-        n_stress = len(STRESS)
-        self.values[cube, :n_stress] = rows.stress
-        self.values[cube, n_stress:] = rows.gradient
+        self.values[cube] = rows.components
         self.residual[cube] = rows.residual
         self.status[cube] = rows.status
         self.left_out[cube] = rows.left_out
@@ -88,9 +86,7 @@ class LatestStress:
         # If a cube has several of the new rows, `count[cube] += 1` would count only one of them.
         np.add.at(self.count, cube, 1)
         is_over_limit = rows.status & RESIDUAL != 0
-        if is_over_limit.any():
-            exceeding = cube[is_over_limit]
-            np.add.at(self._over_limit, exceeding, 1)
+        np.add.at(self._over_limit, cube[is_over_limit], 1)
 
     def health(self, now: float, stale_after: float) -> Index:
         """Return the health of each cube.

@@ -106,8 +106,7 @@ def _find_estimator(calibration: Calibration, mask: int) -> Estimator:
         calibration.neglect,
     )
     # So far, the estimator gives gradients times d0 (half the side of the cube), in Pa.
-    is_stress = np.arange(N_COMPONENTS) < len(STRESS)
-    scale = np.where(is_stress, 1, 1 / calibration.half_side)
+    scale = calibration.component_scale
     return replace(
         estimator,
         matrix=estimator.matrix * scale[:, None],

@@ -163,6 +163,11 @@ class StressRows(_Rows):
     observed: NDArray[np.uint16]
     left_out: PadMasks
 
+    @property
+    def components(self) -> Real:
+        """Stress, in Pa, and gradients, in Pa/m, in one array (N, 15), as `modes.COMPONENTS`."""
+        return np.hstack([self.stress, self.gradient])
+
     @classmethod
     def of(
         cls,

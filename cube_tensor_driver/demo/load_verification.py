@@ -135,8 +135,7 @@ class LoadVerification:
         self._stress.add(rows, received_ns)
         # The rows are stored in the same order as in `Arrivals`, so that indices into its rows can
         # be used here, too.
-        components = np.hstack([rows.stress, rows.gradient])
-        self._components.append(components)
+        self._components.append(rows.components)
 
     def is_beyond(self, end_ns: int) -> bool:
         """Return whether a tensor with a stamp after `end_ns` has arrived from each cube.

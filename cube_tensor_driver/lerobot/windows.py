@@ -138,10 +138,9 @@ def arrange_windows(
     )
 
     shape = (n_frames, depth, n_cubes)
-    components = np.hstack([rows.stress, rows.gradient])
     tactile_shape = (*shape, len(COMPONENTS))
     tactile = np.full(tactile_shape, np.nan, np.float32)
-    tactile[place] = components[order]
+    tactile[place] = rows.components[order]
     windows: dict[str, AnyArray] = {TACTILE: tactile}
     for name, kind in WINDOW_COLUMNS.items():
         empty = np.nan if kind is np.float32 else 0

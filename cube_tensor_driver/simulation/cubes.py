@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from ..config.skin import Skin, SkinLink
 from ..core.arrays import Array, Index
-from ..core.calibration import Calibration
+from ..core.calibration import Calibration, tabulate_pads
 from ..core.errors import ConfigError
-from ..core.modes import COMPONENTS, STRESS, to_gradient_tensor
+from ..core.modes import COMPONENTS, to_gradient_tensor
 from ..core.oscillator import pad_frequency
 from ..core.poses import CubePoses
 from ..device.wire.protocol import NOT_MEASURED
@@ -80,11 +80,16 @@ class SimulatedCubes:
         self._random = np.random.default_rng(seed)
         self._groups = calibration_groups(calibrations)
 
+        self._law = [
+            tabulate_pads(calibrations, name, self.n_pads, fill=np.nan)
+            for name in ("rest_frequency", "beta", "modulus")
+        ]
+
         shape = (len(calibrations), self.n_pads)
-        self._noise = np.full(shape, noise or 0.0)
         if noise is None:
-            for calibration, rows in self._groups:
-                self._noise[rows] = frequency_noise(calibration)
+            self._noise = np.array([frequency_noise(one) for one in calibrations])
+        else:
+            self._noise = np.full(shape, noise)
         self._is_noisy = bool(self._noise.any())
 
         self._behaviour = None
@@ -135,12 +140,8 @@ class SimulatedCubes:
         if self._behaviour is not None:
             pad_stress = self._behaviour.reported(pad_stress, seconds)
 
-        hertz = np.empty_like(pad_stress)
-        for calibration, rows in self._groups:
-            rest = calibration.rest_frequency * drifted * warm[rows]
-            hertz[rows] = pad_frequency(
-                pad_stress[rows], rest, calibration.beta, calibration.modulus
-            )
+        rest, beta, modulus = self._law
+        hertz = pad_frequency(pad_stress, rest * drifted * warm, beta, modulus)
         if self._is_noisy:
             hertz *= 1 + self._noise * self._random.standard_normal(hertz.shape)
         # The frequency is NaN if the stress is outside the range of the pad law.
@@ -342,13 +343,9 @@ def skin_components(
     Returns:
         Components (cubes, 15): six stresses in Pa, then nine gradients in Pa/m.
     """
-    is_stress = np.arange(len(COMPONENTS)) < len(STRESS)
-    shape = (len(skin.cubes), len(COMPONENTS))
-    components = np.empty(shape)
+    components = np.empty((len(skin.cubes), len(COMPONENTS)))
     for calibration, rows in calibration_groups(skin.calibrations):
-        # The modes give gradients in Pa, as the change of the stress over half the side of a cube.
-        # They are converted to Pa/m.
-        scale = np.where(is_stress, 1.0, 1 / calibration.half_side)
         state = true_state(calibration, stress[rows], gradient[rows])
-        components[rows] = state @ calibration.modes.components.T * scale
+        in_pascal = state @ calibration.modes.components.T
+        components[rows] = in_pascal * calibration.component_scale
     return components

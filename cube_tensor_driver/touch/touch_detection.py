@@ -243,11 +243,7 @@ class Touch:
         elapsed_s = (1e-9 * elapsed_ns).clip(0, TIME_CONSTANT_S)
         self._stamp_ns[cube] = rows.stamp_ns
 
-        values = np.concatenate(
-            [rows.stress, rows.gradient],
-            axis=1,
-            dtype=np.float64,
-        )
+        values = rows.components.astype(float)
         slow = self._slow[cube]
         is_unknown = np.isnan(slow)
         if is_unknown.any():

@@ -314,6 +314,6 @@ def resolution(skin: Skin) -> np.ndarray:
         # Less than two periods are missing at the ends; 1 % for slope and frequency under load.
         relative = 1.01 / (ticks - 2 * COUNTER_HZ / rest) + 1e-7
         matrix = make_estimator(calibration.response, calibration.noise, calibration.modes).matrix
-        scale = np.where(np.arange(15) < 6, 1.0, 1 / calibration.half_side)
+        scale = calibration.component_scale
         bounds.append(scale * (np.abs(matrix) @ (stiffness * relative)))
     return np.array(bounds)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cube_tensor_driver.core.arrays import Array, Index, Mask, Real
+from cube_tensor_driver.core.arrays import Array, Index, Mask
 from cube_tensor_driver.core.estimator import chi2_limit
 from cube_tensor_driver.core.matching import NO_MATCH, match_rows
 from cube_tensor_driver.core.modes import COMPONENTS
@@ -177,8 +177,8 @@ class _Reference:
         allowed_residual = MAX_RESIDUAL_ERROR + relative_part
         agrees = agree(made.residual, wanted.residual, allowed_residual)
         agrees &= agree(
-            _components(made),
-            _components(wanted),
+            made.components,
+            wanted.components,
             allowed,
         ).all(axis=1)
         agrees &= made.observed == wanted.observed
@@ -209,8 +209,3 @@ class _Reference:
             variance = np.diag(self._pipeline.covariance(cube, left_out))
             self._deviations[cube, left_out] = np.sqrt(np.nan_to_num(variance))
         return self._deviations[cube, left_out]
-
-
-def _components(rows: StressRows) -> Real:
-    """Return stresses and gradients in one array (N, 15)."""
-    return np.concatenate([rows.stress, rows.gradient], axis=1)
