@@ -157,7 +157,7 @@ class TractionBench:
     def __init__(
         self,
         setting: Setting,
-        side: int = 4,
+        side: int | None = 4,
         influence: Influence | None = None,
     ) -> None:
         """Set up the inverse.
@@ -165,6 +165,7 @@ class TractionBench:
         Args:
             setting: Skin and loads.
             side: Number of points along the side of a cube's patch, the square grid around it.
+                None: as many as the inverse chooses.
             influence: Influence functions that the inverse assumes; None: cubes count as points.
         """
         self.setting = setting
@@ -181,7 +182,7 @@ class TractionBench:
         self.inverse = SurfaceInverse.from_poses(
             self.poses, by_pad, known_layer, setting.depth, side, reading
         )
-        self.surface = Surface(self.poses, setting.depth, side)
+        self.surface = Surface(self.poses, setting.depth, side or 2)
         points = np.abs(self.inverse.points[:, :2])
         from_centre = points.max(axis=1)
         self.window = from_centre < WINDOW / 2

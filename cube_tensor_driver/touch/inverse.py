@@ -32,6 +32,11 @@ from .prediction import MissingValuePrediction
 from .surface import patches
 from .unrolled_skin import unroll
 
+MAX_PITCH_OF_FOUR_POINTS = 3.25
+"""Largest pitch (distance of neighbouring cubes), in depths of the cubes' centres, at which the
+patch of a cube has 2 x 2 points. Beyond it there are 3 x 3, one of them above the cube. A ball of
+0.3 N that pressed there, 4 depths between cubes, was not found between four points."""
+
 
 class TractionField(NamedTuple):
     """Traction (force per area) at M points of the surface of a skin.
@@ -95,7 +100,7 @@ class SurfaceInverse:
         depth: float | None = None,
         thickness: float | None = None,
         poisson: float | None = None,
-        side: int = 2,
+        side: int | None = None,
         influence: Influence | None = None,
     ) -> None:
         """Set up the matrices. The first time takes about a second, later ones load from the cache.
@@ -109,6 +114,7 @@ class SurfaceInverse:
             poisson: Poisson's ratio of the elastomer. None: that of the skin file, or else
                 0.48.
             side: Number of points along a side of the patch (square grid of points) of each cube.
+                None: 2 or 3, depending on the pitch (`MAX_PITCH_OF_FOUR_POINTS`).
             influence: Influence functions (stress of each pad under a force of 1 N, by the force's
                 position), whose depth, thickness and Poisson's ratio replace those given here.
                 None: cubes are modelled as points.
@@ -139,7 +145,7 @@ class SurfaceInverse:
         by_pad: Array,
         layer: Layer,
         depth: float,
-        side: int = 2,
+        side: int | None = None,
         model: MeasurementModel | None = None,
     ) -> SurfaceInverse:
         """Create a `SurfaceInverse` from the cubes' poses and noise, without a skin file.
@@ -149,7 +155,7 @@ class SurfaceInverse:
             by_pad: Noise matrices (cubes, 15, P) as from `noise_of_all_pads`.
             layer: Elastic layer that contains the cubes.
             depth: Distance from the centres of the cubes to the surface, in m.
-            side: Number of points along a side of the patch (square grid of points) of each cube.
+            side: Number of points along a side of the patch of each cube, as for `SurfaceInverse`.
             model: Measurement model of the cubes as from `model_pads`; None: they are modelled as
                 points.
         """
@@ -163,7 +169,7 @@ class SurfaceInverse:
         by_pad: Array,
         layer: Layer,
         depth: float,
-        side: int,
+        side: int | None,
         model: MeasurementModel | None,
     ) -> None:
         """Compute the points on the surface and all matrices; arguments as in `from_poses`.
@@ -172,6 +178,8 @@ class SurfaceInverse:
             ElasticError: `side` is below 1, the layer does not contain the depth, or no cube
                 observes any component.
         """
+        if side is None:
+            side = 2 if poses.pitch <= MAX_PITCH_OF_FOUR_POINTS * depth else 3
         if side < 1:
             raise ElasticError(f"{side} points a side of a patch; it must be at least 1")
         n = len(poses.position)

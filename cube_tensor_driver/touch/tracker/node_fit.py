@@ -48,10 +48,11 @@ MAX_NODES = 80
 """Largest number of nodes (small contacts that make up the traction) of a fit, whose time grows
 with its third power. The nodes of larger regions lie farther apart."""
 
-BORDER_REACH_PITCHES = 1.5
-"""Distance from a region of contact at the border of the skin, divided by the pitch (distance of
-neighbouring cubes), up to which nodes (small contacts) are placed beyond the border. The region
-itself ends there, because it consists of points of the skin, but the contact may not."""
+BORDER_REACH_DEPTHS = 2.4
+"""Distance from a region of contact at the border of the skin, divided by the depth of the cubes'
+centres, up to which nodes (small contacts) are placed beyond the border. The region itself ends
+there, because it consists of points of the skin, but the contact may not. Cubes do not feel the
+force of nodes much farther away, which would make the force of the contact arbitrary."""
 
 ENVELOPE_FLOOR = 0.03
 """Smallest prior standard deviation of the force of a node (one of the small contacts whose sum is
@@ -389,7 +390,7 @@ def _place_nodes(region: Array, around: Array, inverse: SurfaceInverse) -> tuple
     Returns:
         Positions (q, 2) of at most `MAX_NODES` nodes in m, and their distance in m.
     """
-    reach = BORDER_REACH_PITCHES * inverse.pitch
+    reach = BORDER_REACH_DEPTHS * inverse.depth
     margin = _POINT_MARGIN * inverse.spacing
     centre = region.mean(axis=0)
     radius = np.abs(region - centre).max()
