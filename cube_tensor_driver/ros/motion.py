@@ -38,13 +38,7 @@ MAX_TRANSFORM_AGE_NS = SECOND
 of a cube). With an older transform the direction of gravity counts as unknown. The limit does not
 apply to static transforms."""
 
-CROSS_OF_AXES = np.array(
-    [
-        [0.0, 0, 0, 0, 0, -1, 0, 1, 0],
-        [0, 0, 1, 0, 0, 0, -1, 0, 0],
-        [0, -1, 0, 1, 0, 0, 0, 0, 0],
-    ]
-)
+CROSS_OF_AXES = np.cross(np.eye(3)[:, None], np.eye(3)).swapaxes(1, 2).reshape(3, 9)
 """For each axis x, y, z, the 9 numbers of the matrix whose product with any vector r is the cross
 product of the unit vector along the axis and r (3, 9)."""
 
@@ -229,7 +223,7 @@ class ImuMotion:
         """
         try:
             sample, self._imu_frame = _decode(data)
-        except ValueError as error:
+        except (ValueError, struct.error) as error:
             log_refused_message(self._node, self._topic, error)
             return
         velocity = sample.angular_velocity
@@ -298,18 +292,16 @@ def _decode(data: bytes) -> tuple[_Sample, str]:
     takes ten times as long.
 
     Raises:
-        ValueError: The message is damaged, or is not little-endian CDR.
+        struct.error: The message is too short.
+        ValueError: It is not little-endian CDR, or its frame is no text.
     """
-    try:
-        seconds, nanoseconds, length = IMU_HEADER.unpack_from(data)
-        text_end = IMU_HEADER.size + length
-        # The numbers are aligned to 8 bytes, from the end of the first four bytes.
-        begin = -(-(text_end - 4) // 8) * 8 + 4
-        numbers = IMU_NUMBERS.unpack_from(data, begin)
-    except struct.error as error:
-        raise ValueError(f"{len(data)} bytes: {error}") from None
     if data[:2] != LITTLE_ENDIAN[:2]:
         raise ValueError("not little-endian CDR")
+    seconds, nanoseconds, length = IMU_HEADER.unpack_from(data)
+    text_end = IMU_HEADER.size + length
+    # The numbers are aligned to 8 bytes, from the end of the first four bytes.
+    begin = -(-(text_end - 4) // 8) * 8 + 4
+    numbers = IMU_NUMBERS.unpack_from(data, begin)
     # According to sensor_msgs/Imu, a first covariance of -1 means that there is no measurement.
     force = numbers[3:6] if numbers[6] != -1 else (math.nan,) * 3
     sample = _Sample(seconds * SECOND + nanoseconds, force, numbers[:3])

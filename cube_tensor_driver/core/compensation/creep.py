@@ -188,11 +188,10 @@ class Creep:
         """Compute what depends only on the duration of `_set_line` for each cube (C,), in s."""
         self._duration_s = duration_s
         share, mean = self._memories.find_shares(duration_s)
-        seconds = duration_s[: share.shape[1]]
         # The low-passed reading changes, per second, by one fraction of its lag behind the reading
         # and by another fraction of the change of the reading.
-        self._of_lag = share / seconds
-        of_change = (1 - mean) / seconds
+        self._of_lag = share / duration_s
+        of_change = (1 - mean) / duration_s
         self._full_gain = np.zeros_like(self.gain)
         for k, amplitude in enumerate(self._amplitude):
             self._full_gain += amplitude * of_change[k]

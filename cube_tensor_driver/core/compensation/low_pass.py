@@ -110,10 +110,7 @@ class LowPass:
         return share
 
     def find_shares(self, elapsed_s: Real) -> tuple[Array, Array]:
-        """Return m = 1 - exp(-t / time) and m time / t for intervals t (C,), in s.
-
-        Both are (K, C), or (K, 1) if they are the same for all cubes.
-        """
+        """Return m = 1 - exp(-t / time) and m time / t, both (K, C), for intervals t (C,), in s."""
         # The cubes of one hub follow each other and have equal intervals, so one computation serves
         # them all.
         is_other = self._is_other | (elapsed_s[1:] != elapsed_s[:-1])
@@ -124,7 +121,5 @@ class LowPass:
         # The quotient share / ratio tends to 1 as the length of the interval tends to 0.
         divisor = np.maximum(ratio, 1e-300)
         mean = np.where(ratio > 0, share / divisor, 1.0)
-        if len(begins) == 1:
-            return share, mean
         counts = np.diff(begins, append=len(elapsed_s))
         return np.repeat(share, counts, axis=1), np.repeat(mean, counts, axis=1)

@@ -25,8 +25,6 @@ class Weight:
         response: Stress on each pad per specific force (C, 3, P), in Pa per m/s².
     """
 
-    key = "weight"
-
     def __init__(self, pipeline: Pipeline) -> None:
         calibrations = pipeline.calibrations
         shape = len(calibrations), 3, pipeline.n_pads
