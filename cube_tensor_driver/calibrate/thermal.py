@@ -130,14 +130,12 @@ class ThermalFit:
             Rms stress of the unloaded pads before and after the effect of temperature is
             subtracted, in Pa, and rms deviation of the linear coefficient over the pads, in Pa/K.
         """
-        deviation = np.zeros(1)
-        if self.model.deviation is not None:
-            deviation = self.model.deviation[:, 0]
+        deviation = np.array(self.model.deviation)
         change = self.data.stress - self.offset
         return (
             root_mean_square(change),
             root_mean_square(self.residual),
-            root_mean_square(deviation),
+            root_mean_square(deviation[:, 0]),
         )
 
     def calibration(self, base: Calibration, source: str) -> Calibration:

@@ -135,7 +135,7 @@ class TemperatureModel(EffectModel):
     """
 
     key = "temperature"
-    axes: ClassVar[Mapping[str, int]] = {"reference": 0, "coefficients": 2}
+    axes: ClassVar[Mapping[str, str]] = {"reference": "", "coefficients": "PD"}
 
     reference: Array
     coefficients: Array

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import struct
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from sensor_msgs.msg import Imu
@@ -47,22 +47,7 @@ class MissingMotion(CubeError):
     """The motion of the skin is unknown. The text of the error states the reason and the remedy."""
 
 
-class MotionSource(Protocol):
-    """A source of the motion of a skin, such as an IMU."""
-
-    def motion(self, first_ns: int, last_ns: int) -> Motion:
-        """Return the motion at one or more instants, from which it can be interpolated in a span.
-
-        Args:
-            first_ns: Begin of the span of time, in ns since the Unix epoch.
-            last_ns: End of the span of time, in ns since the Unix epoch.
-
-        Raises:
-            MissingMotion: The motion in this span is unknown.
-        """
-
-
-def make_motion_source(node: CubeNode, parent_frame: str) -> MotionSource | None:
+def make_motion_source(node: CubeNode, parent_frame: str) -> ImuMotion | GravityMotion | None:
     """Return the source of the motion that a parameter of a node selects.
 
     The parameter `imu` selects an IMU by its topic, and the parameter `gravity` selects TF by the
@@ -149,7 +134,7 @@ class GravityMotion:
         self._transforms = Transforms(node)
 
     def motion(self, first_ns: int, last_ns: int) -> Motion:
-        """Return the motion that follows from the newest transform; see `MotionSource.motion`."""
+        """Return the motion that follows from the newest transform; see `ImuMotion.motion`."""
         rotation, _, time_ns = self._transforms.newest(self._parent_frame, self._frame)
         age_ns = last_ns - time_ns
         if time_ns and abs(age_ns) > MAX_TRANSFORM_AGE_NS:
@@ -157,7 +142,7 @@ class GravityMotion:
                 f"transform from {self._frame} to {self._parent_frame} is {age_ns / 1e9:.1f} s "
                 "older than the rows: see who publishes it, and that clocks agree"
             )
-        up = rotation @ np.array([0.0, 0.0, STANDARD_GRAVITY])
+        up = STANDARD_GRAVITY * rotation[:, 2]
         no_rotation = np.zeros((1, 3, 3))
         return Motion(np.array([last_ns]), up[None], no_rotation)
 
@@ -249,7 +234,15 @@ class ImuMotion:
         self._samples.append(sample)
 
     def motion(self, first_ns: int, last_ns: int) -> Motion:
-        """Return the motion at the samples around a span of time; see `MotionSource.motion`."""
+        """Return the motion at the samples around a span of time, to be interpolated in it.
+
+        Args:
+            first_ns: Begin of the span, in ns since the Unix epoch.
+            last_ns: End of the span, in ns since the Unix epoch.
+
+        Raises:
+            MissingMotion: The motion in this span is unknown.
+        """
         samples = self._samples
         if len(samples) < 2:
             raise MissingMotion(self._problem)

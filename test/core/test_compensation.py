@@ -139,7 +139,7 @@ def test_blocks_of_a_calibration_are_part_of_its_id_and_are_checked(key):
         with pytest.raises(CalibrationError, match=f"{key}: found"):
             Calibration.from_dict({**PLAIN.to_dict(), "id": whole.id, key: wrong})
     table = MODELS[key].to_dict()
-    name = next(name for name, n_axes in MODELS[key].axes.items() if n_axes == 2)
+    name = next(name for name, axes in MODELS[key].axes.items() if len(axes) == 2)
     for values, message in (
         (table[name][:4], "4 pads|must be"),
         ("much", "give numbers|must be finite"),

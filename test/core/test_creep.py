@@ -199,8 +199,11 @@ def test_a_tare_holds_although_the_pads_are_still_recovering():
     [
         ({"time": [1.0, 1.0], "amplitude": [[0.1, 0.1]] * 8}, "times must be above 0 and rise"),
         ({"time": [1.0, 2.0], "amplitude": [[0.6, 0.6]] * 8}, "add up to less than 1"),
-        ({"time": [1.0], "amplitude": [[0.1, 0.1]] * 8}, "give 1 numbers per pad"),
-        ({"time": [1.0], "amplitude": [[0.1]] * 8, "deviation": [[[0.1, 0.2]]]}, "give 1 numbers"),
+        ({"time": [1.0], "amplitude": [[0.1, 0.1]] * 8}, "amplitude has shape"),
+        (
+            {"time": [1.0], "amplitude": [[0.1]] * 8, "deviation": [[[0.1, 0.2]]]},
+            "deviation has shape",
+        ),
     ],
 )
 def test_laws_that_cannot_be_are_named(values, said):

@@ -77,11 +77,8 @@ class Creep:
         self._models = [calibration.creep for calibration in pipeline.calibrations]
         self.has_model = np.array([model is not None for model in self._models])
         n_cubes, n_pads = offsets.reading.shape
-        times: set[float] = set()
-        for model in self._models:
-            if model is not None:
-                times.update(model.time.tolist())
-        self._times = np.array(sorted(times))
+        times = [model.time for model in self._models if model is not None]
+        self._times = np.unique(np.hstack([[], *times]))
         time = np.repeat(self._times[:, None], n_cubes, axis=1)
         self._memories = LowPass(time, n_pads)
         self._amplitude = np.zeros_like(self._memories.lag)
@@ -100,8 +97,7 @@ class Creep:
         self._time_ns = np.zeros(n_cubes, np.int64)
         self._reading = np.zeros(shape)
         # Fraction of each low-passed reading that depends on loads that were not measured.
-        n_times = len(times)
-        self._unknown = np.ones((n_times, n_cubes))
+        self._unknown = np.ones(time.shape)
         # Largest reading of each pad that such a load is assumed to have caused.
         self._largest_unknown = np.zeros(shape)
         self._is_certain = np.ones(n_cubes, bool)

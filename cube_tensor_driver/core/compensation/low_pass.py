@@ -121,5 +121,5 @@ class LowPass:
         # The quotient share / ratio tends to 1 as the length of the interval tends to 0.
         divisor = np.maximum(ratio, 1e-300)
         mean = np.where(ratio > 0, share / divisor, 1.0)
-        counts = np.diff(begins, append=len(elapsed_s))
-        return np.repeat(share, counts, axis=1), np.repeat(mean, counts, axis=1)
+        run = np.cumsum(begins_run) - 1
+        return share.take(run, axis=1), mean.take(run, axis=1)

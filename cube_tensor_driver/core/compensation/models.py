@@ -27,19 +27,19 @@ class EffectModel:
 
     Attributes:
         key: Name of the model's block in a calibration file.
-        axes: Number of axes of each attribute, by its name. The first axis of an attribute with two
-            axes is the pads.
+        axes: A letter for each axis of each attribute, by its name. Axes with the same letter have
+            the same length; P is the number of pads, and a digit is the length itself.
 
     Raises:
         CalibrationError: A value has the wrong shape, is not finite, or contradicts another.
     """
 
     key: ClassVar[str]
-    axes: ClassVar[Mapping[str, int]]
+    axes: ClassVar[Mapping[str, str]]
 
     def __post_init__(self) -> None:
-        shapes: dict[int, tuple[int, ...]] = {}
-        for name, n_axes in self.axes.items():
+        lengths = {"3": 3}
+        for name, axes in self.axes.items():
             value = getattr(self, name)
             if value is None:
                 continue
@@ -48,15 +48,13 @@ class EffectModel:
             except (TypeError, ValueError):
                 raise CalibrationError(f"{self.key}: {name} is {value!r}; give numbers") from None
             is_finite = np.isfinite(array).all()
-            if array.ndim != n_axes or not is_finite or not array.size:
+            if array.ndim != len(axes) or not is_finite or not array.size:
                 raise CalibrationError(
                     f"{self.key}: {name} is {value!r}; it must be finite numbers "
-                    f"with {n_axes} axes, one list per pad if there are two"
+                    f"with {len(axes)} axes, one list per pad if there are two"
                 )
-            # The second axis of `ramp` has a length of its own, so only its number of pads is
-            # compared with other attributes.
-            shape = array.shape[:1] if name == "ramp" else array.shape
-            wanted = shapes.setdefault(n_axes, array.shape)[: len(shape)]
+            shape = array.shape
+            wanted = tuple(map(lengths.setdefault, axes, shape))
             if shape != wanted:
                 raise CalibrationError(f"{self.key}: {name} has shape {shape}; it must be {wanted}")
             array.flags.writeable = False
@@ -65,7 +63,7 @@ class EffectModel:
     @property
     def n_pads(self) -> int:
         """Number of pads of the model."""
-        per_pad = [name for name, n_axes in self.axes.items() if n_axes == 2]
+        per_pad = [name for name, axes in self.axes.items() if axes.startswith("P")]
         values = getattr(self, per_pad[0])
         return len(values)
 
@@ -108,17 +106,10 @@ class WeightModel(EffectModel):
     """
 
     key = "weight"
-    axes: ClassVar[Mapping[str, int]] = {"response": 2, "deviation": 2}
+    axes: ClassVar[Mapping[str, str]] = {"response": "P3", "deviation": "P3"}
 
     response: Array
     deviation: Array | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.response.shape[1] != 3:
-            raise CalibrationError(
-                f"weight: response has shape {self.response.shape}; it must be (pads, 3)"
-            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +127,7 @@ class CreepModel(EffectModel):
     """
 
     key = "creep"
-    axes: ClassVar[Mapping[str, int]] = {"time": 1, "amplitude": 2, "deviation": 3}
+    axes: ClassVar[Mapping[str, str]] = {"time": "K", "amplitude": "PK", "deviation": "SPK"}
 
     time: Array
     amplitude: Array
@@ -144,13 +135,6 @@ class CreepModel(EffectModel):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        shape = len(self.amplitude), len(self.time)
-        deviation = np.zeros((0, *shape)) if self.deviation is None else self.deviation
-        if self.amplitude.shape != shape or deviation.shape[1:] != shape:
-            raise CalibrationError(
-                f"creep: amplitude and deviation have the shapes {self.amplitude.shape} and "
-                f"{deviation.shape}; give {len(self.time)} numbers per pad, one for each time"
-            )
         steps = np.diff(self.time, prepend=0)
         total = self.amplitude.sum(axis=1)
         if (steps <= 0).any() or (total >= 1).any():
@@ -181,12 +165,12 @@ class ThermalModel(EffectModel):
     """
 
     key = "thermal"
-    axes: ClassVar[Mapping[str, int]] = {
-        "reference": 0,
-        "lag": 1,
-        "coefficient": 2,
-        "deviation": 2,
-        "ramp": 2,
+    axes: ClassVar[Mapping[str, str]] = {
+        "reference": "",
+        "lag": "L",
+        "coefficient": "PD",
+        "deviation": "PD",
+        "ramp": "PK",
     }
 
     reference: Array

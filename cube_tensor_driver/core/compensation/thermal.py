@@ -63,10 +63,8 @@ class Thermal:
         self._models = [calibration.thermal for calibration in pipeline.calibrations]
         self.has_model = np.array([model is not None for model in self._models])
         present = [model for model in self._models if model is not None]
-        lag_counts = [len(model.lag) for model in present]
-        degrees_by_model = [model.coefficient.shape[1] for model in present]
-        n_lags = max(lag_counts, default=0)
-        n_degrees = max(degrees_by_model, default=0)
+        n_lags = max((len(model.lag) for model in present), default=0)
+        n_degrees = max((model.coefficient.shape[1] for model in present), default=0)
         stiffness = np.where(pipeline.stiffness > 0, pipeline.stiffness, np.inf).T
         n = len(self._models)
         times = np.full((n_lags, n), MIN_LAG_S)
@@ -144,8 +142,8 @@ class Thermal:
 
     def resume(self) -> None:
         """Compute `offset` and `is_known` from the state, which may be one from a recording."""
-        is_unknown = np.isnan(self._measured)
-        lag = np.where(is_unknown, np.nan, 0)
+        # NaN as long as no temperature has been measured.
+        lag = 0 * self._measured
         for number, weight in enumerate(self._weight):
             lag += weight * self._filters.lag[number, 0]
         self._lag[:] = lag
