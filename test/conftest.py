@@ -185,6 +185,11 @@ def ros(domain: int) -> Iterator[Ros]:
         yield node
 
 
+def open_files() -> int:
+    """How many files this process has open."""
+    return sum(1 for _ in Path("/proc/self/fd").iterdir())
+
+
 @pytest.fixture
 def deaf() -> Iterator[str]:
     """A TCP port where connecting neither succeeds nor fails, as of a host that is switched off:

@@ -359,34 +359,6 @@ def test_a_cube_twice_in_a_batch_and_cubes_in_any_order():
     assert together.collect()[2].tolist() == [1, 2, 0, 0, 3, 0]
 
 
-def test_a_batch_of_several_scans_is_the_scans_one_after_the_other():
-    together, singly = Skin(), Skin()
-    masks = []
-    for _ in range(12):
-        frequency = np.array([singly.frequency() for _ in range(10)], np.float32)
-        stamp_ns = PERIOD_NS * (singly.row + np.arange(10))[:, None] + np.arange(6)
-        frequency[4, 3, 2] = np.nan
-        faults = np.zeros((10, 6), np.uint32)
-        status = np.zeros((10, 6), np.uint16)
-        status[3:5, 2], status[9, 4] = STAMP, STAMP
-        stamp_ns[3:5, 2] += 1_000_000
-        whole_batch = stamped(
-            np.tile(singly.cube, 10), frequency.reshape(-1, 8), faults.ravel(), stamp_ns.ravel()
-        )
-        of_batch = check(together.health, replace(whole_batch, status=status.ravel()))
-        one_by_one = [
-            check(singly.health, replace(stamped(singly.cube, *one), status=of_scan))
-            for *one, of_scan in zip(frequency, faults, stamp_ns, status, strict=True)
-        ]
-        for whole, parts in zip(of_batch, zip(*one_by_one, strict=True), strict=True):
-            np.testing.assert_array_equal(whole, np.concatenate(parts))
-        masks.append(of_batch[0])
-        singly.row += 10
-    assert np.any(masks) and together.health.closed == singly.health.closed > 0
-    for one, other in zip(together.health.window(), singly.health.window(), strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
 def test_a_jump_back_in_time_begins_a_new_window():
     """What was gathered before is of another time: it goes neither into sums nor into the share of
     bad residuals."""

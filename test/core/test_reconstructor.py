@@ -40,13 +40,6 @@ def frequencies() -> np.ndarray:
     return f
 
 
-def test_a_broken_pad_is_left_out_and_named_in_the_status():
-    rows = stamped(np.arange(2), frequencies(), 0, 0)
-    stress = Reconstructor([CALIBRATION] * 2)(rows)
-    assert stress.left_out.tolist() == [0, 1 << 3]
-    assert stress.status.tolist() == [0, PAD_FAULT | SHORT]
-
-
 def test_doubt_of_a_stamp_goes_with_the_row():
     """Nothing else that a peer writes there does."""
     doubt = np.array([STAMP, STAMP | STUCK])

@@ -24,8 +24,6 @@ pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
-from lifecycle_msgs.msg import State, Transition
-from lifecycle_msgs.srv import ChangeState, GetState
 from played_hub import REST, SINGLE, PlayedHub, greeting, sample
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import PointCloud2
@@ -184,10 +182,9 @@ def test_the_address_of_the_view_is_printed_at_once_without_a_terminal(capsys):
 
 
 @pytest.mark.alone
-@pytest.mark.parametrize("scans", [1, 5])
-def test_every_topic_of_a_skin(ros, tmp_path, scans):
-    """Also with batches of several samples of each cube in a message."""
-    skin = read_skin(SKIN)
+def test_every_topic_of_a_skin(ros, tmp_path):
+    """With batches of five samples of each cube in a message."""
+    skin, scans = read_skin(SKIN), 5
     batches = ros.listen(SkinStress, "stress")
     raw = ros.listen(SkinFrequencies, "frequencies")
     tensors = ros.listen(StressTensorStamped, "cubes/c05/stress")
@@ -197,7 +194,7 @@ def test_every_topic_of_a_skin(ros, tmp_path, scans):
     diagnostics = ros.listen(DiagnosticArray, "/diagnostics")
     with Children(tmp_path) as children:
         for process in skin_processes(SKIN, simulated=SimulatedHubs(tmp_path / "ports")):
-            if process.node and scans > 1:
+            if process.node:
                 process.parameters["publish_period"] = scans / skin.rate
             if process.executable == "reconstruction":
                 process.parameters.update(forces=True, touch_false_alarms=1.0)
@@ -317,22 +314,6 @@ def test_every_topic_of_a_skin(ros, tmp_path, scans):
     assert compared > 40
 
 
-def test_driver_waits_for_a_port_that_is_not_there_yet(ros, tmp_path):
-    frequencies = ros.listen(SkinFrequencies, "frequencies")
-    ports = tmp_path / "ports"
-    simulator, _, driver = (
-        skin_processes(SINGLE, simulated=SimulatedHubs(ports))[i] for i in (0, 1, 2)
-    )
-    with Children(tmp_path) as children:
-        children.start(driver)
-        ros.wait(lambda: "link hub0: waiting" in children.log("driver"))
-        children.start(simulator)
-        ros.wait(lambda: frequencies, 10)
-        children.check()
-        assert "WARN" not in children.log("driver")
-        assert "Traceback" not in children.log("driver")
-
-
 def test_one_process_sends_frequencies_to_who_listens(ros, tmp_path):
     hub = PlayedHub(tmp_path / "ports", "hub0")
     stress = ros.listen(SkinStress, "stress")
@@ -359,13 +340,16 @@ def test_one_process_sends_frequencies_to_who_listens(ros, tmp_path):
     hub.close()
 
 
-@pytest.mark.parametrize("executable", ["driver", "reconstruction"])
 @pytest.mark.parametrize(
-    ("parameters", "words"),
+    ("executable", "parameters", "words"),
     [
-        ({"config": "none.yaml"}, ["none.yaml", "No such file"]),
-        ({"config": ""}, ["parameter config is empty"]),
-        ({"config": str(SKIN), "qos_reliability": "maybe"}, ["maybe", "reliable, best_effort"]),
+        ("driver", {"config": "none.yaml"}, ["none.yaml", "No such file"]),
+        ("reconstruction", {"config": ""}, ["parameter config is empty"]),
+        (
+            "reconstruction",
+            {"config": str(SKIN), "qos_reliability": "maybe"},
+            ["maybe", "reliable, best_effort"],
+        ),
     ],
 )
 def test_a_node_that_cannot_start_says_why_and_ends(domain, executable, parameters, words):
@@ -382,37 +366,3 @@ def test_a_node_that_cannot_start_says_why_and_ends(domain, executable, paramete
     assert "Traceback" not in text
     for word in words:
         assert word in text
-
-
-def test_lifecycle_by_hand(ros, tmp_path):
-    frequencies = ros.listen(SkinFrequencies, "frequencies")
-    ports = tmp_path / "ports"
-    simulator, _, driver = skin_processes(SINGLE, simulated=SimulatedHubs(ports))
-    driver.parameters["autostart"] = False
-
-    def change(number: int) -> None:
-        answer = ros.call(
-            ChangeState,
-            "/driver/change_state",
-            ChangeState.Request(transition=Transition(id=number)),
-        )
-        assert answer.success
-
-    def state() -> int:
-        return ros.call(GetState, "/driver/get_state", GetState.Request()).current_state.id
-
-    with Children(tmp_path) as children:
-        children.start(simulator)
-        children.start(driver)
-        assert state() == State.PRIMARY_STATE_UNCONFIGURED
-        for _ in range(2):
-            change(Transition.TRANSITION_CONFIGURE)
-            assert state() == State.PRIMARY_STATE_INACTIVE
-            frequencies.clear()
-            change(Transition.TRANSITION_ACTIVATE)
-            ros.wait(lambda: len(frequencies) > 5)
-            change(Transition.TRANSITION_DEACTIVATE)
-            ros.wait(lambda: children.log("driver").rstrip().endswith("link hub0: closed"), 5)
-            change(Transition.TRANSITION_CLEANUP)
-        assert state() == State.PRIMARY_STATE_UNCONFIGURED
-        children.check()

@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_native_wire import pieces
 from test_protocol import cobs_of
 
 from conftest import ROOT
@@ -27,7 +26,7 @@ from cube_tensor_driver.device.scans.scan import ScanBuilder
 from cube_tensor_driver.device.scans.sequence import Arrival, SampleAccount
 from cube_tensor_driver.device.track import LinkTrack
 from cube_tensor_driver.device.wire import cobs, native
-from cube_tensor_driver.device.wire.decoder import NativeDecoder, PythonDecoder
+from cube_tensor_driver.device.wire.decoder import PythonDecoder
 from cube_tensor_driver.device.wire.protocol import (
     TEMPERATURE_UNKNOWN,
     Hello,
@@ -37,23 +36,6 @@ from cube_tensor_driver.device.wire.protocol import (
 )
 
 needs_the_module = pytest.mark.skipif(native.wire is None, reason="was not compiled")
-
-
-@needs_the_module
-@settings(max_examples=100, deadline=None)
-@given(parts=st.lists(pieces, max_size=8), cuts=st.lists(st.integers(0, 2**16), max_size=8))
-def test_both_decoders_give_the_same(parts: list[bytes], cuts: list[int]) -> None:
-    data = b"".join(parts)
-    python, c = PythonDecoder(), NativeDecoder()
-    at = 0
-    for cut in [*sorted(cut % (len(data) + 1) for cut in cuts), len(data)]:
-        found = [encode(frame) for frame in c.feed(data[at:cut])]
-        assert found == [encode(frame) for frame in python.feed(data[at:cut])]
-        at = cut
-    python.reset()
-    c.reset()
-    assert c.counters == python.counters
-    assert c.other_version == python.other_version
 
 
 @needs_the_module

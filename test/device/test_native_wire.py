@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from test_protocol import BAD, FRAMES, cobs_of, crc_of, dump, wire
+from test_protocol import BAD, FRAMES, cobs_of, dump, wire
 
 from conftest import ROOT
 from cube_tensor_driver.device.wire.decoder import MAX_RUN, Counters, PythonDecoder
@@ -243,17 +243,6 @@ def test_c_and_python_agree(c: Wire, parts: list[bytes], cuts: list[int], ends: 
 def test_cobs_and_crc_agree_with_other_programs(c: Wire, data: bytes) -> None:
     """With the algorithm of the paper, and with zlib."""
     assert c.encode(data) == (cobs_of(data), zlib.crc32(data))
-
-
-def test_the_longest_frame_passes(c: Wire) -> None:
-    raw = bytes([2, 1]) + (65530).to_bytes(2, "little") + b"\1" * 65530
-    n_cubes = (65530 - 20) // 10
-    raw = raw[:10] + n_cubes.to_bytes(2, "little") + raw[12:]
-    raw += crc_of(raw).to_bytes(4, "little")
-    data = b"\0" + cobs_of(raw) + b"\0"
-    c.new()
-    found = [frame for at in range(0, len(data), 4096) for frame in c.decode(data[at : at + 4096])]
-    assert [frame.raw for frame in found] == [raw]
 
 
 @pytest.mark.parametrize("capacity", [0, 21, 22, 23, 60])

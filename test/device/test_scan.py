@@ -405,23 +405,6 @@ def test_stamps_use_the_arrival_of_their_own_read():
     assert live.row_counts() == RowCounts(delivered=5)
 
 
-def test_pads_that_a_cube_does_not_have_are_nan():
-    scan = ScanBuilder(
-        2,
-        [
-            CubeAddress("wide", 0, 0, None, 3),
-            CubeAddress("narrow", 1, 0, None, 2),
-            CubeAddress("narrow", 1, 1, None, 2),
-        ],
-    )
-    scan.cubes.learn(0, hello([1], 3))
-    scan.cubes.learn(1, hello([2, 3], 2))
-    scan.add(0, sample(0, [[1.0, 0.0, 3.0]]), 0)
-    scan.add(1, sample(0, [[4.0, 5.0], [6.0, 7.0]]), 0)
-    expected = [[1, np.nan, 3], [4, 5, np.nan], [6, 7, np.nan]]
-    np.testing.assert_array_equal(scan.build().frequency, expected)
-
-
 def live_links(on_rows, n_cubes=1):
     """One link whose hub has said HELLO."""
     addresses = [CubeAddress(f"c{index}", 0, index, None, 2) for index in range(n_cubes)]

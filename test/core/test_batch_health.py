@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from conftest import check, stamped
 from cube_tensor_driver.core.calibration import illustrative
 from cube_tensor_driver.core.health.health import Health
 from cube_tensor_driver.core.pipeline import Pipeline
+from cube_tensor_driver.core.status import STAMP
 
 
 @pytest.mark.parametrize("kinds", [["planar"], ["planar", "cube"]])
@@ -30,21 +33,24 @@ def test_many_at_once_is_one_by_one_to_the_bit(kinds, faults):
     stamp_ns[150:] += np.cumsum(rng.integers(0, 2, count - 150) * 10_000_000)[:, None]
     stamp_ns[250:] -= 2_000_000_000  # played again from further back
     cube = np.arange(n, dtype=np.uint16)
-    temperature = np.full((count, n), np.nan, np.float32)
+    status = np.zeros((count, n), np.uint16)
+    status[30:35, 2], status[199, 4] = STAMP, STAMP
     single, many = Health(pipeline), Health(pipeline)
     expected = [
-        check(single, stamped(cube, *one))
-        for one in zip(frequency, pad_fault, stamp_ns, temperature, strict=True)
+        check(single, replace(stamped(cube, *one), status=of_scan))
+        for *one, of_scan in zip(frequency, pad_fault, stamp_ns, status, strict=True)
     ]
     found = [
         check(
             many,
-            stamped(
-                np.tile(cube, len(part)),
-                frequency[part].reshape(-1, pipeline.n_pads),
-                pad_fault[part].ravel(),
-                stamp_ns[part].ravel(),
-                temperature[part].ravel(),
+            replace(
+                stamped(
+                    np.tile(cube, len(part)),
+                    frequency[part].reshape(-1, pipeline.n_pads),
+                    pad_fault[part].ravel(),
+                    stamp_ns[part].ravel(),
+                ),
+                status=status[part].ravel(),
             ),
         )
         for part in np.array_split(np.arange(count), 9)
