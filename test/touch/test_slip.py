@@ -79,6 +79,24 @@ def test_gross_slip_is_reported_within_10_ms_with_its_friction(benches, seed):
     np.testing.assert_allclose(velocity[:2], speed * along, atol=0.25 * speed)
 
 
+def test_the_noise_of_a_light_contact_is_no_motion_and_does_not_hide_its_slip(benches):
+    """The position of 0.06 N on planar cubes has a noise of 41 um. With 0.3 N on cubes of 24 pads
+    it is 2 um, and slip is known after three scans."""
+    random, body = np.random.default_rng(1), Body(0.6, 10e-3, True)
+    skin = RubbedSkin(benches[2], random)
+    pads = skin.pads(body, 0.06, np.array([0.018, 0.0144]), np.zeros(2))
+    at_rest = Run(benches[2], skin.measure(np.tile(pads, (150, 1, 1))))
+    assert at_rest.states[2:].count(STICK) == 148
+
+    skin, along, pads = RubbedSkin(benches[0], random), np.array([0.6, 0.8]), []
+    for number in range(80):
+        slipped = max(0.0, number - 49.5) * PERIOD_S * 20e-3
+        pull = 0.18 if slipped else 0.16
+        pads.append(skin.pads(body, 0.3, pull * along, slipped * along))
+    sliding = Run(benches[0], skin.measure(np.array(pads)))
+    assert 50 <= sliding.begun[0] <= 55
+
+
 @pytest.mark.parametrize(
     ("body", "largest"), [(Body(0.6, 12e-3, True), 0.5), (Body(0.6, 8e-3, False), 0.13)]
 )
