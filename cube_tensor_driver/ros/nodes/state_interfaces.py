@@ -26,7 +26,7 @@ from ...core.errors import ConfigError
 from ...core.forces import Forces
 from ...core.rows import StressRows
 from ...core.status import INVALID
-from ...core.tensor import contact_wrench, rotation_from_rpy
+from ...core.tensor import contact_wrench
 from ...device.links.session import SILENT_S
 from ..messages import message_class, pack_array, to_time
 from ..node import CubeNode
@@ -79,9 +79,8 @@ class SkinWrenches:
         if skin.name in skin.names:
             raise ConfigError(f"hardware_name: skin and cube are named {skin.name}; rename one")
         self.names = [*skin.names, skin.name]
-        forces = Forces(skin, side)
-        self._side, self._position = forces.side, forces.position
-        self._rotation = np.array([rotation_from_rpy(*cube.rpy) for cube in skin.cubes])
+        self._side = Forces(skin, side).side
+        self._position, self._rotation, _ = skin.poses
         n_cubes = len(skin.cubes)
         self._wrench = np.full((n_cubes, 6), np.nan)
         self._arrived = np.full(n_cubes, -np.inf)
