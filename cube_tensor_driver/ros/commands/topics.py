@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import time
 from dataclasses import dataclass
@@ -43,19 +44,14 @@ class ListedTopic:
             of the cube.
         kinds: Types of the messages.
         cubes: Names of the cubes that have the topic; empty for other topics.
-        count: Number of messages within `COUNT_S` on the topic `counted_topic`; None: the type of
-            the messages is not installed.
+        rate: Rate of the messages on the topic `counted_topic`, in Hz; None: the type of the
+            messages is not installed.
     """
 
     name: str
     kinds: list[str]
     cubes: list[str]
-    count: int | None = 0
-
-    @property
-    def rate(self) -> float | None:
-        """Rate of the messages, in Hz; None: the type of the messages is not installed."""
-        return None if self.count is None else self.count / COUNT_S
+    rate: float | None = None
 
     @property
     def counted_topic(self) -> str:
@@ -78,7 +74,7 @@ def list_topics() -> list[ListedTopic]:
             raise CubeError(f"nobody publishes in {domain_text()}; start ./cube demo or a skin")
         for _ in range(MAX_TRIES):
             topics = _find_topics(node)
-            _count_messages(session, topics)
+            _measure_rates(session, topics)
             if len(topics) == len(_find_topics(node)):
                 break
         return topics
@@ -98,48 +94,51 @@ def _find_topics(node: Node) -> list[ListedTopic]:
     return list(topics.values())
 
 
-def _count_messages(session: NodeSession, topics: list[ListedTopic]) -> None:
-    """Count the messages of topics for `COUNT_S`, and store the number in each `ListedTopic`.
+def _measure_rates(session: NodeSession, topics: list[ListedTopic]) -> None:
+    """Count the messages of topics for `COUNT_S`, and store the rate in each `ListedTopic`.
 
     Args:
         session: The node that subscribes to the topics.
-        topics: The topics, whose `count` is set.
+        topics: The topics, whose `rate` is set.
     """
     node, executor = session
-    subscriptions = [_subscribe(node, topic) for topic in topics]
+    counts: dict[str, int] = {}
+    subscriptions = []
+    for topic in topics:
+        # Messages of a type that is not installed cannot be counted.
+        with contextlib.suppress(BagError):
+            subscriptions.append(_subscribe(node, topic, counts))
     # Counting begins after a pause: DDS needs time to connect the subscriptions, and latched
     # messages, which were published earlier, arrive in this time and are not counted.
     spin_until(executor, lambda: False, SETTLE_S)
-    before = {topic.name: topic.count or 0 for topic in topics}
+    before = dict(counts)
     begin = time.monotonic()
     spin_until(executor, lambda: False, COUNT_S)
     # On a busy machine the time that has really passed is longer than COUNT_S.
     seconds = time.monotonic() - begin
     for topic in topics:
-        if topic.count is not None:
-            counted = topic.count - before[topic.name]
-            topic.count = round(counted * COUNT_S / seconds)
-    for subscription in filter(None, subscriptions):
+        if topic.name in counts:
+            topic.rate = (counts[topic.name] - before[topic.name]) / seconds
+    for subscription in subscriptions:
         node.destroy_subscription(subscription)
 
 
-def _subscribe(node: Node, topic: ListedTopic) -> Subscription | None:
-    """Return a subscription that counts messages in `topic.count`.
-
-    None means that the type of the messages is not installed; the count is then None, too.
+def _subscribe(node: Node, topic: ListedTopic, counts: dict[str, int]) -> Subscription:
+    """Return a subscription that counts messages.
 
     Args:
         node: The node that subscribes.
-        topic: The topic, whose `count` is increased by each message.
+        topic: The topic.
+        counts: Name of a topic -> number of its messages. It gets an entry for this topic.
+
+    Raises:
+        BagError: The type of the messages is not installed.
     """
-    try:
-        kind = message_class(topic.counted_topic, topic.kinds[0])
-    except BagError:
-        topic.count = None
-        return None
+    kind = message_class(topic.counted_topic, topic.kinds[0])
+    counts[topic.name] = 0
 
     def receive(_: bytes) -> None:
-        topic.count = (topic.count or 0) + 1
+        counts[topic.name] += 1
 
     offers = node.get_publishers_info_by_topic(topic.counted_topic)
     profile = offered_profile(offers, QUEUE_DEPTH)
