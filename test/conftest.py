@@ -215,6 +215,15 @@ def decoded(message: object) -> object:
     return getattr(codec, f"{name}_codec").decode(serialize_message(message))
 
 
+def encoded(rows: object, frame_id: bytes) -> bytes:
+    """A message of frequencies or stress whose stamp is that of its earliest row."""
+    from cube_tensor_driver.messages import codec
+
+    name = "frequency" if hasattr(rows, "frequency") else "stress"
+    stamps = rows.stamp_ns.min(keepdims=True)
+    return getattr(codec, f"{name}_codec").encode(rows, stamps, frame_id)[0]
+
+
 class Ros:
     """Subscriptions whose messages are kept, and waiting for what should happen."""
 

@@ -304,24 +304,6 @@ class MessageCodec(Generic[AnyRows]):
     def encode(
         self,
         rows: AnyRows,
-        frame_id: bytes,
-        stamp_ns: int | None = None,
-    ) -> bytes:
-        """Return the bytes of one message that contains these rows.
-
-        Args:
-            rows: The rows.
-            frame_id: Frame id with its closing zero.
-            stamp_ns: Time stamp of the header, in ns since the Unix epoch. None takes the stamp of
-                the earliest row.
-        """
-        if stamp_ns is None:
-            stamp_ns = int(rows.stamp_ns.min())
-        return self.encode_many(rows, np.array([stamp_ns]), frame_id)[0]
-
-    def encode_many(
-        self,
-        rows: AnyRows,
         stamp_ns: Times,
         frame_id: bytes,
     ) -> list[bytes]:

@@ -24,6 +24,7 @@ import zstandard
 from sensor_msgs.msg import PointCloud2
 from websockets.sync.client import connect
 
+from conftest import encoded
 from cube_tensor_driver.browser import page as page_module
 from cube_tensor_driver.browser.page import LEFT_WIDTH, RIGHT_WIDTH, Page, PageLayout
 from cube_tensor_driver.browser.viewer import MAX_STEP_S, Viewer
@@ -31,7 +32,6 @@ from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rows import StressRows
-from cube_tensor_driver.messages.codec import stress_codec
 from cube_tensor_driver.messages.contacts import contacts_message, traction_message
 from cube_tensor_driver.msg import SkinContacts, SkinInfo, SkinStress
 from cube_tensor_driver.ros.compat import make_executor
@@ -188,7 +188,7 @@ class Source:
             stamp_ns=self.stamp_ns[number],
             sequence=number,
         )
-        self._stress.publish(stress_codec.encode(rows, b"skin_base\0"))
+        self._stress.publish(encoded(rows, b"skin_base\0"))
 
     def _publish_results(self, number: int) -> None:
         up, force = np.array([0, 0, 1.0]), STEP_N * number

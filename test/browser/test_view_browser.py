@@ -35,13 +35,12 @@ from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.keys import Keys
 from websockets.sync.client import connect
 
-from conftest import ROOT, end
+from conftest import ROOT, encoded, end
 from cube_tensor_driver.browser.page import LEFT_WIDTH
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.oscillator import pad_frequency
 from cube_tensor_driver.core.rows import FrequencyRows
-from cube_tensor_driver.messages.codec import frequency_codec
 from cube_tensor_driver.msg import SkinFrequencies, SkinStress
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import Process
@@ -121,7 +120,7 @@ class Skin(threading.Thread):
                 none,
                 none.astype(np.uint16),
             )
-            self._publisher.publish(frequency_codec.encode(scan, b"skin_base\0"))
+            self._publisher.publish(encoded(scan, b"skin_base\0"))
             self.sent += 1
 
     def end(self) -> None:

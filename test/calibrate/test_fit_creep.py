@@ -18,6 +18,7 @@ pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 
 from bag_maker import START_NS, info_of
 
+from conftest import encoded
 from cube_tensor_driver.bags.metadata import quality, typestore
 from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.calibrate.creep import CreepFit, add_creep, fit_creep, reading_after_step
@@ -30,7 +31,6 @@ from cube_tensor_driver.core.errors import FitError
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import FrequencyRows
-from cube_tensor_driver.messages.codec import frequency_codec
 from cube_tensor_driver.messages.types import FREQUENCIES, INFO
 from cube_tensor_driver.simulation.cubes import PadErrors, SimulatedCubes
 from cube_tensor_driver.simulation.imperfections import Imperfections
@@ -185,7 +185,7 @@ def test_three_commands_lead_from_a_bag_to_a_calibration(tmp_path, capsys):
             stamp_ns = START_NS + n * 100_000_000
             number = np.zeros(1, np.uint16)
             rows = FrequencyRows.of(number, pads[None], stamp_ns=stamp_ns, sequence=n)
-            writer.write("/frequencies", stamp_ns, frequency_codec.encode(rows, b"base\0"))
+            writer.write("/frequencies", stamp_ns, encoded(rows, b"base\0"))
     assert cli.main(["fit", "--creep", str(bag), "-o", str(saved)]) == 0
     assert "relaxation times explain a hold of 85 s to 0.0" in capsys.readouterr().out
     assert saved.with_suffix(".png").stat().st_size > 20_000

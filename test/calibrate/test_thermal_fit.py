@@ -14,6 +14,7 @@ pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 
 from bag_maker import START_NS, info_of
 
+from conftest import encoded
 from cube_tensor_driver.bags.metadata import quality, typestore
 from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.calibrate.thermal import Warming, fit_thermal
@@ -27,7 +28,6 @@ from cube_tensor_driver.core.poses import CubePoses
 from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.core.status import COMPENSATION, THERMAL
-from cube_tensor_driver.messages.codec import frequency_codec
 from cube_tensor_driver.messages.types import FREQUENCIES, INFO
 from cube_tensor_driver.simulation.cubes import PadErrors, SimulatedCubes
 from cube_tensor_driver.simulation.imperfections import Imperfections
@@ -85,7 +85,7 @@ def make_bag(folder, knots, faces="both", seconds=600.0, measured=True):
             if not measured:
                 rows = replace(rows, temperature=np.full(N_CUBES, np.nan, np.float32))
             stamp_ns = int(rows.stamp_ns[0])
-            writer.write("/frequencies", stamp_ns, frequency_codec.encode(rows, b"base\0"))
+            writer.write("/frequencies", stamp_ns, encoded(rows, b"base\0"))
     return folder
 
 

@@ -14,6 +14,7 @@ pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 
 from bag_maker import START_NS, header, info_of, message
 
+from conftest import encoded
 from cube_tensor_driver.bags.metadata import quality, typestore
 from cube_tensor_driver.bags.reprocess.job import Overrides, choose_settings
 from cube_tensor_driver.bags.source import open_bag
@@ -32,7 +33,6 @@ from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.core.status import COMPENSATION, WEIGHT
-from cube_tensor_driver.messages.codec import frequency_codec
 from cube_tensor_driver.messages.types import COMPENSATION as COMPENSATION_TYPE
 from cube_tensor_driver.messages.types import FREQUENCIES, INFO
 from cube_tensor_driver.simulation.imperfections import Imperfections
@@ -99,7 +99,7 @@ def write_bag(folder, skin, scans, motion=True):
         for rows in scans:
             stamps = rows.stamp_ns + START_NS
             stamp_ns = int(stamps[0])
-            data = frequency_codec.encode(replace(rows, stamp_ns=stamps), b"base\0")
+            data = encoded(replace(rows, stamp_ns=stamps), b"base\0")
             writer.write("/frequencies", stamp_ns, data)
             if motion:
                 one = message(

@@ -18,6 +18,7 @@ import pytest
 pytest.importorskip("pyarrow", reason="needs pyarrow: pip install pyarrow")
 pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 
+from conftest import encoded
 from cube_tensor_driver.bags.read import Bag
 from cube_tensor_driver.bags.reprocess.contacts import ContactOptions
 from cube_tensor_driver.bags.reprocess.job import ReprocessJob, reprocess
@@ -36,7 +37,6 @@ from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rows import FrequencyRows, StressRows
 from cube_tensor_driver.mechanics import contact
 from cube_tensor_driver.mechanics.influence import read_influence
-from cube_tensor_driver.messages.codec import frequency_codec, stress_codec
 from cube_tensor_driver.messages.contacts import CLOUD
 from cube_tensor_driver.messages.types import FREQUENCIES, INFO
 from cube_tensor_driver.touch.contact_finder import ContactSettings
@@ -74,7 +74,7 @@ def bag_of(folder: Path, skin: Skin, info: bytes, scans: list[np.ndarray]) -> Pa
         for number, hertz in enumerate(scans):
             stamp_ns = now + (number + 1) * 20_000_000
             rows = FrequencyRows.of(np.arange(len(hertz)), hertz, stamp_ns=stamp_ns)
-            writer.write("/frequencies", stamp_ns, frequency_codec.encode(rows, FRAME))
+            writer.write("/frequencies", stamp_ns, encoded(rows, FRAME))
     return folder
 
 
@@ -228,7 +228,7 @@ def test_contacts_and_traction_of_a_pressed_skin_live_and_out_of_a_bag(ros, tmp_
     )
 
     def ready() -> bool:
-        publisher.publish(stress_codec.encode(untouched, FRAME))
+        publisher.publish(encoded(untouched, FRAME))
         return bool(contacts and clouds)
 
     def answered(wanted: SkinContacts) -> bool:

@@ -10,6 +10,7 @@ import time
 import numpy as np
 import pytest
 
+from conftest import encoded
 from cube_tensor_driver.config import parameters
 from cube_tensor_driver.core.latest_stress import DOUBTFUL, FAULTY, FINE, STALE, LatestStress
 from cube_tensor_driver.core.poses import CubePoses
@@ -143,7 +144,6 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
     from cube_tensor_driver.config.package_data import package_data
     from cube_tensor_driver.config.skin import read_skin
     from cube_tensor_driver.core.pipeline import Pipeline
-    from cube_tensor_driver.messages.codec import stress_codec
     from cube_tensor_driver.msg import SkinContacts, SkinInfo, SkinStress
     from cube_tensor_driver.processes.children import Children
     from cube_tensor_driver.processes.skin_processes import Process
@@ -166,7 +166,7 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
         made = rows(values)
         made.stamp_ns[:] = time.time_ns()
         chosen = made.select(np.arange(n) != silent)
-        publisher.publish(stress_codec.encode(chosen, b"skin_base\0"))
+        publisher.publish(encoded(chosen, b"skin_base\0"))
 
     def drawn() -> bool:
         sent()

@@ -21,6 +21,7 @@ from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Imu
 
+from conftest import encoded
 from cube_tensor_driver.bags.metadata import quality, typestore
 from cube_tensor_driver.bags.read import Bag
 from cube_tensor_driver.bags.reprocess.job import ReprocessJob, reconstruct, reprocess
@@ -36,7 +37,7 @@ from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import FrequencyRows, concatenate
 from cube_tensor_driver.core.status import COMPENSATION, CREEP, THERMAL, WEIGHT
 from cube_tensor_driver.core.tensor import rotation_from_rpy
-from cube_tensor_driver.messages.codec import frequency_codec, stress_codec
+from cube_tensor_driver.messages.codec import stress_codec
 from cube_tensor_driver.messages.types import COMPENSATION as COMPENSATION_TYPE
 from cube_tensor_driver.messages.types import FREQUENCIES, INFO, STRESS
 from cube_tensor_driver.ros.messages import to_ns, to_time
@@ -284,7 +285,7 @@ def write_bag(folder, node, rows: FrequencyRows, dropped: range) -> None:
     topics = {"info": INFO, "frequencies": FREQUENCIES, "stress": STRESS}
     topics["compensation"] = COMPENSATION_TYPE
     scans = [rows.select(slice(k, k + 2)) for k in range(0, len(rows), 2)]
-    frequencies = [frequency_codec.encode(scan, b"tool\0") for scan in scans]
+    frequencies = [encoded(scan, b"tool\0") for scan in scans]
     compensation = [as_sent(one) for one in node.sent["compensation"]]
     with BagWriter(folder) as writer:
         for topic, kind in topics.items():

@@ -20,10 +20,9 @@ from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
-from conftest import free_domain, observer_node
+from conftest import encoded, free_domain, observer_node
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.core.rows import FrequencyRows
-from cube_tensor_driver.messages.codec import frequency_codec
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import SimulatedHubs, skin_processes
@@ -98,7 +97,7 @@ def test_a_rate_that_no_hub_can_have_is_refused(skin):
 def test_messages_of_any_content_are_refused_and_counted(skin):
     publisher = skin.node.create_publisher(SkinFrequencies, "frequencies", 100)
     diagnostics = skin.listen(DiagnosticArray, "/diagnostics")
-    good = frequency_codec.encode(
+    good = encoded(
         FrequencyRows.of(np.zeros(1, np.uint16), np.full((1, 8), 1e5, np.float32)), b"skin\0"
     )
     rows_at = len(good) - len(good[good.index(b"skin\0") + 8 :])
@@ -107,7 +106,7 @@ def test_messages_of_any_content_are_refused_and_counted(skin):
     publisher.publish(good[:20])
     many = np.zeros(30_000, np.uint16)
     rows = FrequencyRows.of(many, np.zeros((len(many), 8), np.float32))
-    publisher.publish(frequency_codec.encode(rows, b"skin\0"))
+    publisher.publish(encoded(rows, b"skin\0"))
 
     def refused() -> bool:
         values = {

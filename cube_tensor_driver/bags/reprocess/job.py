@@ -295,7 +295,7 @@ def _write_skin(
         contacts = ContactWriter(writer, skin, job.contacts)
     for segment, stress in reconstruct(source, settings):
         messages = segment.messages
-        encoded = stress_codec.encode_many(stress, messages.stamp_ns, messages.frame_id)
+        encoded = stress_codec.encode(stress, messages.stamp_ns, messages.frame_id)
         times_ns = segment.recorded_ns.tolist()
         for time_ns, data in zip(times_ns, encoded, strict=True):
             writer.write(f"{skin}stress", time_ns, data)
