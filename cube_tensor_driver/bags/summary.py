@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import AnyArray, Times
 from ..core.rows import COUNTER_RANGE
 from ..messages.codec import frequency_codec
 from .read import Bag
@@ -28,8 +27,6 @@ class CubeSummary:
     """Completeness of the recorded samples of one cube.
 
     Attributes:
-        name: Name of the cube.
-        uid: Unique id of the cube, as in the SkinInfo message; 0 if it is not known.
         samples: Number of recorded samples.
         lost: Number of samples whose sequence numbers are missing.
         gaps: Number of gaps: times between two samples that exceed the median sampling period by
@@ -38,8 +35,6 @@ class CubeSummary:
         longest_gap: Longest time between two samples, in s; None with fewer than two samples.
     """
 
-    name: str
-    uid: int
     samples: int
     lost: int = 0
     gaps: int = 0
@@ -47,29 +42,37 @@ class CubeSummary:
     longest_gap: float | None = None
 
 
-def cube_summaries(
-    bag: Bag,
-    topic: str,
-    info: Any,
-) -> Iterator[CubeSummary]:
+def cube_summaries(bag: Bag, topic: str, n_cubes: int) -> Iterator[CubeSummary]:
     """Summarise the recorded samples of every cube of a skin.
 
     Args:
         bag: Open bag.
         topic: Topic of the skin's frequencies.
-        info: SkinInfo message of the skin, which lists the cubes.
+        n_cubes: Number of cubes of the skin.
     """
     # The empty first part stands for a topic without messages.
     parts = [[np.empty(0, np.int64)] * 3]
     parts += bag.columns(topic, frequency_codec, ("cube", "sequence"))
     stamp_ns, cube, sequence = (np.concatenate(column) for column in zip(*parts, strict=True))
-    for number, one in enumerate(info.cubes):
+    for number in range(n_cubes):
         rows = cube == number
-        yield _summarise(
-            one.name,
-            one.uid,
-            sequence[rows],
-            stamp_ns[rows],
+        n_samples = int(np.count_nonzero(rows))
+        if n_samples < 2:
+            yield CubeSummary(n_samples)
+            continue
+        steps = np.mod(np.diff(sequence[rows]), COUNTER_RANGE)
+        # A forward step of at least half the range is in fact a step back: the hub restarted and
+        # counts from 0 again, so no samples were lost.
+        is_forward = (steps > 0) & (steps < COUNTER_RANGE // 2)
+        periods_ns = np.diff(stamp_ns[rows])
+        # The median is used because a pause of the recording would lengthen the mean period.
+        median_ns = float(np.median(periods_ns))
+        yield CubeSummary(
+            n_samples,
+            lost=int((steps[is_forward] - 1).sum()),
+            gaps=int(np.count_nonzero(periods_ns > MIN_GAP_PERIODS * median_ns)),
+            rate=1e9 / median_ns if median_ns > 0 else np.nan,
+            longest_gap=1e-9 * float(periods_ns.max()),
         )
 
 
@@ -82,38 +85,3 @@ def last_diagnostics(bag: Bag) -> list[Any]:
         for status in message.status:
             last[status.name] = status
     return [last[name] for name in sorted(last)]
-
-
-def _summarise(
-    name: str,
-    uid: int,
-    sequence: AnyArray,
-    stamp_ns: Times,
-) -> CubeSummary:
-    """Summarise the samples of one cube.
-
-    Args:
-        name: Name of the cube.
-        uid: Unique id of the cube.
-        sequence: (N,) sequence numbers of its samples in the order of recording.
-        stamp_ns: (N,) stamps of its samples, in ns since the Unix epoch.
-    """
-    if len(sequence) < 2:
-        return CubeSummary(name, uid, len(sequence))
-    steps = np.mod(np.diff(sequence), COUNTER_RANGE)
-    # A forward step of at least half the range is in fact a step back: the hub restarted and
-    # counts from 0 again, so no samples were lost.
-    is_forward = (steps > 0) & (steps < COUNTER_RANGE // 2)
-    lost = (steps[is_forward] - 1).sum()
-    periods_ns = np.diff(stamp_ns)
-    # The median is used because a pause of the recording would lengthen the mean period.
-    median_ns = float(np.median(periods_ns))
-    return CubeSummary(
-        name,
-        uid,
-        samples=len(sequence),
-        lost=int(lost),
-        gaps=int(np.count_nonzero(periods_ns > MIN_GAP_PERIODS * median_ns)),
-        rate=1e9 / median_ns if median_ns > 0 else np.nan,
-        longest_gap=1e-9 * float(periods_ns.max()),
-    )

@@ -138,13 +138,14 @@ def show_skin(bag: Bag, topic: str) -> None:
         say(f"  calibration {name}, layout {layout}: {cubes}")
 
     rows = []
-    for cube in cube_summaries(bag, topic, info):
+    summaries = cube_summaries(bag, topic, len(info.cubes))
+    for cube, summary in zip(info.cubes, summaries, strict=True):
         # Rate, losses and gaps are unknown for a cube with fewer than two samples.
         cells = ["", "", "", ""]
-        if cube.rate is not None and cube.longest_gap is not None:
-            gap_ms = f"{1e3 * cube.longest_gap:.1f}"
-            cells = [f"{cube.rate:.1f}", str(cube.lost), str(cube.gaps), gap_ms]
-        rows.append((cube.name, f"{cube.uid:#x}", str(cube.samples), *cells))
+        if summary.rate is not None and summary.longest_gap is not None:
+            gap_ms = f"{1e3 * summary.longest_gap:.1f}"
+            cells = [f"{summary.rate:.1f}", str(summary.lost), str(summary.gaps), gap_ms]
+        rows.append((cube.name, f"{cube.uid:#x}", str(summary.samples), *cells))
     print_table(("cube", "uid"), ("samples", "Hz", "lost", "gaps", "longest gap / ms"), rows)
 
 

@@ -91,7 +91,7 @@ def run(options: argparse.Namespace) -> int:
 
     overrides, contacts = overrides_of(options), contacts_of(options)
     jobs = make_jobs(options.bags, options.output, options.format, overrides, contacts)
-    write_recipe(options.output, options.format, overrides, contacts)
+    write_recipe(options.output, jobs[0])
     # A bag whose result exists is skipped, so that an interrupted run can be continued.
     waiting = [job for job in jobs if not job.output.exists()]
     console = Console(stderr=True, highlight=False)

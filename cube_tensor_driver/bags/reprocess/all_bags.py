@@ -69,28 +69,22 @@ def make_jobs(
     ]
 
 
-def write_recipe(
-    folder: Path,
-    form: str,
-    overrides: Overrides,
-    contacts: ContactOptions | None = None,
-) -> None:
+def write_recipe(folder: Path, job: ReprocessJob) -> None:
     """Create the folder of the results, with a file `RECIPE_NAME` that states their options.
 
     The file prevents that an interrupted run is continued with other options.
 
     Args:
         folder: Folder of the results.
-        form: Format of the results, a key of `SUFFIXES`.
-        overrides: Calibrations and tare that replace those of the recordings.
-        contacts: Options with which contacts are computed; None: no contacts are computed.
+        job: One of the jobs, which all have the same options.
 
     Raises:
         BagError: The folder has results that were made with other options, or cannot be written.
     """
+    overrides, contacts = job.overrides, job.contacts
     cubes = overrides.skin.cubes if overrides.skin else ()
     recipe: dict[str, Any] = {
-        "format": form,
+        "format": job.form,
         "calibration": overrides.calibration.id if overrides.calibration else None,
         "skin": {cube.name: cube.calibration.id for cube in cubes} or None,
         "tare_from_s": list(overrides.tare) if overrides.tare else None,
