@@ -220,8 +220,8 @@ class Scene:
         )
         # The points of the field are drawn at the lower faces of the cubes, so contacts are too.
         self._contact_depth = surface.depth * placement.unit + placement.poses.half_side.mean()
-        self._low = placement.point(surface.points).min(axis=0)
-        self._high = placement.point(surface.points).max(axis=0)
+        points = placement.point(surface.points)
+        self._low, self._high = points.min(axis=0), points.max(axis=0)
 
         distance = np.linalg.norm(placement.poses.position, axis=1)
         self.first_cube = int(distance.argmin())

@@ -68,9 +68,8 @@ def measure_pads_at_rest(frequency: Array, seconds: Array) -> PadsAtRest:
     # Second differences remove drift, which would count as noise in a standard deviation.
     second = np.diff(frequency, n=2, axis=0)
     squares = np.ma.masked_invalid(second**2)
-    n_squares = squares.count(axis=0)
-    sum_squares = squares.sum(axis=0).filled(0)
-    noise = np.sqrt(sum_squares / np.maximum(6 * n_squares, 1))
+    mean_square = squares.mean(axis=0).filled(0)
+    noise = np.sqrt(mean_square / 6)
 
     # Slope of the straight line that is fitted to the measured samples of each pad.
     centred = seconds - seconds.mean()

@@ -135,13 +135,11 @@ def find_cube(
     Raises:
         BagError: No cube has the name, or the name is None and there are several cubes.
     """
-    names = [cube.name for cube in source.skin.cubes]
-    listed = ", ".join(names[:MAX_LISTED_CUBES])
-    if name is None and len(names) > 1:
-        raise BagError(f"{path}: {len(names)} cubes; say which one with --cube: {listed}")
-    if name is not None and name not in names:
-        raise BagError(f"{path}: no cube {name!r}; there are {listed}")
-    return 0 if name is None else names.index(name)
+    cubes = find_cubes(source, path, name)
+    if len(cubes) > 1:
+        listed = ", ".join(source.skin.names[:MAX_LISTED_CUBES])
+        raise BagError(f"{path}: {len(cubes)} cubes; say which one with --cube: {listed}")
+    return cubes[0]
 
 
 def find_cubes(
@@ -154,9 +152,13 @@ def find_cubes(
     Raises:
         BagError: No cube has the name.
     """
+    names = source.skin.names
     if name is None:
-        return list(range(len(source.skin.cubes)))
-    return [find_cube(source, path, name)]
+        return list(range(len(names)))
+    if name not in names:
+        listed = ", ".join(names[:MAX_LISTED_CUBES])
+        raise BagError(f"{path}: no cube {name!r}; there are {listed}")
+    return [names.index(name)]
 
 
 class BlockMeans:

@@ -120,7 +120,6 @@ class LiveWindows:
         self._cube_at = nearest_cubes(source.skin, width, height)
         self._number = 0
         self._writer: pyarrow.ipc.RecordBatchStreamWriter | None = None
-        self._file: pyarrow.NativeFile | None = None
         self._rows: list[StressRows] = []
         self._newest_ns = 0
         rate = source.skin.rate
@@ -172,9 +171,9 @@ class LiveWindows:
         """Close the links and complete the file. Samples after the last frame are left out."""
         self._source.close()
         self._thread.join()
-        if self._writer is not None and self._file is not None:
+        if self._writer is not None:
             self._writer.close()
-            self._file.close()
+            # The file is closed together with the object.
             self._writer = None
 
     def _collect(self) -> None:
@@ -201,8 +200,7 @@ class LiveWindows:
         batch = pyarrow.record_batch({NUMBER_COLUMN: pyarrow.array([self._number])} | arrays)
         if self._writer is None:
             path = self._folder / f"{self._number}.arrow"
-            self._file = pyarrow.OSFile(str(path), "wb")
-            self._writer = pyarrow.ipc.new_stream(self._file, batch.schema)
+            self._writer = pyarrow.ipc.new_stream(str(path), batch.schema)
         self._writer.write_batch(batch)
 
     def _picture(self) -> AnyArray:

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..bags.read import Bag
+from ..bags.read import MAX_TIME_NS, Bag
 from ..bags.reprocess.job import AS_RECORDED, Overrides
 from ..bags.source import BagSource, open_bag
 from ..config.skin import Skin
@@ -36,9 +36,6 @@ text of a mark is the task of the episode that begins with it."""
 MIN_NS = -(1 << 63)
 """Smallest time in 64 bits, in ns. A bag without marks (texts that begin an episode) has a single
 episode that begins at this time."""
-
-MAX_NS = (1 << 63) - 1
-"""Largest time in 64 bits, in ns: the end of the last episode (execution of a task) of a bag."""
 
 MAX_STAMP_RATIO = 10
 """Largest allowed ratio of the time between the first and the last stamp of an episode (execution
@@ -253,7 +250,7 @@ def plan_bag(
         # The progress that is displayed is the fraction of the messages that have been read.
         counts = {one.topic: one.msgcount for one in source.bag.connections}
         total = counts[source.topic]
-        spans = [(MIN_NS, MAX_NS, choices.task)]
+        spans = [(MIN_NS, MAX_TIME_NS, choices.task)]
         if choices.marks is not None:
             spans = _marked_spans(source.bag, choices.marks)
         n_cubes = len(source.skin.cubes)
@@ -271,7 +268,7 @@ def plan_bag(
         ]
 
         samples = np.zeros(n_cubes, np.int64)
-        first_ns, last_ns = MAX_NS, MIN_NS
+        first_ns, last_ns = MAX_TIME_NS, MIN_NS
         for rows in source:
             is_known = rows.cube < n_cubes
             cube = rows.cube[is_known].astype(np.intp)
@@ -406,7 +403,7 @@ def _marked_spans(
     marks = [(time_ns, mark.data.strip()) for time_ns, mark in bag.decoded({topic})]
     spans = [
         (since_ns, until_ns, task)
-        for (since_ns, task), (until_ns, _) in pairwise([*marks, (MAX_NS, "")])
+        for (since_ns, task), (until_ns, _) in pairwise([*marks, (MAX_TIME_NS, "")])
         if task
     ]
     if not spans:

@@ -397,10 +397,11 @@ def _place_rings(
     # outermost ring are about as far apart as neighbouring rings.
     n = 4 * len(rings)
     angle = 2.0 * np.pi * (np.arange(n) + 0.5) / n
-    x = radius * np.outer(rings, np.cos(angle))
-    y = radius * np.outer(rings, np.sin(angle))
+    x = radius * np.outer(rings, np.cos(angle)).ravel()
+    y = radius * np.outer(rings, np.sin(angle)).ravel()
     per_force = np.repeat(fractions / n, n)
     cx, cy = np.asarray(centre, dtype=np.float64)[:2]
-    sources = np.stack([cx + x.ravel(), cy + y.ravel(), np.zeros(x.size)], axis=-1)
+    z = np.zeros_like(x)
+    sources = np.stack([cx + x, cy + y, z], axis=-1)
     total = np.asarray(force, dtype=np.float64)
     return sources, per_force[:, None] * total

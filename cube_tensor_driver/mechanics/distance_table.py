@@ -69,7 +69,11 @@ class DistanceTable:
         index = np.arange(-1.0, self.last + 3)
         self.distances = index * self.step
 
-    def weights(self, distance: Array, count: int = 1) -> tuple[Array, ...]:
+    def weights(
+        self,
+        distance: Array,
+        count: int = 1,
+    ) -> tuple[Array, ...]:
         """Return the rows and weights of the interpolation of a table over the distance.
 
         Args:
@@ -98,7 +102,11 @@ class DistanceTable:
         decay = ratio**2
         return np.minimum(index, self.last), decay
 
-    def interpolate(self, table: Array, distance: Array) -> Array:
+    def interpolate(
+        self,
+        table: Array,
+        distance: Array,
+    ) -> Array:
         """Interpolate a table over the distance between load and cube, or between two cubes.
 
         Args:

@@ -238,7 +238,11 @@ def wavenumber_quadrature(depth: float) -> tuple[Array, Array]:
     return k, weights * half_range * k / (2 * np.pi)
 
 
-def layer_spectra(layer: Layer, depth: float, waves_of: float | None = None) -> Spectra:
+def layer_spectra(
+    layer: Layer,
+    depth: float,
+    waves_of: float | None = None,
+) -> Spectra:
     """Return the field at a depth below a unit traction wave on the surface, for all wavenumbers.
 
     The field (`FIELD`) is stress and its gradient, in circular components: combinations that a

@@ -22,15 +22,21 @@ from ..core.modes import COMPONENTS, STRESS
 from ..core.poses import CubePoses
 from ..core.tensor import TRACTION_COMPONENTS, principal_stresses
 
-SEQUENTIAL = "ffffcc ffeda0 fed976 feb24c fd8d3c fc4e2a e31a1c bd0026 800026"
-"""Colour scale of values that are never negative, as hexadecimal RGB (YlOrRd of ColorBrewer).
+
+def _colour_table(hexes: str) -> Array:
+    colours = [tuple(bytes.fromhex(text)) for text in hexes.split()]
+    return np.array(colours) / 255
+
+
+SEQUENTIAL = _colour_table("ffffcc ffeda0 fed976 feb24c fd8d3c fc4e2a e31a1c bd0026 800026")
+"""Colour scale (9, 3) of values that are never negative, from 0 to 1 (YlOrRd of ColorBrewer).
 
 It is light at zero, so that a skin at rest is visible, and its lightness falls monotonically, so
 that it can be read in grey.
 """
 
-DIVERGING = "053061 2a71b2 6bacd1 c2ddec f7f6f6 fbccb4 e48066 ba2832 67001f"
-"""Colour scale of values on both sides of zero, as hexadecimal RGB (RdBu of ColorBrewer, reversed).
+DIVERGING = _colour_table("053061 2a71b2 6bacd1 c2ddec f7f6f6 fbccb4 e48066 ba2832 67001f")
+"""Colour scale (9, 3) of values on both sides of zero, from 0 to 1 (RdBu of ColorBrewer, reversed).
 
 It is light at zero and becomes darker on both sides: blue for negative, red for positive values.
 """
@@ -233,10 +239,10 @@ def colours(
             is signed.
     """
     share = np.nan_to_num(values) / top
-    table = _colour_table(SEQUENTIAL)
+    table = SEQUENTIAL
     if quantity.signed:
         share = share / 2 + 0.5
-        table = _colour_table(DIVERGING)
+        table = DIVERGING
     entries = np.linspace(0, 1, len(table))
     channels = [np.interp(share, entries, channel) for channel in table.T]
     mixed = np.stack(channels, axis=1)
@@ -253,11 +259,6 @@ def linear_light(colours: Array) -> NDArray[np.uint8]:
     curved = ((colours + 0.055) / 1.055) ** 2.4
     linear = np.where(colours <= 0.04045, colours / 12.92, curved)
     return (255 * linear).astype(np.uint8)
-
-
-def _colour_table(hexes: str) -> Array:
-    colours = [tuple(bytes.fromhex(text)) for text in hexes.split()]
-    return np.array(colours) / 255
 
 
 def above(poses: CubePoses, factor: float) -> Array:
