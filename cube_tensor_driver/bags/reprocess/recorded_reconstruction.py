@@ -62,7 +62,7 @@ class RecordedReconstruction:
         if settings is not self._settings:
             self._settings = settings
             reconstructor.rest_frequency = settings.rest_frequency
-        return self._source.recording.health.at(rows)
+        return self._source.recording.health_at(rows)
 
     def compensation_at(self, stamp_ns: int, reconstructor: Reconstructor) -> Motion | None:
         """Return the recorded motion of the skin, which the compensation of its weight requires.
