@@ -18,6 +18,7 @@ from ..core.modes import COMPONENTS, STRESS
 from ..views.figures.panels import draw_panels
 from ..views.figures.style import png
 from ..views.round_numbers import round_range
+from ..views.scene import component_unit
 from . import markup
 from .history import History
 
@@ -264,7 +265,7 @@ def make_chart(history: History, names: Sequence[str], cubes: Sequence[int], gro
         cubes: Indices of the cubes, in the order of their lines.
         group: Name of the values in `GROUPS`.
     """
-    size, unit = markup.unit(GROUPS[group][0])
+    size, unit = component_unit(GROUPS[group][0])
     observed = [name for name in GROUPS[group] if name in history.observed_names]
     lines = {
         f"{names[cube]} {markup.label(name)}": (cube, History.COLUMNS.index(name))

@@ -138,17 +138,6 @@ def label(name: str) -> str:
     return f"∂σ{name[:2]}/∂{name[3]}" if "_" in name else f"σ{name}"
 
 
-def unit(name: str) -> tuple[float, str]:
-    """Return the unit in which the page shows a component or the residual.
-
-    Returns:
-        Size of the unit in SI units, and its name: (1000, "kPa") for a stress.
-    """
-    if name == "residual":
-        return 1.0, "× noise"
-    return (1e6, "kPa/mm") if "_" in name else (1e3, "kPa")
-
-
 def clock(seconds: float) -> str:
     """Return a duration in seconds as text, such as "12.3 s" or "3 min 12.3 s"."""
     minutes, rest = divmod(round(seconds, 1), 60)
@@ -282,9 +271,9 @@ def numbers(scan: Scan, cube: int, above: Array | None) -> str:
     """
     rows = []
     for name, si_value in zip(COMPONENTS, scan.values[cube], strict=True):
-        size, unit_name = unit(name)
+        size, unit = scene.component_unit(name)
         if np.isfinite(si_value):
-            rows.append((label(name), f"{si_value / size:+.3f}", unit_name))
+            rows.append((label(name), f"{si_value / size:+.3f}", unit))
     if above is not None and np.isfinite(above).all():
         pressure, deviation = 1e-3 * above
         rows.append(("on the surface", f"{pressure:.2f} ± {deviation:.2f}", "kPa"))

@@ -173,6 +173,17 @@ range of colours, in SI units.
 """
 
 
+def component_unit(name: str) -> tuple[float, str]:
+    """Return the unit in which users see a component of stress or gradient, or the residual.
+
+    Returns:
+        Size of the unit in SI units, and its name: (1000, "kPa") for a stress.
+    """
+    if name == "residual":
+        return 1.0, "× noise"
+    return (1e6, "kPa/mm") if "_" in name else (1e3, "kPa")
+
+
 def automatic_top(
     quantity: Quantity,
     values: Array,

@@ -21,6 +21,7 @@ from ...core.latest_stress import LatestStress
 from ...core.modes import COMPONENTS
 from ...core.rows import StressRows
 from ...core.status import describe_status
+from ..scene import component_unit
 from .output import counted
 
 DRAW_PERIOD_S = 0.1
@@ -212,11 +213,10 @@ class LiveTable:
         for name in SHOWN:
             values = self._component(name)
             if np.isfinite(values).any():
-                label, scale, unit = name, 1e-3, "kPa"
-                if "_" in name:
-                    stress, axis = name.split("_")
-                    label, scale, unit = f"∂{stress}/∂{axis}", 1e-6, "kPa/mm"
-                columns[f"{label}\n{unit}"] = _numbers(scale * values, shown, "+7.2f")
+                size, unit = component_unit(name)
+                stress, _, axis = name.partition("_")
+                label = f"∂{stress}/∂{axis}" if axis else stress
+                columns[f"{label}\n{unit}"] = _numbers(values / size, shown, "+7.2f")
         columns["residual"] = _numbers(self._latest.residual, shown, ".2f")
         columns["Hz"] = _numbers(self._rate, shown, "4.0f")
         columns["state"] = [self._state(cube) for cube in shown]
