@@ -54,7 +54,7 @@ MIN_BODY_RATIO = 1.1
 """Smallest ratio of the body's width, depth and height to the cube's side."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Body:
     """A box of elastomer with a cube bonded in it.
 

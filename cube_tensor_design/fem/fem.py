@@ -62,7 +62,7 @@ ground. Without ground a rigid cube is held at rest, but on ground it moves rela
 ground."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Response:
     """A computed response matrix: stress of each pad under each mode (linear stress field).
 

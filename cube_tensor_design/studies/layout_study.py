@@ -180,9 +180,9 @@ def _solve_box(
     """Return response (pads, modes) and pad stresses (pads, passages) of a cube in its box."""
     # The cube is rigid; lengths are in units of its side.
     body = Body(
-        BOX_RATIO,
-        BOX_RATIO,
-        BOX_RATIO,
+        width=BOX_RATIO,
+        depth=BOX_RATIO,
+        height=BOX_RATIO,
         side=1.0,
         poisson=POISSONS_RATIO,
         cube_young=np.inf,

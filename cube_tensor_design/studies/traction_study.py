@@ -81,7 +81,7 @@ MIN_PRESSURE_SHARE = 0.1
 error over predicted deviation) of a pressure field."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Setting:
     """One skin and its loads; lengths in m.
 

@@ -30,7 +30,7 @@ WRITE_ERRORS = (OSError, sqlite3.Error)
 """Exceptions that the libraries raise when writing fails, for example on a full disk."""
 
 
-@dataclass
+@dataclass(kw_only=True)
 class _Part:
     """The storage file that is being written; a bag can be divided into several.
 
@@ -247,7 +247,7 @@ class BagWriter:
         name = f"{self.folder.resolve().name}_{len(self._complete)}{SUFFIXES[self._storage]}"
         path = self.folder / name
         file = McapWriter(path) if self._storage == "mcap" else SqliteWriter(path)
-        self._part = _Part(path, file)
+        self._part = _Part(path=path, file=file)
         for one in self._topics:
             self._connect(self._part, one)
 

@@ -48,7 +48,7 @@ FOLDS = 10
 without each of the parts, and its error is measured on the part that was left out."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Fit:
     """Result of a fit of a cube's response (stress on its P pads per known stress) to N loads.
 

@@ -42,7 +42,7 @@ EFFECTS: dict[str, type[EffectModel]] = {
 that holds the model."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Calibration:
     """Properties of one cube, or of all cubes of a kind.
 

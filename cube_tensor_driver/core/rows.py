@@ -134,7 +134,7 @@ class FrequencyRows(_Rows):
         return cls(frequency=np.asarray(frequency), **columns)
 
 
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
+@dataclass(frozen=True, kw_only=True, slots=True, eq=False, repr=False)
 class StressRows(_Rows):
     """Reconstructed stress: N rows (samples of one cube), in the cube's frame, tension positive.
 

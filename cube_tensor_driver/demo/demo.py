@@ -33,7 +33,7 @@ CUBES_PER_HUB = 8
 """Number of cubes on each simulated hub of the grid that `./cube demo --cubes N` simulates."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class DemoSettings:
     """What a demo simulates, shows and writes.
 

@@ -44,7 +44,7 @@ _UINT32_MASK = 0xFFFFFFFF
 and wrap around; those of the simulation do not."""
 
 
-@dataclass
+@dataclass(kw_only=True)
 class SimulatedHub:
     """A hub (device that samples the pads of some cubes and sends their frequencies to the host).
 

@@ -112,7 +112,7 @@ _TABLES = {"creep", "temperature", "air", "poses"}
 """Names of the fields of `Imperfections` that hold rows of numbers."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Imperfections:
     """How the pads of simulated cubes differ from their calibrations.
 

@@ -330,7 +330,7 @@ def test_space_without_a_cube(coarse):
 
 def test_any_field_as_outer_tractions(coarse):
     """A field given as a function acts as the modes it is made of, whatever its parities."""
-    layout, body = LAYOUTS["cube"], Body(12e-3, 10e-3, 11e-3, cube_young=RIGID)
+    layout, body = LAYOUTS["cube"], Body(width=12e-3, depth=10e-3, height=11e-3, cube_young=RIGID)
     modes = fem.find_structure(layout, "none").modes
     state = np.random.default_rng(4).normal(size=(modes.n_modes, 2))
     stress = np.einsum("mn,mij->nij", state, modes.stress)
@@ -346,7 +346,7 @@ def test_any_field_as_outer_tractions(coarse):
 
 
 def test_cubic_body_has_the_full_structure(coarse):
-    body = Body(12e-3, 12e-3, 12e-3, cube_young=RIGID)
+    body = Body(width=12e-3, depth=12e-3, height=12e-3, cube_young=RIGID)
     result = compute_response(body, LAYOUTS["cube"], "full", meshes=1)
     assert result.structure_residual < 1e-9
     assert result.rank == 18 and result.unobservable == ("yz_x", "zx_y", "xy_z")

@@ -205,7 +205,17 @@ def test_defaults(computed, model):
     """planar_slab.yaml lists every default; its symmetry is another one."""
     assert cli.main(["fem", *model]) == 1
     body, layout, symmetry, meshes, _ = computed[0]
-    assert body == bodies.Body(0.06, 0.06, 0.011, 0.004, 0.3e6, 0.48, 200e9, 0.30, "strain")
+    assert body == bodies.Body(
+        width=0.06,
+        depth=0.06,
+        height=0.011,
+        side=0.004,
+        young=0.3e6,
+        poisson=0.48,
+        cube_young=200e9,
+        cube_poisson=0.30,
+        plane="strain",
+    )
     assert layout.same_as(LAYOUTS["planar"])
     assert (symmetry, meshes) == ("slab" if model else "full", 3)
 
@@ -223,7 +233,17 @@ pads: {width: 0.0015, centre: 0.00125}
     assert fem(model, "--meshes", 2) == 1
     body, layout, symmetry, meshes, _ = computed[0]
     assert body == bodies.Body(
-        0.03, 0.04, 0.02, 0.005, 1e5, 0.4, np.inf, 0.20, "stress", 1e-3, -2e-3
+        width=0.03,
+        depth=0.04,
+        height=0.02,
+        side=0.005,
+        young=1e5,
+        poisson=0.4,
+        cube_young=np.inf,
+        cube_poisson=0.20,
+        plane="stress",
+        x=1e-3,
+        z=-2e-3,
     )
     assert layout.pad_size == pytest.approx(0.6)
     assert layout.positions[1] == pytest.approx([0.5, 0, 1])

@@ -117,7 +117,7 @@ def test_a_round_rod_presses_as_hertz_says():
     is found for a contact that sets in over 0.005 mm, 0.2 % and 0.1 % for a half and a quarter of
     that, 20 % for 0.05 mm.
     """
-    body = Body(200e-3, 1.0, 100e-3, 10e-3)
+    body = Body(width=200e-3, depth=1.0, height=100e-3, side=10e-3)
     radius = 50e-3
     bench = VirtualBench(body, cube=False, size=1.0)
     rod = Rod(1e-3, 0.0, 2 * radius, radius)

@@ -45,7 +45,9 @@ class RandomHub:
     """
 
     def __init__(self, port: Path, number: int, uids: list[int]) -> None:
-        self.hub = SimulatedHub(100 + number, uids, N_PADS, boot_us=1_000_003 * (number + 1))
+        self.hub = SimulatedHub(
+            uid=100 + number, cube_uids=uids, n_pads=N_PADS, boot_us=1_000_003 * (number + 1)
+        )
         self.sent: dict[int, np.ndarray] = {}
         self.sampled_us: dict[int, int] = {}
         self._random = np.random.default_rng(number)

@@ -444,7 +444,7 @@ def answers(hub: SimulatedHub, request: int, argument: int = 0, now_us: int = 0)
 
 def test_a_simulated_hub_keeps_the_rules_of_the_page():
     """By their numbers in docs/protocol.md."""
-    hub = SimulatedHub(1, [2], 3, period_us=1000)
+    hub = SimulatedHub(uid=1, cube_uids=[2], n_pads=3, period_us=1000)
     assert not hub.started  # R8
     assert hub.receive(encode(Request(2))[:-3] + b"\0", 0) == b""  # F2: damaged
     assert hub.receive(encode(Request(2), version=2), 0) == b""  # F2: another version

@@ -47,7 +47,7 @@ def test_reciprocity_in_space(monkeypatch):
     is moved along x so that the solver uses no mirror symmetry along x.
     """
     monkeypatch.setattr(bodies, "BRICK_SIZES", (bodies.BrickSizes(1.0, 0.3, 6.0),))
-    layer = Body(9e-3, 9e-3, 7e-3, ground=True, cube_young=float("inf"))
+    layer = Body(width=9e-3, depth=9e-3, height=7e-3, ground=True, cube_young=float("inf"))
     faces = np.concatenate([np.eye(3), -np.eye(3)])
     layout = Layout("faces", faces, faces, 0.6)
     influence = compute_influence(layer, layout, 0)

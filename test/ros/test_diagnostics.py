@@ -161,7 +161,16 @@ def test_each_count_of_the_reconstruction_is_in_its_pair():
 
 def test_each_count_of_the_driver_is_in_its_pair():
     """Only what was lost since the last report is a problem now."""
-    counts = RowCounts(100, 1, 2, 0, 3, 4, 5, "OSError()")
+    counts = RowCounts(
+        delivered=100,
+        unknown_cube=1,
+        wrong_pads=2,
+        unaccounted=0,
+        duplicate=3,
+        overload=4,
+        lost=5,
+        lost_reason="OSError()",
+    )
     links = SimpleNamespace(row_counts=lambda: replace(counts))
     diagnostics = LinkDiagnostics("skin")
 

@@ -53,7 +53,7 @@ class FaultyLink(SimulatedLink):
     """A link under faults."""
 
     def __init__(self, *faults):
-        hub = SimulatedHub(1, [10, 11], 8, period_us=PERIOD_US, started=True)
+        hub = SimulatedHub(uid=1, cube_uids=[10, 11], n_pads=8, period_us=PERIOD_US, started=True)
         super().__init__("hub0", hub, KeptLine())
         self.injector = Injector([self], [Fault(**fault) for fault in faults], seed=3)
 

@@ -89,7 +89,9 @@ def test_values_are_those_that_a_hub_sends():
         sent = []
         for hub in hubs:
             millihertz = hub.frequency(*load.at(0.01 * number), 0.01 * number)
-            device = SimulatedHub(1, list(range(len(hub.members))), hub.cubes.n_pads)
+            device = SimulatedHub(
+                uid=1, cube_uids=list(range(len(hub.members))), n_pads=hub.cubes.n_pads
+            )
             (frame,) = Decoder().feed(device.sample(millihertz))
             assert isinstance(frame, Sample)
             sent.append(frame.frequency)

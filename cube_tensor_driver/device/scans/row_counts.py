@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 
-@dataclass
+@dataclass(kw_only=True)
 class RowCounts:
     """Numbers of rows (samples of cubes) of all links, by what happened to them.
 
