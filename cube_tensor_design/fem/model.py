@@ -43,27 +43,38 @@ DEFAULT_LAYOUT = "planar"
 """Name of the layout (places of the pads) of a model file that names none."""
 
 _NUMBER = real("a number in SI units")
+"""Schema of any quantity."""
 _POSITIVE = real("a positive number in SI units", exclusiveMinimum=0)
-# The elements do not lock close to 0.5, but at 0.5 pressure is no longer a function of strain.
+"""Schema of a length, modulus or density."""
 _POISSON = real(
     "a number in [0, 0.5), for rubber 0.48 to 0.4999",
     minimum=0,
     exclusiveMaximum=0.5,
 )
+"""Schema of Poisson's ratio. The elements do not lock close to 0.5, but at 0.5 pressure is no
+longer a function of strain."""
 _MODES = list_of(TEXT, "names of modes") | {
     "minItems": 0,
     "description": "a list of modes",
 }
+"""Schema of the modes that the calibration takes as zero."""
 _RIGID = {"type": "boolean", "description": "true or false"}
+"""Schema of the choice whether the cube is rigid."""
 _SYMMETRY = {
     "enum": ["full", "slab", "mirrors", "none"],
     "description": "full, slab, mirrors or none",
 }
+"""Schema of the symmetry group of the response."""
 _PLANE = {"enum": ["strain", "stress"], "description": "strain or stress"}
+"""Schema of the assumption of plane models."""
 _MATERIAL = {"young": _POSITIVE, "poisson": _POISSON, "expansion": _NUMBER, "density": _POSITIVE}
+"""Keys of an elastic material and their schemas."""
 _BODY = {"width": _POSITIVE, "depth": _POSITIVE, "height": _POSITIVE, **_MATERIAL}
+"""Keys of the box of elastomer and their schemas."""
 _CUBE = {"side": _POSITIVE, "x": _NUMBER, "z": _NUMBER, **_MATERIAL, "rigid": _RIGID}
+"""Keys of the cube in the box and their schemas."""
 _PADS = {"width": _NUMBER, "centre": _NUMBER}
+"""Keys of the pads and their schemas, both lengths in m."""
 _SCHEMA = Schema(
     mapping(
         (),
@@ -78,6 +89,7 @@ _SCHEMA = Schema(
         },
     )
 )
+"""Schema of a model file of `./cube fem`."""
 
 
 @dataclass(frozen=True, eq=False)

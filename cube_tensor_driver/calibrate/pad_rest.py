@@ -24,6 +24,7 @@ MIN_SAMPLES = 3
 which needs three samples."""
 
 MINUTE_S = 60.0
+"""Duration of a minute in s, because drift is stated per minute."""
 
 
 class PadsAtRest(NamedTuple):

@@ -28,7 +28,9 @@ from .fit import loads_from_forces
 from .load_table import Loads
 
 WRENCH_TYPE = "geometry_msgs/msg/WrenchStamped"
+"""Message type of a force sensor as the reference."""
 TENSOR_TYPE = "cube_tensor_driver/msg/StressTensorStamped"
+"""Message type of another calibrated cube as the reference."""
 
 MAX_STEP_RATIO = 5.0
 """Longest time between two messages of the reference sensor over which its load is interpolated, as

@@ -72,3 +72,4 @@ PACKAGES = {
 """Name of a command -> Python package that contains its module, for commands outside the driver."""
 
 COMMANDS = {name: text for group in GROUPS.values() for name, text in group.items()}
+"""Name of a command -> its description, without the groups."""

@@ -33,7 +33,9 @@ FRICTION_SAMPLES = 1001
 limit of friction (coefficient of friction times normal force)."""
 
 _TIME = real("a time in s from 0 up", minimum=0)
+"""Schema of a time in s after the start of the script."""
 _PEAK_FORCE = real("a force in N greater than 0", exclusiveMinimum=0)
+"""Schema of the largest normal force of a tap."""
 _FORCE: JsonSchema = {
     "anyOf": [
         {"type": "number", "exclusiveMinimum": 0},
@@ -45,6 +47,7 @@ _FORCE: JsonSchema = {
     ],
     "description": "a force in N greater than 0, or a list of at least two from 0 up",
 }
+"""Schema of a normal force: constant, or values at equal intervals during the action."""
 _SHEAR: JsonSchema = {
     "anyOf": [
         TRIPLE,
@@ -56,8 +59,11 @@ _SHEAR: JsonSchema = {
     ],
     "description": "a force [x, y, z] in N, or a list of at least two",
 }
+"""Schema of a tangential force: constant, or values at equal intervals during the action."""
 _TIMES = integer(1, MAX_TAPS, f"an integer from 1 to {MAX_TAPS}")
+"""Schema of the number of taps of one action."""
 _PATH = list_of(TRIPLE, "positions [x, y, z]", 2)
+"""Schema of the positions on the surface along which an indenter moves."""
 
 
 def _action_schema(optional: JsonSchema, **required: JsonSchema) -> JsonSchema:
@@ -81,12 +87,14 @@ _ACTIONS: JsonSchema = {
     "roll": _action_schema({"shear": _SHEAR}, path=_PATH, force=_FORCE),
     "tap": _action_schema({"times": _TIMES}, at=TRIPLE, force=_PEAK_FORCE),
 }
-# In YAML an action is a mapping with a single key, its kind: {press: {from: 0, to: 1, ...}}.
+"""Kind of an action -> schema of its keys."""
 _ACTION = mapping((), _ACTIONS) | {
     "minProperties": 1,
     "maxProperties": 1,
     "description": f"one of {', '.join(_ACTIONS)}",
 }
+"""Schema of an action. In YAML it is a mapping with a single key, its kind: {press: {from: 0, to:
+1, ...}}."""
 _INDENTER = mapping(
     ("name", "shape", "radius", "does"),
     {
@@ -97,6 +105,7 @@ _INDENTER = mapping(
         "does": list_of(_ACTION, "actions"),
     },
 )
+"""Schema of an indenter and the list of its actions."""
 _SCHEMA = Schema(
     mapping(
         ("indenters",),
@@ -110,6 +119,7 @@ _SCHEMA = Schema(
         },
     )
 )
+"""Schema of a load script."""
 
 
 @dataclass(frozen=True)

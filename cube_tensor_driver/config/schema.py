@@ -52,6 +52,7 @@ TRIPLE: JsonSchema = {
 """Schema of a list of three numbers, such as a position [x, y, z]."""
 
 _NUMBER_WORDS = {1: "one", 2: "two"}
+"""Words for small numbers in error messages."""
 
 
 def mapping(required: Iterable[str], properties: JsonSchema) -> JsonSchema:

@@ -34,8 +34,7 @@ _FRAME: JsonSchema = {
     "pattern": r"^[A-Za-z][A-Za-z0-9_]*(/[A-Za-z0-9_]+)*\Z",
     "description": "a frame id of letters, digits, _ and /, a letter first",
 }
-# The labels on cubes show the uid (unique number) in hexadecimal, so the skin file accepts a text
-# such as 0x1f, too.
+"""Schema of a frame id of TF."""
 _UID: JsonSchema = {
     "anyOf": [
         {
@@ -47,8 +46,12 @@ _UID: JsonSchema = {
     ],
     "description": "a uid: 1 to 2^64 - 1, or hexadecimal as in 0x1f",
 }
+"""Schema of a uid (unique number) of a cube or hub. A text such as 0x1f is accepted, too, because
+the labels on cubes show the uid in hexadecimal."""
 _INDEX = integer(0, 65535, "an integer from 0 to 65535")
+"""Schema of the index of a cube on its hub, which has 16 bits in the protocol."""
 _BAUD = integer(1200, 20_000_000, "1200 to 20000000")
+"""Schema of a baud rate, in bits per second."""
 _LINK = mapping(
     ("name", "port"),
     {
@@ -58,6 +61,7 @@ _LINK = mapping(
         "hub_uid": _UID,
     },
 )
+"""Schema of a link, the connection to one hub."""
 _CUBE = mapping(
     ("name", "pose", "layout", "calibration"),
     {
@@ -70,6 +74,7 @@ _CUBE = mapping(
         "calibration": TEXT,
     },
 )
+"""Schema of a cube. It is found by its link and index, or by its uid."""
 _ELASTOMER = mapping(
     ("depth", "thickness"),
     {
@@ -78,6 +83,7 @@ _ELASTOMER = mapping(
         "poisson": real("0 to 0.5", minimum=0, maximum=0.5),
     },
 )
+"""Schema of the elastomer above the cubes."""
 _SCHEMA = Schema(
     mapping(
         ("name", "parent_frame", "links", "cubes"),
@@ -91,6 +97,7 @@ _SCHEMA = Schema(
         },
     )
 )
+"""Schema of a skin file."""
 
 
 @dataclass(frozen=True)

@@ -236,7 +236,9 @@ _NEXT_AXES = str.maketrans("xyz", "yzx")
 # The layout "cube" has the eight pads of "planar" in each of the planes z-x, x-y and y-z. The names
 # of the pads in the next plane follow by renaming the axes.
 _SECOND_SECTION = _PLANAR_PADS.translate(_NEXT_AXES)
+"""Names of the pads of the layout "cube" in the plane x-y."""
 _THIRD_SECTION = _SECOND_SECTION.translate(_NEXT_AXES)
+"""Names of the pads of the layout "cube" in the plane y-z."""
 
 LAYOUTS = {
     "quad": _make_layout("quad", _QUAD_PADS),

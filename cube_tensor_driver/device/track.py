@@ -34,6 +34,7 @@ _TYPES: dict[str, Any] = {
     "float": c_double,
     "list[Any]": c_int64 * 2 * MAX_DISORDER,
 }
+"""Annotation of a field of `LinkTrack` -> its type in C, which native/cube_track.h repeats."""
 
 
 class LinkTrack(Structure):

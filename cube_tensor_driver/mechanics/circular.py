@@ -80,10 +80,16 @@ def _define_components() -> tuple[Complex, Orders]:
     return np.stack(coefficients), np.array(orders)
 
 
-CIRCULAR_FROM_FIELD, ORDERS = _define_components()
-"""Matrix (14, 24) from the stresses and gradients `FIELD` to the circular components, and the order
-m (14,) of each one. A circular component is a combination of stresses and gradients that a rotation
-of the frame about z by an angle multiplies by exp(-i m angle)."""
+_COMPONENTS = _define_components()
+"""Matrix and orders of the circular components, which are defined together."""
+
+CIRCULAR_FROM_FIELD = _COMPONENTS[0]
+"""Matrix (14, 24) from the stresses and gradients `FIELD` to the circular components. A circular
+component is a combination of stresses and gradients that a rotation of the frame about z by an
+angle multiplies by exp(-i m angle), where m is its order."""
+
+ORDERS = _COMPONENTS[1]
+"""Order m (14,) of each circular component."""
 
 _PARTS_FROM_FIELD = np.concatenate([CIRCULAR_FROM_FIELD.real, CIRCULAR_FROM_FIELD.imag])
 """Matrix (28, 24) from the stresses and gradients `FIELD` to the real and then the imaginary parts

@@ -46,9 +46,13 @@ PER_MESSAGE = 0
 one value for the whole message."""
 
 _SECONDS_AT = len(LITTLE_ENDIAN)
+"""Byte offset of the seconds of the stamp, an int32, in a serialised message."""
 _NANOSECONDS_AT = _SECONDS_AT + 4
+"""Byte offset of the nanoseconds of the stamp, a uint32."""
 _FRAME_LENGTH_AT = _NANOSECONDS_AT + 4
+"""Byte offset of the length of the frame id, a uint32."""
 _FRAME_AT = _FRAME_LENGTH_AT + 4
+"""Byte offset of the text of the frame id."""
 
 SHAPE_AT = _FRAME_LENGTH_AT
 """Byte offset, from the start of a serialised message, of the bytes that `MessageCodec.shape_bytes`
@@ -85,6 +89,7 @@ _FREQUENCIES = (
     _Field("pad_fault", "<u4", 1),
     _Field("status", "<u2", 1),
 )
+"""Fields of SkinFrequencies after the header, in the order of the message definition."""
 _STRESS = (
     *_FIRST_FIELDS,
     _Field("stress", "<f4", len(STRESS)),
@@ -94,6 +99,7 @@ _STRESS = (
     _Field("observed", "<u2", 1),
     _Field("left_out", "<u4", 1),
 )
+"""Fields of SkinStress after the header, in the order of the message definition."""
 
 
 class _Shape(NamedTuple):

@@ -34,18 +34,22 @@ _NUMBERS = (
     "position_uncertainty",
     "force_uncertainty",
 )
+"""Numbers of a contact that every method gives, with one name in message and `Contact`."""
 _TRACKED_NUMBERS = (
     "moment",
     "shear_uncertainty",
     "area_uncertainty",
     "moment_uncertainty",
 )
+"""Numbers of a contact that only the method inverse gives; otherwise they are NaN."""
 _FRICTION = ("friction", "friction_uncertainty", "friction_use")
+"""Numbers of a contact that are taken from `Slip`."""
 _VECTORS = {
     "position": "Point",
     "normal": "Vector3",
     "force": "Vector3",
 }
+"""Name of a vector of a contact -> its type in geometry_msgs."""
 
 
 def contacts_message(

@@ -60,11 +60,11 @@ MOMENTARY_FAULTS = (*FRAME_FAULTS, "reset", "wrap", "drift", "step")
 """Kinds of faults without a duration: they end as soon as they have begun. All other kinds last for
 the time `seconds` of the fault."""
 
-
-# Times and counts of a fault are not negative. Only its size (`value`) may be negative: a clock may
-# run slow, and a temperature may fall.
 _AMOUNT = real("a number from 0 up", minimum=0)
+"""Schema of a time in s, which is not negative. Only the size of a fault (`value`) may be negative:
+a clock may run slow, and a temperature may fall."""
 _COUNT = integer(0, MAX_COUNT, "a whole number from 0 up")
+"""Schema of a number of samples and of an index of a cube or pad."""
 _SCHEMA = Schema(
     mapping(
         ["kind"],
@@ -80,6 +80,7 @@ _SCHEMA = Schema(
         },
     )
 )
+"""Schema of a fault."""
 
 
 @dataclass(frozen=True)

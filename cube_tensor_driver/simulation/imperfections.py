@@ -67,12 +67,14 @@ _CREEP_TERM: JsonSchema = {
     "maxItems": 2,
     "description": "[size, seconds]",
 }
+"""Schema of an exponential term of creep: size relative to the load, and time constant."""
 
 _KNOTS: JsonSchema = {
     "type": "array",
     "items": list_of(real("a number"), "a time in s and a temperature in °C", 2) | {"maxItems": 2},
     "description": "[[seconds, °C], ...]",
 }
+"""Schema of a temperature that is linear in time between the given points."""
 
 _SCHEMA = Schema(
     mapping(
@@ -107,6 +109,7 @@ _SCHEMA = Schema(
         },
     )
 )
+"""Schema of the file of imperfections."""
 
 _TABLES = {"creep", "temperature", "air", "poses"}
 """Names of the fields of `Imperfections` that hold rows of numbers."""

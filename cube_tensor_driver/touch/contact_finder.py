@@ -27,10 +27,14 @@ from .slip import NO_CONTACTS, Slip, SlipEstimator
 from .surface import Contact, Surface
 from .tracker.contact_tracker import ContactTracker, TrackedContact
 
-AUTO, INTERPOLATION, INVERSE = CONTACT_METHODS
-"""Names of the methods that find contacts: interpolation of the pressure between the cubes, and
-fits of the traction in each contact to the values of the cubes around it (inverse). `AUTO` stands
-for `INVERSE` if the skin file describes the elastomer, otherwise for `INTERPOLATION`."""
+AUTO = CONTACT_METHODS[0]
+"""Method that is `INVERSE` if the skin file describes the elastomer, otherwise `INTERPOLATION`."""
+
+INTERPOLATION = CONTACT_METHODS[1]
+"""Method that interpolates the pressure between the cubes."""
+
+INVERSE = CONTACT_METHODS[2]
+"""Method that fits the traction in each contact to the values of the cubes around it."""
 
 
 @dataclass(frozen=True)

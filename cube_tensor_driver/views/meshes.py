@@ -21,8 +21,11 @@ NO_MESH: Mesh = (np.zeros((3, 3)), np.array([[0, 1, 2]]))
 """An invisible mesh: one triangle without area, because viser refuses a mesh without triangles."""
 
 _CORNERS = product((-1.0, 1.0), repeat=3)
+"""Corners of a cube with its centre at the origin and half a side of 1."""
 _CORNER_PAIRS = np.array(list(combinations(_CORNERS, 2)))
+"""All pairs (28, 2, 3) of corners of the cube."""
 _N_DIFFERENT = np.count_nonzero(_CORNER_PAIRS[:, 0] != _CORNER_PAIRS[:, 1], axis=1)
+"""Number (28,) of coordinates in which the corners of each pair differ: 1 along an edge."""
 CUBE_EDGES = _CORNER_PAIRS[_N_DIFFERENT == 1]
 """Edges (12, 2, 3) of a cube with its centre at the origin and half a side of 1: the positions of
 both ends of each edge."""
@@ -33,9 +36,10 @@ COLOUR_STEPS = 32
 The squares of each colour are a mesh of their own, so more colours take the browser more time.
 """
 
-# Corners of a square with sides of 1 around the origin, and its two triangles.
 _SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2
+"""Corners (4, 2) of a square with sides of 1 around the origin."""
 _SQUARE_FACES = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
+"""Indices (2, 3) of the corners of the two triangles of `_SQUARE`."""
 
 
 def join_squares(corners: AnyArray) -> Mesh:

@@ -18,6 +18,7 @@ from cube_tensor_driver.simulation.faults import Fault
 from cube_tensor_driver.simulation.sample_log import FaultRecord, SampleLog
 
 NS_PER_S = 1_000_000_000
+"""Number of nanoseconds in a second."""
 
 CUT_FAULTS = (
     "stall",
@@ -66,7 +67,9 @@ GAP_MARGIN_S = 0.05
 rows that arrived before and after the gap."""
 
 EARLIEST_NS = np.iinfo(np.int64).min
+"""Time in ns that is earlier than every stamp."""
 LATEST_NS = np.iinfo(np.int64).max
+"""Time in ns that is later than every stamp."""
 
 
 @dataclass(frozen=True)

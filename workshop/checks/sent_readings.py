@@ -27,6 +27,7 @@ CHUNK = 100_000
 memory for intermediate results does not grow with the duration of a run."""
 
 HERTZ_PER_MILLIHERTZ = 1e-3
+"""Factor from the unit of frequencies on the wire (mHz) to that of messages (Hz)."""
 
 
 def reading_type(n_cubes: int, n_pads: int) -> np.dtype[np.void]:

@@ -15,6 +15,7 @@ from .record import CUT_FAULTS, DRIVER_KILLS, DRIVER_STOPS, NS_PER_S, Span
 from .run import Run
 
 MS_PER_NS = 1e-6
+"""Factor from ns to ms."""
 
 CLOCK_FAULTS = ("reset", "wrap", "unplug", "rename", "drift")
 """Kinds of faults after which the driver fits the clock of the hub from the start."""

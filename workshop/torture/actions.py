@@ -82,7 +82,9 @@ ActionResult = tuple[bool, str]
 """Result of an action: whether the node did what was requested, and the text of its answer."""
 
 DOWN = (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP)
+"""Transitions of lifecycle that stop an active node and free what it holds."""
 UP = (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE)
+"""Transitions of lifecycle that start an unconfigured node again."""
 
 
 class Actions:

@@ -42,12 +42,16 @@ MAX_BAD_ANSWERS = 3
 """Number of successive answers to the request TIME (for the hub's time) that contradict the device
 times of its samples before this is reported as a problem."""
 CLOCK_SET = "the hub's clock was set: stamps follow its new time"
+"""Problem that is reported after a step of the hub's clock."""
 CLOCK_STANDS_STILL = "the hub's clock stands still: rows are stamped by their arrival"
+"""Problem that is reported while the device times do not advance."""
 CLOCK_KEEPS_JUMPING = (
     f"the hub's clock jumped {MAX_STEPS} times within {STEPS_NS / 1e9:g} s: "
     "rows are stamped by their arrival"
 )
+"""Problem that is reported while the hub's clock steps too often to be used."""
 BAD_ANSWERS = "the hub's answers to TIME contradict its samples: they are not used"
+"""Problem that is reported after `MAX_BAD_ANSWERS` answers in a row that cannot be true."""
 
 
 class HubClock:

@@ -58,9 +58,13 @@ _NO_PERMISSION = (
     "no_permission",
     "add yourself to the group dialout (sudo usermod -aG dialout $USER) and log in again",
 )
+"""Kind of error and fix if the user may not open the port."""
 _NO_DEVICE = "no_port", "nothing is behind this port: plug the hub in or correct the port"
+"""Kind of error and fix if the device file exists, but no device answers."""
 _IN_USE = "busy", "another program has it open: end that one (fuser -v shows which)"
+"""Kind of error and fix if another program has the port open."""
 _NOT_SERIAL = "not_serial", "this is no serial port: correct the port"
+"""Kind of error and fix if the path is no serial port."""
 _OPEN_ERRORS = {
     errno.ENOENT: ("no_port", "plug the hub in or correct the port"),
     errno.ENXIO: _NO_DEVICE,

@@ -25,6 +25,7 @@ with their number ("and 3 more")."""
 ABSENT = -1
 """Value that stands for the index in the skin if a hub's cube is not in the skin file."""
 _OTHER_LINK_HAS_IT = "left out here: another link has a cube of the same uid"
+"""Reason in the log why a cube with a uid that came before is left out."""
 
 
 HubIndex = NDArray[np.int32]

@@ -44,12 +44,17 @@ HEADER = struct.Struct("<BBH")
 OVERHEAD = HEADER.size + 4
 """Number of bytes of a frame besides its payload: header and CRC-32 (checksum, 4 bytes)."""
 _HELLO = struct.Struct("<QIHBBI")
+"""Numbers at the start of the payload of HELLO, before those of its cubes."""
 _SAMPLE = struct.Struct("<IHHQB3x")
+"""Numbers at the start of the payload of SAMPLE, before those of its cubes."""
 _FREQUENCY = HEADER.size + _SAMPLE.size
 """Byte offset of the frequencies from the start of a decoded SAMPLE frame."""
 _U32 = np.dtype("<u4")
+"""Type of frequencies and pad faults in the payload."""
 _U64 = np.dtype("<u8")
+"""Type of the uids of cubes in the payload."""
 _I16 = np.dtype("<i2")
+"""Type of temperatures in the payload."""
 _Arrays = tuple[NDArray[np.uint32], NDArray[np.uint32], NDArray[np.int16]]
 """Arrays of a SAMPLE frame: frequencies, pad faults and temperatures (see `Sample`)."""
 
@@ -264,6 +269,7 @@ class _FixedFrame:
 
     __slots__ = ()
     _PAYLOAD: ClassVar[struct.Struct]
+    """Numbers of the payload, in the order of the fields."""
 
     def _pack(self) -> bytes:
         numbers = (getattr(self, field.name) for field in fields(self))  # type: ignore[arg-type]
@@ -355,7 +361,9 @@ _TYPES: dict[int, type[Frame]] = {
     0x10: Request,
     0x11: Ack,
 }
+"""Number of a type in the header -> class of the frame."""
 _CODES = {frame_type: code for code, frame_type in _TYPES.items()}
+"""Class of a frame -> number of its type in the header."""
 UNPACK: dict[int, Callable[[bytes, int], Frame | None]] = {
     code: frame_type._unpack for code, frame_type in _TYPES.items()
 }

@@ -33,6 +33,7 @@ ANY_CUBE = "<name>"
 """Text that replaces the name of the cube in a listed topic, as in cubes/<name>/stress."""
 
 _CUBE_TOPIC = re.compile(r"(?P<before>.*/cubes/)(?P<cube>[^/]+)(?P<after>/(stress|wrench))")
+"""Pattern of the name of a topic of one cube, to list the topics of all cubes as one line."""
 
 
 @dataclass

@@ -41,8 +41,6 @@ Its lightness grows from end to end, so that it can be read in grey. In a colour
 blue, both ends would have the same grey.
 """
 
-# Curves with different colours also have different markers, and curves with the same colour have
-# different line styles (see `curve_style`), so that all can be distinguished in grey.
 _CURVE_COLOURS = (
     "black",
     "tab:red",
@@ -53,8 +51,12 @@ _CURVE_COLOURS = (
     "tab:brown",
     "0.5",
 )
+"""Colours of matplotlib of successive curves. Curves with different colours also have different
+markers, so that they can be distinguished in grey."""
 _CURVE_MARKERS = "os^Dv<>p"
+"""Markers of successive curves, one for each colour."""
 _CURVE_DASHES = ("-", "--", "-.", ":")
+"""Line styles of curves with the same colour."""
 
 
 @contextmanager
