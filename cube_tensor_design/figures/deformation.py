@@ -139,8 +139,8 @@ def _draw_stress(axis: Any, deformation: Deformation, drawn: Array, window: floa
     """
     points = deformation.points
     ring = np.abs(points).max(axis=0)
-    farthest = ring[deformation.triangles].max(axis=0)
-    is_outside = farthest > 1 + 1e-9
+    largest_coordinate = ring[deformation.triangles].max(axis=0)
+    is_outside = largest_coordinate > 1 + 1e-9
     triangles = deformation.triangles[:, is_outside]
 
     # The value of a node is the mean of the triangles around it.

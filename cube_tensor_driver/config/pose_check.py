@@ -46,8 +46,8 @@ def pose_doubts(skin: Skin) -> Iterator[str]:
     positions = np.array([cube.xyz for cube in skin.cubes])
     yield from _find_shared_positions(skin, positions)
     if _seems_in_millimetres(positions):
-        farthest = int(np.abs(positions).max(axis=1).argmax())
-        cube = skin.cubes[farthest]
+        most_distant = int(np.abs(positions).max(axis=1).argmax())
+        cube = skin.cubes[most_distant]
         yield (
             f"cubes: {cube.name!r} is at [{_format(cube.xyz)}] m, where no skin reaches: "
             "xyz is in m; divide by 1000 what was typed in mm"

@@ -316,9 +316,9 @@ class ContactResponse:
         steps = [0, 1, columns, columns + 1]
         indices = first[:, None] + steps
         neighbours = rows.take(indices, axis=0)
-        farther = index - below
+        upper_share = index - below
         wider = size_index - narrower
-        by_distance = np.stack([1 - farther, farther]) * decay
+        by_distance = np.stack([1 - upper_share, upper_share]) * decay
         of_narrower = (1 - wider) * by_distance
         of_wider = wider * by_distance
         weights = np.concatenate([of_narrower, of_wider])
@@ -402,12 +402,12 @@ class ContactResponse:
                 be used.
 
         Returns:
-            Functions R, Z and T (distances, 3, n) at the tabulated distances up to the farthest of
-            these positions.
+            Functions R, Z and T (distances, 3, n) at the tabulated distances up to the most distant
+            of these positions.
         """
         distance, _ = to_polar(place)
-        farthest = distance.max(initial=0.0) / self._table.step
-        n_distances = int(min(farthest, self._table.last)) + 4
+        last_step = distance.max(initial=0.0) / self._table.step
+        n_distances = int(min(last_step, self._table.last)) + 4
 
         size_index = _size_index(size, self._depth)
         first, weights = cubic_weights(size_index)

@@ -69,7 +69,7 @@ SPREAD = 0.25
 of the farther cube divided by that of the nearer one. This ratio limits the pressure that a load
 can cause at other cubes. A touch at such a cube must exceed this limit."""
 
-FAR = 1e-4
+MAX_DISTANT_RATIO = 1e-4
 """Largest ratio of the pressure of a cube at least seven pitches away from a load to the largest
 pressure, at a pitch of 8 mm, a depth of 5 mm, and with a shear force of half the normal one."""
 
@@ -374,8 +374,8 @@ class Touch:
         # fast enough: slow parts change little in the scans until the limit has reached all cubes.
         reach_around = self._reach[self._near].max(axis=0)
         spread = SPREAD * reach_around
-        far_pressure = FAR * strength.max()
-        felt = np.maximum(spread, far_pressure)
+        distant_pressure = MAX_DISTANT_RATIO * strength.max()
+        felt = np.maximum(spread, distant_pressure)
         is_own = strength > felt
         self._reach = np.maximum(strength, spread)
         self._held = self._reach > self._deviation / 2

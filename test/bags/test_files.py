@@ -302,7 +302,7 @@ def test_what_was_found_before_the_recording_began_is_taken_from_it(tmp_path):
     reprocess(ReprocessJob(path, tmp_path / "bag.parquet", "parquet"))
     table = pyarrow.parquet.read_table(tmp_path / "bag.parquet")
     assert table["left_out"].to_numpy()[:16].tolist() == [0, 0, 0, 4] + [0] * 12
-    # another tare judges anew, and does not find it
+    # another tare begins the assessment anew, and does not find it
     with open_bag(path) as source:
         ((_, rows), *_) = reconstruct(source, choose_settings(source, Overrides(tare=(0.0, 0.1))))
     assert not rows.left_out.any() and (rows.status & STUCK == 0).all()

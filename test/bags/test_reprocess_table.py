@@ -77,7 +77,7 @@ def test_a_whole_bag_gives_the_values_of_reprocess(bag, tmp_path, form):
 
 
 def test_frequencies_alone_are_those_of_a_node_that_starts(bag, frequencies, tmp_path):
-    """Rest frequencies of the calibrations, and pads judged by a new reconstructor."""
+    """Rest frequencies of the calibrations, and pads assessed by a new reconstructor."""
     skin = ctd.read_skin(SKIN)
     found = ctd.reprocess_table(frequencies.select(["stamp_ns", "cube", "frequency_Hz"]), skin)
     reconstruct = ctd.Reconstructor(skin)

@@ -220,9 +220,9 @@ def test_rviz_gets_the_frame_a_wrench_and_a_view_of_any_skin():
     assert topic in {f"cubes/{cube.name}/wrench" for cube in skin.cubes}
     camera = manager["Views"]["Current"]
     centre = np.array([camera["Focal Point"][axis] for axis in "XYZ"])
-    furthest = np.linalg.norm(np.array([cube.xyz for cube in skin.cubes]) - centre, axis=1).max()
+    radius = np.linalg.norm(np.array([cube.xyz for cube in skin.cubes]) - centre, axis=1).max()
     # RViz's camera sees 45 degrees: half of that reaches 0.41 of the distance.
-    assert furthest < 0.41 * camera["Distance"] < 2 * furthest
+    assert radius < 0.41 * camera["Distance"] < 2 * radius
 
 
 def test_cubes_at_rest_and_arrows_stand_out_from_the_ground_of_rviz():

@@ -648,7 +648,7 @@ def test_the_figures_of_the_papers_page_are_those_of_its_json():
         name: np.abs(shear - found["rod shear"]["same_load"]).max() / 1e3
         for name, shear in recovered.items()
     }
-    said.append(f"within {errors['pads']:.1f} kPa, a twentieth of the greatest shear")
+    said.append(f"within {errors['pads']:.1f} kPa, a twentieth of the largest shear")
     said.append(
         f"{errors['eq_4']:.0f} kPa off and the tensor of eight pads {errors['tensor']:.0f} kPa"
     )

@@ -80,7 +80,7 @@ def test_stamps_and_drift(delay, rate: float, drift_ppm: float) -> None:
 
 
 def test_bursts_in_step_with_the_samples() -> None:
-    """1 kHz and 16 ms: the least delay creeps through a whole sample period before it repeats, so
+    """1 kHz and 16 ms: the smallest delay creeps through a sample period before it repeats, so
     until then 1 ms is the best that can be known; the scheduler's 50 µs come on top."""
     for seed, drift_ppm in enumerate((-100.0, -37.0, 55.0)):
         run = Run(usb_bursts, 1000.0, drift_ppm, 65.0, seed)

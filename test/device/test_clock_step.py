@@ -52,7 +52,7 @@ class Run:
         self.in_doubt, self.named, self.true_s = np.array(doubt), np.array(named), true_s
 
     def usual_ms(self) -> float:
-        """The greatest error before anything happens."""
+        """The largest error before anything happens."""
         return float(self.error_ms[(self.true_s > 3) & (self.true_s < AT_S)].max())
 
 

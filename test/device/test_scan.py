@@ -507,7 +507,7 @@ def test_an_error_in_the_callback_is_counted_with_its_reason_and_the_next_rows_g
 
 
 def test_rows_that_the_data_path_forgets_without_an_error_are_unaccounted(monkeypatch):
-    """The account is not kept by the code that it judges."""
+    """The account is not kept by the code that it checks."""
     live = live_links(lambda rows: None)
     monkeypatch.setattr(ScanBuilder, "add", lambda self, link, sample, stamp_ns, status: None)
     live.receive([LinkFrames(0, 0, [timed(0, 0)])])

@@ -105,7 +105,7 @@ def test_on_the_axis_of_a_disc_and_of_a_sphere(tmp_path, shape, radius):
 
 
 def test_few_points_from_afar_are_as_good(tmp_path):
-    """Against 24 rings for every cube: within 1e-3 of the greatest value, wherever the number of
+    """Against 24 rings for every cube: within 1e-3 of the largest value, wherever the number of
     points changes."""
     places = np.stack([np.linspace(0, 0.3, 181), np.full(181, 0.0007), np.zeros(181)], axis=1)
     for shape, radius in (("disc", 0.006), ("disc", 0.025), ("sphere", 0.02)):

@@ -183,7 +183,7 @@ def test_the_program_of_the_page_runs(tmp_path, monkeypatch, capsys):
     shutil.copy(FILE, tmp_path / "skin.yaml")
     monkeypatch.chdir(tmp_path)
     exec(program + imperfect, {})
-    assert re.fullmatch(r"greatest pressure \d+\.\d kPa\n", capsys.readouterr().out)
+    assert re.fullmatch(r"largest pressure \d+\.\d kPa\n", capsys.readouterr().out)
 
 
 @pytest.mark.parametrize(

@@ -155,7 +155,7 @@ def test_the_noise_of_a_cube_is_how_its_values_scatter_with_the_gains_and_the_co
     values = np.array([local.whiten(one[None], 0.0) for one in np.concatenate(drawn)])
     n = values.shape[1]
     found = np.linalg.eigvalsh(np.cov(values.T))
-    # Marchenko and Pastur: the least and greatest of a sample covariance that is right
+    # Marchenko and Pastur: the smallest and largest eigenvalue of a sample covariance that is right
     spread = np.sqrt(n / len(values))
     assert 0.9 * (1 - spread) ** 2 < found[0] and found[-1] < 1.1 * (1 + spread) ** 2
 

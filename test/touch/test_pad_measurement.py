@@ -34,7 +34,7 @@ PLANAR, CUBE = (shipped_calibration(LAYOUTS[name]) for name in ("planar", "cube"
 SCALE = 2e-3
 UNITS = np.where(np.arange(len(COMPONENTS)) < len(STRESS), 1.0, SCALE)
 LEFT_OUT = 0.015
-"""Of the greatest value: components whose singular values are below a thousandth add up, most for
+"""Of the largest value: components whose singular values are below a thousandth add up, most for
 narrow contacts."""
 
 
@@ -77,8 +77,8 @@ def test_a_contact_is_the_sum_of_its_forces(influence, cubes, size):
             for at, turn, number in zip(place, angle, which, strict=True)
         ]
     )
-    greatest = np.abs(expected).max(axis=(0, 2), keepdims=True)
-    assert (np.abs(found - expected) <= LEFT_OUT * greatest).all()
+    largest = np.abs(expected).max(axis=(0, 2), keepdims=True)
+    assert (np.abs(found - expected) <= LEFT_OUT * largest).all()
 
 
 def test_covariances_of_the_prior_are_sums_over_the_surface(influence, cubes):

@@ -119,7 +119,7 @@ def test_false_alarms_in_noise_are_as_many_as_stated(make_skin):
     [(8e-3, "cube", 2e-3), (12e-3, "cube", 6e-3), (8e-3, "planar", 3e-3), (12e-3, "planar", 1e-2)],
 )
 def test_a_small_touch_is_found_in_two_scans_wherever_it_is(make_skin, pitch, layout, force):
-    """At one false alarm an hour of 256 cubes: between four cubes, where all are farthest away. The
+    """At one false alarm an hour of 256 cubes: between four cubes, where all are most distant. The
     calculated chance is 97 % or more, and of 30 touches 27 must be found."""
     run = Run(make_skin(16, pitch, layout))
     load = run.ball((0.0, 0.0, -force), (0.0, 0.0))

@@ -263,7 +263,7 @@ class NodeAction(Span):
     """Something that was done to the nodes, with the span of time from the request to its end.
 
     Attributes:
-        kind: Name of the action in `torture/round.yaml`.
+        kind: Name of the action in `torture/cycle.yaml`.
         succeeded: Whether the node did what was requested.
         answer: Answer of the node.
         cubes: Indices of the cubes that were tared.

@@ -30,14 +30,14 @@ Event = dict[str, Any]
 """A fault of a hub, with the key `kind` as in `simulation.faults`, or an action on a node, with the
 key `action`; other keys are its values."""
 
-ROUND_S = 30.0
-"""Time, in seconds, after which the actions of `ROUND` are repeated."""
+CYCLE_S = 30.0
+"""Time, in seconds, after which the actions of `CYCLE` are repeated."""
 
-ROUND: dict[float, Event] = read_yaml(Path(__file__).with_name("round.yaml"))
-"""Events of each round, by time in seconds after its begin."""
+CYCLE: dict[float, Event] = read_yaml(Path(__file__).with_name("cycle.yaml"))
+"""Events of each cycle, by time in seconds after its begin."""
 
-FIRST_ROUND_ONLY = ("restart reconstruction", "restart driver")
-"""Actions of the first round only. They end the life of a process, over which the growth of its
+FIRST_CYCLE_ONLY = ("restart reconstruction", "restart driver")
+"""Actions of the first cycle only. They end the life of a process, over which the growth of its
 memory is measured."""
 
 HELD_HUB = 0
@@ -73,11 +73,11 @@ def schedule(duration: float, seed: int) -> list[tuple[float, Event]]:
     """Return all events of a torture of `duration` seconds, each with its time in seconds.
 
     Frames are damaged all the time, links are cut one after the other, pads break, hubs get warm,
-    and the actions of `ROUND` are repeated.
+    and the actions of `CYCLE` are repeated.
     """
     # The order of these calls decides what each seed gives.
     mix = _Mix(duration, seed)
-    mix.add_rounds()
+    mix.add_cycles()
     mix.add_frame_faults()
     mix.add_opening()
     for hub in range(HUBS):
@@ -109,14 +109,14 @@ class _Mix:
         if not (disturbs and _disturbs_tare(at, fault.get("seconds", 0.0))):
             self._add(at, link=f"hub{hub}", **fault)
 
-    def add_rounds(self) -> None:
+    def add_cycles(self) -> None:
         """Add the actions on the nodes, and the times at which the load of a hub is held."""
-        # `np.arange` needs an end above 0 to give one round, also for a very short torture.
-        starts = np.arange(0.0, max(self._end, 0.1), ROUND_S)
+        # `np.arange` needs an end above 0 to give one cycle, also for a very short torture.
+        starts = np.arange(0.0, max(self._end, 0.1), CYCLE_S)
         for start in starts.tolist():
-            for after, event in ROUND.items():
-                # Rounds after the first do not end processes, see `FIRST_ROUND_ONLY`.
-                is_due = start == 0 or event.get("action") not in FIRST_ROUND_ONLY
+            for after, event in CYCLE.items():
+                # Cycles after the first do not end processes, see `FIRST_CYCLE_ONLY`.
+                is_due = start == 0 or event.get("action") not in FIRST_CYCLE_ONLY
                 if start + after < self._end and is_due:
                     self._add(start + after, **event)
 
@@ -194,10 +194,10 @@ class _Mix:
 
 def _disturbs_tare(at: float, seconds: float) -> bool:
     """Return whether a fault of the held hub would be too close to a tare."""
-    holds = [after for after, event in ROUND.items() if event.get("kind") == "hold"]
-    # The fault may last into the next round.
-    rounds = np.arange(0.0, at + ROUND_S + 10, ROUND_S)
-    hold_s = np.add.outer(rounds, holds)
+    holds = [after for after, event in CYCLE.items() if event.get("kind") == "hold"]
+    # The fault may last into the next cycle.
+    cycles = np.arange(0.0, at + CYCLE_S + 10, CYCLE_S)
+    hold_s = np.add.outer(cycles, holds)
     begins_before = at < hold_s + QUIET_AFTER_S
     ends_after = at + seconds > hold_s - QUIET_BEFORE_S
     return bool((begins_before & ends_after).any())

@@ -3,7 +3,7 @@
 """Arrays that the kernel reads and writes, in the order in which it takes them.
 
 The kernel computes stress from the frequencies of rows (samples of one cube), and adds the rows to
-the sums from which the health of the pads is judged. It exists in C (native/cube_scan.c) and in
+the sums from which the health of the pads is assessed. It exists in C (native/cube_scan.c) and in
 numpy (`rows.py`), with the same bits. N is the number of rows, C that of the cubes of the skin, P
 the largest number of pads of a cube. "real" is the precision of the computation, float32 or
 float64.
@@ -36,7 +36,7 @@ NEEDS_WINDOW = -2
 """Result of the kernel (the loop over rows of frequencies): it has stopped before a scan.
 
 The newest time stamp of the scan lies outside the present window of 0.5 s, over which the health of
-pads is judged. The caller ends this window, opens another, and calls the kernel again from that
+pads is assessed. The caller ends this window, opens another, and calls the kernel again from that
 scan on.
 """
 
@@ -44,7 +44,7 @@ NEEDS_CONDITION = -3
 """Result of the kernel (the loop over rows of frequencies): it has stopped before a row.
 
 A pad of this row has an impossible frequency, or the device reports it as broken. The health of
-pads is judged over windows of 0.5 s, so the kernel stops at the first such row of a cube in a
+pads is assessed over windows of 0.5 s, so the kernel stops at the first such row of a cube in a
 window only.
 
 The caller finds the condition of the pad (open, short, out of range or reported), and calls the
@@ -93,7 +93,7 @@ CUBE_STATE = np.dtype(
     },
     align=True,
 )
-"""Layout in memory of the state of one cube from which the health of its pads is judged.
+"""Layout in memory of the state of one cube from which the health of its pads is assessed.
 
 Fields: newest time stamp and interval between the newest two rows, in ns; longest interval of at
 least `GAP_NS` before the first row of the present window of 0.5 s and within the window, in ns;
@@ -165,7 +165,7 @@ class Tables(NamedTuple):
 
 
 class HealthState(NamedTuple):
-    """State from which the health of the pads is judged; the kernel changes it with each row.
+    """State from which the health of the pads is assessed; the kernel changes it with each row.
 
     Attributes:
         words: Memory of `cubes` (C, 8), because numpy passes no structured arrays to C.
@@ -275,12 +275,12 @@ class Task(NamedTuple):
     Attributes:
         n_residuals: Number of outputs of a matrix (see `Tables.matrix`) that are residuals.
         tables: Tables of the skin.
-        health: State of the health, which is changed; None: health is not judged.
+        health: State of the health, which is changed; None: health is not assessed.
         offsets: What is subtracted and its state, which is changed; None: nothing is.
         columns: Rows to process.
         out: Rows to write; its arrays are contiguous. Before the call, `left_out` and `status` hold
             the pads that are not used and the conditions of the pads, for all rows whose health is
-            not judged in this call.
+            not assessed in this call.
         offset: Array for what is subtracted (N, P), stress / stiffness; None: not wanted.
     """
 

@@ -41,7 +41,7 @@ MAX_ROWS = 4096
 """Maximum number of rows (samples of one cube) that numpy computes together.
 
 Each row takes a copy of the matrix of its cube, up to 6 kB, so the copies take up to 25 MB. Where
-the health of pads is judged, a scan (at most one row per cube) is computed at a time instead.
+the health of pads is assessed, a scan (at most one row per cube) is computed at a time instead.
 """
 
 
@@ -197,10 +197,10 @@ def _process(scan: slice, task: Task) -> tuple[int, int]:
     has_new_condition = np.zeros(len(cube), bool)
     if health is not None:
         state = health.cubes[cube]
-        is_judged = np.ones(len(cube), bool) if rows.known is None else ~rows.known
+        is_assessed = np.ones(len(cube), bool) if rows.known is None else ~rows.known
         left_out = rows.pad_fault | state["mask"]
-        np.copyto(out.left_out, left_out, where=is_judged)
-        np.copyto(out.status, state["status"], where=is_judged)
+        np.copyto(out.left_out, left_out, where=is_assessed)
+        np.copyto(out.status, state["status"], where=is_assessed)
         is_impossible, is_reported = find_impossible(tables, health, rows, cube)
         new_conditions = pack_bits(is_impossible | is_reported) & ~state["found"]
         has_new_condition = new_conditions != 0

@@ -17,7 +17,7 @@ except ImportError:
     native = None  # type: ignore[assignment]
 
 _NO_HEALTH = (None,) * len(HealthState._fields)
-"""Arguments of the kernel in C instead of a `HealthState`, where health is not judged."""
+"""Arguments of the kernel in C instead of a `HealthState`, where health is not assessed."""
 
 _NO_OFFSETS = (None,) * len(Offsets._fields)
 """Arguments of the kernel in C instead of `Offsets`, where nothing is compensated."""

@@ -350,11 +350,11 @@ class MujocoSkin:
         # One table of stresses serves all cubes, so their depths must be nearly equal.
         median = float(np.median(depth))
         deviation = np.abs(depth - median)
-        farthest = int(np.argmax(deviation))
-        if deviation[farthest] > MAX_DEPTH_DEVIATION * median:
+        wrong = int(np.argmax(deviation))
+        if deviation[wrong] > MAX_DEPTH_DEVIATION * median:
             raise ConfigError(
-                f"skin {skin.name} does not fit the MuJoCo model: cube {skin.cubes[farthest].name} "
-                f"lies {1e3 * depth[farthest]:.3g} mm below the surface, the others "
+                f"skin {skin.name} does not fit the MuJoCo model: cube {skin.cubes[wrong].name} "
+                f"lies {1e3 * depth[wrong]:.3g} mm below the surface, the others "
                 f"{1e3 * median:.3g} mm; all must have one depth to {MAX_DEPTH_DEVIATION:.0%}: "
                 "move cubes or geoms"
             )

@@ -4,7 +4,7 @@
 
 A ball presses as a Hertz contact: force, centre and radius describe it with a few numbers, which
 the values of the cubes determine better than the forces of many nodes (node_fit.py), above all
-where the cubes are far apart. Gauss-Newton steps find the parameters x with the greatest posterior.
+where the cubes are far apart. Gauss-Newton steps find the parameters x with the largest posterior.
 With the derivatives J of the whitened values by the parameters, the whitened residual r, and the
 prior precision P about x0::
 

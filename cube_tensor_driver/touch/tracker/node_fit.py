@@ -12,7 +12,7 @@ the whitened values w, which have noise of variance 1, the posterior is that of 
     mean f = s^2 K B' W w,    covariance t (s^2 K - s^4 K B' W B K),    W = (1 + s^2 B K B')^-1
 
 K is the prior covariance of the forces for a pressure of variance 1 Pa^2. The scale s is that with
-the greatest evidence; the misfit t is chi-squared divided by the number of values, but at least 1,
+the largest evidence; the misfit t is chi-squared divided by the number of values, but at least 1,
 so that an imperfect model increases the stated deviations. An eigenvalue
 decomposition of K^1/2' B' B K^1/2 gives all of this for every s at once.
 
@@ -92,7 +92,7 @@ _VARIANCE_SHARES = np.array([0.4, 0.4, 0.2])
 
 _SCALES = AMPLITUDE * np.geomspace(0.01, 100, 41)
 """Prior standard deviations (41,) of the pressure, in Pa, from which every fit chooses the one with
-the greatest evidence (probability of the values)."""
+the largest evidence (probability of the values)."""
 
 _RELATIVE_DEVIATIONS = np.array([SHEAR_RATIO, SHEAR_RATIO, 1.0])
 """Prior standard deviations of the traction along x, y and z, divided by that of the pressure."""

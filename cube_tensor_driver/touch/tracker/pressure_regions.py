@@ -91,8 +91,8 @@ class PressureRegions:
         if not np.array_equal(self._inside, before):
             self._regions = self._connect_points()
         if uncertain is not None and uncertain.any():
-            least = np.where(uncertain[self._cube], UNCERTAIN_PRESSURE, 0.0)
-            is_certain = pressure > np.where(before, RELEASE_FRACTION * least, least)
+            min_pressure = np.where(uncertain[self._cube], UNCERTAIN_PRESSURE, 0.0)
+            is_certain = pressure > np.where(before, RELEASE_FRACTION * min_pressure, min_pressure)
             for region in self._regions:
                 self._inside[region] = is_certain[region].any()
             self._regions = [region for region in self._regions if self._inside[region[0]]]

@@ -169,9 +169,7 @@ class LiveTable:
             by_size = np.argsort(-size, kind="stable")
             # Sorting the indices keeps the rows in the order of the skin file.
             shown = np.sort(by_size[:max_rows])
-            notes.append(
-                f"the {max_rows} cubes under the greatest normal stress of {len(pressure)}"
-            )
+            notes.append(f"the {max_rows} cubes under the largest normal stress of {len(pressure)}")
 
         columns = self._columns(shown.tolist(), pressure)
         # The first and the last two columns (name, rate and state) are always shown.
