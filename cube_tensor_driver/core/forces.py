@@ -61,6 +61,10 @@ class Forces:
         if side is not None:
             self.side[:] = side
 
+    def __repr__(self) -> str:
+        side_mm = 1e3 * np.median(self.side)
+        return f"Forces({len(self.side)} cubes, on squares of {side_mm:.3g} mm)"
+
     def __call__(self, rows: StressRows) -> Array:
         """Compute the force on the skin at the cube of each row.
 

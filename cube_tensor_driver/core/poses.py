@@ -25,6 +25,9 @@ class CubePoses(NamedTuple):
     rotation: Array
     half_side: Array
 
+    def __repr__(self) -> str:
+        return f"CubePoses({len(self.position)} cubes, pitch {1e3 * self.pitch:.3g} mm)"
+
     @property
     def pitch(self) -> float:
         """Median distance of a cube to its nearest neighbour, in m.

@@ -158,6 +158,11 @@ class LinkSource:
         )
         self._links.start()
 
+    def __repr__(self) -> str:
+        state = "closed" if self._closed else "open"
+        sizes = f"{len(self.skin.cubes)} cubes on {len(self.skin.links)} links"
+        return f"LinkSource({self.skin.name!r}: {sizes}, {state}, {self._given} rows given)"
+
     def statistics(self) -> dict[str, object]:
         """Return the numbers of rows, and the state, notes and counters of each link.
 

@@ -103,6 +103,11 @@ class SimulatedSource:
     scans: int = 0
     is_live: ClassVar[bool] = False  # rows are computed on request, not measured
 
+    def __repr__(self) -> str:
+        end = "endless" if self.duration is None else f"{self.duration:g} s"
+        sizes = f"{len(self.skin.cubes)} cubes, {1e6 / self.period_us:g} Hz, {end}"
+        return f"SimulatedSource({self.skin.name!r}: {sizes}, {self.scans} scans given)"
+
     def statistics(self) -> dict[str, object]:
         """Return how much the latest iteration over this source has simulated.
 

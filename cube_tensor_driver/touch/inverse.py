@@ -50,6 +50,10 @@ class TractionField(NamedTuple):
     traction: Array
     depth_pressure: Array
 
+    def __repr__(self) -> str:
+        largest_kpa = 1e-3 * abs(self.pressure.max(initial=0.0))
+        return f"TractionField({len(self.traction)} points, pressure up to {largest_kpa:.3g} kPa)"
+
     @property
     def pressure(self) -> Array:
         """Pressure (M,) in Pa on the surface at the M points, positive where a body presses."""
@@ -162,6 +166,10 @@ class SurfaceInverse:
         inverse = cls.__new__(cls)
         inverse._set_up(poses, by_pad, layer, depth, side, model)
         return inverse
+
+    def __repr__(self) -> str:
+        points = f"{len(self.points)} points {1e3 * self.spacing:.3g} mm apart"
+        return f"SurfaceInverse({self.poses!r}, {points}, depth {1e3 * self.depth:.3g} mm)"
 
     def _set_up(
         self,

@@ -14,7 +14,7 @@ Force and position of a contact follow from the equilibrium of the layer above t
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -84,6 +84,20 @@ class Contact(NamedTuple):
     force_uncertainty: float
     slips: bool = False
     is_coarse: bool = False
+
+    def __repr__(self) -> str:
+        return f"Contact({describe_contact(self)})"
+
+
+def describe_contact(contact: Any) -> str:
+    """Describe a contact by its forces, position and area.
+
+    Args:
+        contact: A `Contact`, or another contact with its attributes.
+    """
+    x, y, z = 1e3 * contact.position
+    forces = f"{contact.normal_force:.3g} N normal, {contact.shear_force:.3g} N shear"
+    return f"{forces}, at [{x:.1f} {y:.1f} {z:.1f}] mm, {1e6 * contact.area:.3g} mm²"
 
 
 class Surface:

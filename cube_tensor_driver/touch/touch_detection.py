@@ -125,6 +125,10 @@ class Touches(NamedTuple):
     force: Array
     force_uncertainty: Array
 
+    def __repr__(self) -> str:
+        largest_kpa = 1e-3 * self.pressure.max(initial=0.0)
+        return f"Touches({len(self.cube)} touches, pressure up to {largest_kpa:.3g} kPa)"
+
 
 NO_TOUCHES = Touches(
     stamp_ns=0,
@@ -200,6 +204,10 @@ class Touch:
         # above the noise, the slow part is held (`_held`), so that it does not adapt to the load.
         self._reach = np.zeros(n)
         self._held = np.zeros(n, bool)
+
+    def __repr__(self) -> str:
+        touched = np.count_nonzero(self._touched)
+        return f"Touch({len(self._sum)} cubes, {touched} of them touched)"
 
     def restart(self) -> None:
         """Start the slow parts again after a tare, which changes all values.

@@ -24,6 +24,7 @@ from scipy.spatial.distance import cdist
 
 from ...core.arrays import Array, Index, Mask
 from ..inverse import FieldDeviation, SurfaceInverse, TractionField
+from ..surface import describe_contact
 from .contact_estimate import ContactEstimate, Discs
 from .fitted_field import add_fits, fit_variances
 from .hertz_fit import HertzFit, linearise
@@ -105,6 +106,9 @@ class TrackedContact(NamedTuple):
     area_uncertainty: float
     refined: bool
 
+    def __repr__(self) -> str:
+        return f"TrackedContact({self.id}: {describe_contact(self)})"
+
 
 class ContactTracker:
     """Follows the contacts of a skin from scan to scan (set of values of all cubes)."""
@@ -125,6 +129,10 @@ class ContactTracker:
         self._next_id = 0
         n_values = (len(inverse.poses.position), len(inverse.columns))
         self._scaled = np.full(n_values, np.nan)
+
+    def __repr__(self) -> str:
+        contacts = f"{len(self._last_ids)} contacts in the newest scan"
+        return f"ContactTracker({self._inverse.poses!r}, {contacts})"
 
     def update(
         self,
