@@ -38,7 +38,8 @@ def arguments(parser: Parser) -> None:
     parser.add_path(
         "--imperfections",
         "FILE",
-        "spread of the gains, dead pads and creep (docs/simulation.md; default: none)",
+        "how pads differ from their calibrations: gains, dead pads, creep, temperature, and weight "
+        "in a moving skin (docs/simulation.md; default: not at all)",
     )
     parser.add_number(
         "--duration",

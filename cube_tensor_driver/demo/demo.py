@@ -46,7 +46,9 @@ class DemoSettings:
         rate: Samples per second of each cube; None: that of the skin file, else `DEFAULT_RATE`.
         noise: Standard deviation of the pads' frequencies, relative to the frequencies; None: as
             the calibrations state.
-        imperfections: File with deviations of the pads (gains, dead pads, creep); None: none.
+        imperfections: File that states how pads differ from their calibrations: spread of gains
+            and of heights of the layer, dead pads, creep, temperature, and weight in a moving skin;
+            None: not at all.
         duration: Time to measure, in seconds, after which the results are printed; None: the demo
             runs until Ctrl-C and prints no results.
         headless: Whether the live table is not shown.
