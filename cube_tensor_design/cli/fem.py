@@ -28,7 +28,8 @@ DEFAULT_MESHES = 3
 """Number of meshes, from coarse to fine, that are computed without the option --meshes."""
 
 
-def arguments(parser: Parser) -> None:
+def add_arguments(parser: Parser) -> None:
+    """Add the options of the command."""
     parser.add_argument(
         "model",
         nargs="?",
@@ -68,6 +69,7 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    """Compute a cube's response matrix by finite elements."""
     from cube_tensor_driver.config.output_files import write_json
     from cube_tensor_driver.views.terminal.output import progress_bar
 

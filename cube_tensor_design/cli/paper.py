@@ -10,7 +10,8 @@ from pathlib import Path
 from cube_tensor_driver.cli.parser import Parser
 
 
-def arguments(parser: Parser) -> None:
+def add_arguments(parser: Parser) -> None:
+    """Add the options of the command."""
     parser.add_output(
         "--out",
         kind="folder",
@@ -20,6 +21,7 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    """Repeat the source paper's experiments on a virtual bench."""
     from cube_tensor_driver.views.terminal.output import progress_bar
 
     from ..figures.paper import save_paper

@@ -10,7 +10,8 @@ from pathlib import Path
 from cube_tensor_driver.cli.parser import Parser
 
 
-def arguments(parser: Parser) -> None:
+def add_arguments(parser: Parser) -> None:
+    """Add the options of the command."""
     parser.add_json()
     parser.add_output(
         "--figure",
@@ -21,6 +22,7 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    """Find how wide a contact must be for each layout to be right."""
     from cube_tensor_driver.config.output_files import write_json
     from cube_tensor_driver.views.figures.style import save
     from cube_tensor_driver.views.terminal.output import progress_bar

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from ..bags.read import Bag
 
 
-def arguments(parser: Parser) -> None:
+def add_arguments(parser: Parser) -> None:
+    """Add the options of the command."""
     info = parser.add_subcommand(
         "info", "print skin, cubes, calibrations, rates, gaps and counters"
     )
@@ -27,6 +28,7 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    """Show what a bag holds, or repair one."""
     if options.what == "info":
         show_bag(options.bag)
     else:

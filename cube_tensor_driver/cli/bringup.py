@@ -48,7 +48,8 @@ nothing. Below the limit the message is that several rotations fit, above it tha
 """
 
 
-def arguments(parser: Parser) -> None:
+def add_arguments(parser: Parser) -> None:
+    """Add the options of the command."""
     parser.add_text("port", "PORT", "device path, or socket://host:port")
     parser.add_output("-o", "--output", kind="skin", required=True, help="skin file to write")
     parser.add_argument("--name", default="skin", help="name of the skin (default: %(default)s)")

@@ -13,7 +13,8 @@ from ..config.grid import DEFAULT_PITCH
 from .parser import Parser, count, positive
 
 
-def arguments(parser: Parser) -> None:
+def add_arguments(parser: Parser) -> None:
+    """Add the options of the command."""
     grid = parser.add_subcommand("grid", "write the skin file of a flat grid of cubes")
     grid.add_number("--nx", count, "N", "cubes along x", required=True)
     grid.add_number("--ny", count, "N", "cubes along y", required=True)
@@ -48,6 +49,7 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    """Write the skin file of a grid, or check a skin file."""
     return write_grid(options) if options.what == "grid" else check_file(options.file)
 
 

@@ -12,7 +12,8 @@ DEFAULT_DURATION_S = 10.0
 """Duration, in seconds, of a demo with --headless, --json or --figure but without --duration."""
 
 
-def arguments(parser: Parser) -> None:
+def add_arguments(parser: Parser) -> None:
+    """Add the options of the command."""
     parser.add_path("--config", "FILE", "skin file to simulate (default: sixteen planar cubes)")
     parser.add_number("--cubes", count, "N", "simulate a grid of N planar cubes instead")
     parser.add_path("--load", "FILE", "load script (default: a contact that wanders over the skin)")
@@ -59,6 +60,7 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    """Run simulated cubes, driver and reconstruction, with a live table."""
     from dataclasses import fields
 
     from ..demo.demo import DemoSettings, run_demo

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from ..ros.commands.echo import StressReading
 
 
-def arguments(parser: Parser) -> None:
+def add_arguments(parser: Parser) -> None:
+    """Add the options of the command."""
     parser.add_text("topic", "TOPIC", "as in stress or cubes/c05/stress")
     parser.add_switch("--once", "end after the first message")
     parser.add_switch("--json", "print one JSON object per line")

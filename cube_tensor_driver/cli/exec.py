@@ -15,7 +15,8 @@ NOT_FOUND = 127
 """Exit code if the command cannot be executed; shells use it for a command that is not found."""
 
 
-def arguments(parser: Parser) -> None:
+def add_arguments(parser: Parser) -> None:
+    """Add the options of the command."""
     parser.add_words(
         "words",
         "CMD",

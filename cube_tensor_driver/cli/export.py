@@ -29,7 +29,8 @@ TABLES = {
 """Name of a table format, which is also a subcommand -> help text of the subcommand."""
 
 
-def arguments(parser: Parser) -> None:
+def add_arguments(parser: Parser) -> None:
+    """Add the options of the command."""
     lerobot = parser.add_subcommand("lerobot", "one LeRobot data set (v3.0) of all bags")
     _add_common(lerobot)
     lerobot.add_number("--fps", count, "N", "frames per second of the data set", required=True)

@@ -26,7 +26,8 @@ FIGURES = (
 """Names of the attributes of a fit that the JSON file contains."""
 
 
-def arguments(parser: Parser) -> None:
+def add_arguments(parser: Parser) -> None:
+    """Add the options of the command."""
     parser.add_path(
         "loads",
         "LOADS",
@@ -79,6 +80,7 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    """Calibrate from a table of known loads and measured frequencies."""
     import datetime
     from dataclasses import replace
 

@@ -9,7 +9,8 @@ import argparse
 from .parser import Parser
 
 
-def arguments(parser: Parser) -> None:
+def add_arguments(parser: Parser) -> None:
+    """Add the options of the command."""
     parser.add_text(
         "fault",
         "KEY=VALUE",
@@ -23,6 +24,7 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    """Inject a fault into running simulated hubs."""
     from ..simulation.inject import inject
 
     print(inject(options.ports, options.fault))

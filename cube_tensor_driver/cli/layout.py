@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from ..core.layout import Layout
 
 
-def arguments(parser: Parser) -> None:
+def add_arguments(parser: Parser) -> None:
+    """Add the options of the command."""
     parser.add_text("name", "NAME", "quad, planar, cube, or a YAML file with a layout")
     parser.add_text(
         "--symmetry", "G", "full, slab, mirrors or none (default: that of the calibration)"
@@ -30,6 +31,7 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    """Show what a layout's pads measure: ranks, unobservable modes."""
     from ..config.calibration import (
         find_calibration,
         named_layout,

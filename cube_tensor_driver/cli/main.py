@@ -152,7 +152,7 @@ def command_parser(name: str) -> Parser:
             f"the command {name} is not part of the driver: run it as ./cube {name} in a checkout"
         )
     parser = Parser(prog=f"{PROGRAM} {name}", description=sentence(COMMANDS[name]))
-    module.arguments(parser)
+    module.add_arguments(parser)
     parser.set_defaults(run=module.run)
     return parser
 

@@ -9,13 +9,15 @@ import argparse
 from .parser import Parser
 
 
-def arguments(parser: Parser) -> None:
+def add_arguments(parser: Parser) -> None:
+    """Add the options of the command."""
     parser.add_text("node", "NODE", "as in reconstruction", nargs="?")
     parser.add_text("name", "NAME", "the parameter (default: all)", nargs="?")
     parser.add_text("value", "VALUE", "set it to this, as in YAML", nargs="?")
 
 
 def run(options: argparse.Namespace) -> int:
+    """List, read or set the parameters of nodes that run."""
     from ..ros.commands.services import list_nodes, read_parameters, set_parameter
 
     if options.node is None:

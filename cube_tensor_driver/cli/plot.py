@@ -10,7 +10,8 @@ import math
 from .parser import Parser, number
 
 
-def arguments(parser: Parser) -> None:
+def add_arguments(parser: Parser) -> None:
+    """Add the options of the command."""
     parser.add_bag()
     parser.add_text("--cube", "NAME", "which cube (default: the first)")
     parser.add_number(
@@ -33,6 +34,7 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    """Draw frequencies, stress, gradient and residual of one cube."""
     from ..bags.source import open_bag
     from ..views.figures.style import save
     from ..views.figures.time_series import cube_series, draw_series

@@ -9,7 +9,8 @@ import argparse
 from .parser import Parser
 
 
-def arguments(parser: Parser) -> None:
+def add_arguments(parser: Parser) -> None:
+    """Add the options of the command."""
     parser.epilog = (
         "Asks each port for one second who is there, and starts nothing. Ports that a running "
         "driver has open are busy: its diagnostics name their hubs."

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from ..ros.commands.record import Recorder
 
 
-def arguments(parser: Parser) -> None:
+def add_arguments(parser: Parser) -> None:
+    """Add the options of the command."""
     from ..processes.skin_processes import RECORDED
 
     parser.add_argument(

@@ -29,7 +29,8 @@ KEYS = "space: pause, s: step, q: quit"
 """Text beside the progress bar that tells which keys control the replay."""
 
 
-def arguments(parser: Parser) -> None:
+def add_arguments(parser: Parser) -> None:
+    """Add the options of the command."""
     parser.add_bag()
     parser.add_number(
         "--rate", positive, "R", "times the recorded speed (default: %(default)g)", default=1.0
@@ -48,6 +49,7 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    """Publish a bag; a reconstruction node makes the stress again."""
     from ..bags.read import Bag
     from ..ros.commands.replay import replay
 

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from ..bags.reprocess.job import Overrides, ReprocessResult
 
 
-def arguments(parser: Parser) -> None:
+def add_arguments(parser: Parser) -> None:
+    """Add the options of the command."""
     parser.add_bags()
     parser.add_argument(
         "-o",

@@ -9,7 +9,8 @@ import argparse
 from .parser import Parser
 
 
-def arguments(parser: Parser) -> None:
+def add_arguments(parser: Parser) -> None:
+    """Add the options of the command."""
     parser.epilog = (
         "Listens for one second. Topics of single cubes are sent while somebody listens; "
         "of each kind it listens to the first cube's."
@@ -17,6 +18,7 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    """List the topics that are published, with types and rates."""
     from ..ros.commands.topics import list_topics
 
     topics = list_topics()

@@ -9,7 +9,8 @@ import argparse
 from .parser import Parser
 
 
-def arguments(parser: Parser) -> None:
+def add_arguments(parser: Parser) -> None:
+    """Add the options of the command."""
     parser.add_path("file", "FILE", "skin file")
     parser.add_text(
         "--frame-prefix",
@@ -20,6 +21,7 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    """Print the URDF of a skin: one link per cube under its parent frame."""
     from ..config.skin import read_skin
     from ..config.urdf import skin_urdf
 

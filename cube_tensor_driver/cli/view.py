@@ -14,7 +14,8 @@ RECORDINGS = Path("~/cube_recordings")
 """Default folder for the bags that users record from the page; --recordings names another one."""
 
 
-def arguments(parser: Parser) -> None:
+def add_arguments(parser: Parser) -> None:
+    """Add the options of the command."""
     parser.add_text(
         "--host",
         "ADDRESS",
@@ -45,6 +46,7 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    """Show a running skin in the browser: 3-D, plots, tare, recording."""
     # The module imports viser, which the other commands do not need.
     from ..browser.viewer import run_view
 

@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from ..check import Checked
 
 
-def arguments(parser: Parser) -> None:
+def add_arguments(parser: Parser) -> None:
+    """Add the options of the command."""
     parser.add_argument("port", metavar="PORT", help="device path, or socket://host:port")
     parser.add_argument(
         "--baud",

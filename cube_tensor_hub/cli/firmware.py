@@ -28,7 +28,8 @@ EMULATED_HUB = (4, 8)
 """Number of cubes of the emulated hub, and number of pads of each of them."""
 
 
-def arguments(parser: Parser) -> None:
+def add_arguments(parser: Parser) -> None:
+    """Add the options of the command."""
     parser.add_subcommand("build", "compile the hubs in C, and print how large one is")
     run = parser.add_subcommand("run", "run the hub of a microcontroller in QEMU, under a load")
     run.add_argument(
@@ -45,6 +46,7 @@ def arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
+    """Build, run or test the hubs in C."""
     return {"build": build_all, "run": run_emulated, "test": run_tests}[options.what](options)
 
 

@@ -14,7 +14,7 @@ DEFAULT_COUNTS = [1, 4, 16, 64, 256, 1024, 4096]
 """Numbers of cubes for which `./cube bench scale` measures the chain by default."""
 
 
-def arguments(parser: Parser) -> None:
+def add_arguments(parser: Parser) -> None:
     """Add a subcommand for each benchmark."""
     _add(
         parser,

@@ -12,7 +12,7 @@ from cube_tensor_driver.cli import ROOT
 from cube_tensor_driver.cli.parser import Parser
 
 
-def arguments(parser: Parser) -> None:
+def add_arguments(parser: Parser) -> None:
     """Add the folder of the pages."""
     parser.add_output(
         "-o",

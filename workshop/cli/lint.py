@@ -31,7 +31,7 @@ TOOLS = (
 """Modules that are run, with their arguments. The second check of types is the strict one."""
 
 
-def arguments(parser: Parser) -> None:
+def add_arguments(parser: Parser) -> None:
     """Add no arguments."""
 
 

@@ -13,7 +13,7 @@ from cube_tensor_driver.cli import ROOT
 from cube_tensor_driver.cli.parser import Parser
 
 
-def arguments(parser: Parser) -> None:
+def add_arguments(parser: Parser) -> None:
     """Add arguments that pytest gets."""
     parser.add_words(
         "words", "ARGUMENT", "arguments of pytest, as in -k name; ./cube exec pytest --help"

@@ -9,7 +9,7 @@ import argparse
 from cube_tensor_driver.cli.parser import Parser, positive, whole_number
 
 
-def arguments(parser: Parser) -> None:
+def add_arguments(parser: Parser) -> None:
     """Add duration, seed and mutation."""
     parser.add_argument(
         "--duration",
