@@ -178,8 +178,8 @@ class DiscTables(_ContactTables):
     ) -> tuple[Array, Array]:
         """Compute the sum of the fields of L Hertz contacts at N cubes.
 
-        Each contact carries the traction 3 F / (2 pi a^2) sqrt(1 - r^2 / a^2). Contacts farther
-        away than `REACH_DEPTHS` depths have no effect.
+        Each contact carries the traction 3 F / (2 pi a^2) sqrt(1 - r^2 / a^2). Beyond
+        `REACH_DEPTHS` depths, its field falls with the inverse square of the distance.
 
         Args:
             position: Position (N, L, 2) in m of each cube relative to the centre of the contact, in
@@ -212,15 +212,16 @@ class DiscTables(_ContactTables):
 
         # The table is interpolated linearly between the two nearest distances.
         index = distance / self.depth * POINTS_PER_DEPTH
-        is_near = index < _LAST_DISTANCE
-        below = np.minimum(index, _LAST_DISTANCE - 1).astype(np.intp)
+        ratio = _LAST_DISTANCE / np.maximum(index, _LAST_DISTANCE)
+        index = np.minimum(index, _LAST_DISTANCE)
+        below = index.astype(np.intp)
         fraction = index - below
         weights = np.stack(
             [1 - fraction, fraction],
             axis=-1,
             dtype=np.float32,
         )
-        weights *= is_near[..., None]
+        weights *= ratio[..., None] ** 2
 
         n_distances = _LAST_DISTANCE + 2
         first_row = self._nearest_size(radius) * n_distances + below

@@ -108,6 +108,17 @@ def test_discs_are_those_of_point_forces():
     assert np.abs(gradient - slope).max() < 2e-3 * np.abs(slope).max()
 
 
+@pytest.mark.parametrize("depths", [19.9, 20.1, 40])
+def test_discs_far_away_act_within_the_noise_of_a_pad(depths):
+    """The tables end at 20 depths, where 3 N that rub cause 73 Pa. The noise of a pad is 3 Pa."""
+    force, place = np.array([0.9, 0.0, -3.0]), depths * DEPTH * np.array([1.0, 0.0])
+    tables = DiscTables(Layer(poisson=0.48), DEPTH)
+    stress, _ = tables.field(place[None, None], force[None, None], np.array([3e-3]))
+    load = contact.hertz(3e-3, force, (0, 0), order=8)
+    expected, _ = contact.field(np.array([[*place, -DEPTH]]), *load, 0.48)
+    np.testing.assert_allclose(stress, expected, atol=2.0)
+
+
 def under(polygon: Polygon, cubes: np.ndarray, layer: Layer) -> tuple[np.ndarray, np.ndarray]:
     """Stress and gradient at cubes (N, 2) below a polygon on the plane z = 0."""
     start = polygon.corners[:, :2] - cubes[:, None]
