@@ -28,9 +28,8 @@ from cube_tensor_driver.core.defaults import (
     REST_FREQUENCY,
 )
 from cube_tensor_driver.core.errors import ElasticError
-from cube_tensor_driver.core.estimator import Estimator, make_estimator
+from cube_tensor_driver.core.estimator import estimate_modes
 from cube_tensor_driver.core.layout import Layout
-from cube_tensor_driver.core.modes import Modes
 from cube_tensor_driver.core.response import project
 from cube_tensor_driver.core.symmetry import (
     Structure,
@@ -157,27 +156,6 @@ def compute_response(
         unobservable=tuple(unobservable.tolist()),
         convergence=tuple(rows),
         seconds=sum(result.seconds for result in results),
-    )
-
-
-def estimate_modes(
-    response: Array,
-    modes: Modes,
-    neglect: Sequence[str] = (),
-) -> Estimator:
-    """Return the estimator of the amplitudes of all modes (linear stress fields).
-
-    Args:
-        response: Response matrix (pads, modes) of pads that have equal noise.
-        modes: The modes.
-        neglect: Names of modes that are assumed to be zero.
-    """
-    return make_estimator(
-        response,
-        noise=np.ones(len(response)),
-        modes=modes,
-        neglect=neglect,
-        targets=np.eye(modes.n_modes),
     )
 
 

@@ -19,12 +19,13 @@ import numpy as np
 
 from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.defaults import BETA, REST_FREQUENCY
+from cube_tensor_driver.core.estimator import estimate_modes
 from cube_tensor_driver.core.layout import LAYOUTS, Layout
 from cube_tensor_driver.core.modes import PLANE
 from cube_tensor_driver.core.oscillator import pad_frequency
 
 from ..fem.body import Body
-from ..fem.fem import Progress, Response, compute_response, count_steps, estimate_modes
+from ..fem.fem import Progress, Response, compute_response, count_steps
 from .rod import Rod
 from .virtual_bench import Deformation, LoadStep, VirtualBench
 

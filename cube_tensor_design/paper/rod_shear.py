@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cube_tensor_driver.core.arrays import Array
+from cube_tensor_driver.core.estimator import estimate_modes
 from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.core.modes import PLANE
 from cube_tensor_driver.mechanics.layer import Layer
@@ -28,7 +29,7 @@ from cube_tensor_driver.mechanics.traction_prior import PRIOR_LENGTHS, SHEAR_RAT
 from cube_tensor_driver.touch.posterior import MODEL_ERROR
 
 from ..fem.body import Body
-from ..fem.fem import Progress, compute_response, count_steps, estimate_modes
+from ..fem.fem import Progress, compute_response, count_steps
 from ..fem.line_load import line_load
 from ..fem.reciprocity import compute_influence
 from .experiments import SHEAR_SIGNS, dent

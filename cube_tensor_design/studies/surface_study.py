@@ -25,6 +25,7 @@ import numpy as np
 
 from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.errors import ElasticError
+from cube_tensor_driver.core.estimator import estimate_modes
 from cube_tensor_driver.core.layout import Layout
 from cube_tensor_driver.core.modes import PLANE
 from cube_tensor_driver.core.symmetry import default_modes, largest_symmetry
@@ -34,7 +35,7 @@ from cube_tensor_driver.mechanics.layer import FIELD, Layer
 from cube_tensor_driver.mechanics.measurement_model import CubeMeasurement
 
 from ..fem.body import Body
-from ..fem.fem import Progress, compute_response, count_steps, estimate_modes
+from ..fem.fem import Progress, compute_response, count_steps
 from ..fem.line_load import line_load
 from ..fem.reciprocity import compute_influence
 

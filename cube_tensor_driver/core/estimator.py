@@ -270,6 +270,27 @@ def _orthonormalise(
     return result
 
 
+def estimate_modes(
+    response: Array,
+    modes: Modes,
+    neglect: Sequence[str] = (),
+) -> Estimator:
+    """Construct the estimator of the amplitudes of all modes, for pads that have equal noise.
+
+    Args:
+        response: Response (P, M), in Pa per Pa.
+        modes: The M modes.
+        neglect: Names of modes whose amplitude is assumed to be zero.
+    """
+    return make_estimator(
+        response,
+        noise=np.ones(len(response)),
+        modes=modes,
+        neglect=neglect,
+        targets=np.eye(modes.n_modes),
+    )
+
+
 def summarize_response(
     structure: Structure,
     response: Array,
@@ -297,13 +318,7 @@ def summarize_response(
         None stands for a value that does not exist.
     """
     modes = structure.modes
-    estimator = make_estimator(
-        response,
-        noise=np.ones(structure.layout.n_pads),
-        modes=modes,
-        neglect=neglect,
-        targets=np.eye(modes.n_modes),
-    )
+    estimator = estimate_modes(response, modes, neglect)
     result: dict[str, Any] = {
         "pads": list(structure.layout.pads),
         "modes": list(modes.names),
@@ -325,10 +340,8 @@ def summarize_response(
 
     deviations = np.sqrt(np.diag(estimator.covariance)).tolist()
     noise = {
-        name: deviation if observed else None
-        for name, deviation, observed in zip(
-            modes.names, deviations, estimator.observed, strict=True
-        )
+        name: None if math.isnan(deviation) else deviation
+        for name, deviation in zip(modes.names, deviations, strict=True)
     }
     result["unobservable"] = [name for name, value in noise.items() if value is None]
     result["noise"] = noise
