@@ -19,7 +19,7 @@ import numpy as np
 from cube_tensor_driver.config.skin import Skin, SkinLink
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.device.links.tcp import parse_url
-from cube_tensor_driver.simulation.cubes import Millihertz
+from cube_tensor_driver.simulation.cubes import NO_ERRORS, Millihertz, PadErrors
 from cube_tensor_driver.simulation.injector import Injector, SimulatedLink
 from cube_tensor_driver.simulation.line import SimulatedLine
 from cube_tensor_driver.simulation.load import Fields
@@ -149,8 +149,10 @@ class StoringInjector(Injector):
 class TorturedSimulator(Simulator):
     """A simulator that stores what its hubs send, whose links with a TCP address are on TCP."""
 
-    def __init__(self, skin: Skin, load: Fields, ports: Path, **options: Any) -> None:
-        super().__init__(skin, load, ports, **options)
+    def __init__(
+        self, skin: Skin, load: Fields, ports: Path, errors: PadErrors = NO_ERRORS, **options: Any
+    ) -> None:
+        super().__init__(skin, load, ports, errors, **options)
         self._injector = self._store = StoringInjector(self._links, ports.with_name(READINGS))
 
     def close(self) -> None:
