@@ -21,7 +21,7 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typest
 
 from ..config.input_files import read_bounded
 from ..config.package_data import package_data
-from ..config.yaml import MAX_BYTES, parse_yaml, write_yaml
+from ..config.yaml import parse_yaml, write_yaml
 from ..core.errors import BagError, ConfigError
 from ..messages.types import PACKAGE
 
@@ -204,7 +204,7 @@ def read_metadata(folder: Path) -> tuple[list[Path], str]:
     # the storage files, which also state them.
     reason = "damaged"
     try:
-        text = _TOPICS.sub(b"", read_bounded(path, MAX_BYTES, "metadata of a bag"))
+        text = _TOPICS.sub(b"", read_bounded(path, "metadata of a bag"))
         about = parse_yaml(text, str(path))["rosbag2_bagfile_information"]
         if (version := about.get("version", 0)) > METADATA_VERSION:
             reason = f"its version {version} is newer than {METADATA_VERSION}, the newest known one"

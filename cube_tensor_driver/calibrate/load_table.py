@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 
 from ..config.input_files import read_bounded
-from ..config.yaml import MAX_BYTES
 from ..core.arrays import Array
 from ..core.errors import ConfigError, FitError
 from ..core.layout import Layout
@@ -179,7 +178,7 @@ def _read_cells(path: Path) -> tuple[list[str], Array]:
     """
     try:
         # Spreadsheet programs begin a file with a byte order mark, which this encoding removes.
-        text = read_bounded(path, MAX_BYTES, "table of loads").decode("utf-8-sig")
+        text = read_bounded(path, "table of loads").decode("utf-8-sig")
         # The csv module must get the ends of lines unchanged, because a cell in quotation marks may
         # contain some.
         file = io.StringIO(text, newline="")

@@ -18,7 +18,6 @@ NOT_FOUND = 127
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
     parser.add_words(
-        "words",
         "CMD",
         "command and its arguments, as in ./cube exec python -c '...'",
         missing="name a command to run, as in ./cube exec python or ./cube exec bash",

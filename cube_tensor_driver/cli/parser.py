@@ -43,7 +43,7 @@ class Parser(argparse.ArgumentParser):
         self._flags: list[str] = []
         self._outputs: list[Output] = []
         self._subcommands: Any = None
-        self._words: str | None = None
+        self._passes_words = False
         self._missing = ""
         settings.setdefault("formatter_class", formatter)
         super().__init__(**settings)
@@ -142,22 +142,23 @@ class Parser(argparse.ArgumentParser):
         added: Parser = self._subcommands.add_parser(name, help=text, description=sentence(text))
         return added
 
-    def add_words(self, name: str, metavar: str, text: str, missing: str = "") -> None:
+    def add_words(self, metavar: str, text: str, missing: str = "") -> None:
         """Pass on all words that follow the command, including options, to another program.
 
+        The parsed options have the words as the list `words`.
+
         Args:
-            name: Name of the list of words in the parsed options.
             metavar: Name of the words in the help text.
             text: Help text about the words.
             missing: Error message if no word follows; empty if none is needed.
         """
-        self.add_argument(name, nargs=argparse.REMAINDER, metavar=metavar, help=text)
+        self.add_text("words", metavar, text, nargs=argparse.REMAINDER)
         self.usage = f"%(prog)s {metavar} ..."
-        self._words, self._missing = name, missing
+        self._passes_words, self._missing = True, missing
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         words = list(args or ())
-        if self._words is None:
+        if not self._passes_words:
             self._refuse_unknown(words)
             return super().parse_known_args(words, namespace)
         if words[:1] in (["-h"], ["--help"]):
@@ -167,7 +168,7 @@ class Parser(argparse.ArgumentParser):
         if self._missing and not words:
             self.exit(2, f"{self._prefix()}{self._missing}\n")
         namespace, _ = super().parse_known_args([], namespace)
-        setattr(namespace, self._words, words)
+        namespace.words = words
         return namespace, []
 
     def _refuse_unknown(self, words: list[str]) -> None:

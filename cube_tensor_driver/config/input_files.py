@@ -19,6 +19,13 @@ from ..core.errors import ConfigError
 if TYPE_CHECKING:
     from ..core.arrays import AnyArray
 
+MAX_BYTES = 16 << 20
+"""Maximum size of a text file that is read as a whole, in bytes.
+
+The skin file of the largest skin, a grid of 65536 cubes, has 9 MB. The limit refuses bags and disk
+images that were named by mistake.
+"""
+
 _ARCHIVE_ERRORS = (
     zipfile.BadZipFile,
     zlib.error,
@@ -53,12 +60,11 @@ def check_regular(path: Path) -> None:
         raise ConfigError(f"{path}: a device, a pipe or a socket; name a regular file")
 
 
-def read_bounded(path: Path, limit: int, purpose: str) -> bytes:
-    """Return the bytes of a regular file.
+def read_bounded(path: Path, purpose: str) -> bytes:
+    """Return the bytes of a regular file of at most `MAX_BYTES`.
 
     Args:
         path: The file.
-        limit: Maximum size, in bytes.
         purpose: What the file should be, such as "configuration file", for the error message.
 
     Raises:
@@ -69,9 +75,11 @@ def read_bounded(path: Path, limit: int, purpose: str) -> bytes:
     with path.open("rb") as file:
         # stat() states a size of 0 for files below /proc, so the size is checked by reading: one
         # byte more than the limit shows that the file is too large.
-        data = file.read(limit + 1)
-    if len(data) > limit:
-        raise ConfigError(f"{path}: too large, the limit is {limit} bytes: this is no {purpose}")
+        data = file.read(MAX_BYTES + 1)
+    if len(data) > MAX_BYTES:
+        raise ConfigError(
+            f"{path}: too large, the limit is {MAX_BYTES} bytes: this is no {purpose}"
+        )
     return data
 
 

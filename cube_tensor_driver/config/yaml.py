@@ -17,13 +17,6 @@ from ..core.errors import ConfigError
 from .input_files import read_bounded
 from .output_files import atomic_write
 
-MAX_BYTES = 16 << 20
-"""Maximum size of a YAML file that is read, in bytes.
-
-The skin file of the largest skin, a grid of 65536 cubes, has 9 MB. The limit refuses bags and disk
-images that were named by mistake.
-"""
-
 MAX_DEPTH = 100
 """Maximum number of nested lists and mappings in a YAML text.
 
@@ -113,11 +106,11 @@ def read_yaml(path: Path) -> Any:
     """Return the plain Python value of a YAML file.
 
     Raises:
-        ConfigError: The path leads to no regular file, the file cannot be read or is larger than
-            `MAX_BYTES`, or `parse_yaml` refuses its text.
+        ConfigError: The path leads to no regular file, the file cannot be read or is too
+            large, or `parse_yaml` refuses its text.
     """
     try:
-        data = read_bounded(path, MAX_BYTES, "configuration file")
+        data = read_bounded(path, "configuration file")
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}; name a YAML file that can be read") from None
     return parse_yaml(data, str(path))

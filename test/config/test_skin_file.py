@@ -285,7 +285,7 @@ def test_missing_file_and_folder_and_size(tmp_path, monkeypatch):
         read_skin(tmp_path / "none.yaml")
     with pytest.raises(ConfigError, match="Is a directory"):
         read_skin(tmp_path)
-    monkeypatch.setattr("cube_tensor_driver.config.yaml.MAX_BYTES", 10)
+    monkeypatch.setattr("cube_tensor_driver.config.input_files.MAX_BYTES", 10)
     with pytest.raises(ConfigError, match="the limit is 10"):
         read(tmp_path, GOOD)
 
@@ -301,8 +301,7 @@ def test_missing_file_and_folder_and_size(tmp_path, monkeypatch):
 def test_only_regular_files_are_read_and_only_up_to_their_limit(tmp_path, monkeypatch, path, words):
     """A device has no end and a pipe waits for ever: neither is read at all."""
     os.mkfifo(tmp_path / "pipe")
-    monkeypatch.setattr("cube_tensor_driver.config.yaml.MAX_BYTES", 1000)
-    monkeypatch.setattr("cube_tensor_driver.calibrate.load_table.MAX_BYTES", 1000)
+    monkeypatch.setattr("cube_tensor_driver.config.input_files.MAX_BYTES", 1000)
     layout = read_skin(package_data() / "config" / "cube.yaml").calibrations[0].layout
     for read_one in (read_skin, lambda at: read_loads(at, layout)):
         with pytest.raises((ConfigError, FitError)) as caught:

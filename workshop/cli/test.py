@@ -15,9 +15,7 @@ from cube_tensor_driver.cli.parser import Parser
 
 def add_arguments(parser: Parser) -> None:
     """Add arguments that pytest gets."""
-    parser.add_words(
-        "words", "ARGUMENT", "arguments of pytest, as in -k name; ./cube exec pytest --help"
-    )
+    parser.add_words("ARGUMENT", "arguments of pytest, as in -k name; ./cube exec pytest --help")
 
 
 def run(options: argparse.Namespace) -> int:
