@@ -250,6 +250,7 @@ class Explanation:
 
     @property
     def is_rotated(self) -> bool:
+        """Whether the cube is turned relative to the layout."""
         identity = np.eye(3)
         return not np.array_equal(self.rotation, identity)
 

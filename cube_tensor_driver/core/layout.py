@@ -119,6 +119,7 @@ class Layout:
 
     @property
     def n_pads(self) -> int:
+        """Number of pads."""
         return len(self.positions)
 
     @cached_property

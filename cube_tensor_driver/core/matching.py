@@ -31,13 +31,16 @@ class SampleRows(Protocol):
     """
 
     @property
-    def cube(self) -> AnyArray: ...
+    def cube(self) -> AnyArray:
+        """Index of the cube (N,)."""
 
     @property
-    def sequence(self) -> AnyArray: ...
+    def sequence(self) -> AnyArray:
+        """Sequence number (N,)."""
 
     @property
-    def stamp_ns(self) -> AnyArray: ...
+    def stamp_ns(self) -> AnyArray:
+        """Time of sampling (N,), in ns."""
 
 
 class SampleKeys(NamedTuple):

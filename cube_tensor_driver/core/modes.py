@@ -98,6 +98,7 @@ class Modes:
 
     @property
     def n_modes(self) -> int:
+        """Number of modes."""
         return len(self.names)
 
     @property

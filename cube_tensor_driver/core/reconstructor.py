@@ -54,10 +54,12 @@ class CalibratedSkin(Protocol):
     """A skin that has a name and a calibration for each cube."""
 
     @property
-    def names(self) -> Sequence[str]: ...
+    def names(self) -> Sequence[str]:
+        """Name of each cube."""
 
     @property
-    def calibrations(self) -> Sequence[Calibration]: ...
+    def calibrations(self) -> Sequence[Calibration]:
+        """Calibration of each cube."""
 
 
 class Reconstructor:

@@ -181,6 +181,7 @@ class Structure:
 
     @property
     def n_coefficients(self) -> int:
+        """Number of coefficients."""
         return len(self.names)
 
     @property

@@ -61,6 +61,7 @@ class Topic:
 
     @property
     def is_image(self) -> bool:
+        """Whether the messages of the topic are images."""
         return self.msgtype in IMAGE_TYPES
 
     def describe(self, bag: Bag) -> None:

@@ -111,4 +111,5 @@ class _SetLoad:
     period: float = 0.0
 
     def at(self, seconds: float) -> StressField:
+        """Return the stress and gradient that were set last."""
         return self.field

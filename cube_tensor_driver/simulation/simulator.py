@@ -377,6 +377,7 @@ class StopRequest:
         return not is_needed or time.monotonic() >= self._until_s
 
     def close(self) -> None:
+        """Close both ends of the pipe."""
         os.close(self.fd)
         os.close(self._write)
 

@@ -91,11 +91,7 @@ def read_thermal_stress(name: str, n_pads: int) -> ThermalLayer:
 
 
 class WarmLayer:
-    """Temperature of the layer at some cubes over time.
-
-    Attributes:
-        temperature: Temperature of each finite volume (cubes, `CELLS`), in °C, from the ground up.
-    """
+    """Temperature of the layer at some cubes over time."""
 
     def __init__(
         self,
@@ -142,6 +138,7 @@ class WarmLayer:
 
     @property
     def temperature(self) -> Array:
+        """Temperature of each finite volume (cubes, `CELLS`), in °C, from the ground up."""
         columns = self._vectors @ self._amplitude[:, :, None]
         temperature: Array = columns[:, :, 0]
         return temperature

@@ -119,6 +119,7 @@ class HubFault(Span):
 
     @property
     def kind(self) -> str:
+        """Kind of the fault."""
         return self.fault.kind
 
 

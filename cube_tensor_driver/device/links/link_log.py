@@ -30,11 +30,14 @@ LINE_PERIOD_S = 1.0
 class Log(Protocol):
     """Methods of a logger that this package calls; the loggers of Python and of ROS have them."""
 
-    def info(self, message: str, /) -> object: ...
+    def info(self, message: str, /) -> object:
+        """Log a normal event."""
 
-    def warning(self, message: str, /) -> object: ...
+    def warning(self, message: str, /) -> object:
+        """Log something that a person should look at."""
 
-    def error(self, message: str, /) -> object: ...
+    def error(self, message: str, /) -> object:
+        """Log a failure."""
 
 
 class LinkLogger:

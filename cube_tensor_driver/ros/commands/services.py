@@ -178,6 +178,7 @@ class _NodeParameters:
             raise ConfigError(f"no node {self._name} in {domain_text()}; its nodes: {others}")
 
     def names(self) -> list[str]:
+        """Return the sorted names of all parameters of the node."""
         answer = self._call(ListParameters, "list_parameters", ListParameters.Request())
         return sorted(answer.result.names)
 
@@ -197,6 +198,7 @@ class _NodeParameters:
             )
 
     def values(self, names: list[str]) -> dict[str, Any]:
+        """Return the values of the parameters with these names."""
         request = GetParameters.Request(names=names)
         answer = self._call(GetParameters, "get_parameters", request)
         values = [parameter_value_to_python(value) for value in answer.values]

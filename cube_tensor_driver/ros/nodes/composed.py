@@ -22,6 +22,7 @@ def make_nodes() -> list[CubeNode]:
 
 
 def main() -> None:
+    """Run driver and reconstruction in one process."""
     run(make_nodes)
 
 

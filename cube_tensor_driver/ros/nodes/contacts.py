@@ -141,6 +141,7 @@ class Contacts(SkinSubscriberNode):
 
 
 def main() -> None:
+    """Run the node `contacts`."""
     run(lambda: [Contacts()])
 
 

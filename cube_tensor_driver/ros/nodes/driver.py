@@ -194,6 +194,7 @@ class FrequenciesPublisher:
 
 
 def main() -> None:
+    """Run the node `driver`."""
     run(lambda: [Driver()])
 
 

@@ -75,6 +75,7 @@ class Markers(SkinSubscriberNode):
 
 
 def main() -> None:
+    """Run the node `markers`."""
     run(lambda: [Markers()])
 
 

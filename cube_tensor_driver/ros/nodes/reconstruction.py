@@ -333,6 +333,7 @@ class Reconstruction(CubeNode):
 
 
 def main() -> None:
+    """Run the node `reconstruction`."""
     run(lambda: [Reconstruction()])
 
 
