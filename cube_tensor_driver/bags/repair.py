@@ -42,7 +42,6 @@ from mcap.records import (
     MetadataIndex,
     Schema,
     Statistics,
-    SummaryOffset,
 )
 from mcap.summary import Summary
 
@@ -453,26 +452,19 @@ def _summary_bytes(salvaged: _SalvagedChunks, name: str) -> bytes:
     data_end = _bytes_of([metadata, DataEnd(0)])
 
     summary_start = salvaged.end + len(data_end)
-    groups: list[tuple[Opcode, Sequence[McapRecord]]] = [
-        (Opcode.SCHEMA, list(index.schemas.values())),
-        (Opcode.CHANNEL, list(index.channels.values())),
-        (Opcode.CHUNK_INDEX, chunks),
-        (Opcode.METADATA_INDEX, [metadata_index]),
-        (Opcode.STATISTICS, [statistics]),
-    ]
-    # The summary ends with the offset of each group of records, so that a reader can read one group
-    # without the others.
-    summary = b""
-    offsets: list[McapRecord] = []
-    for opcode, records in groups:
-        group = _bytes_of(records)
-        group_start = summary_start + len(summary)
-        offsets.append(SummaryOffset(opcode, group_start, len(group)))
-        summary += group
-    offsets_start = summary_start + len(summary)
-    summary += _bytes_of(offsets)
+    summary = _bytes_of(
+        [
+            *index.schemas.values(),
+            *index.channels.values(),
+            *chunks,
+            metadata_index,
+            statistics,
+        ]
+    )
     # The checksum covers the summary and that part of the footer which precedes the checksum.
-    footer = _bytes_of([Footer(summary_start, offsets_start, 0)])
+    # The offsets of groups of records, which may stand between summary and footer, are left out
+    # (0), because readers find these records without them.
+    footer = _bytes_of([Footer(summary_start, 0, 0)])
     footer = footer[:-CHECKSUM_BYTES]
     checksum = struct.pack("<I", crc32(summary + footer))
     return data_end + summary + footer + checksum + MCAP_MAGIC
