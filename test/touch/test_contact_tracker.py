@@ -6,11 +6,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from point_loads import below, below_ball
 
-from cube_tensor_design.studies.traction_study import CUBES, Setting, TractionBench
-from cube_tensor_driver.core.modes import STRESS, to_matrix
+from cube_tensor_design.studies.field_study import flat_skin
+from cube_tensor_design.studies.traction_study import CUBES, Setting, TractionBench, flat_punch
+from cube_tensor_driver.core.modes import STRESS
 from cube_tensor_driver.core.poses import CubePoses
-from cube_tensor_driver.core.tensor import rotate_gradient, rotate_stress, rotation_from_rpy
+from cube_tensor_driver.core.tensor import rotation_from_rpy
 from cube_tensor_driver.mechanics import contact
 from cube_tensor_driver.mechanics.layer import Layer
 from cube_tensor_driver.touch.inverse import SurfaceInverse
@@ -25,33 +27,19 @@ PADS_NOISE = np.where(np.arange(15) < len(STRESS), 3.0, 3.0 / 2e-3)
 
 @pytest.fixture(scope="module")
 def inverse():
-    line = (np.arange(COUNT) - COUNT // 2) * PITCH
-    x, y = np.meshgrid(line, line)
-    position = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1)
-    poses = CubePoses(position, np.tile(np.eye(3), (COUNT**2, 1, 1)), np.full(COUNT**2, 2e-3))
+    poses = flat_skin(PITCH, (COUNT - 1) * PITCH)
     by_pad = np.tile(np.diag(PADS_NOISE), (COUNT**2, 1, 1))  # one pad for each component
     return SurfaceInverse.from_poses(poses, by_pad, Layer(), DEPTH)
 
 
-def seen(inverse, sources, forces) -> np.ndarray:
-    """(N, 15) under point forces on the surface, by Boussinesq and Cerruti."""
-    below = inverse.poses.position - [0, 0, DEPTH]
-    stress, gradient = contact.field(below, sources, forces, 0.48)
-    return np.concatenate([stress, gradient[:, :3].reshape(len(below), 9)], axis=1)
-
-
 def ball(inverse, width, centre, force) -> np.ndarray:
-    return seen(inverse, *contact.hertz(width / 2, force, centre, order=12))
+    return below_ball(inverse.poses, DEPTH, width, centre, force)
 
 
-def flat_punch(inverse, width, centre, force) -> np.ndarray:
+def punch(inverse, width, centre, force) -> np.ndarray:
     """Pressure 1 / sqrt(a^2 - r^2), infinite at the edge: no Hertz contact at all."""
-    t, weight = np.polynomial.legendre.leggauss(12)
-    r = width / 2 * np.sqrt(1 - ((t + 1) / 2) ** 2)
-    angle = 2 * np.pi * np.arange(48) / 48
-    x, y = np.outer(r, np.cos(angle)).ravel(), np.outer(r, np.sin(angle)).ravel()
-    sources = np.stack([centre[0] + x, centre[1] + y, 0 * x], axis=1)
-    return seen(inverse, sources, np.repeat(weight / 2 / 48, 48)[:, None] * np.asarray(force))
+    load = flat_punch(width / 2, np.array(force), np.array(centre), 12)
+    return below(inverse.poses, DEPTH, load)
 
 
 def noisy(values, random) -> np.ndarray:
@@ -61,7 +49,7 @@ def noisy(values, random) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("load", "width", "force_limit", "place_limit"),
-    [(ball, 5e-3, 0.02, 0.1e-3), (flat_punch, 5e-3, 0.03, 0.2e-3), (flat_punch, 1e-2, 0.15, 3e-3)],
+    [(ball, 5e-3, 0.02, 0.1e-3), (punch, 5e-3, 0.03, 0.2e-3), (punch, 1e-2, 0.15, 3e-3)],
 )
 def test_a_contact_between_wide_pitches_has_its_force_and_place(
     inverse, load, width, force_limit, place_limit
@@ -124,7 +112,7 @@ def test_a_flat_punch_is_no_hertz_contact_even_if_far_cubes_fit(inverse, seed):
     """The evidence of all cubes preferred a Hertz contact, more than five stated deviations off."""
     random = np.random.default_rng(seed)
     centre = random.uniform(-PITCH / 2, PITCH / 2, 2)
-    values = noisy(flat_punch(inverse, 8e-3, centre, (0.6, -0.3, -3.0)), random)
+    values = noisy(punch(inverse, 8e-3, centre, (0.6, -0.3, -3.0)), random)
     (found,) = ContactTracker(inverse, LEAST).update(values, max_work=np.inf)
     assert np.abs(found.position[:2] - centre).max() < 4 * found.position_uncertainty
     assert abs(found.normal_force - 3) < 4 * found.force_uncertainty
@@ -189,17 +177,9 @@ def test_a_contact_that_moves_on_to_a_turned_cube_is_as_unsure_as_one_that_begin
     turned_poses = poses._replace(rotation=turns)
     turned = SurfaceInverse.from_poses(turned_poses, by_pad, Layer(), DEPTH, side=6)
 
-    def values(place) -> np.ndarray:
-        load = contact.hertz(3e-3, force, place, order=12)
-        stress, gradient = contact.field(poses.position - [0, 0, DEPTH], *load, 0.48)
-        slopes = np.moveaxis(to_matrix(np.moveaxis(gradient, 1, 2)), 1, 3)
-        into_cubes = turns.swapaxes(1, 2)
-        normal = np.einsum("niik->nik", rotate_gradient(slopes, into_cubes))
-        return np.concatenate([rotate_stress(stress, into_cubes), normal.reshape(-1, 9)], axis=1)
-
     moved, begun = ContactTracker(turned, LEAST), ContactTracker(turned, LEAST)
     for x in (5.9e-3, 5.98e-3, 5.99e-3, 6.01e-3):
-        there = values((x, 2e-3))
+        there = ball(turned, 6e-3, (x, 2e-3), force)
         (one,) = moved.update(there, max_work=np.inf)
     (other,) = begun.update(there, max_work=np.inf)
     # The two fits began at different places, and the values have no noise.
@@ -235,7 +215,7 @@ def test_two_balls_beside_each_other_without_a_valley_are_told_apart_by_likeliho
             assert found.normal_force == pytest.approx(force, rel=0.05)
             assert np.linalg.norm(found.position[:2] - centre - sign * apart) < 0.3e-3
     (one,) = ContactTracker(inverse, LEAST).update(
-        flat_punch(inverse, 20e-3, centre, (0, 0, -3.0)), max_work=np.inf
+        punch(inverse, 20e-3, centre, (0, 0, -3.0)), max_work=np.inf
     )
     assert one.normal_force == pytest.approx(3, rel=0.1)
 

@@ -6,19 +6,18 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from point_loads import below_ball
 
 from cube_tensor_design.studies.field_study import field_study
 from cube_tensor_design.studies.pads_example import sweep
 from cube_tensor_driver.core.defaults import (
     CONTACT_PRESSURE,
     HALF_SIDE,
-    POISSONS_RATIO,
     SURFACE_DEPTH,
 )
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.poses import CubePoses
 from cube_tensor_driver.core.tensor import rotation_from_rpy
-from cube_tensor_driver.mechanics import contact
 from cube_tensor_driver.touch.surface import Surface
 
 DEPTH = SURFACE_DEPTH
@@ -32,18 +31,9 @@ def flat(nx: int, ny: int, pitch: float) -> CubePoses:
     return CubePoses(position, np.tile(np.eye(3), (nx * ny, 1, 1)), np.full(nx * ny, HALF_SIDE))
 
 
-def at(
-    points: np.ndarray, width: float, force: tuple, centre: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Stress and gradient at points of the cubes' plane, below a ball of this contact width."""
-    below = np.column_stack([points[:, :2], np.full(len(points), -DEPTH)])
-    return contact.field(below, *contact.hertz(width / 2, force, centre), POISSONS_RATIO)
-
-
 def measured(places: CubePoses, width: float, force: tuple, centre: np.ndarray) -> np.ndarray:
     """What cubes that see everything give: (N, 15)."""
-    stress, gradient = at(places.position, width, force, centre)
-    return np.concatenate([stress, gradient[:, :3].reshape(len(stress), 9)], axis=1)
+    return below_ball(places, DEPTH, width, centre, force)
 
 
 def test_a_study_ranks_the_kinds_of_cubes_and_counts_those_that_are_saved():

@@ -7,8 +7,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from curved_skin import cylinder_stress, flat_error
+from point_loads import below_ball
 
+from cube_tensor_design.studies.field_study import field_below, flat_skin
 from cube_tensor_driver.core.calibration import illustrative
+from cube_tensor_driver.core.defaults import POISSONS_RATIO
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.modes import COMPONENTS, STRESS
 from cube_tensor_driver.core.poses import CubePoses
@@ -19,15 +22,8 @@ from cube_tensor_driver.touch.inverse import SurfaceInverse
 from cube_tensor_driver.touch.surface import Surface
 
 DEPTH, PITCH, COUNT = 5e-3, 8e-3, 7
+FLAT = flat_skin(PITCH, (COUNT - 1) * PITCH)
 ACROSS = [k for k, name in enumerate(COMPONENTS) if "y" in name]
-
-
-def grid(rotation=None) -> CubePoses:
-    line = (np.arange(COUNT) - COUNT // 2) * PITCH
-    x, y = np.meshgrid(line, line)
-    position = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1)
-    turns = np.tile(np.eye(3), (COUNT**2, 1, 1)) if rotation is None else rotation
-    return CubePoses(position, turns, np.full(COUNT**2, 2e-3))
 
 
 def pads_noise() -> np.ndarray:
@@ -36,11 +32,14 @@ def pads_noise() -> np.ndarray:
     return np.tile(np.diag(sd), (COUNT**2, 1, 1))
 
 
-def ball(points: np.ndarray, width: float, centre, force=(0.6, 0.3, -3.0)) -> np.ndarray:
-    """(N, 15) below a ball of this contact width, by Boussinesq's and Cerruti's point forces."""
-    below = np.column_stack([points[:, :2], np.full(len(points), -DEPTH)])
-    stress, gradient = contact.field(below, *contact.hertz(width / 2, force, centre, 12), 0.48)
-    return np.concatenate([stress, gradient[:, :3].reshape(len(points), 9)], axis=1)
+def ball(poses: CubePoses, width: float, centre, force=(0.6, 0.3, -3.0)) -> np.ndarray:
+    return below_ball(poses, DEPTH, width, centre, force)
+
+
+def true_stress(inverse: SurfaceInverse, width: float, centre) -> np.ndarray:
+    """(M,) sigma_zz below the points of the surface."""
+    load = contact.hertz(width / 2, (0.6, 0.3, -3.0), centre, 12)
+    return field_below(inverse.points, DEPTH, load, POISSONS_RATIO)[:, 2]
 
 
 def noisy(values: np.ndarray, seed: int = 1) -> np.ndarray:
@@ -56,16 +55,16 @@ def rms(values: np.ndarray) -> float:
 
 @pytest.fixture(scope="module")
 def inverse():
-    return SurfaceInverse.from_poses(grid(), pads_noise(), Layer(), DEPTH, side=4)
+    return SurfaceInverse.from_poses(FLAT, pads_noise(), Layer(), DEPTH, side=4)
 
 
 @pytest.mark.parametrize(("width", "limit"), [(5e-3, 0.06), (10e-3, 0.03)])
 def test_the_field_at_the_cubes_depth_is_the_true_one(inverse, width, limit):
     """And far nearer to it than what interpolation between the cubes gives."""
     centre = np.array([0.3, 0.4]) * PITCH
-    values = noisy(ball(inverse.poses.position, width, centre))
+    values = noisy(ball(inverse.poses, width, centre))
     middle = np.abs(inverse.points[:, :2]).max(axis=1) < 0.02
-    truth = -ball(inverse.points, width, centre)[middle, 2]
+    truth = -true_stress(inverse, width, centre)[middle]
     field = inverse.field(values)
     interpolated = Surface(inverse.poses, DEPTH, 4).field(values).pressure[middle]
     size = np.sqrt((truth**2).mean())
@@ -81,7 +80,7 @@ def test_the_field_at_the_cubes_depth_is_the_true_one(inverse, width, limit):
 
 def test_the_traction_carries_the_load(inverse):
     centre, force = np.array([0.002, -0.001]), np.array([0.6, 0.3, -3.0])
-    field = inverse.field(noisy(ball(inverse.poses.position, 10e-3, centre, force)))
+    field = inverse.field(noisy(ball(inverse.poses, 10e-3, centre, force)))
     found = field.traction.sum(axis=0) * inverse.area
     np.testing.assert_allclose(found, force, atol=0.05 * np.linalg.norm(force))
     pressing = field.pressure
@@ -93,7 +92,7 @@ def test_the_traction_carries_the_load(inverse):
 def test_values_that_are_missing_are_those_of_a_skin_without_them(inverse):
     """Cubes fall out, and pads of one: as good and as sure as matrices that are set up anew, which
     see what is missing from all cubes of each window, not from those next to it alone."""
-    values = noisy(ball(inverse.poses.position, 10e-3, np.zeros(2)))
+    values = noisy(ball(inverse.poses, 10e-3, np.zeros(2)))
     whole, before = inverse.field(values), inverse.deviation(values)
     lost = values.copy()
     lost[[17, 24]], lost[30, ACROSS] = np.nan, np.nan
@@ -101,9 +100,9 @@ def test_values_that_are_missing_are_those_of_a_skin_without_them(inverse):
     noise = pads_noise()
     noise[[17, 24]] = np.nan
     noise[30, ACROSS] = np.nan
-    anew = SurfaceInverse.from_poses(grid(), noise, Layer(), DEPTH, side=4)
+    anew = SurfaceInverse.from_poses(FLAT, noise, Layer(), DEPTH, side=4)
     expected, stated = anew.field(lost), inverse.deviation(lost)
-    truth = -ball(inverse.points, 10e-3, np.zeros(2))[:, 2]
+    truth = -true_stress(inverse, 10e-3, np.zeros(2))
     assert rms(field.depth_pressure - truth) < 1.2 * rms(expected.depth_pressure - truth)
     assert rms(stated.depth_pressure) == pytest.approx(
         rms(anew.deviation(lost).depth_pressure), rel=0.2
@@ -125,28 +124,13 @@ def test_cubes_that_are_turned_see_the_same_traction(inverse):
     random = np.random.default_rng(4)
     angle = random.uniform(-3, 3, COUNT**2)
     turns = np.array([rotation_from_rpy(0, 0, a) for a in angle])
-    values = ball(grid().position, 10e-3, np.array([0.001, 0.002]))
-    below = np.column_stack([grid().position[:, :2], np.full(COUNT**2, -DEPTH)])
-    load = contact.hertz(5e-3, (0.6, 0.3, -3.0), (0.001, 0.002), 12)
-    stress, gradient = contact.field(below, *load, 0.48)
-    matrix = stress[:, [[0, 5, 4], [5, 1, 3], [4, 3, 2]]]
-    slopes = gradient[:, [[0, 5, 4], [5, 1, 3], [4, 3, 2]]]
-    matrix = np.einsum("nai,nbj,nab->nij", turns, turns, matrix)
-    slopes = np.einsum("nai,nbj,nck,nabc->nijk", turns, turns, turns, slopes)
-    turned = np.concatenate(
-        [
-            np.stack(
-                [matrix[:, i, j] for i, j in ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))], 1
-            ),
-            np.stack([slopes[:, i, i, k] for i in range(3) for k in range(3)], 1),
-        ],
-        axis=1,
-    )
+    values = ball(FLAT, 10e-3, (0.001, 0.002))
+    turned = ball(FLAT._replace(rotation=turns), 10e-3, (0.001, 0.002))
     away = rotation_from_rpy(0.7, -1.1, 2.0)
-    poses = CubePoses(grid().position @ away.T + [1, 2, 3], away @ turns, grid().half_side)
+    poses = CubePoses(FLAT.position @ away.T + [1, 2, 3], away @ turns, FLAT.half_side)
     straight = inverse.field(values)
     field = SurfaceInverse.from_poses(poses, pads_noise(), Layer(), DEPTH, side=1).field(turned)
-    one = SurfaceInverse.from_poses(grid(), pads_noise(), Layer(), DEPTH, side=1).field(values)
+    one = SurfaceInverse.from_poses(FLAT, pads_noise(), Layer(), DEPTH, side=1).field(values)
     peak = np.abs(straight.traction).max()
     in_parent = np.einsum("nij,nj->ni", turns, field.traction)
     np.testing.assert_allclose(in_parent, one.traction, atol=0.03 * peak)
@@ -155,11 +139,11 @@ def test_cubes_that_are_turned_see_the_same_traction(inverse):
 
 def test_a_skin_that_observes_nothing_and_a_patch_without_points():
     with pytest.raises(ElasticError, match="no cube"):
-        SurfaceInverse.from_poses(grid(), pads_noise() * np.nan, Layer(), DEPTH)
+        SurfaceInverse.from_poses(FLAT, pads_noise() * np.nan, Layer(), DEPTH)
     with pytest.raises(ElasticError, match="at least 1"):
-        SurfaceInverse.from_poses(grid(), pads_noise(), Layer(), DEPTH, side=0)
+        SurfaceInverse.from_poses(FLAT, pads_noise(), Layer(), DEPTH, side=0)
     with pytest.raises(ElasticError, match="between 0 and"):
-        SurfaceInverse.from_poses(grid(), pads_noise(), Layer(3e-3), DEPTH)
+        SurfaceInverse.from_poses(FLAT, pads_noise(), Layer(3e-3), DEPTH)
 
 
 def test_a_curved_skin_laid_flat_is_off_by_half_its_depth_over_its_radius():
@@ -176,7 +160,7 @@ def test_a_curved_skin_laid_flat_is_off_by_half_its_depth_over_its_radius():
 def test_it_is_made_of_a_skin_as_read_from_its_file():
     from types import SimpleNamespace as Skin
 
-    poses = CubePoses(*(column[:6] for column in grid()))
+    poses = CubePoses(*(column[:6] for column in FLAT))
     calibrations = [illustrative("planar")] * 6
     inverse = SurfaceInverse(
         Skin(poses=poses, calibrations=calibrations, elastomer=None), depth=DEPTH

@@ -11,10 +11,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from point_loads import below_ball
 
+from cube_tensor_design.studies.field_study import field_below
 from cube_tensor_driver.config.grid import grid
 from cube_tensor_driver.config.skin import Elastomer, Skin, read_skin
 from cube_tensor_driver.config.yaml import write_yaml
+from cube_tensor_driver.core.defaults import POISSONS_RATIO
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.core.rows import StressRows, concatenate
 from cube_tensor_driver.mechanics import contact
@@ -55,10 +58,8 @@ class Run:
         self.scans = 0
 
     def ball(self, force, centre, width: float = 5e-3) -> np.ndarray:
-        """(cubes, 15) under a ball, by Boussinesq's and Cerruti's point forces."""
-        below = self.skin.poses.position - [0, 0, DEPTH]
-        stress, slope = contact.field(below, *contact.hertz(width / 2, force, centre, 12), 0.48)
-        return np.concatenate([stress, slope[:, :3].reshape(len(below), 9)], axis=1)
+        """(cubes, 15) under a ball."""
+        return below_ball(self.skin.poses, DEPTH, width, centre, force)
 
     def rows(self, load: np.ndarray | float = 0.0, **columns) -> StressRows:
         """Return the next scan."""
@@ -278,11 +279,9 @@ def test_response_of_a_small_load_is_that_of_point_forces_and_of_the_tables():
     leave 0.2 % of the largest value of each component."""
     random = np.random.default_rng(3)
     offset, angle = random.uniform(-0.03, 0.03, (200, 2)), random.uniform(-3, 3, 200)
-    below = np.column_stack([offset, np.full(200, -DEPTH)])
-    expected = np.zeros((200, 15, 3))
-    for axis, force in enumerate(np.eye(3)):
-        stress, slope = contact.field(below, *contact.hertz(2.5e-3, force, (0, 0), 12), 0.48)
-        expected[:, :, axis] = np.hstack([stress, slope[:, :3].reshape(200, 9)])
+    loads = [contact.hertz(2.5e-3, force, (0, 0), 12) for force in np.eye(3)]
+    fields = [field_below(offset, DEPTH, load, POISSONS_RATIO) for load in loads]
+    expected = np.stack(fields, axis=-1)[:, :15]
     layer = Layer(11e-3)
     responses = ContactResponse(CubeMeasurement(layer, DEPTH, 1.0))
     for found, truth in (
