@@ -234,7 +234,8 @@ def test_every_topic_of_a_skin(ros, tmp_path):
     assert {to_ns(touch.header.stamp) for touch in touches[-10:-5]} <= stamps_ns
     rows = decoded(batches[-1]).rows
     assert batches[-1].header.frame_id == "skin_base"
-    assert (rows.status == 0).all()
+    # A busy machine makes stamps uncertain.
+    assert set(rows.status.tolist()) <= {0, SkinStress.STAMP}
     names = ("xx", "yy", "zz", "yz", "zx", "xy")
     seen = [name for k, name in enumerate(names) if rows.observed[0] >> k & 1]
     assert seen == ["xx", "zz", "zx"]
