@@ -27,6 +27,7 @@ import numpy as np
 import pytest
 
 from cube_tensor_driver.core.rows import FrequencyRows
+from cube_tensor_driver.device.wire.protocol import Sample
 
 # A shell that starts us in the background has SIGINT ignored, in all that we start too.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -284,6 +285,15 @@ def stamped(cube, frequency, pad_fault, stamp_ns, temperature=None) -> Frequency
     return FrequencyRows.of(
         cube, frequency, pad_fault=pad_fault, stamp_ns=stamp_ns, temperature=known
     )
+
+
+def sample_frame(
+    number: int, device_us: int = 0, n_cubes: int = 1, n_pads: int = 2, first: int = 0
+) -> Sample:
+    """A sample whose pads all have 1 mHz."""
+    frequency = np.ones((n_cubes, n_pads), "<u4")
+    no_fault, temperature = np.zeros(n_cubes, "<u4"), np.zeros(n_cubes, "<i2")
+    return Sample(number, first, device_us, frequency, no_fault, temperature)
 
 
 def check(health, rows: FrequencyRows) -> tuple[np.ndarray, np.ndarray]:

@@ -14,13 +14,14 @@ import pytest
 from numpy.typing import NDArray
 from test_clock import BASE_S, EPOCH_NS, random_delays, stalls, usb_bursts
 
+from conftest import sample_frame
 from cube_tensor_driver.core.status import STAMP
 from cube_tensor_driver.device.chain import LiveLinks
 from cube_tensor_driver.device.clock.hub_clock import CLOCK_SET, CLOCK_STANDS_STILL, HubClock
 from cube_tensor_driver.device.links.link import LinkConfig
 from cube_tensor_driver.device.links.reader import LinkFrames
 from cube_tensor_driver.device.scans.cube_table import CubeAddress
-from cube_tensor_driver.device.wire.protocol import Hello, Sample
+from cube_tensor_driver.device.wire.protocol import Hello
 
 AT_S = 10.0  # when the clock is set
 SEEN_S = 0.25  # limit of the issue
@@ -154,14 +155,7 @@ def test_the_doubt_is_in_the_rows() -> None:
     arrived_ns = np.maximum.accumulate(10_000_000 * np.arange(1000) + late_ns)
     for k in range(1000):
         device_us = 10_000 * k - (6000 if k >= 500 else 0)
-        frame = Sample(
-            k,
-            0,
-            device_us,
-            np.ones((1, 2), "<u4"),
-            np.zeros(1, "<u4"),
-            np.zeros(1, "<i2"),
-        )
+        frame = sample_frame(k, device_us)
         live.receive([LinkFrames(0, EPOCH_NS + int(arrived_ns[k]), [frame])])
     doubtful = [number for number, status in rows if status]
     assert [number for number, _ in rows] == list(range(1000))

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from test_clock import EPOCH_NS
 
+from conftest import sample_frame
 from cube_tensor_driver.core.status import STAMP
 from cube_tensor_driver.device import chain
 from cube_tensor_driver.device.chain import LiveLinks
@@ -28,14 +29,8 @@ PERIOD_US = 1000
 
 
 def sample(number: int, device_us: int | None = None, first: int = 0, n_cubes: int = 1) -> Sample:
-    return Sample(
-        number,
-        first,
-        PERIOD_US * number if device_us is None else device_us,
-        np.ones((n_cubes, 2), "<u4"),
-        np.zeros(n_cubes, "<u4"),
-        np.zeros(n_cubes, "<i2"),
-    )
+    device_us = PERIOD_US * number if device_us is None else device_us
+    return sample_frame(number, device_us, n_cubes, first=first)
 
 
 def hello(n_cubes: int) -> Hello:

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from conftest import sample_frame
 from cube_tensor_driver.core.errors import LinkError
 from cube_tensor_driver.device.chain import LiveLinks
 from cube_tensor_driver.device.links.link import LinkConfig, LinkState
@@ -376,10 +377,7 @@ def test_stamps_use_the_arrival_of_their_own_read():
     live = LiveLinks(links, addresses, given.append)
 
     def samples(*numbers_and_us):
-        return [
-            Sample(number, 0, us, np.ones((1, 1), "<u4"), np.zeros(1, "<u4"), np.zeros(1, "<i2"))
-            for number, us in numbers_and_us
-        ]
+        return [sample_frame(number, us, n_pads=1) for number, us in numbers_and_us]
 
     live.receive([LinkFrames(0, 0, [hello([1], 1)]), LinkFrames(1, 0, [hello([2], 1)])])
     live.receive(
@@ -413,17 +411,6 @@ def live_links(on_rows, n_cubes=1):
     return live
 
 
-def timed(sequence, device_us, n_cubes=1, n_pads=2, first=0):
-    return Sample(
-        sequence,
-        first,
-        device_us,
-        np.ones((n_cubes, n_pads), "<u4"),
-        np.zeros(n_cubes, "<u4"),
-        np.zeros(n_cubes, "<i2"),
-    )
-
-
 @pytest.mark.parametrize("strange", [{"n_pads": 3}, {"first": 7}, {"n_cubes": 0}])
 def test_rows_that_are_left_out_do_not_pile_up(strange):
     """In bursts longer than one callback holds; healthy rows come at once after them."""
@@ -431,13 +418,13 @@ def test_rows_that_are_left_out_do_not_pile_up(strange):
     live = live_links(given.append)
     for burst in range(100):
         numbers = range(20 * burst, 20 * burst + 20)
-        frames = [timed(number, 1000 * number, **strange) for number in numbers]
+        frames = [sample_frame(number, 1000 * number, **strange) for number in numbers]
         live.receive([LinkFrames(0, 1_000_000 * numbers[-1], frames)])
     assert not given
     left_out = 0 if "n_cubes" in strange else 2000
     counts = live.row_counts()
     assert (counts.unknown_cube + counts.wrong_pads, counts.unaccounted) == (left_out, 0)
-    live.receive([LinkFrames(0, 2_000_000_000, [timed(2000, 2_000_000)])])
+    live.receive([LinkFrames(0, 2_000_000_000, [sample_frame(2000, 2_000_000)])])
     assert [rows.sequence.tolist() for rows in given] == [[2000]], "older ones come first"
 
 
@@ -452,7 +439,7 @@ def test_no_device_time_loses_a_row():
         frames = []
         for _ in range(int(random.integers(1, 40))):
             device_us = int(random.integers(0, 2**63)) >> int(random.integers(0, 63))
-            frames.append(timed(sequence, device_us))
+            frames.append(sample_frame(sequence, device_us))
             sequence += 1
         live.receive([LinkFrames(0, arrival_ns, frames)])
     counts = live.row_counts()
@@ -464,7 +451,7 @@ def test_no_device_time_loses_a_row():
 
 def test_a_long_read_of_times_that_fall_back_is_taken():
     live = live_links(lambda rows: None)
-    frames = [timed(number, 2_000_000 * (5000 - number)) for number in range(5000)]
+    frames = [sample_frame(number, 2_000_000 * (5000 - number)) for number in range(5000)]
     live.receive([LinkFrames(0, 10**18, frames)])
     assert live.row_counts().delivered == 5000
 
@@ -477,10 +464,10 @@ def test_rows_far_apart_in_time_are_given_one_after_the_other():
     live = LiveLinks(links, addresses, given.append)
     live.receive([LinkFrames(link, 0, [hello([link + 1])]) for link in (0, 1)])
     second = 10**9
-    live.receive([LinkFrames(0, 0, [timed(0, 0)]), LinkFrames(1, 0, [timed(0, 0)])])
-    waited = [timed(1, 1_000_000), timed(2, 5_000_000)]
+    live.receive([LinkFrames(0, 0, [sample_frame(0, 0)]), LinkFrames(1, 0, [sample_frame(0, 0)])])
+    waited = [sample_frame(1, 1_000_000), sample_frame(2, 5_000_000)]
     live.receive(
-        [LinkFrames(0, 5 * second, waited), LinkFrames(1, 5 * second, [timed(1, 5_000_000)])]
+        [LinkFrames(0, 5 * second, waited), LinkFrames(1, 5 * second, [sample_frame(1, 5_000_000)])]
     )
     stamps = sorted((rows.stamp_ns / second).tolist() for rows in given[1:])
     assert stamps == [[1.0], [5.0, 5.0]]
@@ -497,7 +484,7 @@ def test_an_error_in_the_callback_is_counted_with_its_reason_and_the_next_rows_g
 
     live = live_links(on_rows, n_cubes=3)
     for number in range(4):
-        frames = [timed(number, 1000 * number, n_cubes=3)] * 2
+        frames = [sample_frame(number, 1000 * number, n_cubes=3)] * 2
         live.receive([LinkFrames(0, 1_000_000 * number, frames)])
     assert [int(rows.sequence[0]) for rows in given] == [0, 2, 3]
     assert live.row_counts() == RowCounts(
@@ -510,7 +497,7 @@ def test_rows_that_the_data_path_forgets_without_an_error_are_unaccounted(monkey
     """The account is not kept by the code that it checks."""
     live = live_links(lambda rows: None)
     monkeypatch.setattr(ScanBuilder, "add", lambda self, link, sample, stamp_ns, status: None)
-    live.receive([LinkFrames(0, 0, [timed(0, 0)])])
+    live.receive([LinkFrames(0, 0, [sample_frame(0, 0)])])
     assert live.row_counts() == RowCounts(unaccounted=1)
 
 
@@ -518,12 +505,12 @@ def test_rows_that_wait_for_their_scan_are_neither_lost_nor_unaccounted():
     links = [LinkConfig("a", "/dev/none"), LinkConfig("b", "/dev/none")]
     addresses = [CubeAddress("a", 0, 0, None, 2), CubeAddress("b", 1, 0, None, 2)]
     live = LiveLinks(links, addresses, lambda rows: None)
-    live.receive([LinkFrames(link, 0, [hello([link + 1]), timed(0, 0)]) for link in (0, 1)])
-    live.receive([LinkFrames(0, 1_000_000, [timed(1, 1000)])])
+    live.receive([LinkFrames(link, 0, [hello([link + 1]), sample_frame(0, 0)]) for link in (0, 1)])
+    live.receive([LinkFrames(0, 1_000_000, [sample_frame(1, 1000)])])
     assert live.row_counts() == RowCounts(delivered=2)
     live._count_error(OSError())
     assert live.row_counts().lost == 0
-    live.receive([LinkFrames(1, 1_000_000, [timed(1, 1000)])])
+    live.receive([LinkFrames(1, 1_000_000, [sample_frame(1, 1000)])])
     assert live.row_counts() == RowCounts(delivered=4, lost_reason="OSError()")
 
 
@@ -545,7 +532,7 @@ def test_setting_the_host_clock_shows_in_the_report_and_in_no_stamp(step_ns):
         arrival_ns = clock_ns()  # of the last one before the clock was set: in the old time
         if number == 30:
             set_ns = step_ns
-        live.receive([LinkFrames(0, arrival_ns, [timed(number, sampled_us)])])
+        live.receive([LinkFrames(0, arrival_ns, [sample_frame(number, sampled_us)])])
         (stamp_ns,) = given[-1].stamp_ns.tolist()
         assert abs(stamp_ns - (begun_ns + 1000 * sampled_us + set_ns)) < 1_000_000
     (report,) = live.report()

@@ -26,7 +26,7 @@ pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
-from played_hub import SINGLE, PlayedHub
+from played_hub import CUBE_UID, PERIOD_US, SINGLE, PlayedHub, greeting, sample
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -38,7 +38,6 @@ from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.config.tare import write_tare
 from cube_tensor_driver.config.yaml import read_yaml, write_yaml
 from cube_tensor_driver.core.oscillator import pad_frequency
-from cube_tensor_driver.device.wire.protocol import Hello, Sample, encode
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
 from cube_tensor_driver.processes.children import Children, ros_arguments
 from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, skin_processes
@@ -46,8 +45,7 @@ from cube_tensor_driver.srv import Tare
 
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 CALIBRATION = read_skin(SINGLE).cubes[0].calibration
-PERIOD_S = 0.01
-UID = 0xCD
+PERIOD_S = 1e-6 * PERIOD_US
 
 
 class PlayedSkin:
@@ -71,7 +69,7 @@ class PlayedSkin:
                 process.parameters["tare_folder"] = str(self.folder / "tare")
             self.children.start(process)
         self.ros.wait(lambda: 1 in self.hub.listen())
-        self.hub.send(encode(Hello(0xAB, 1, 8, round(1e6 * PERIOD_S), np.array([UID], "<u8"))))
+        self.hub.send(greeting())
         self.ros.wait(lambda: 2 in self.hub.listen())
         self.began = time.monotonic() - self.number * PERIOD_S
         self.wait(lambda: self.stress)
@@ -81,19 +79,7 @@ class PlayedSkin:
         while self.number * PERIOD_S < time.monotonic() - self.began:
             f = self.pads * (1 + 8e-6 * self.noise.standard_normal(8))
             millihertz = np.rint(1e3 * f).astype("<u4")[None]
-            device_us = round(1e6 * PERIOD_S * self.number)
-            self.hub.send(
-                encode(
-                    Sample(
-                        self.number,
-                        0,
-                        device_us,
-                        millihertz,
-                        np.zeros(1, "<u4"),
-                        np.zeros(1, "<i2"),
-                    )
-                )
-            )
+            self.hub.send(sample(self.number, millihertz))
             self.number += 1
 
     def wait(self, done, seconds=20.0):
@@ -161,7 +147,7 @@ def test_tare_is_refused_taken_told_kept_and_undone(stage):
     assert answer.success and "kept on disk" in answer.message, answer.message
     stage.wait(lambda: abs(stage.zz()) < 50)
     stage.wait(lambda: abs(stage.infos[-1].cubes[0].rest_frequency[0] / stage.pads[0] - 1) < 1e-5)
-    assert stage.infos[-1].cubes[0].uid == UID
+    assert stage.infos[-1].cubes[0].uid == CUBE_UID
 
     # another start: the same rest, from the file of this uid
     stage.children.end(["reconstruction", "driver"])
