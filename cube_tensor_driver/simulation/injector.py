@@ -7,7 +7,7 @@ from __future__ import annotations
 import heapq
 import itertools
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 
 import numpy as np
 
@@ -56,28 +56,8 @@ class _BrokenPad:
 
 
 @dataclass
-class LinkFaults:
-    """Faults that affect one link now; only `Injector` uses it.
-
-    Attributes:
-        frames: Kinds of faults for the next SAMPLE frames (messages with a sample), one for each.
-        held_back: Frame that is sent after the next one (fault `reorder`).
-        pads: Pads under a fault.
-        warming: Simulated time in µs at which the temperature began to change, and the fault.
-        hold: Simulated time in µs whose load acts for the duration of a fault `hold`, and the
-            fault; None: the load changes with time.
-    """
-
-    frames: list[str] = field(default_factory=list)
-    held_back: bytes = b""
-    pads: list[_BrokenPad] = field(default_factory=list)
-    warming: tuple[int, Fault] | None = None
-    hold: tuple[int, Fault] | None = None
-
-
-@dataclass
 class SimulatedLink:
-    """A link of the skin: a simulated hub and its line to the host.
+    """A link of the skin: a simulated hub, its line to the host, and the faults that affect it now.
 
     Attributes:
         name: Name of the link.
@@ -85,14 +65,25 @@ class SimulatedLink:
         line: Line between hub and host.
         damaged: Samples whose frame was altered or not sent: for each, the number of the hub's
             restarts before, and the number of the sample.
-        faults: Faults that affect the link now.
+        frame_faults: Kinds of faults for the next SAMPLE frames (messages with a sample), one for
+            each.
+        held_back: Frame that is sent after the next one (fault `reorder`).
+        broken_pads: Pads under a fault.
+        warming: Simulated time in µs at which the temperature began to change, and the fault.
+        hold: Simulated time in µs whose load acts for the duration of a fault `hold`, and the
+            fault; None: the load changes with time.
     """
 
     name: str
     hub: SimulatedHub
     line: SimulatedLine
-    damaged: list[tuple[int, int]] = field(default_factory=list, kw_only=True)
-    faults: LinkFaults = field(default_factory=LinkFaults, kw_only=True)
+    _: KW_ONLY
+    damaged: list[tuple[int, int]] = field(default_factory=list)
+    frame_faults: list[str] = field(default_factory=list)
+    held_back: bytes = b""
+    broken_pads: list[_BrokenPad] = field(default_factory=list)
+    warming: tuple[int, Fault] | None = None
+    hold: tuple[int, Fault] | None = None
 
     @property
     def size(self) -> HubSize:
@@ -103,6 +94,14 @@ class SimulatedLink:
         """Record that the frame of the hub's newest sample is altered or not sent."""
         newest = self.hub.sequence - 1
         self.damaged.append((self.hub.boots, newest))
+
+    def load_us(self, now_us: int) -> int:
+        """Return the simulated time, in µs, whose load acts on the cubes of the hub.
+
+        It is earlier than the present time `now_us` during the fault `hold`, which keeps the load
+        constant.
+        """
+        return now_us if self.hold is None else self.hold[0]
 
 
 class Injector:
@@ -180,12 +179,11 @@ class Injector:
             frequency: Frequencies (cubes, pads) in mHz of pads without faults.
             now_us: Simulated time of the sample in µs.
         """
-        state = link.faults
         hub = link.hub
         # The array is copied, because it may be used again for a later sample.
         frequency = frequency.copy()
-        if state.warming is not None:
-            begin_us, fault = state.warming
+        if link.warming is not None:
+            begin_us, fault = link.warming
             # The temperature rises linearly during the fault and then stays constant.
             elapsed_s = 1e-6 * (now_us - begin_us)
             share = min(1.0, elapsed_s / max(fault.seconds, 1e-6))
@@ -194,7 +192,7 @@ class Injector:
             hub.celsius = round(100 * (ROOM_CELSIUS + rise)) if rise else TEMPERATURE_UNKNOWN
             warmed = frequency * (1 + RELATIVE_CHANGE_PER_CELSIUS * rise)
             frequency = np.rint(warmed).astype("<u4")
-        for broken in state.pads:
+        for broken in link.broken_pads:
             pad = broken.fault.cube, broken.fault.pad
             sound = int(frequency[pad])
             if broken.reading is None:
@@ -202,18 +200,6 @@ class Injector:
             frequency[pad] = broken_reading(broken.fault, sound, broken.reading, now_us)
         no_cubes, pads_behind = (0, 0), (0, hub.extra_pads)
         return np.pad(frequency, (no_cubes, pads_behind))
-
-    def load_us(self, link: SimulatedLink, now_us: int) -> int:
-        """Return the simulated time, in µs, whose load acts on the cubes of a hub.
-
-        It is earlier than the present time during the fault `hold`, which keeps the load constant.
-
-        Args:
-            link: Link of the hub.
-            now_us: Present simulated time in µs.
-        """
-        hold = link.faults.hold
-        return now_us if hold is None else hold[0]
 
     def transmitted(self, link: SimulatedLink, data: bytes) -> bytes:
         """Return the bytes that are sent on a link in place of one frame (message) with a sample.
@@ -226,13 +212,12 @@ class Injector:
             The frame, altered if a fault acts on it; empty if the frame is lost or held back. A
             frame that was held back before (fault `reorder`) follows at the end.
         """
-        state = link.faults
-        kind = state.frames.pop(0) if state.frames else ""
-        held_back, state.held_back = state.held_back, b""
+        kind = link.frame_faults.pop(0) if link.frame_faults else ""
+        held_back, link.held_back = link.held_back, b""
         if kind in DAMAGING_FAULTS:
             link.mark_damaged()
         if kind == "reorder" and not held_back:
-            state.held_back = data
+            link.held_back = data
             return b""
         return self._alter_frame(kind, data) + held_back
 
@@ -271,23 +256,22 @@ class Injector:
             now_us: Simulated time in µs.
         """
         link = self._links[fault.link]
-        state = link.faults
         hub = link.hub
         line = link.line
         is_momentary = fault.kind in MOMENTARY_FAULTS
         end_us = now_us if is_momentary else now_us + round(1e6 * fault.seconds)
         match fault.kind:
             case kind if kind in FRAME_FAULTS:
-                state.frames += [kind] * fault.count
+                link.frame_faults += [kind] * fault.count
             case kind if kind in PAD_FAULTS:
-                state.pads.append(_BrokenPad(fault))
+                link.broken_pads.append(_BrokenPad(fault))
                 _report_pads(link)
             case "stall":
                 line.held_until_us = end_us
             case "burst":
                 line.burst_until_us = end_us
             case "unplug" | "rename":
-                state.held_back = b""
+                link.held_back = b""
                 hub.started = False  # a hub is powered by its port
                 line.unplug()
             case "reset":
@@ -300,9 +284,9 @@ class Injector:
             case "step":
                 hub.set_clock(now_us, step_us=round(1e6 * fault.value))
             case "temperature":
-                state.warming = now_us, fault
+                link.warming = now_us, fault
             case "hold":
-                state.hold = now_us, fault
+                link.hold = now_us, fault
             case "uid":
                 hub.false_uid = hub.uid ^ _FALSE_UID_BITS
             case "pads":
@@ -327,7 +311,7 @@ class Injector:
             now_us: Simulated time in µs.
             sequence: Number of the next sample of the hub.
         """
-        link.faults.held_back = b""
+        link.held_back = b""
         link.hub.reset(now_us, sequence)
         link.line.send(link.hub.hello(), now_us)
 
@@ -339,17 +323,18 @@ class Injector:
             now_us: Simulated time in µs.
         """
         link = self._links[fault.link]
-        state = link.faults
         hub = link.hub
         line = link.line
         match fault.kind:
             case kind if kind in PAD_FAULTS:
-                state.pads = [broken for broken in state.pads if broken.fault is not fault]
+                link.broken_pads = [
+                    broken for broken in link.broken_pads if broken.fault is not fault
+                ]
                 _report_pads(link)
             case "hold":
                 # A fault `hold` that began later has replaced this one, and does not end now.
-                if state.hold is not None and state.hold[1] is fault:
-                    state.hold = None
+                if link.hold is not None and link.hold[1] is fault:
+                    link.hold = None
             case "unplug" | "rename":
                 if line.plugged:
                     return  # the end of another fault has plugged the line in already
@@ -412,7 +397,7 @@ def broken_reading(
 def _report_pads(link: SimulatedLink) -> None:
     """Set the pads that a hub reports as failed in its frames: those under the fault `report`."""
     bits = np.zeros(len(link.hub.cube_uids), "<u4")
-    for broken in link.faults.pads:
+    for broken in link.broken_pads:
         if broken.fault.kind == "report":
             bits[broken.fault.cube] |= np.uint32(1 << broken.fault.pad)
     link.hub.pad_fault = bits

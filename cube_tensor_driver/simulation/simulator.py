@@ -297,7 +297,7 @@ class Simulator:
             now_us: Present simulated time in µs; the sample may have been due earlier.
         """
         time_us = link.hub.next_us
-        load_us = self._injector.load_us(link, time_us)
+        load_us = link.load_us(time_us)
         if link.prepared:
             instant = load_us // link.hub.period_us % len(link.prepared)
             frequency = link.prepared[instant]

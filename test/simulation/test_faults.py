@@ -22,7 +22,7 @@ from cube_tensor_driver.simulation.faults import FRAME_FAULTS, KINDS, Fault, par
 from cube_tensor_driver.simulation.hub import SimulatedHub
 from cube_tensor_driver.simulation.inject import inject
 from cube_tensor_driver.simulation.injector import Injector, SimulatedLink
-from workshop.torture.mix import ROUND, schedule
+from workshop.torture.mix import CYCLE, schedule
 
 PERIOD_US = 2000
 VALUES = np.arange(1, 17, dtype="<u4").reshape(2, 8) * 1_000_000
@@ -246,7 +246,7 @@ def test_a_long_torture_has_every_fault_and_action_and_the_same_seed_the_same_mi
     mix = list(schedule(120.0, 5))
     assert {event["kind"] for _, event in mix if "kind" in event} == set(KINDS)
     assert {event["action"] for _, event in mix if "action" in event} == {
-        event["action"] for event in ROUND.values() if "action" in event
+        event["action"] for event in CYCLE.values() if "action" in event
     }
     assert mix == list(schedule(120.0, 5)) != list(schedule(120.0, 6))
     assert [at for at, _ in mix] == sorted(at for at, _ in mix)
@@ -259,7 +259,7 @@ def test_the_load_stays_while_it_is_held():
     loads = []
     for now_us in range(0, 50_000, PERIOD_US):
         link.injector.step(now_us)
-        loads.append(link.injector.load_us(link, now_us))
+        loads.append(link.load_us(now_us))
     expected = np.arange(0, 50_000, PERIOD_US)
     expected[(expected >= 10_000) & (expected < 20_000)] = 10_000
     expected[(expected >= 20_000) & (expected < 40_000)] = 20_000
