@@ -119,7 +119,9 @@ def test_ended_demo_leaves_no_process(domain, number):
     process.send_signal(number)
     process.communicate(timeout=10)
     if number == signal.SIGINT:
-        assert time.monotonic() - start < 2.0  # what the README promises
+        # What the README promises; longer if each processor has more than two processes to run.
+        crowded = os.getloadavg()[0] / (2 * len(os.sched_getaffinity(0)))
+        assert time.monotonic() - start < 2.0 * max(1.0, crowded)
         assert process.returncode == 0
     # Killed, it ends none of its children: each ends by itself, which takes seconds under load.
     _, left = psutil.wait_procs(children, timeout=0 if number == signal.SIGINT else 15)
