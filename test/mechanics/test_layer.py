@@ -1,18 +1,15 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""The layer in wavenumber space against point forces, and against finite elements."""
+"""The layer in wavenumber space against point forces; test_influence.py has finite elements."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-
-pytest.importorskip("skfem", reason="needs skfem: pip install scikit-fem")
-
-from pressed_layer import press_layer
+from point_loads import in_cubes
 
 from cube_tensor_driver.core.errors import ElasticError
-from cube_tensor_driver.core.modes import COMPONENTS, STRESS, to_matrix
+from cube_tensor_driver.core.tensor import rotation_from_rpy
 from cube_tensor_driver.mechanics import contact
 from cube_tensor_driver.mechanics.contact_response import ContactResponse
 from cube_tensor_driver.mechanics.layer import FIELD, Layer
@@ -31,15 +28,9 @@ def half_space():
 
 def in_cube_frames(stress, gradient, angle):
     """(N, 15) components, gradients times SCALE, of fields (N, 6) and (N, 6, 3) in turned cubes."""
-    turned = []
-    for s, g, a in zip(stress, gradient, angle, strict=True):
-        c, d = np.cos(a), np.sin(a)
-        turn = np.array([[c, d, 0], [-d, c, 0], [0, 0, 1]])
-        matrix = turn @ to_matrix(s) @ turn.T
-        slopes = np.einsum("ia,jb,kc,cab->ijk", turn, turn, turn, to_matrix(g.T))
-        uniform = [matrix["xyz".index(n[0]), "xyz".index(n[1])] for n in STRESS]
-        turned.append([*uniform, *(SCALE * slopes[i, i, k] for i in range(3) for k in range(3))])
-    return np.array(turned)
+    rotation = np.array([rotation_from_rpy(0, 0, one) for one in angle])
+    field = np.concatenate([stress, gradient.reshape(-1, 18)], axis=1)
+    return in_cubes(field, rotation) * np.where(np.arange(15) < 6, 1.0, SCALE)
 
 
 @pytest.mark.parametrize(("size", "tolerance"), [(0.8e-3, 1e-4), (5e-3, 1e-3)])
@@ -83,28 +74,6 @@ def test_a_layer_is_in_equilibrium_and_sticks_to_its_ground():
     xx, yy, zz = (layer.transfer(kx, ky, 8e-3 - 1e-12)[:, k] for k in range(3))
     strain = xx - 0.45 * (yy + zz)
     assert np.abs(strain).max() < 1e-8 * np.abs(xx).max()
-
-
-def test_stress_in_a_layer_is_that_of_finite_elements():
-    """A rigid flat punch without friction on a bonded layer: its contact pressure, from the
-    elements, makes at depth the stress that the elements have there."""
-    punch = press_layer(thickness=8e-3, radius=3e-3, poisson=0.45, width=40e-3)
-    responses = ContactResponse(CubeMeasurement(Layer(8e-3, 0.45), 4e-3, SCALE))
-    at = np.array([0.5e-3, 2e-3, 5e-3, 9e-3])
-    seen = np.zeros((len(at), 15))
-    for radius, force in zip(punch.radius, punch.force, strict=True):  # rings of small discs
-        angle = 2 * np.pi * np.arange(48) / 48
-        ring = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        for place, row in zip(at, seen, strict=True):
-            response = responses.response(
-                np.array([place, 0.0]) - ring, 0 * angle, POINTS[:48], 0.5e-3
-            )
-            row += response.mean(axis=0) @ [0, 0, -force]
-    found = punch.stress(at, 4e-3)
-    scale = np.abs(found[:, 2]).max()
-    for name, column in (("xx", 0), ("yy", 1), ("zz", 2), ("zx", 3)):
-        error = np.abs(seen[:, COMPONENTS.index(name)] - found[:, column])
-        assert error.max() < 0.01 * scale, name
 
 
 def test_covariances_of_the_prior_are_sums_over_its_waves(half_space):
