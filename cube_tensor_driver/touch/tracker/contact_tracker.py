@@ -15,7 +15,6 @@ the field, which are less exact.
 
 from __future__ import annotations
 
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -31,7 +30,13 @@ from .hertz_fit import HertzFit, linearise
 from .local_values import CubeNoise, rotations_about_normal
 from .node_fit import NodeFit
 from .pressure_regions import PressureRegions
-from .tracked_region import MAX_START_SIZE, TrackedRegion, Work, update_responses
+from .tracked_region import (
+    MAX_START_SIZE,
+    MAX_STEPS,
+    TrackedRegion,
+    Work,
+    update_responses,
+)
 
 NEIGHBOUR_REACH_PITCHES = 3.0
 """Distance between two regions of contact, divided by the pitch (distance of neighbouring cubes),
@@ -49,6 +54,10 @@ The unit is the time that a new fit takes per node (one of the small contacts wh
 traction of a region), so a new fit with 80 nodes counts 80. The limit bounds the time of a scan;
 the remaining steps are made in the next scans.
 """
+
+FIRST_FIT_WORK = 20
+"""Computing work, in the unit of `MAX_WORK_PER_SCAN`, of the first fit of a Hertz contact, which
+takes four to six Gauss-Newton steps."""
 
 MAX_FIT_STEPS = 12
 """Largest number of steps (new fits and improvements of fits) in one scan (set of values of all
@@ -173,9 +182,7 @@ class ContactTracker:
             coarse = dict(zip(unfitted, self._integrate_field(unfitted, field), strict=True))
             for region, contact in coarse.items():
                 region.start = self._start_of_fit(contact)
-        if self._improve_fits(max_work) and len(regions) > 1:
-            # A new fit changes the response that is subtracted from the values of the other fits.
-            self._update_fits()
+        self._improve_fits(max_work)
 
         contacts = []
         for region in regions:
@@ -299,45 +306,37 @@ class ContactTracker:
             return
         if len(fitted) > 1:
             update_responses(self._inverse, fitted, self._fitted_cubes)
-        responses = np.array([region.response for region in self._regions])
-        errors = np.array([region.relative_error for region in self._regions])
-        # Deviations add linearly, because the same errors of the elastomer cause them.
-        deviation = np.tensordot(errors, np.abs(responses), 1)
-        total = responses.sum(axis=0)
+        total, deviation = self._sum_responses()
         for region in fitted:
             if region.fit is not None:
-                values = region.fit.values
-                cubes = values.cubes
-                own = region.response[cubes]
-                region.others = total[cubes] - own
-                values.disturbance = deviation[cubes] - region.relative_error * np.abs(own)
-                region.fit.step(values.whiten(self._scaled, region.others))
+                region.subtract_others(region.fit.values, total, deviation)
+                region.fit.step(region.fit.values.whiten(self._scaled, region.others))
                 if region.near:
+                    cubes = region.fit.values.cubes
                     explained = region.fit.explained
-                    total[cubes] += explained - own
+                    total[cubes] += explained - region.response[cubes]
                     region.response[cubes] = explained
 
-    def _respond_to_others(self, cubes: Index, excluded: TrackedRegion) -> tuple[Array, Array]:
-        """Return the response of some cubes to all regions of contact but one.
+    def _sum_responses(self) -> tuple[Array, Array]:
+        """Return the stored response (cubes, C), in Pa, of all cubes to all regions, and its
+        standard deviation (cubes, C)."""
+        total = np.zeros(self._scaled.shape)
+        deviation = np.zeros(self._scaled.shape)
+        for region in self._regions:
+            total += region.response
+            # Deviations add linearly, because the same errors of the elastomer cause them.
+            deviation += region.relative_error * np.abs(region.response)
+        return total, deviation
 
-        The stored responses to regions whose contacts have changed are computed again before.
+    def _respond(self, cubes: Index) -> tuple[Array, Array]:
+        """Return `_sum_responses`, up to date for some cubes.
 
         Args:
             cubes: Indices (n,) of the cubes.
-            excluded: Region whose contacts are left out.
-
-        Returns:
-            Change (n, C), in Pa, of the C measured components of each cube by the other regions,
-            and its standard deviation (n, C), in Pa.
         """
-        others = [region for region in self._regions if region is not excluded]
-        update_responses(self._inverse, others, cubes)
-        total = np.zeros((len(cubes), len(self._inverse.columns)))
-        deviation = np.zeros_like(total)
-        for region in others:
-            total += region.response[cubes]
-            deviation += region.relative_error * np.abs(region.response[cubes])
-        return total, deviation
+        if len(self._regions) > 1:
+            update_responses(self._inverse, self._regions, cubes)
+        return self._sum_responses()
 
     def _start_of_fit(self, contact: TrackedContact) -> tuple[int, Discs]:
         """Return the start of the fit of a contact.
@@ -362,28 +361,56 @@ class ContactTracker:
         log_radius = np.log([squared_radius]) / 2
         return home, Discs(force[None], place[None], log_radius)
 
-    def _improve_fits(self, max_work: float) -> bool:
+    def _improve_fits(self, max_work: float) -> None:
         """Make and improve fits of regions, the most urgent first (`Work`), up to a limit of work.
 
         Args:
             max_work: Work, in the unit of `MAX_WORK_PER_SCAN`, after which no further fit is made
                 or improved in this scan.
-
-        Returns:
-            Whether a fit has been made or improved.
         """
         regions = self._regions
-        spent = 0
+        spent = self._begin_hertz_fits(max_work)
         for _ in range(MAX_FIT_STEPS * len(regions)):
             # Among equally urgent regions, the one that has waited longest comes first.
             order = [(region.next_work, -region.waited) for region in regions]
             number = min(range(len(regions)), key=order.__getitem__)
             if spent >= max_work or order[number][0] == Work.NONE:
                 break
-            region = regions[number]
-            respond_to_others = partial(self._respond_to_others, excluded=region)
-            spent += region.improve(self._scaled, respond_to_others)
-        return spent > 0
+            spent += regions[number].improve(self._scaled, self._respond)
+
+    def _begin_hertz_fits(self, max_work: float) -> float:
+        """Fit a Hertz contact to each region that has no fit yet, as far as the work allows.
+
+        The fits are made together, which takes little longer than one of them.
+
+        Args:
+            max_work: Largest work, in the unit of `MAX_WORK_PER_SCAN`.
+
+        Returns:
+            Work of these fits.
+        """
+        due = [region for region in self._regions if region.needs_hertz_fit]
+        due.sort(key=lambda region: -region.waited)
+        n_fits = min(len(due), max_work // FIRST_FIT_WORK)
+        due = due[: int(n_fits)]
+        if not due:
+            return 0
+        homes = [region.start[0] for region in due]
+        cubes = np.unique(self._inverse.near[homes])
+        self._noise.update(self._scaled, cubes)
+        total, deviation = self._respond(cubes)
+        trials = [region.begin_hertz_fit(total, deviation) for region in due]
+        moving = list(zip(due, trials, strict=True))
+        for _ in range(MAX_STEPS):
+            linearise(self._inverse, [fit for _, fit in moving])
+            for region, fit in moving:
+                fit.step(fit.values.whiten(self._scaled, region.others))
+            moving = [(region, fit) for region, fit in moving if fit.needs_linearisation]
+            if not moving:
+                break
+        for region, fit in zip(due, trials, strict=True):
+            region.accept_if_good(fit)
+        return n_fits * FIRST_FIT_WORK
 
     def _integrate_field(
         self, unfitted: list[TrackedRegion], field: TractionField
@@ -400,38 +427,48 @@ class ContactTracker:
         region_points = np.concatenate([one.points for one in regions])
         sizes = [len(one.points) for one in regions]
         numbers = np.repeat(np.arange(len(regions)), sizes)
-        distance, nearest = cKDTree(inverse.points[region_points]).query(inverse.points)
-        owner = np.where(distance < inverse.pitch, numbers[nearest], -1)
-        force = inverse.area * field.traction
+        tree = cKDTree(inverse.points[region_points])
+        distance, nearest = tree.query(inverse.points, distance_upper_bound=inverse.pitch)
+        # Points without a region within this distance have an infinite one.
+        own = np.flatnonzero(np.isfinite(distance))
+        owner = numbers[nearest[own]]
+
+        rotation = inverse.poses.rotation[inverse.cube[own]]
+        force = inverse.area * field.traction[own]
+        pressing = -force[:, 2:]
+        shear = np.einsum("nij,nj->ni", rotation[:, :, :2], force[:, :2])
+        moments = pressing * inverse.points[own]
+        normals = pressing * rotation[:, :, 2]
+        rows = np.hstack([pressing, shear, moments, normals])
+        order = np.argsort(owner, kind="stable")
+        firsts = np.searchsorted(owner[order], np.arange(len(regions)))
+        sums = np.add.reduceat(rows[order], firsts)
         return [
-            self._sum_points(np.flatnonzero(owner == number), force, len(region.points))
+            self._coarse_contact(sums[number], sizes[number])
             for number, region in enumerate(regions)
             if region in unfitted
         ]
 
-    def _sum_points(self, own: Index, force: Array, count: int) -> TrackedContact:
-        """Return the contact whose traction is that at some points of the surface.
+    def _coarse_contact(self, sums: Array, count: int) -> TrackedContact:
+        """Return the contact of a region from integrals of the traction field.
 
         Args:
-            own: Indices (n,) of the points over which the traction is summed.
-            force: Force (M, 3), in N, on the square around each of the M points of the surface, in
-                the frame of the cube below the point.
-            count: Number of squares whose area is the area of the contact. These are the points
-                with a pressure above the threshold, which are fewer than n.
+            sums: Sums (10,) over the points around the region: normal force in N, shear force (3,)
+                in N, first moments (3,) of the pressure in N m, normals (3,) times normal forces.
+            count: Number of points of the region. Each one stands for a square of the surface, and
+                the area of the contact is that of these squares.
         """
         inverse = self._inverse
-        rotation = inverse.poses.rotation[inverse.cube[own]]
-        pressing = -force[own, 2]
-        normal_force = float(pressing.sum())
+        normal_force = float(sums[0])
+        shear = sums[1:4]
         divisor = max(normal_force, 1e-12)
-        normal = pressing @ rotation[:, :, 2] / divisor
+        normal = sums[7:] / divisor
         normal /= max(np.linalg.norm(normal), 1e-12)
-        shear = np.einsum("nij,nj->i", rotation[:, :, :2], force[own, :2])
         area = count * inverse.area
         deviation = COARSE_DEVIATION * abs(normal_force)
         return TrackedContact(
             id=-1,
-            position=pressing @ inverse.points[own] / divisor,
+            position=sums[4:7] / divisor,
             normal=normal,
             force=shear - normal * normal_force,
             normal_force=normal_force,

@@ -58,6 +58,10 @@ the traction on nodes (small contacts on a grid) is used instead. The misfit of 
 1 with a standard deviation of 0.12 for 9 cubes with 15 values each, and of 0.2 for planar
 cubes."""
 
+MAX_NEAR_MISFIT = 200.0
+"""Misfit (chi-squared per known value) up to which the first Hertz contact of a region is kept while
+other regions are near, whose contacts may cause the misfit. Two balls in one region have more."""
+
 MAX_BAD_SCANS = 5
 """Number of successive scans (sets of values of all cubes) with too large a misfit (chi-squared per
 known value) after which a fit on nodes (small contacts on a grid) is tried instead of Hertz
@@ -117,9 +121,9 @@ STEP_WORK = 5
 
 
 Respond = Callable[[Index], tuple[Array, Array]]
-"""Function that takes the indices of n cubes and returns their response to all regions of contact
-except the one that is being fitted: changes (n, C), in Pa, of their C measured components, and the
-standard deviations of these changes (n, C), in Pa."""
+"""Function that takes the indices of n cubes and returns the response of all cubes of the skin to
+all regions of contact, up to date for these n: changes (cubes, C), in Pa, of their C measured
+components, and the standard deviations of these changes (cubes, C), in Pa."""
 
 
 class Work(IntEnum):
@@ -325,7 +329,7 @@ class TrackedRegion:
         """Next step of the fit of this region."""
         fit = self.fit
         if fit is None:
-            return Work.NONE if self._is_tried else Work.BEGIN
+            return Work.NONE if self._is_tried or self._is_hertz_due else Work.BEGIN
         is_worse = self._is_misfit_larger
         if isinstance(fit, HertzFit):
             if fit.is_unsettled or (is_worse and fit.needs_linearisation):
@@ -347,17 +351,13 @@ class TrackedRegion:
             return Work.FIT
         return Work.NONE if fit.is_sharp else Work.SHARPEN
 
-    def improve(
-        self,
-        scaled: Array,
-        respond_to_others: Respond,
-    ) -> int:
+    def improve(self, scaled: Array, respond: Respond) -> int:
         """Make the next step of the fit (`next_work`).
 
         Args:
             scaled: The C measured components of stress and gradient (times d0, half the side of a
                 cube) of all cubes (cubes, C), in Pa.
-            respond_to_others: Function that returns the response of cubes to the other regions.
+            respond: Function that returns the response of cubes to all regions.
 
         Returns:
             Work of this step, in the unit of `MAX_WORK_PER_SCAN`.
@@ -365,8 +365,6 @@ class TrackedRegion:
         self.waited = 0
         work = self.next_work
         fit = self.fit
-        if fit is None and self._is_hertz_due:
-            return self._fit_hertz_directly(scaled, respond_to_others)
         if isinstance(fit, HertzFit) and work == Work.MOVE:
             return self._iterate(fit, scaled, 1)
         if isinstance(fit, NodeFit) and work == Work.CHOOSE:
@@ -377,7 +375,7 @@ class TrackedRegion:
             self._is_hertz_due = fit.is_sharp
             self._first_misfit = fit.shape_misfit
             return len(fit.places) // 2
-        return self._fit_nodes(scaled, respond_to_others)
+        return self._fit_nodes(scaled, respond)
 
     def _iterate(self, fit: HertzFit, scaled: Array, steps: int) -> int:
         """Make Gauss-Newton steps until the fit has converged.
@@ -400,36 +398,52 @@ class TrackedRegion:
                 break
         return work
 
-    def _fit_hertz_directly(
-        self,
-        scaled: Array,
-        respond_to_others: Respond,
-    ) -> int:
-        """Fit one Hertz contact, from the contact `start` that the linear inverse problem found.
+    @property
+    def needs_hertz_fit(self) -> bool:
+        """Whether the first fit of this region is due, and is that of a Hertz contact."""
+        return self.fit is None and self._is_hertz_due
 
-        The fit is kept if its steps have converged and its misfit is small. It is always kept if
-        other regions are near: their contacts may cause the misfit, which then falls when these
-        regions are fitted, too.
+    def begin_hertz_fit(self, total: Array, deviation: Array) -> HertzFit:
+        """Return a fit of one Hertz contact, at the contact `start` that the linear inverse problem
+        found.
+
+        Args:
+            total: Response (cubes, C), in Pa, of all cubes to all regions.
+            deviation: Standard deviation (cubes, C) of this response, in Pa.
         """
         home, discs = self.start
         self._is_hertz_due = False
-        cubes = self._inverse.near[home]
-        self._noise.update(scaled, cubes)
-        values = self._collect(home, cubes)
-        if not values.count:
-            self._is_tried = True
-            return 0
-        self.others, values.disturbance = respond_to_others(values.cubes)
-        values.refresh()
-        fit = HertzFit(self._inverse, values, discs)
-        work = self._iterate(fit, scaled, MAX_STEPS)
-        is_good = not fit.is_unsettled and fit.shape_misfit < MAX_HERTZ_MISFIT
-        if is_good or self.near:
+        self.waited = 0
+        values = self._collect(home, self._inverse.near[home])
+        self.subtract_others(values, total, deviation)
+        return HertzFit(self._inverse, values, discs)
+
+    def accept_if_good(self, fit: HertzFit) -> None:
+        """Keep a first fit if its steps have converged and its misfit is small.
+
+        It is always kept if other regions are near: their contacts may cause the misfit, which then
+        falls when these regions are fitted, too.
+        """
+        limit = MAX_NEAR_MISFIT if self.near else MAX_HERTZ_MISFIT
+        is_settled = not fit.is_unsettled or self.near
+        if fit.values.count and is_settled and fit.shape_misfit < limit:
             self._accept(fit)
             self._first_misfit = MAX_HERTZ_MISFIT / MAX_MISFIT_GROWTH
-        return work
 
-    def _fit_nodes(self, scaled: Array, respond_to_others: Respond) -> int:
+    def subtract_others(self, values: LocalValues, total: Array, deviation: Array) -> None:
+        """Set `others`, the response to the other regions that a fit subtracts from its values.
+
+        Args:
+            values: Values of the fit, whose `disturbance` is set.
+            total: Response (cubes, C), in Pa, of all cubes to all regions.
+            deviation: Standard deviation (cubes, C) of this response, in Pa.
+        """
+        cubes = values.cubes
+        own = self.response[cubes]
+        self.others = total[cubes] - own
+        values.disturbance = deviation[cubes] - self.relative_error * np.abs(own)
+
+    def _fit_nodes(self, scaled: Array, respond: Respond) -> int:
         """Fit the traction on nodes (small contacts on a grid) in place of the present fit, and
         return the work of it."""
         self._is_tried = True
@@ -451,7 +465,7 @@ class TrackedRegion:
         values = self._collect(home, cubes)
         if not values.count:
             return 0
-        self.others, values.disturbance = respond_to_others(values.cubes)
+        self.subtract_others(values, *respond(cubes))
         values.refresh()
         fit = NodeFit(inverse, self.points, values)
         white = values.whiten(scaled, self.others)
