@@ -47,22 +47,20 @@ MAX_REGIONS = 32
 """Largest number of regions of contact on one skin; those with the largest pressure are kept."""
 
 MAX_WORK_PER_SCAN = 40
-"""Computing work after which no further step of a fit is made in the same scan (set of values of
-all cubes).
+"""Computing work in one scan (set of values of all cubes) after which no further step of a fit is
+made; the remaining steps are made in the next scans.
 
 The unit is the time that a new fit takes per node (one of the small contacts whose sum is the
-traction of a region), so a new fit with 80 nodes counts 80. The limit bounds the time of a scan;
-the remaining steps are made in the next scans.
+traction of a region), so a new fit with 80 nodes counts 80.
 """
+
+MAX_NODE_UPDATES = 8
+"""Largest number of fits on nodes that are computed again for the values of one scan. If there are
+more, they take turns, and the others are reported as coarse."""
 
 FIRST_FIT_WORK = 20
 """Computing work, in the unit of `MAX_WORK_PER_SCAN`, of the first fit of a Hertz contact, which
 takes four to six Gauss-Newton steps."""
-
-MAX_FIT_STEPS = 12
-"""Largest number of steps (new fits and improvements of fits) in one scan (set of values of all
-cubes), divided by the number of regions of contact. It ends a scan whose work is not limited by
-`MAX_WORK_PER_SCAN`."""
 
 MATCH_PITCHES = 1.0
 """Largest distance that a contact moves between two scans, divided by the pitch (distance of
@@ -156,8 +154,8 @@ class ContactTracker:
             values: Components (cubes, 15) in Pa and Pa/m, NaN where unknown.
             uncertain: Whether the compensation of each cube is uncertain, so that a new contact
                 needs `UNCERTAIN_PRESSURE`; None: of no cube.
-            max_work: Work, in the unit of `MAX_WORK_PER_SCAN`, after which no further fit is made
-                or improved in this scan. Infinite: all fits are improved as far as possible.
+            max_work: As `MAX_WORK_PER_SCAN`. 0: no fit is made or improved. Infinite: all fits are
+                improved as far as possible.
 
         Returns:
             Contacts, the one with the largest normal force first.
@@ -171,9 +169,8 @@ class ContactTracker:
         self._noise.update(scaled, self._fitted_cubes)
         for region in regions:
             region.drop_nodes_of_other_values()
-        hertz_fits = [fit for fit in self._fits if isinstance(fit, HertzFit)]
-        linearise(inverse, [fit for fit in hertz_fits if fit.needs_linearisation])
-        self._update_fits()
+        fitted = self._choose_updates(max_work)
+        self._update_fits(fitted)
 
         # Contacts in regions without a fit are integrals of the traction field.
         coarse = {}
@@ -182,15 +179,16 @@ class ContactTracker:
             coarse = dict(zip(unfitted, self._integrate_field(unfitted, field), strict=True))
             for region, contact in coarse.items():
                 region.start = self._start_of_fit(contact)
-        self._improve_fits(max_work)
+        if max_work > 0:
+            self._improve_fits(max_work)
 
         contacts = []
         for region in regions:
             if region.fit is None:
                 contacts.append(coarse[region])
                 continue
-            is_refined = region.has_fitted_neighbours
-            for one in region.fit.estimate_contacts():
+            is_refined = region.has_fitted_neighbours and region.is_updated
+            for one in region.estimate_contacts():
                 contacts.append(self._to_parent_frame(one, region.fit, is_refined))
         return self._number_contacts([one for one in contacts if one.normal_force > 0])
 
@@ -296,24 +294,43 @@ class ContactTracker:
         to_points = np.minimum.reduceat(cdist(points, points), starts, axis=0)
         return np.asarray(np.minimum.reduceat(to_points, starts, axis=1))
 
-    def _update_fits(self) -> None:
-        """Compute all fits for the newest values.
+    def _choose_updates(self, max_work: float) -> list[TrackedRegion]:
+        """Return the regions whose fits are computed for the newest values: all fits of Hertz
+        contacts, and those fits on nodes that have waited longest (`MAX_NODE_UPDATES`).
+
+        Args:
+            max_work: Largest work of the scan; infinite: all regions are chosen.
+        """
+        nodes = [region for region in self._regions if isinstance(region.fit, NodeFit)]
+        waiting = []
+        if np.isfinite(max_work):
+            nodes.sort(key=lambda region: -region.age)
+            waiting = nodes[MAX_NODE_UPDATES:]
+        fitted = [region for region in self._regions if region.fit is not None]
+        return [region for region in fitted if region not in waiting]
+
+    def _update_fits(self, chosen: list[TrackedRegion]) -> None:
+        """Compute fits for the newest values.
 
         The response of the cubes to the other regions is subtracted from their values before.
+
+        Args:
+            chosen: Regions whose fits are computed.
         """
+        fits = [region.fit for region in chosen]
+        moved = [fit for fit in fits if isinstance(fit, HertzFit) and fit.needs_linearisation]
+        linearise(self._inverse, moved)
         fitted = [region for region in self._regions if region.fit is not None]
-        if not fitted:
-            return
         if len(fitted) > 1:
             update_responses(self._inverse, fitted, self._fitted_cubes)
         total, deviation = self._sum_responses()
-        for region in fitted:
-            if region.fit is not None:
-                region.subtract_others(region.fit.values, total, deviation)
-                region.fit.step(region.fit.values.whiten(self._scaled, region.others))
+        for region, fit in zip(chosen, fits, strict=True):
+            if fit is not None:
+                region.subtract_others(fit.values, total, deviation)
+                region.step(fit, self._scaled)
                 if region.near:
-                    cubes = region.fit.values.cubes
-                    explained = region.fit.explained
+                    cubes = fit.values.cubes
+                    explained = fit.explained
                     total[cubes] += explained - region.response[cubes]
                     region.response[cubes] = explained
 
@@ -365,18 +382,19 @@ class ContactTracker:
         """Make and improve fits of regions, the most urgent first (`Work`), up to a limit of work.
 
         Args:
-            max_work: Work, in the unit of `MAX_WORK_PER_SCAN`, after which no further fit is made
-                or improved in this scan.
+            max_work: Work that is left in this scan, in the unit of `MAX_WORK_PER_SCAN`.
         """
-        regions = self._regions
         spent = self._begin_hertz_fits(max_work)
-        for _ in range(MAX_FIT_STEPS * len(regions)):
-            # Among equally urgent regions, the one that has waited longest comes first.
-            order = [(region.next_work, -region.waited) for region in regions]
-            number = min(range(len(regions)), key=order.__getitem__)
-            if spent >= max_work or order[number][0] == Work.NONE:
+        # Among equally urgent regions, the one that has waited longest comes first.
+        order = [(region.next_work, -region.waited) for region in self._regions]
+        while order:
+            number = min(range(len(order)), key=order.__getitem__)
+            region = self._regions[number]
+            work, _ = order[number]
+            if work == Work.NONE or spent >= max_work:
                 break
-            spent += regions[number].improve(self._scaled, self._respond)
+            spent += region.improve(work, self._scaled, self._respond)
+            order[number] = region.next_work, -region.waited
 
     def _begin_hertz_fits(self, max_work: float) -> float:
         """Fit a Hertz contact to each region that has no fit yet, as far as the work allows.
@@ -391,7 +409,7 @@ class ContactTracker:
         """
         due = [region for region in self._regions if region.needs_hertz_fit]
         due.sort(key=lambda region: -region.waited)
-        n_fits = min(len(due), max_work // FIRST_FIT_WORK)
+        n_fits = min(len(due), max(max_work // FIRST_FIT_WORK, 1))
         due = due[: int(n_fits)]
         if not due:
             return 0
@@ -404,7 +422,7 @@ class ContactTracker:
         for _ in range(MAX_STEPS):
             linearise(self._inverse, [fit for _, fit in moving])
             for region, fit in moving:
-                fit.step(fit.values.whiten(self._scaled, region.others))
+                region.step(fit, self._scaled)
             moving = [(region, fit) for region, fit in moving if fit.needs_linearisation]
             if not moving:
                 break
@@ -463,7 +481,7 @@ class ContactTracker:
         shear = sums[1:4]
         divisor = max(normal_force, 1e-12)
         normal = sums[7:] / divisor
-        normal /= max(np.linalg.norm(normal), 1e-12)
+        normal /= max(float(np.linalg.norm(normal)), 1e-12)
         area = count * inverse.area
         deviation = COARSE_DEVIATION * abs(normal_force)
         return TrackedContact(

@@ -162,6 +162,8 @@ class NodeFit:
         self._white_response = white.reshape(n_values, 3, -1)
         self._peak_width = _PEAK_WIDTH * inverse.depth
         self.is_sharp = False
+        # Contacts of the present posterior and labels, computed when they are needed.
+        self._estimates: list[ContactEstimate] | None = None
         # The sensitivity (n, C, S) holds the changes of the values, in Pa, by one standard
         # deviation of each of S quantities of the elastomer, the depth first. It is known after the
         # first step; until then one column of zeros stands for the depth.
@@ -238,6 +240,7 @@ class NodeFit:
             root=root.reshape(3, n_nodes, -1),
             score=float(scores[best]),
         )
+        self._estimates = None
 
     def update_sensitivity(self) -> None:
         """Compute how the values change by errors of depth, thickness and Poisson's ratio of the
@@ -294,6 +297,7 @@ class NodeFit:
         reach = 1.5 * self.spacing
         is_neighbour = self._squared_distances < reach**2
         self.labels = split_peaks(pressure, root, is_neighbour)
+        self._estimates = None
 
     @property
     def explained(self) -> Array:
@@ -313,6 +317,8 @@ class NodeFit:
 
     def estimate_contacts(self) -> list[ContactEstimate]:
         """Return force, centre, moment and area of each contact of the region, by integration."""
+        if self._estimates is not None:
+            return self._estimates
         estimates = []
         n_contacts = self.labels.max() + 1
         for label in range(n_contacts):
@@ -322,6 +328,7 @@ class NodeFit:
             root = self.posterior.root[:, own]
             estimate = estimate_contact(places, forces, root, self.size)
             estimates.append(estimate)
+        self._estimates = estimates
         return estimates
 
     @property

@@ -16,7 +16,7 @@ import numpy as np
 
 from ...core.arrays import Array, Index
 from ..inverse import SurfaceInverse
-from .contact_estimate import Discs, discs_of
+from .contact_estimate import ContactEstimate, Discs, discs_of
 from .hertz_fit import HertzFit, linearise
 from .local_values import MIN_FACING, CubeNoise, LocalValues
 from .node_fit import NodeFit
@@ -59,8 +59,9 @@ the traction on nodes (small contacts on a grid) is used instead. The misfit of 
 cubes."""
 
 MAX_NEAR_MISFIT = 200.0
-"""Misfit (chi-squared per known value) up to which the first Hertz contact of a region is kept while
-other regions are near, whose contacts may cause the misfit. Two balls in one region have more."""
+"""Misfit (chi-squared per known value) up to which the first Hertz contact of a region is kept
+while other regions are near, whose contacts may cause the misfit. Two balls that are fitted as one
+contact have a larger one."""
 
 MAX_BAD_SCANS = 5
 """Number of successive scans (sets of values of all cubes) with too large a misfit (chi-squared per
@@ -92,9 +93,10 @@ HOME_PITCHES = 0.55
 which the skin is laid flat for the fit, in pitches (distances of neighbouring cubes). Beyond this
 distance, the cube nearest to the contacts becomes the home cube."""
 
-MAX_STALE_CHANGE = 0.003
+MAX_STALE_CHANGE = 0.06
 """Largest relative change of a region's contacts up to which the stress that they cause in distant
-cubes is not computed again.
+cubes is not computed again, divided by the relative deviation of this stress (`FIT_ERROR`,
+`START_ERROR`).
 
 The relative change is the larger one of two ratios: the shift of the contacts divided by the
 distance of the nearest other region, and the change of force divided by the largest force.
@@ -151,6 +153,7 @@ class TrackedRegion:
 
     Attributes:
         points: Indices (k,) of the k points of the surface in the region, in the newest scan.
+        cubes: Indices (m,) of the cubes below these points.
         peak: Largest pressure in Pa in the region, at the depth of the cubes' centres.
         near: Other regions within `NEIGHBOUR_REACH_PITCHES`. Their contacts change the values of
             the same cubes, so the fit of this region subtracts the response to them.
@@ -161,10 +164,12 @@ class TrackedRegion:
         start: Index of the home cube (around which the skin is laid flat; its frame is that of the
             fit) and the Hertz contact at which the first fit begins.
         waited: Number of scans (sets of values of all cubes) since the fit was last improved.
+        age: Number of scans since the fit was last computed for new values.
     """
 
     def __init__(self, inverse: SurfaceInverse, noise: CubeNoise) -> None:
         self.points: Index = np.zeros(0, np.intp)
+        self.cubes: Index = np.zeros(0, np.intp)
         self.peak = 0.0
         self.near: list[TrackedRegion] = []
         self.fit: HertzFit | NodeFit | None = None
@@ -174,6 +179,7 @@ class TrackedRegion:
         self.response = np.zeros((n_cubes, len(inverse.columns)))
         self._responding = np.zeros(n_cubes, bool)
         self.waited = 0
+        self.age = 0
         self._inverse = inverse
         self._noise = noise
         self._fitted_points = self.points
@@ -183,8 +189,10 @@ class TrackedRegion:
         self._is_hertz_due = inverse.pitch < MAX_DIRECT_PITCH * inverse.depth
         self._is_tried = False
         self._bad_scans = 0
+        self._steps = 0
+        self._updated_peak = 1.0
         self.start: tuple[int, Discs]
-        self._responded: tuple[int, Discs]
+        self._responded = -1, Discs(np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0))
 
     def begin_scan(self, points: Index, peak: float) -> None:
         """Begin a new scan (set of values of all cubes), and move Hertz contacts to where they are
@@ -196,10 +204,14 @@ class TrackedRegion:
             points: Indices of the points of the surface that form the region in this scan.
             peak: Largest pressure in Pa at these points, at the depth of the cubes' centres.
         """
-        self.points = points
+        if points is not self.points:
+            self.points = points
+            self.cubes = np.unique(self._inverse.cube[points])
         self.peak = peak
         self.waited += 1
+        self.age += 1
         self._is_tried = False
+        self._steps = 0
         fit = self.fit
         is_bad = self._is_misfit_larger and self.has_fitted_neighbours
         self._bad_scans = self._bad_scans + 1 if is_bad else 0
@@ -239,10 +251,9 @@ class TrackedRegion:
         values = fit.values
         found = fit.found
         below = values.nearest_cubes(found.centres)
-        cubes_below_points = inverse.cube[self.points]
-        cubes_of_region = inverse.near[cubes_below_points, : NEAREST_CUBES[-1]]
-        is_below = cubes_of_region == below[:, None, None]
-        is_in_region = is_below.any(axis=(1, 2))
+        around = inverse.near[self.cubes, : NEAREST_CUBES[-1]]
+        is_around = around[:, :, None] == below
+        is_in_region = is_around.any(axis=(0, 1))
         presses = found.forces[:, 2] < 0
         if not (is_in_region & presses).all():
             self.fit = None
@@ -291,26 +302,29 @@ class TrackedRegion:
             return self.fit.values.home, self.fit.discs
         return self.start
 
-    def is_response_stale(self, cubes: Index) -> bool:
-        """Return whether the stored stress that this region causes in some cubes is out of date.
+    def stale_cubes(self, cubes: Index) -> Index:
+        """Return those of some cubes for which the stored response to this region is out of date.
 
-        It is if it was not computed for all of these cubes, or if the contacts of the region have
+        Those are cubes for which it was not computed, or all if the contacts of the region have
         changed by more than `MAX_STALE_CHANGE` since.
+
+        Args:
+            cubes: Indices (n,) of the cubes.
         """
-        if not self._responding[cubes].all():
-            return True
         home, discs = self.discs
         old_home, old = self._responded
-        if home != old_home:
-            return True
-        if len(old.forces) != len(discs.forces):
-            return True
-        shift = np.abs(discs.centres - old.centres)
-        relative_shift = shift.max() / self.gap
-        force_change = np.abs(discs.forces - old.forces)
-        largest_force = np.abs(discs.forces).max()
-        relative_change = force_change.max() / largest_force
-        return bool(max(relative_shift, relative_change) > MAX_STALE_CHANGE)
+        if home == old_home and len(old.forces) == len(discs.forces):
+            shift = np.abs(discs.centres - old.centres)
+            relative_shift = shift.max() / self.gap
+            force_change = np.abs(discs.forces - old.forces)
+            largest_force = np.abs(discs.forces).max()
+            relative_change = force_change.max() / largest_force
+            limit = MAX_STALE_CHANGE * self.relative_error
+            if max(relative_shift, relative_change) < limit:
+                return cubes[~self._responding[cubes]]
+        self._responding[:] = False
+        self._responded = home, discs
+        return cubes
 
     def take_response(self, cubes: Index, response: Array) -> None:
         """Store the newest response of some cubes to this region.
@@ -320,9 +334,17 @@ class TrackedRegion:
             response: Change (n, C), in Pa, of their C measured components by this region.
         """
         self.response[cubes] = response
-        self._responding[:] = False
         self._responding[cubes] = True
-        self._responded = self.discs
+
+    @property
+    def _moved_share(self) -> float:
+        """Share of the points that have joined the region since its last fit, or that have left it;
+        the larger one of the two."""
+        new, old = self.points, self._fitted_points
+        if new is old:
+            return 0.0
+        common = np.intersect1d(new, old, assume_unique=True)
+        return 1 - len(common) / max(len(new), len(old))
 
     @property
     def next_work(self) -> Work:
@@ -332,7 +354,8 @@ class TrackedRegion:
             return Work.NONE if self._is_tried or self._is_hertz_due else Work.BEGIN
         is_worse = self._is_misfit_larger
         if isinstance(fit, HertzFit):
-            if fit.is_unsettled or (is_worse and fit.needs_linearisation):
+            is_moving = fit.is_unsettled or (is_worse and fit.needs_linearisation)
+            if is_moving and self._steps < MAX_STEPS:
                 return Work.MOVE
             if self._is_tried:
                 return Work.NONE
@@ -341,20 +364,18 @@ class TrackedRegion:
             return Work.FIT if is_given_up else Work.NONE
         if self._is_hertz_due:
             return Work.CHOOSE
-        peak_ratio = self.peak / self._fitted_peak
-        peak_change = abs(peak_ratio - 1)
-        joined = _new_share(self.points, self._fitted_points)
-        left = _new_share(self._fitted_points, self.points)
-        is_changed = max(peak_change, joined, left) > MAX_CHANGE
+        peak_change = abs(self.peak / self._fitted_peak - 1)
+        is_changed = max(peak_change, self._moved_share) > MAX_CHANGE
         is_outdated = is_changed or is_worse or self._have_others_changed(fit)
         if is_outdated and not self._is_tried:
             return Work.FIT
         return Work.NONE if fit.is_sharp else Work.SHARPEN
 
-    def improve(self, scaled: Array, respond: Respond) -> int:
-        """Make the next step of the fit (`next_work`).
+    def improve(self, work: Work, scaled: Array, respond: Respond) -> int:
+        """Make the next step of the fit.
 
         Args:
+            work: Kind of the step (`next_work`).
             scaled: The C measured components of stress and gradient (times d0, half the side of a
                 cube) of all cubes (cubes, C), in Pa.
             respond: Function that returns the response of cubes to all regions.
@@ -363,9 +384,9 @@ class TrackedRegion:
             Work of this step, in the unit of `MAX_WORK_PER_SCAN`.
         """
         self.waited = 0
-        work = self.next_work
         fit = self.fit
         if isinstance(fit, HertzFit) and work == Work.MOVE:
+            self._steps += 1
             return self._iterate(fit, scaled, 1)
         if isinstance(fit, NodeFit) and work == Work.CHOOSE:
             return self._replace_by_hertz(fit, scaled)
@@ -376,6 +397,43 @@ class TrackedRegion:
             self._first_misfit = fit.shape_misfit
             return len(fit.places) // 2
         return self._fit_nodes(scaled, respond)
+
+    def step(self, fit: HertzFit | NodeFit, scaled: Array) -> None:
+        """Compute a fit of this region for the newest values.
+
+        Args:
+            fit: The fit; a `HertzFit` makes a Gauss-Newton step.
+            scaled: Values (cubes, C), in Pa, of all cubes.
+        """
+        self.age = 0
+        self._updated_peak = self.peak
+        fit.step(fit.values.whiten(scaled, self.others))
+
+    @property
+    def is_updated(self) -> bool:
+        """Whether the fit was computed for the newest values."""
+        return self.age == 0
+
+    def estimate_contacts(self) -> list[ContactEstimate]:
+        """Return the contacts of the fit, scaled with the pressure if it is that of older values.
+
+        The stated deviation of a force then includes its whole change.
+        """
+        if self.fit is None:
+            return []
+        estimates = self.fit.estimate_contacts()
+        if self.is_updated:
+            return estimates
+        growth = self.peak / self._updated_peak - 1
+        scaled = []
+        for one in estimates:
+            change = growth * one.force
+            covariance = one.force_covariance + np.outer(change, change)
+            moment = (1 + growth) * one.moment
+            scaled.append(
+                one._replace(force=one.force + change, force_covariance=covariance, moment=moment)
+            )
+        return scaled
 
     def _iterate(self, fit: HertzFit, scaled: Array, steps: int) -> int:
         """Make Gauss-Newton steps until the fit has converged.
@@ -454,9 +512,8 @@ class TrackedRegion:
         distance = np.linalg.norm(from_centre, axis=1)
         central_point = distance.argmin()
         home = int(below[central_point])
-        cubes_below = np.unique(below)
         for count in NEAREST_CUBES:
-            cubes = np.unique(inverse.near[cubes_below, :count])
+            cubes = np.unique(inverse.near[self.cubes, :count])
             if len(cubes) <= MAX_CUBES:
                 break
         else:
@@ -505,6 +562,8 @@ class TrackedRegion:
         If later scans differ from it too much, the region is fitted again.
         """
         self.fit = fit
+        self.age = 0
+        self._updated_peak = self.peak
         self._fitted_points = self.points
         self._fitted_peak = self.peak
         self._fitted_others = self.others
@@ -526,9 +585,10 @@ def update_responses(
         regions: Regions whose `response` is computed.
         cubes: Indices (n,) of the cubes.
     """
-    stale = [region for region in regions if region.is_response_stale(cubes)]
+    stale = [(region, region.stale_cubes(cubes)) for region in regions]
+    stale = [(region, own) for region, own in stale if len(own)]
     if stale:
-        _update_stale_responses(inverse, stale, cubes)
+        _update_stale_responses(inverse, stale)
     for region in regions:
         fit = region.fit
         if fit is not None:
@@ -536,57 +596,37 @@ def update_responses(
 
 
 def _update_stale_responses(
-    inverse: SurfaceInverse, regions: Sequence[TrackedRegion], cubes: Index
+    inverse: SurfaceInverse, stale: Sequence[tuple[TrackedRegion, Index]]
 ) -> None:
     """Compute the response of cubes to the Hertz contacts of all regions in one call.
 
     Args:
         inverse: Poses and responses of the skin.
-        regions: Regions, at least one, whose response is computed.
-        cubes: Indices (n,) of the cubes.
+        stale: Regions, at least one, and the indices of the cubes whose response is computed.
     """
-    homes = np.array([region.discs[0] for region in regions])
-    discs = [region.discs[1] for region in regions]
-    counts = np.array([len(one.forces) for one in discs])
-    forces = np.concatenate([one.forces for one in discs])
-    centres = np.concatenate([one.centres for one in discs])
-    log_sizes = np.concatenate([one.log_sizes for one in discs])
-    n_discs = len(forces)
-    n_cubes = len(cubes)
-    region_of_disc = np.repeat(np.arange(len(regions)), counts)
-
-    unrolled = [inverse.unroll(home, cubes) for home in homes.tolist()]
-    places, angles = zip(*unrolled, strict=True)
-    place = np.stack(places)[region_of_disc]
-    angle = np.stack(angles)[region_of_disc]
-    offset = place - centres[:, None]
-    variant = np.tile(inverse.variant[cubes], n_discs)
-    sizes = np.repeat(np.exp(log_sizes), n_cubes)
-    # On a bent skin, cubes that face away from a contact do not respond to it.
     normals = inverse.poses.rotation[:, :, 2]
-    cosines = normals[homes] @ normals[cubes].T
-    is_facing = cosines > MIN_FACING
-    acts_on_cube = is_facing[region_of_disc]
-    acting_forces = acts_on_cube[:, :, None] * forces[:, None]
-    response = inverse.contact_response.response_to_forces(
-        offset.reshape(-1, 2),
-        angle.ravel(),
-        variant,
-        sizes,
-        acting_forces.reshape(-1, 3),
-    )
-    measured = response[:, inverse.columns]
-    by_disc = measured.reshape(n_discs, n_cubes, -1)
-    first_disc = np.cumsum(counts) - counts
-    by_region = np.add.reduceat(by_disc, first_disc, axis=0)
-    for region, own in zip(regions, by_region, strict=True):
-        region.take_response(cubes, own)
-
-
-def _new_share(new: Index, old: Index) -> float:
-    """Return the fraction (0 to 1) of the indices in `new` that are not in `old`; 0 if `new` is
-    empty."""
-    if not len(new):
-        return 0.0
-    is_old = np.isin(new, old)
-    return 1 - float(is_old.mean())
+    offsets, angles, sizes, forces, all_cubes = [], [], [], [], []
+    for region, cubes in stale:
+        home, discs = region.discs
+        place, angle = inverse.unroll(home, cubes)
+        # On a bent skin, cubes that face away from a contact do not respond to it.
+        is_facing = normals[cubes] @ normals[home] > MIN_FACING
+        for force, centre, log_size in zip(*discs, strict=True):
+            offsets.append(place - centre)
+            angles.append(angle)
+            sizes.append(np.full(len(cubes), np.exp(log_size)))
+            forces.append(is_facing[:, None] * force)
+            all_cubes.append(cubes)
+    measured = inverse.contact_response.response_to_forces(
+        np.concatenate(offsets),
+        np.concatenate(angles),
+        inverse.variant[np.concatenate(all_cubes)],
+        np.concatenate(sizes),
+        np.concatenate(forces),
+    )[:, inverse.columns]
+    first = 0
+    for region, cubes in stale:
+        end = first + len(region.discs[1].forces) * len(cubes)
+        by_disc = measured[first:end].reshape(-1, len(cubes), measured.shape[1])
+        region.take_response(cubes, by_disc.sum(axis=0))
+        first = end
