@@ -397,11 +397,9 @@ def _solve(
 
     normal = weighted.T @ weighted
     # The prior of the last unknown: at the start, the temperature of the elastomer differs from the
-    # measured one by about 1 K. It counts as often as there are blocks within the longest lag,
-    # because the errors of so many blocks are alike, and together tell no more than one.
+    # measured one by about 1 K.
     start_deviation = START_KELVIN * max(slope, 1.0)
-    n_alike = lags[0] / (BLOCK_NS * 1e-9)
-    normal[-1, -1] += n_alike / start_deviation**2
+    normal[-1, -1] += 1 / start_deviation**2
     values = np.linalg.solve(normal, weighted.T @ stress)
 
     residual = (data.stress - columns @ values) * weight[:, None]
