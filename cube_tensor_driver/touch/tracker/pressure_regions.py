@@ -23,12 +23,13 @@ RELEASE_FRACTION = 0.75
 belonged to a contact in the previous scan (set of values of all cubes). This hysteresis keeps noise
 from changing the regions of contact in every scan."""
 
-UNCERTAIN_PRESSURE = 600.0
+UNCERTAIN_PRESSURE = 1200.0
 """Smallest pressure, in Pa at the depth of the cubes' centres, of a new contact above a cube whose
 compensation is uncertain (status bit COMPENSATION).
 
 When the ground of nine unloaded cubes 24 mm apart warmed by 15 K within a minute, the compensated
-values gave up to 402 Pa; with smaller distances they gave less.
+values gave up to 402 Pa, and up to 860 Pa if they had been tared before, because a tare removes the
+error of the fit at rest, which cancels a part. With smaller distances they gave less.
 """
 
 JOIN_PITCHES = 1.25
