@@ -13,8 +13,8 @@ import numpy as np
 from rich.console import Console
 
 from cube_tensor_driver.config.calibration import (
+    find_shipped_calibration,
     read_calibration,
-    shipped_calibration,
     write_calibration,
 )
 from cube_tensor_driver.config.yaml import write_yaml
@@ -29,7 +29,7 @@ from cube_tensor_driver.mechanics.influence import write_influence
 from cube_tensor_driver.views.terminal.output import print_table, say
 
 from .fem.body import Body
-from .fem.fem import Response, calibration_from_fem
+from .fem.fem import Response, make_calibration_from_fem
 from .fem.volume_loads import ThermalStress, VolumeResponse
 from .studies.layout_study import DEPTH, LayoutStudy
 from .studies.surface_study import SurfaceRow, SurfaceStudy
@@ -182,7 +182,7 @@ def _write_response(
     # A body without the symmetry would lose a part of its response in the coefficients.
     needs_matrix = result.structure_residual > MAX_STRUCTURE_RESIDUAL
     source = f"computed by {command}"
-    calibration = calibration_from_fem(result, needs_matrix, neglect, source)
+    calibration = make_calibration_from_fem(result, needs_matrix, neglect, source)
     # A pad is crushed where its stress reaches the modulus of its foam.
     to_pressure = result.matrix[:, result.modes.index("zz")]
     largest = np.abs(to_pressure).max()
@@ -255,7 +255,7 @@ def _show_volume(result: VolumeResponse) -> None:
     print_table(("pad",), heads, rows, title=title)
     if result.change is not None:
         say(f"change from the mesh before: {100 * result.change:.2g} %")
-    calibration = shipped_calibration(result.layout)
+    calibration = find_shipped_calibration(result.layout)
     if calibration is None:
         return
     matrix = Pipeline([calibration]).matrix(0)
@@ -277,7 +277,7 @@ def _write_weight(
     """Write the base calibration, by default the shipped one of the layout, with the response to
     specific force."""
     body, layout = result.body, result.layout
-    old = read_calibration(base) if base else shipped_calibration(layout)
+    old = read_calibration(base) if base else find_shipped_calibration(layout)
     if old is None or not old.layout.same_as(layout):
         raise ConfigError(
             f"--base: the weight is that of a cube with the layout {layout.name!r}, and "
@@ -300,7 +300,7 @@ def draw(result: Result, folder: Path) -> None:
 
     from .figures.deformation import draw_loads
     from .figures.response import draw_convergence, draw_influence, draw_response
-    from .paper.experiments import mode_deformations
+    from .paper.experiments import compute_mode_deformations
 
     folder.mkdir(parents=True, exist_ok=True)
     body, layout = result.body, result.layout
@@ -311,7 +311,7 @@ def draw(result: Result, folder: Path) -> None:
         save(draw_convergence(result), folder / "convergence.png")
         save(draw_response(result), folder / "response.png")
         if layout.planar:
-            save(draw_loads(layout, mode_deformations(body, layout)), folder / "loads.png")
+            save(draw_loads(layout, compute_mode_deformations(body, layout)), folder / "loads.png")
     print(f"pictures in {folder}")
 
 

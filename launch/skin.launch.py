@@ -12,9 +12,9 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import ExecutableInPackage
 
-from cube_tensor_driver.config.output_files import temporary_folder
+from cube_tensor_driver.config.output_files import make_temporary_folder
 from cube_tensor_driver.config.skin import Skin
-from cube_tensor_driver.config.urdf import skin_urdf
+from cube_tensor_driver.config.urdf import make_skin_urdf
 from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, skin_processes
 from cube_tensor_driver.ros.launching import (
     DEMO_LOAD,
@@ -22,10 +22,10 @@ from cube_tensor_driver.ros.launching import (
     check_arguments,
     declare_switch,
     declare_text,
-    parameter_file,
     record_skin,
-    rviz_file,
     stay_ended,
+    write_parameter_file,
+    write_rviz_file,
 )
 
 PACKAGE = "cube_tensor_driver"
@@ -105,7 +105,7 @@ def start_skin(context: LaunchContext) -> list[Action]:
     if "simulate" in wanted:
         # Each launch makes a new folder for the pseudo-terminals of its simulated hubs, so that two
         # simulated skins on one host do not use the same paths.
-        ports = temporary_folder("cube_ports_")
+        ports = make_temporary_folder("cube_ports_")
         simulated = SimulatedHubs(ports, given.load, noise=None)
     processes = skin_processes(
         given.config,
@@ -126,7 +126,7 @@ def start_skin(context: LaunchContext) -> list[Action]:
                 package="rviz2",
                 executable="rviz2",
                 namespace=namespace,
-                arguments=["-d", rviz_file(given.skin)],
+                arguments=["-d", write_rviz_file(given.skin)],
             )
         )
     return actions
@@ -153,7 +153,7 @@ def make_action(process: Process, given: SkinArguments) -> Action:
         # them would get it.
         name=None if name == "composed" else name,
         namespace=given.texts["namespace"],
-        parameters=[parameter_file(parameters)],
+        parameters=[write_parameter_file(parameters)],
         output="screen",
         emulate_tty=True,
         respawn="respawn" in given.switched_on,
@@ -168,7 +168,7 @@ def make_state_publisher(skin: Skin, namespace: str) -> Node:
     Its node and its topic have names of their own, because the robot's own robot_state_publisher
     may run in the same namespace.
     """
-    urdf = ParameterValue(skin_urdf(skin), value_type=str)
+    urdf = ParameterValue(make_skin_urdf(skin), value_type=str)
     return Node(
         package="robot_state_publisher",
         executable="robot_state_publisher",

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from cube_tensor_driver.bags.metadata import quality, typestore
+from cube_tensor_driver.bags.metadata import make_typestore, quality
 from cube_tensor_driver.bags.write import BagWriter
-from cube_tensor_driver.config.calibration import calibration_text
+from cube_tensor_driver.config.calibration import format_calibration
 from cube_tensor_driver.config.skin import Elastomer, read_skin
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rows import FrequencyRows
@@ -24,7 +24,7 @@ WRENCH = "geometry_msgs/msg/WrenchStamped"
 
 
 def message(kind: str, **fields: object) -> object:
-    return typestore().types[kind](**fields)
+    return make_typestore().types[kind](**fields)
 
 
 def header(stamp_ns: int, frame_id: str = "skin_base") -> object:
@@ -71,7 +71,7 @@ def info_of(
         name=skin.name,
         cubes=cubes,
         calibration_ids=list(kinds),
-        calibrations=[calibration_text(kind) for kind in kinds.values()],
+        calibrations=[format_calibration(kind) for kind in kinds.values()],
         covariance=np.zeros(225 * len(kinds)),
         elastomer_depth=elastomer.depth,
         elastomer_thickness=elastomer.thickness,
@@ -142,7 +142,7 @@ def make_bag(
     """
     skin = read_skin(skin_file)
     pipeline = Pipeline([cube.calibration for cube in skin.cubes], np.float32)
-    store = typestore()
+    store = make_typestore()
 
     def put(topic: str, time_ns: int, one: object) -> None:
         writer.write(topic, time_ns, bytes(store.serialize_cdr(one, one.__msgtype__)))

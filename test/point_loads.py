@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cube_tensor_design.studies.field_study import field_below
+from cube_tensor_design.studies.field_study import compute_field_below
 from cube_tensor_driver.core.defaults import POISSONS_RATIO
 from cube_tensor_driver.core.modes import to_matrix
 from cube_tensor_driver.core.poses import CubePoses
@@ -25,7 +25,7 @@ def in_cubes(field: np.ndarray, rotation: np.ndarray) -> np.ndarray:
 
 def below(poses: CubePoses, depth: float, load: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     """(cubes, 15) of each cube in its own frame. load: positions and forces (L, 3)."""
-    field = field_below(poses.position, depth, load, POISSONS_RATIO)
+    field = compute_field_below(poses.position, depth, load, POISSONS_RATIO)
     return in_cubes(field, poses.rotation)
 
 

@@ -19,8 +19,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cube_tensor_design.studies.field_study import field_below
-from cube_tensor_design.studies.traction_study import TractionBench, flat_punch
+from cube_tensor_design.studies.field_study import compute_field_below
+from cube_tensor_design.studies.traction_study import TractionBench, make_flat_punch
 from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.defaults import FREQUENCY_NOISE, YOUNGS_MODULUS
 from cube_tensor_driver.core.oscillator import pad_frequency
@@ -72,7 +72,7 @@ class Body:
         """Positions (L, 3) in m and forces (L, 3) in N on the skin."""
         radius = self.radius(normal)
         if not self.is_ball:
-            return flat_punch(radius, np.array([*shear, -normal]), centre, ORDER)
+            return make_flat_punch(radius, np.array([*shear, -normal]), centre, ORDER)
         pull = np.linalg.norm(shear)
         limit = self.friction * normal
         share = max(0.0, 1 - pull / limit)
@@ -106,7 +106,7 @@ class RubbedSkin:
     def pads_under(self, load: tuple[Array, Array]) -> Array:
         """Stress (cubes, P) in Pa of each pad under point forces."""
         cubes, setting = self.bench.poses.position[:, :2], self.bench.setting
-        return self.bench.pads_in(field_below(cubes, setting.depth, load, setting.poisson))
+        return self.bench.pads_in(compute_field_below(cubes, setting.depth, load, setting.poisson))
 
     def measure(self, pads: Array) -> Array:
         """Components (scans, cubes, 15) that the pipeline computes from pads (scans, cubes, P)."""

@@ -21,7 +21,7 @@ import pytest
 from conftest import ROOT
 from cube_tensor_driver.cli.main import main
 from cube_tensor_driver.cli.table import COMMANDS
-from cube_tensor_driver.config.grid import grid
+from cube_tensor_driver.config.grid import describe_grid
 from cube_tensor_driver.config.yaml import write_yaml
 
 sys.path.insert(0, str(ROOT / "tools"))
@@ -329,7 +329,7 @@ def test_set_up_reports_its_progress_without_a_terminal(tmp_path, capsys):
 @pytest.mark.parametrize("words", ["--help", "urdf {skin}"])
 def test_a_reader_that_has_enough_is_no_error(words, tmp_path):
     skin = tmp_path / "skin.yaml"
-    write_yaml(skin, grid(nx=20, ny=20, pitch=0.01, links=1, rate=100.0))
+    write_yaml(skin, describe_grid(nx=20, ny=20, pitch=0.01, links=1, rate=100.0))
     command = f"{sys.executable} -m cube_tensor_driver.cli {words.format(skin=skin)} | head -c 5"
     done = subprocess.run(["bash", "-c", command], **CAPTURED)
     assert len(done.stdout) == 5 and not done.stderr

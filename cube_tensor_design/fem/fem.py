@@ -257,7 +257,7 @@ def _mode_residual(
     return dict(zip(structure.modes.names, relative.tolist(), strict=True))
 
 
-def calibration_from_fem(
+def make_calibration_from_fem(
     result: Response,
     whole_matrix: bool = False,
     neglect: tuple[str, ...] = (),

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cube_tensor_driver.config.calibration import named_layout
+from cube_tensor_driver.config.calibration import find_named_layout
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.schema import (
     TEXT,
@@ -33,8 +33,8 @@ from cube_tensor_driver.core.errors import (
 from cube_tensor_driver.core.layout import Layout
 from cube_tensor_driver.core.symmetry import (
     default_modes,
+    find_largest_symmetry,
     find_structure,
-    largest_symmetry,
 )
 
 from .body import Body, strip_layout
@@ -147,7 +147,7 @@ def _build_model(data: Mapping[str, Any], folder: Path) -> Model:
     `folder`."""
     name = str(data.get("layout", DEFAULT_LAYOUT))
     is_file = name.endswith((".yaml", ".yml"))
-    layout = named_layout(str(folder / name) if is_file else name)
+    layout = find_named_layout(str(folder / name) if is_file else name)
     if "plane" in data and not layout.planar:
         raise ElasticError(
             f"plane is {data['plane']!r}, which is for layouts in a plane; "
@@ -156,7 +156,7 @@ def _build_model(data: Mapping[str, Any], folder: Path) -> Model:
 
     body = _build_body(data)
     layout = _place_pads(layout, data.get("pads", {}), body.side / 2)
-    symmetry = data.get("symmetry") or largest_symmetry(layout)
+    symmetry = data.get("symmetry") or find_largest_symmetry(layout)
     neglect = tuple(data.get("neglect", ()))
     # Both calls raise an error for a name that does not fit the layout, before any work.
     find_structure(layout, symmetry)

@@ -10,7 +10,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from cube_tensor_driver.core.arrays import Array
-from cube_tensor_driver.views.figures.style import curve_style
+from cube_tensor_driver.views.figures.style import choose_curve_style
 
 
 def draw_curves(
@@ -28,10 +28,10 @@ def draw_curves(
         curves: (n,) values in Pa or Hz by label.
         spacing: Number of points from one marker of a curve to the next. The first markers of the
             curves are at different points, so that markers do not cover each other.
-        style: Styles that all curves share, in place of those of `curve_style`.
+        style: Styles that all curves share, in place of those of `choose_curve_style`.
     """
     for number, (label, values) in enumerate(curves.items()):
-        own_style = curve_style(number) | {"markevery": (4 * number % spacing, spacing)}
+        own_style = choose_curve_style(number) | {"markevery": (4 * number % spacing, spacing)}
         axis.plot(1e3 * x, 1e-3 * values, label=label, **own_style | style)
 
 

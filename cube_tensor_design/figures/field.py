@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cube_tensor_driver.core.arrays import Array
-from cube_tensor_driver.views.figures.style import curve_style, print_style
+from cube_tensor_driver.views.figures.style import choose_curve_style, print_style
 
 from ..studies.field_study import FieldExample, FieldStudy
 from ..studies.traction_study import METHODS
@@ -179,7 +179,7 @@ def draw_field_study(study: FieldStudy) -> Figure:
     pitches = 1e3 * study.pitches
     for kind, (axis, title) in enumerate(zip(axes, titles, strict=True), 1):
         for row, width in enumerate(study.widths):
-            style = curve_style(row) | {"linestyle": "-"}
+            style = choose_curve_style(row) | {"linestyle": "-"}
             errors = study.error[row]
             axis.loglog(pitches, errors[:, 0], **style | {"linestyle": "--"})
             axis.loglog(pitches, errors[:, kind], label=f"{1e3 * width:.0f} mm", **style)

@@ -21,7 +21,7 @@ from cube_tensor_driver.views.figures.style import (
     print_style,
 )
 
-from ..studies.pads_example import BALL_X, LOAD, Sweep, simple_loads
+from ..studies.pads_example import BALL_X, LOAD, Sweep, make_simple_loads
 from .curves import draw_curves
 
 ARROWS = np.linspace(-0.8, 0.8, 5)
@@ -37,7 +37,7 @@ PAD_THICKNESS = 0.22
 @print_style()
 def draw_pads(calibration: Calibration) -> Figure:
     """Draw three loads as arrows on a piece of the elastomer, and the pads' stresses below."""
-    loads = simple_loads(calibration)
+    loads = make_simple_loads(calibration)
     figure = Figure(figsize=(9, 5.6))
     axes = figure.subplots(2, len(loads))
     states = np.array(list(loads.values()))

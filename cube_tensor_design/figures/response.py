@@ -13,7 +13,7 @@ from cube_tensor_driver.core.layout import Layout
 from cube_tensor_driver.mechanics.influence import Influence
 from cube_tensor_driver.views.figures.style import (
     SIGNED_COLOURS,
-    curve_style,
+    choose_curve_style,
     print_style,
     symbol,
 )
@@ -52,7 +52,7 @@ def draw_convergence(result: Response) -> Figure:
             unknowns,
             100 * abs(change) / largest,
             label=name,
-            **curve_style(number),
+            **choose_curve_style(number),
         )
     label = f"distance from the result with {finest['unknowns']} unknowns / % of the largest"
     axis.set(xlabel="unknowns of the mesh", ylabel=label)

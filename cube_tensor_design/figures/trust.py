@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.modes import COMPONENTS, STRESS
 from cube_tensor_driver.views.figures.style import (
-    curve_style,
+    choose_curve_style,
     print_style,
     symbol,
 )
@@ -90,8 +90,8 @@ def _draw_errors(
 def _component_style(number: int) -> dict[str, Any]:
     """Return the style of a component: six stresses, then the gradients xx_x, xx_y, xx_z, ..."""
     if number < len(STRESS):
-        return curve_style(number) | {"linestyle": "-"}
+        return choose_curve_style(number) | {"linestyle": "-"}
     component, direction = divmod(number - len(STRESS), 3)
     dashes = DIRECTION_DASHES[direction]
     colour = DIRECTION_COLOURS[direction]
-    return curve_style(component) | {"linestyle": dashes, "color": colour}
+    return choose_curve_style(component) | {"linestyle": dashes, "color": colour}

@@ -241,7 +241,7 @@ def figure_4() -> dict[str, Deformation]:
     return _deformations(VirtualBench(Body(), size=0.2), ("zx", "zz_x"))
 
 
-def mode_deformations(body: Body, layout: Layout) -> dict[str, Deformation]:
+def compute_mode_deformations(body: Body, layout: Layout) -> dict[str, Deformation]:
     """Return the section deformed by `MODE_AMPLITUDE` of each plane mode (linear stress field), by
     the mode's name."""
     return _deformations(VirtualBench(body, layout=layout, size=0.3), PLANE.names)

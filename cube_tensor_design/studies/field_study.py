@@ -111,7 +111,7 @@ class FieldExample:
     centre: Array
 
 
-def flat_skin(pitch: float, side: float = SKIN_SIDE) -> CubePoses:
+def make_flat_skin(pitch: float, side: float = SKIN_SIDE) -> CubePoses:
     """Return a square grid of cubes about the origin, with an odd number along each side.
 
     Args:
@@ -136,7 +136,7 @@ def draw_force(random: np.random.Generator) -> Array:
     return FORCE * np.array([shear_x, shear_y, -1.0])
 
 
-def true_components(
+def compute_true_components(
     points: Array,
     width: float,
     force: Array,
@@ -155,12 +155,12 @@ def true_components(
     """
     order = contact.hertz_order(width / 2, SURFACE_DEPTH)
     load = contact.hertz(width / 2, force, centre, order)
-    field = field_below(points, SURFACE_DEPTH, load, POISSONS_RATIO)
+    field = compute_field_below(points, SURFACE_DEPTH, load, POISSONS_RATIO)
     # Of the gradients, those of the normal stresses come first.
     return field[:, : len(COMPONENTS)]
 
 
-def field_below(
+def compute_field_below(
     points: Array,
     depth: float,
     load: tuple[Array, Array],
@@ -182,18 +182,18 @@ def field_below(
     return np.concatenate([stress, slopes], axis=1)
 
 
-def field_example() -> FieldExample:
+def compute_field_example() -> FieldExample:
     """Return the pressure under a contact between four cubes: the true one, and what interpolation
     computes with and without gradients."""
     pitch, width = 0.010, 0.012
-    skin = flat_skin(pitch, 0.05)
+    skin = make_flat_skin(pitch, 0.05)
     centre = pitch * np.array([0.35, 0.25])
     force = FORCE * np.array([FRICTION, 0.0, -1.0])
-    values = true_components(skin.position, width, force, centre)
+    values = compute_true_components(skin.position, width, force, centre)
     pressure = {}
     for kind in SKIN_KINDS[:2]:
         surface = Surface(skin, SURFACE_DEPTH, 20, gradients=kind != "values alone")
-        true = true_components(surface.points, width, force, centre)
+        true = compute_true_components(surface.points, width, force, centre)
         pressure["truth"] = -true[:, COMPONENTS.index("zz")]
         pressure[kind] = surface.field(values).pressure
     return FieldExample(surface.points, pressure, skin.position, centre)
@@ -222,7 +222,7 @@ class _Trial:
 
     def __init__(self, pitch: float) -> None:
         self._pitch = pitch
-        self._skin = flat_skin(pitch)
+        self._skin = make_flat_skin(pitch)
         side = round(pitch / POINT_SPACING)
         self._surfaces = {}
         for kind in SKIN_KINDS:
@@ -238,9 +238,9 @@ class _Trial:
         under a random contact of this width."""
         centre = self._pitch * (random.random(2) - 0.5)
         force = draw_force(random)
-        true = true_components(self._points, width, force, centre)
+        true = compute_true_components(self._points, width, force, centre)
         pressure = -true[:, COMPONENTS.index("zz")]
-        measured = true_components(self._skin.position, width, force, centre)
+        measured = compute_true_components(self._skin.position, width, force, centre)
         square_errors = []
         for kind, surface in self._surfaces.items():
             values = measured.copy()

@@ -20,9 +20,9 @@ from cube_tensor_driver.core.defaults import POISSONS_RATIO, SURFACE_DEPTH
 from cube_tensor_driver.core.modes import COMPONENTS
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.mechanics import contact
-from cube_tensor_driver.simulation.cubes import true_state
+from cube_tensor_driver.simulation.cubes import compute_true_state
 
-from .field_study import field_below
+from .field_study import compute_field_below
 
 LOAD = -10e3
 """Stress of each simple load on the cube, in Pa; compression is negative."""
@@ -38,12 +38,12 @@ PAIR = ("+z-x", "+z+x")
 """Names of the two pads of a sensor that has pads on its upper face only."""
 
 
-def planar_calibration() -> Calibration:
+def read_planar_calibration() -> Calibration:
     """Return the calibration of planar cubes in the package."""
     return read_calibration(package_data() / "config" / "calibration" / "planar.yaml")
 
 
-def simple_loads(calibration: Calibration) -> dict[str, Array]:
+def make_simple_loads(calibration: Calibration) -> dict[str, Array]:
     """Return the amplitudes of the modes (7,) of three loads, by their title: pressure, shear, and
     a pressure that grows along x."""
     size = f"{abs(LOAD) / 1e3:g}"
@@ -91,13 +91,13 @@ def sweep(points: int = 129) -> Sweep:
 
     The response is linear in stress and gradient, as in the driver.
     """
-    calibration = planar_calibration()
+    calibration = read_planar_calibration()
     place = np.linspace(-REACH, REACH, points)
     zz, zx, zz_x = (COMPONENTS.index(name) for name in ("zz", "zx", "zz_x"))
     at_sensor = _beside_ball(np.array([-BALL_X]))[0]
     passing = _beside_ball(-place)
     gradient = passing[:, 6:].reshape(points, 6, 3)
-    pads = true_state(calibration, passing[:, :6], gradient) @ calibration.response.T
+    pads = compute_true_state(calibration, passing[:, :6], gradient) @ calibration.response.T
 
     to_components = Pipeline([calibration]).matrix(0)
     left, right = (calibration.layout.pads.index(name) for name in PAIR)
@@ -120,4 +120,4 @@ def _beside_ball(x: Array) -> Array:
     centre, in m, in the plane of the sensor."""
     ball = contact.hertz(BALL_RADIUS, BALL_FORCE)
     points = np.stack([x, 0 * x], axis=1)
-    return field_below(points, SURFACE_DEPTH, ball, POISSONS_RATIO)
+    return compute_field_below(points, SURFACE_DEPTH, ball, POISSONS_RATIO)

@@ -28,7 +28,7 @@ from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.estimator import estimate_modes
 from cube_tensor_driver.core.layout import Layout
 from cube_tensor_driver.core.modes import PLANE
-from cube_tensor_driver.core.symmetry import default_modes, largest_symmetry
+from cube_tensor_driver.core.symmetry import default_modes, find_largest_symmetry
 from cube_tensor_driver.mechanics.contact_response import ContactResponse
 from cube_tensor_driver.mechanics.influence import Influence
 from cube_tensor_driver.mechanics.layer import FIELD, Layer
@@ -153,7 +153,7 @@ def _inverse_rows(
 ) -> dict[str, Array]:
     """Return, for each component that the pads tell from all other modes, the row (P,) of the
     pseudo-inverse of the response matrix: from pad stresses to the component."""
-    response = compute_response(body, layout, largest_symmetry(layout), meshes)
+    response = compute_response(body, layout, find_largest_symmetry(layout), meshes)
     modes = default_modes(layout)
     estimator = estimate_modes(response.matrix, modes, neglect)
     rows = {

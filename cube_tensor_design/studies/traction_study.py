@@ -40,7 +40,7 @@ from cube_tensor_driver.mechanics.layer import Layer
 from cube_tensor_driver.mechanics.measurement_model import CubeMeasurement
 from cube_tensor_driver.touch.inverse import SurfaceInverse
 from cube_tensor_driver.touch.pad_measurement import model_pads
-from cube_tensor_driver.touch.pad_noise import noise_of_all_pads
+from cube_tensor_driver.touch.pad_noise import compute_noise_of_all_pads
 from cube_tensor_driver.touch.surface import Surface
 from cube_tensor_driver.touch.tracker.contact_tracker import ContactTracker, TrackedContact
 
@@ -49,9 +49,9 @@ from .field_study import (
     FRICTION,
     WINDOW,
     FieldExample,
+    compute_field_below,
     draw_force,
-    field_below,
-    flat_skin,
+    make_flat_skin,
 )
 
 CUBES = ("24-pad", "planar", "planar, crosswise")
@@ -176,7 +176,7 @@ class TractionBench:
         self._pipeline = Pipeline(calibrations)
 
         # What the inverse assumes: noise of the pads, their response, and the layer.
-        by_pad = noise_of_all_pads(calibrations)
+        by_pad = compute_noise_of_all_pads(calibrations)
         reading = None if influence is None else model_pads(influence, calibrations)
         known_layer = Layer(setting.known_thickness)
         self.inverse = SurfaceInverse.from_poses(
@@ -209,7 +209,7 @@ class TractionBench:
             return unit_fields @ force
         depth = self.setting.depth + self.setting.depth_error
         load = self.point_forces(width, force, centre)
-        return field_below(points, depth, load, self.setting.poisson)
+        return compute_field_below(points, depth, load, self.setting.poisson)
 
     def surface_truth(
         self,
@@ -235,7 +235,7 @@ class TractionBench:
         order: int = ORDER,
     ) -> tuple[Array, Array]:
         """Return the load as point forces: positions (S, 3) in m and forces (S, 3) in N."""
-        distribute = flat_punch if self.setting.shape == "flat punch" else contact.hertz
+        distribute = make_flat_punch if self.setting.shape == "flat punch" else contact.hertz
         return distribute(width / 2, force, centre, order)
 
     def values(
@@ -351,7 +351,7 @@ class TractionBench:
         on_surface = self.surface_truth(width, force, centre)
         below = errors[-1] / predicted.depth_pressure[self.window]
         surface = (tracker.field.pressure - on_surface) / predicted.pressure
-        found = [contact_errors(contacts, centre) for contacts in (interpolated, tracked)]
+        found = [sum_contact_errors(contacts, centre) for contacts in (interpolated, tracked)]
         return (
             field,
             found,
@@ -423,7 +423,7 @@ class ContactErrors(NamedTuple):
     position_deviation: float
 
 
-def contact_errors(contacts: Sequence[Any], centre: Array) -> ContactErrors:
+def sum_contact_errors(contacts: Sequence[Any], centre: Array) -> ContactErrors:
     """Return the errors of contacts that are summed as if they were independent of each other.
 
     Args:
@@ -452,7 +452,7 @@ def contact_errors(contacts: Sequence[Any], centre: Array) -> ContactErrors:
 
 
 def _place_cubes(setting: Setting) -> CubePoses:
-    skin = flat_skin(setting.pitch, max(setting.side, 5 * setting.pitch))
+    skin = make_flat_skin(setting.pitch, max(setting.side, 5 * setting.pitch))
     if setting.cubes != "planar, crosswise":
         return skin
     cell = np.round(skin.position[:, :2] / setting.pitch)
@@ -462,14 +462,14 @@ def _place_cubes(setting: Setting) -> CubePoses:
     return skin._replace(rotation=rotation)
 
 
-def traction_example() -> FieldExample:
+def compute_traction_example() -> FieldExample:
     """Return the pressure under a contact of 6 mm between planar cubes, every second one turned."""
     setting = Setting(cubes=CUBES[2], pitch=10e-3, depth=4e-3)
     centre = setting.pitch * np.array([0.35, 0.25])
     return TractionBench(setting, side=10).example(6e-3, centre)
 
 
-def flat_punch(
+def make_flat_punch(
     radius: float,
     force: Array,
     centre: Array,

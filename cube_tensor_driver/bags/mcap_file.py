@@ -30,7 +30,7 @@ from mcap.writer import CompressionType, Writer
 
 from ..config.yaml import to_yaml
 from ..core.arrays import AnyArray
-from .metadata import Connection, FileSummary, QosProfile, bag_information, parse_profiles
+from .metadata import Connection, FileSummary, QosProfile, make_bag_information, parse_profiles
 from .stored_messages import StoredMessages, join, join_in_blocks
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -377,7 +377,7 @@ def unpack_chunk(chunk: Chunk) -> bytes:
 
 def rosbag2_metadata(file: FileSummary) -> dict[str, str]:
     """Return the content of the metadata record that rosbag2 reads if metadata.yaml is missing."""
-    return {"serialized_metadata": to_yaml(bag_information("mcap", [file]))}
+    return {"serialized_metadata": to_yaml(make_bag_information("mcap", [file]))}
 
 
 def summarise(name: str, index: Summary) -> FileSummary:

@@ -151,7 +151,7 @@ def parse_profiles(text: str, topic: str) -> Sequence[QosProfile]:
 
 
 @lru_cache
-def typestore() -> Typestore:
+def make_typestore() -> Typestore:
     """Return the message types of ROS 2 Jazzy and of the installed version of this package."""
     store = get_typestore(Stores.ROS2_JAZZY)
     types: dict[str, Any] = {}
@@ -164,7 +164,7 @@ def typestore() -> Typestore:
     return store
 
 
-def type_hash(msgtype: str, definition: str) -> str:
+def find_type_hash(msgtype: str, definition: str) -> str:
     """Return the hash by which ROS 2 identifies the definition of a message type (REP 2011).
 
     Args:
@@ -236,13 +236,13 @@ def write_metadata(
         BagError: The file cannot be written.
     """
     try:
-        information = bag_information(storage, files)
+        information = make_bag_information(storage, files)
         write_yaml(folder / FILE_NAME, {"rosbag2_bagfile_information": information})
     except ConfigError as error:
         raise BagError(str(error)) from None
 
 
-def bag_information(storage: str, files: Sequence[FileSummary]) -> dict[str, Any]:
+def make_bag_information(storage: str, files: Sequence[FileSummary]) -> dict[str, Any]:
     """Return the content of metadata.yaml, with every key that rosbag2 requires.
 
     Args:
@@ -259,7 +259,7 @@ def bag_information(storage: str, files: Sequence[FileSummary]) -> dict[str, Any
         **_time_span(start_ns, end_ns),
         "message_count": sum(file.msgcount for file in files),
         "topics_with_message_count": [
-            _topic_information(connection)
+            _make_topic_information(connection)
             for connection in merge_connections(file.connections for file in files)
         ],
         "compression_format": "",
@@ -309,7 +309,7 @@ def _time_span(start_ns: int, end_ns: int) -> dict[str, Any]:
     }
 
 
-def _topic_information(connection: Connection) -> dict[str, Any]:
+def _make_topic_information(connection: Connection) -> dict[str, Any]:
     """Return the entry of a topic in metadata.yaml, with the keys that rosbag2 requires.
 
     Args:
@@ -321,7 +321,7 @@ def _topic_information(connection: Connection) -> dict[str, Any]:
             "type": connection.msgtype,
             "serialization_format": "cdr",
             "offered_qos_profiles": list(connection.qos),
-            "type_description_hash": type_hash(connection.msgtype, connection.definition),
+            "type_description_hash": find_type_hash(connection.msgtype, connection.definition),
         },
         "message_count": connection.msgcount,
     }

@@ -31,7 +31,7 @@ from ..core.rows import FrequencyRows, StressRows
 from ..messages.codec import SECOND, Decoded, MessageCodec, frequency_codec, stress_codec
 from ..messages.types import FREQUENCIES, PACKAGE
 from .mcap_file import McapReader
-from .metadata import SUFFIXES, merge_connections, read_metadata, typestore
+from .metadata import SUFFIXES, make_typestore, merge_connections, read_metadata
 from .sqlite_file import SqliteReader
 from .stored_messages import StoredMessages, join_in_blocks
 
@@ -165,12 +165,12 @@ def make_message(kind: str, **fields: Any) -> Any:
         kind: Name of the message type, such as ``std_msgs/msg/String``.
         fields: Value of each field of the message.
     """
-    return typestore().types[kind](**fields)
+    return make_typestore().types[kind](**fields)
 
 
 def serialise(message: Any) -> bytes:
     """Return the bytes (CDR) of a message that `make_message` made or `Bag.decoded` read."""
-    return bytes(typestore().serialize_cdr(message, message.__msgtype__))
+    return bytes(make_typestore().serialize_cdr(message, message.__msgtype__))
 
 
 def stamp_ns(message: Any) -> int:
@@ -365,7 +365,7 @@ class Bag:
         """
         for entry in self.entries(topics):
             try:
-                message = typestore().deserialize_cdr(entry.data, entry.msgtype)
+                message = make_typestore().deserialize_cdr(entry.data, entry.msgtype)
             except READ_ERRORS as error:
                 self.skip(entry.topic, entry.time_ns, error)
             else:
@@ -573,7 +573,7 @@ def message_fields(msgtype: str) -> list[tuple[str, Any]]:
 
     The list is empty if the type is unknown.
     """
-    constants_and_fields = typestore().fielddefs.get(msgtype, ((), ()))
+    constants_and_fields = make_typestore().fielddefs.get(msgtype, ((), ()))
     return list(constants_and_fields[1])
 
 

@@ -20,7 +20,7 @@ from ..core.errors import BagError, MessageError
 from ..core.reconstructor import Reconstructor, RecordedHealth
 from ..core.rows import FrequencyRows, StressRows
 from ..core.tensor import rpy_from_quaternion
-from ..messages.skin_info import cube_calibrations, cube_poses, skin_elastomer
+from ..messages.skin_info import read_cube_calibrations, read_cube_poses, read_skin_elastomer
 from ..messages.types import INFO
 from .read import Bag, stamp_ns
 from .recorded_compensation import CompensationReader
@@ -64,9 +64,9 @@ class Recording:
         self._bag = bag
         self.infos: list[Any] = []
         self.settings: list[Settings] = []
-        for info in sorted(skin_infos(bag, topic), key=stamp_ns):
+        for info in sorted(find_skin_infos(bag, topic), key=stamp_ns):
             try:
-                settings = settings_of(info)
+                settings = read_settings(info)
             except MessageError as error:
                 reason = error
                 bag.skip(topic.replace("frequencies", "info"), stamp_ns(info), error)
@@ -79,7 +79,7 @@ class Recording:
         self._since_ns = np.array(since_ns)
         # The recorded stress, which states the health, is read only when `health_at` is called.
         self._health = RecordedHealthReader(bag, topic)
-        poses = cube_poses(self.infos[-1])
+        poses = read_cube_poses(self.infos[-1])
         self.compensation = CompensationReader(bag, topic, poses)
 
     def __repr__(self) -> str:
@@ -89,7 +89,7 @@ class Recording:
     @property
     def skin(self) -> Skin:
         """The skin (cubes, their poses and calibrations) in the last SkinInfo message."""
-        return recorded_skin(self.infos[-1], self.settings[-1].calibrations)
+        return make_recorded_skin(self.infos[-1], self.settings[-1].calibrations)
 
     def info_index_at(self, newest_ns: Times) -> Index:
         """Return the index in `infos` of the SkinInfo that applies to each message of frequencies.
@@ -147,7 +147,7 @@ class Recording:
             )
 
 
-def skin_infos(bag: Bag, topic: str) -> list[Any]:
+def find_skin_infos(bag: Bag, topic: str) -> list[Any]:
     """Return the SkinInfo messages of the skin whose frequencies are on a topic.
 
     The messages of the reconstruction node are preferred, because they contain the rest frequencies
@@ -192,14 +192,14 @@ def reconstruct_rows(
     return reconstructor.process(rows, health)
 
 
-def settings_of(info: Any) -> Settings:
+def read_settings(info: Any) -> Settings:
     """Return the calibrations and rest frequencies in a SkinInfo message.
 
     Raises:
         MessageError: The message has no cubes, an invalid calibration, a number of rest frequencies
             that is not the number of the cube's pads, or one that is not above 0.
     """
-    calibrations = cube_calibrations(info)
+    calibrations = read_cube_calibrations(info)
     # A skin without cubes cannot be reconstructed, and the steps below require at least one cube.
     if not calibrations:
         raise MessageError(f"info of the skin {info.name}: it has no cubes")
@@ -222,7 +222,7 @@ def settings_of(info: Any) -> Settings:
     return Settings(calibrations, pad_table(rest, widest, np.nan))
 
 
-def recorded_skin(info: Any, calibrations: tuple[Calibration, ...]) -> Skin:
+def make_recorded_skin(info: Any, calibrations: tuple[Calibration, ...]) -> Skin:
     """Return the skin that a SkinInfo message describes.
 
     Args:
@@ -263,5 +263,5 @@ def recorded_skin(info: Any, calibrations: tuple[Calibration, ...]) -> Skin:
         links=links,
         cubes=tuple(cubes),
         frame_prefix=frame_prefix,
-        elastomer=skin_elastomer(info),
+        elastomer=read_skin_elastomer(info),
     )

@@ -149,13 +149,13 @@ def _storage_files(folder: Path) -> list[Path]:
     def sort_key(path: Path) -> tuple[int, int, str]:
         """Return the position in metadata.yaml, the number in the name, and the name of a file."""
         position = listed.index(path.name) if path.name in listed else len(listed)
-        return position, file_number(path.stem), path.name
+        return position, parse_file_number(path.stem), path.name
 
     existing = (path for path in folder.iterdir() if path.suffix in SUFFIXES.values())
     return sorted(existing, key=sort_key)
 
 
-def file_number(stem: str) -> int:
+def parse_file_number(stem: str) -> int:
     """Return the number that rosbag2 gave a storage file of a bag, counted from 0.
 
     Args:
@@ -247,7 +247,7 @@ def _write_summary(path: Path, salvaged: _SalvagedChunks) -> int:
     with path.open("r+b", buffering=0) as stream:
         stream.truncate(salvaged.end)
         stream.seek(salvaged.end)
-        summary = _summary_bytes(salvaged, path.name)
+        summary = _encode_summary(salvaged, path.name)
         needed = len(summary) + METADATA_ROOM
         with suppress(OSError):
             if stream.write(summary + bytes(METADATA_ROOM)) == needed:
@@ -422,7 +422,7 @@ class _SalvagedChunks:
             self.index.channels.setdefault(channel.id, channel)
 
 
-def _summary_bytes(salvaged: _SalvagedChunks, name: str) -> bytes:
+def _encode_summary(salvaged: _SalvagedChunks, name: str) -> bytes:
     """Return the records that follow the chunks of a complete MCAP file, up to its end.
 
     Args:

@@ -16,9 +16,9 @@ from .metadata import (
     Connection,
     FileSummary,
     QosProfile,
-    bag_information,
+    find_type_hash,
+    make_bag_information,
     parse_profiles,
-    type_hash,
 )
 from .stored_messages import StoredMessages, join_in_blocks
 
@@ -200,7 +200,7 @@ class SqliteWriter:
         Returns:
             The id of the topic in the file, which `write` takes.
         """
-        digest = type_hash(msgtype, definition)
+        digest = find_type_hash(msgtype, definition)
         if msgtype not in self._types:
             self._types.add(msgtype)
             self._database.execute(
@@ -244,7 +244,7 @@ class SqliteWriter:
         Args:
             summary: Topics, times and numbers of messages of the file.
         """
-        information = to_yaml(bag_information("sqlite3", [summary]))
+        information = to_yaml(make_bag_information("sqlite3", [summary]))
         self._database.execute(
             "INSERT INTO metadata(metadata_version, metadata) VALUES (?, ?)",
             (METADATA_VERSION, information),

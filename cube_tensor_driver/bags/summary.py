@@ -42,7 +42,7 @@ class CubeSummary:
     longest_gap: float | None = None
 
 
-def cube_summaries(bag: Bag, topic: str, n_cubes: int) -> Iterator[CubeSummary]:
+def summarise_cubes(bag: Bag, topic: str, n_cubes: int) -> Iterator[CubeSummary]:
     """Summarise the recorded samples of every cube of a skin.
 
     Args:

@@ -83,7 +83,7 @@ def as_array(column: pyarrow.Array) -> AnyArray:
     return values.reshape(-1, *shape)
 
 
-def cube_column(rows: FrequencyRows | StressRows, cubes: pyarrow.Array) -> pyarrow.Array:
+def make_cube_column(rows: FrequencyRows | StressRows, cubes: pyarrow.Array) -> pyarrow.Array:
     """Return the Arrow column with the name of the cube of each row (sample of a cube).
 
     Args:
@@ -94,7 +94,7 @@ def cube_column(rows: FrequencyRows | StressRows, cubes: pyarrow.Array) -> pyarr
     return pyarrow.DictionaryArray.from_arrays(index.astype(np.int32), cubes)
 
 
-def stress_batch(rows: StressRows, cubes: pyarrow.Array) -> pyarrow.RecordBatch:
+def make_stress_batch(rows: StressRows, cubes: pyarrow.Array) -> pyarrow.RecordBatch:
     """Return rows of stress (samples of cubes) as Arrow columns with `STRESS_SCHEMA`.
 
     Args:
@@ -103,7 +103,7 @@ def stress_batch(rows: StressRows, cubes: pyarrow.Array) -> pyarrow.RecordBatch:
     """
     columns = [
         pyarrow.array(rows.stamp_ns),
-        cube_column(rows, cubes),
+        make_cube_column(rows, cubes),
         pyarrow.array(rows.sequence),
         *map(pyarrow.array, rows.stress.T),
         *map(pyarrow.array, rows.gradient.T),
@@ -205,4 +205,4 @@ class TableWriter(BufferedTable):
             self._writer.close()
 
     def _append(self, rows: StressRows) -> None:
-        self._writer.write_batch(stress_batch(rows, self._cubes).cast(self._schema))
+        self._writer.write_batch(make_stress_batch(rows, self._cubes).cast(self._schema))

@@ -21,7 +21,7 @@ from .metadata import (
     Connection,
     FileSummary,
     QosProfile,
-    typestore,
+    make_typestore,
     write_metadata,
 )
 from .sqlite_file import SqliteWriter
@@ -171,7 +171,7 @@ class BagWriter:
         Raises:
             BagError: The message type is unknown, or writing to the disk failed.
         """
-        store = typestore()
+        store = make_typestore()
         if msgtype not in store.fielddefs:
             raise BagError(
                 f"{topic}: the type {msgtype} is not known; known are those of ROS 2 Jazzy and "

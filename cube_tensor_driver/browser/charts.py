@@ -18,7 +18,7 @@ from ..core.modes import COMPONENTS, STRESS
 from ..views.figures.panels import draw_panels
 from ..views.figures.style import png
 from ..views.round_numbers import round_range
-from ..views.scene import component_unit
+from ..views.scene import find_component_unit
 from . import markup
 from .history import History
 
@@ -238,7 +238,7 @@ class Charts:
         if client is None or history is None:
             return
         if kind == "CSV":
-            content = csv_of(history, self._cubes, self._names)
+            content = format_csv(history, self._cubes, self._names)
             client.send_file_download(
                 "skin.csv",
                 content,
@@ -265,7 +265,7 @@ def make_chart(history: History, names: Sequence[str], cubes: Sequence[int], gro
         cubes: Indices of the cubes, in the order of their lines.
         group: Name of the values in `GROUPS`.
     """
-    size, unit = component_unit(GROUPS[group][0])
+    size, unit = find_component_unit(GROUPS[group][0])
     observed = [name for name in GROUPS[group] if name in history.observed_names]
     lines = {
         f"{names[cube]} {markup.label(name)}": (cube, History.COLUMNS.index(name))
@@ -274,7 +274,7 @@ def make_chart(history: History, names: Sequence[str], cubes: Sequence[int], gro
     return Chart(f"{group} / {unit}", size, lines)
 
 
-def chart_properties(history: History, chart: Chart) -> dict[str, Any]:
+def make_chart_properties(history: History, chart: Chart) -> dict[str, Any]:
     """Return the data and the ranges of a plot, by their names in viser; {} if it has no lines.
 
     Args:
@@ -297,7 +297,7 @@ def _scales(low: float, high: float) -> dict[str, uplot.Scale]:
     return {"x": TIME_SCALE, "y": uplot.Scale(auto=False, range=(low, high))}
 
 
-def csv_of(
+def format_csv(
     history: History,
     cubes: Sequence[int],
     names: Sequence[str],

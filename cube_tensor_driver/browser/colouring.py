@@ -66,7 +66,7 @@ class Colouring(NamedTuple):
         }.get(quantity.label)
         if field is None:
             field = cubes[surface.cube]
-        top = fixed_top or scene.automatic_top(
+        top = fixed_top or scene.choose_automatic_top(
             quantity,
             np.concatenate([cubes, field]),
             last_top,

@@ -144,7 +144,7 @@ def clock(seconds: float) -> str:
     return f"{minutes:.0f} min {rest:.1f} s" if minutes else f"{rest:.1f} s"
 
 
-def newtons(contact: Contact) -> str:
+def format_newtons(contact: Contact) -> str:
     """Return normal and shear force of a contact as text in N, and whether it slips.
 
     A shear force that is unknown (NaN), because no cube measures shear, is left out. "~" marks
@@ -185,7 +185,7 @@ def headline(
         f"<span style='color:{colour}'>⬤</span> <b>{word}</b>",
         f"{live} of {len(health)} cubes",
         f"{scan.rate.max():.0f} Hz",
-        newtons(scan.contacts[0]).replace(" ", "&nbsp;") if scan.contacts else "no load",
+        format_newtons(scan.contacts[0]).replace(" ", "&nbsp;") if scan.contacts else "no load",
     ]
     if recording:
         parts.append(f"<b style='color:{RED}'>● recording</b>")
@@ -271,7 +271,7 @@ def numbers(scan: Scan, cube: int, above: Array | None) -> str:
     """
     rows = []
     for name, si_value in zip(COMPONENTS, scan.values[cube], strict=True):
-        size, unit = scene.component_unit(name)
+        size, unit = scene.find_component_unit(name)
         if np.isfinite(si_value):
             rows.append((label(name), f"{si_value / size:+.3f}", unit))
     if above is not None and np.isfinite(above).all():
@@ -290,7 +290,7 @@ def contacts(scan: Scan) -> str:
     rows = []
     for contact in scan.contacts:
         x, y, z = 1e3 * contact.position
-        rows.append((f"{x:.1f}, {y:.1f}, {z:.1f} mm", newtons(contact), ""))
+        rows.append((f"{x:.1f}, {y:.1f}, {z:.1f} mm", format_newtons(contact), ""))
     return box(_table(rows) if rows else "none")
 
 

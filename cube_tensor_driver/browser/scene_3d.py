@@ -24,11 +24,11 @@ from ..views.meshes import (
     COLOUR_STEPS,
     CUBE_EDGES,
     NO_MESH,
-    corner_lines,
+    compute_square_corners,
     find_hit_cube,
+    make_corner_lines,
     make_cube,
     paint_squares,
-    square_corners,
     step_colours,
 )
 from ..views.round_numbers import round_down
@@ -291,12 +291,12 @@ class Scene:
         lines = dict.fromkeys(LINES, NO_LINES)
         traction, gradient = self._arrow_lengths(ranges)
         if "traction" in parts:
-            lines["traction"] = self._arrows(scene.traction_arrows, scan.values, traction)
+            lines["traction"] = self._arrows(scene.make_traction_arrows, scan.values, traction)
         if "gradient" in parts:
-            lines["gradient"] = self._arrows(scene.gradient_arrows, scan.values, gradient)
+            lines["gradient"] = self._arrows(scene.make_gradient_arrows, scan.values, gradient)
         if "principal" in parts:
             lines |= self._crosses(scan.values, ranges.traction)
-        crosses = scene.fault_crosses(self._placement.poses, scan.health)
+        crosses = scene.make_fault_crosses(self._placement.poses, scan.health)
         for state in FAULT_COLOURS:
             lines[f"fault {state}"] = crosses[scan.health == state]
         lines["chosen"] = self._chosen_cube(chosen)
@@ -332,7 +332,7 @@ class Scene:
         values, visible = colouring.field, np.full(len(colouring.field), with_field)
         update: Update = {}
         if self._is_solid:
-            colours = scene.linear_light(scene.colours(quantity, colouring.cubes, top))
+            colours = scene.convert_to_linear_light(scene.colours(quantity, colouring.cubes, top))
             update["cubes"] = {"batched_colors": colours}
         else:
             values = np.append(values, colouring.cubes)
@@ -380,8 +380,8 @@ class Scene:
         """
         placement, pitch = self._placement, self._placement.pitch
         poses = placement.poses
-        lines, is_tension = scene.principal_crosses(poses, values, pitch / longest)
-        # `scene.principal_crosses` returns crosses centred on the upper faces; this lifts them.
+        lines, is_tension = scene.make_principal_crosses(poses, values, pitch / longest)
+        # The crosses are centred on the upper faces; this lifts them.
         height = CROSS_HEIGHT * pitch - poses.half_side
         lift = height[:, None] * poses.rotation[:, :, 2]
         lines = lines + lift[:, None, None]
@@ -392,7 +392,7 @@ class Scene:
         placement = self._placement
         # The marks stand a little outside of the face; on a large skin they have a minimum size.
         side = max(2.6 * float(placement.poses.half_side[cube]), 0.2 * placement.arrow)
-        lines = corner_lines(placement.poses.rotation[cube], side)
+        lines = make_corner_lines(placement.poses.rotation[cube], side)
         return np.asarray(lines + scene.above(placement.poses, 1.1)[cube])
 
     def _contacts(self, contacts: Sequence[Contact]) -> Array:
@@ -513,7 +513,7 @@ def _make_squares(
         points = np.concatenate([points, scene.above(poses, 1.0)])
         rotation = np.concatenate([rotation, poses.rotation])
         side = np.append(side, 2 * poses.half_side)
-    return square_corners(points, rotation, side)
+    return compute_square_corners(points, rotation, side)
 
 
 def _set_up_lights(api: viser.SceneApi) -> None:

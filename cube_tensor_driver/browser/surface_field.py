@@ -16,7 +16,7 @@ from ..core.calibration import Calibration
 from ..core.defaults import POISSONS_RATIO
 from ..mechanics.layer import Layer
 from ..touch.inverse import SurfaceInverse
-from ..touch.pad_noise import noise_of_all_pads
+from ..touch.pad_noise import compute_noise_of_all_pads
 from ..touch.surface import Surface
 from ..views.scene import QUANTITIES, Quantity
 
@@ -131,7 +131,7 @@ class FieldModel:
 
 
 def _make_inverse(surface: Surface, calibrations: Sequence[Calibration]) -> SurfaceInverse:
-    by_pad = noise_of_all_pads(calibrations)
+    by_pad = compute_noise_of_all_pads(calibrations)
     layer = Layer(np.inf, POISSONS_RATIO)
     return SurfaceInverse.from_poses(
         surface.poses,

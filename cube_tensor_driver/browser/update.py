@@ -13,7 +13,7 @@ from ..core.poses import CubePoses
 from ..touch.surface import Surface
 from ..views.scene import QUANTITIES, Quantity, Ranges
 from . import markup
-from .charts import GROUPS, Chart, chart_properties
+from .charts import GROUPS, Chart, make_chart_properties
 from .colouring import Colouring
 from .history import History
 from .scan import Scan
@@ -126,7 +126,7 @@ def build_update(
     }
     update |= {name: {"content": text} for name, text in texts.items()}
     for number, chart in enumerate(settings.charts):
-        update[f"chart {number}"] = chart_properties(history, chart)
+        update[f"chart {number}"] = make_chart_properties(history, chart)
     return update | _options(history, scan, settings), ranges
 
 

@@ -34,12 +34,12 @@ from ..core.errors import ConfigError
 from ..core.latest_stress import STALE, STALE_S
 from ..core.rows import StressRows
 from ..messages.contacts import decode_contacts, decode_traction
-from ..messages.skin_info import cube_calibrations
+from ..messages.skin_info import read_cube_calibrations
 from ..msg import SkinContacts
 from ..processes.stop_signals import stop_event
 from ..ros.callbacks import CallbackErrors
 from ..ros.messages import to_ns
-from ..ros.session import domain_text, node_session, spin_until
+from ..ros.session import describe_domain, node_session, spin_until
 from ..ros.skin_subscriber import FollowedSkin, SkinSubscriber
 from ..srv import Tare
 from . import markup
@@ -189,7 +189,7 @@ class Viewer:
             )
         elif self._shown is None and now_s >= self._waiting_note_s:
             self._waiting_note_s = math.inf
-            print(markup.waiting(domain_text()), flush=True)
+            print(markup.waiting(describe_domain()), flush=True)
 
     def close(self) -> None:
         """End a recording that runs, and stop the server."""
@@ -205,7 +205,7 @@ class Viewer:
             skin: The state of the new skin, as received on its topics.
         """
         names = [cube.name for cube in skin.info.cubes]
-        calibrations = cube_calibrations(skin.info)
+        calibrations = read_cube_calibrations(skin.info)
         self._shown = ShownSkin(
             skin.info.name,
             names,
@@ -233,7 +233,7 @@ class Viewer:
         size = client.camera.image_width, client.camera.image_height
         layout = self._layouts.setdefault(client.client_id, PageLayout(*size))
         if self._shown is None:
-            show_waiting(client, layout, markup.waiting(domain_text()))
+            show_waiting(client, layout, markup.waiting(describe_domain()))
             return
 
         def act(action: str, *arguments: Any) -> None:

@@ -286,7 +286,7 @@ def fit_creep(
     )
 
 
-def reading_after_step(model: CreepModel, seconds: float) -> Array:
+def compute_step_reading(model: CreepModel, seconds: float) -> Array:
     """Return the readings of the pads after a step of the stress by 1 (P,).
 
     Args:
@@ -322,9 +322,9 @@ def add_creep(calibration: Calibration, model: CreepModel) -> Calibration:
         calibration: Calibration of the recording; it may have an older law of creep.
         model: The new law.
     """
-    gain = calibration.gain / reading_after_step(model, GAIN_TIME_S)
+    gain = calibration.gain / compute_step_reading(model, GAIN_TIME_S)
     if calibration.creep is not None:
-        gain = gain * reading_after_step(calibration.creep, GAIN_TIME_S)
+        gain = gain * compute_step_reading(calibration.creep, GAIN_TIME_S)
     return replace(calibration, creep=model, gain=gain)
 
 

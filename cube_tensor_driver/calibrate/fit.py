@@ -35,12 +35,12 @@ from ..core.symmetry import Structure
 from .robust import (
     MAX_STEPS,
     STAGES,
+    compute_robust_covariance,
     compute_weights,
     estimate_scatter,
+    find_null_space,
     find_undetermined,
-    least_squares,
-    null_space,
-    robust_covariance,
+    solve_least_squares,
 )
 
 FOLDS = 10
@@ -233,7 +233,7 @@ def fit(
     theta, weights, scale = model.solve(design, y)
 
     jacobian = model.jacobian(theta, design)
-    null = null_space(jacobian)
+    null = find_null_space(jacobian)
     n_free = len(model.free)
     is_open = find_undetermined(null, n_free)
     advice = _advise(model, theta, x, null, is_open)
@@ -243,7 +243,7 @@ def fit(
     fitted = model.predict(theta, design)
     whitened = (y - fitted) / sigma
     residuals = whitened.ravel() / scale
-    covariance = robust_covariance(jacobian, residuals, scale)
+    covariance = compute_robust_covariance(jacobian, residuals, scale)
     # Coefficients that the loads do not determine have an unknown variance (NaN). The covariance is
     # computed with a pseudo-inverse, which gives them a small one.
     covariance[:n_free][is_open] = np.nan
@@ -422,7 +422,7 @@ class _Model:
                 root = np.sqrt(weights)
                 jacobian = self.jacobian(theta, design)
                 weighted = root[:, None] * jacobian
-                step = least_squares(weighted, root * r)
+                step = solve_least_squares(weighted, root * r)
                 theta = theta + step
                 # The tolerance of the step is relative to the norm of the parameters. Adding 1 to
                 # the norm keeps the tolerance from becoming 0 for parameters near 0.
@@ -578,7 +578,7 @@ def _advise(
         for mode, load in enumerate(single_modes):
             candidate = np.vstack([loads, load])
             jacobian = model.jacobian(theta, model.design(candidate))
-            new_null = null_space(jacobian)
+            new_null = find_null_space(jacobian)
             new_open = find_undetermined(new_null, len(names))
             # The best load leaves the fewest coefficients undetermined. Among equal ones, it leaves
             # the fewest independent changes of the parameters that change no reading.

@@ -172,7 +172,7 @@ class PressDetector:
         return SteadyPress(cube, change[cube])
 
 
-def cube_rotations() -> Index:
+def list_cube_rotations() -> Index:
     """Return the 24 rotations that map a cube onto itself (24, 3, 3), the identity first."""
     elements = find_group("full")
     is_rotation = np.linalg.det(elements) > 0
@@ -180,7 +180,7 @@ def cube_rotations() -> Index:
     return rotations
 
 
-def expected_presses(
+def compute_expected_presses(
     calibration: Calibration,
     rotations: Index,
     *,
@@ -279,11 +279,11 @@ def explain_presses(measured: Array, expected: Array) -> Explanation:
 
     Args:
         measured: Stresses on the pads in K presses (K, P), in Pa; NaN for a pad that does not work.
-        expected: Stresses that `expected_presses` computes for the 24 rotations of
-            `cube_rotations`, the K presses and G distances (24, K, G, P), in Pa.
+        expected: Stresses that `compute_expected_presses` computes for the 24 rotations of
+            `list_cube_rotations`, the K presses and G distances (24, K, G, P), in Pa.
     """
     explanations = []
-    rotations = cube_rotations()
+    rotations = list_cube_rotations()
     for rotation, of_rotation in zip(rotations, expected, strict=True):
         places, misfit = _find_order(measured, of_rotation)
         explanations.append(Explanation(rotation, places, misfit))

@@ -84,7 +84,7 @@ def compute_weights(stage: str, r: Array) -> Array:
     return np.where(size < TUKEY_LIMIT, inside, 0)
 
 
-def least_squares(a: Array, b: Array) -> Array:
+def solve_least_squares(a: Array, b: Array) -> Array:
     """Solve the linear least squares problem |a x - b|² = min for x (C,).
 
     Args:
@@ -101,7 +101,7 @@ def least_squares(a: Array, b: Array) -> Array:
     return solution
 
 
-def null_space(jacobian: Array) -> Array:
+def find_null_space(jacobian: Array) -> Array:
     """Return a basis (C, H) of the changes of the parameters that change no measured value.
 
     Args:
@@ -134,7 +134,7 @@ def find_undetermined(null: Array, count: int) -> Mask:
     return undetermined
 
 
-def robust_covariance(
+def compute_robust_covariance(
     jacobian: Array,
     r: Array,
     scale: float,
@@ -162,7 +162,7 @@ def robust_covariance(
     psi_squared = np.mean(psi**2)
     slope = (1 - u) * (1 - 5 * u)
     psi_slope = np.mean(slope)
-    null = null_space(jacobian)
+    null = find_null_space(jacobian)
     rank = jacobian.shape[1] - null.shape[1]
     n_residuals = len(r)
     dof = max(n_residuals - rank, 1)

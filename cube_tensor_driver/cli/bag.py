@@ -88,7 +88,7 @@ def show_bag(path: Path) -> None:
         for topic in bag.topics(FREQUENCIES):
             show_skin(bag, topic)
         for status in last_diagnostics(bag):
-            say(diagnostics_line(status))
+            say(format_diagnostics(status))
 
 
 def show_topics(bag: Bag, duration_s: float) -> None:
@@ -117,13 +117,13 @@ def show_skin(bag: Bag, topic: str) -> None:
         bag: The bag.
         topic: Topic with the frequencies of the skin's pads.
     """
-    from ..bags.recording import skin_infos
-    from ..bags.summary import cube_summaries
+    from ..bags.recording import find_skin_infos
+    from ..bags.summary import summarise_cubes
     from ..core.errors import BagError
     from ..views.terminal.output import counted, print_table, say
 
     try:
-        info = skin_infos(bag, topic)[-1]
+        info = find_skin_infos(bag, topic)[-1]
     except BagError as error:
         # A skin that cannot be shown must not keep the other skins of the bag from being shown.
         say(str(error), "red")
@@ -140,7 +140,7 @@ def show_skin(bag: Bag, topic: str) -> None:
         say(f"  calibration {name}, layout {layout}: {cubes}")
 
     rows = []
-    summaries = cube_summaries(bag, topic, len(info.cubes))
+    summaries = summarise_cubes(bag, topic, len(info.cubes))
     for cube, summary in zip(info.cubes, summaries, strict=True):
         # Rate, losses and gaps are unknown for a cube with fewer than two samples.
         cells = ["", "", "", ""]
@@ -151,7 +151,7 @@ def show_skin(bag: Bag, topic: str) -> None:
     print_table(("cube", "uid"), ("samples", "Hz", "lost", "gaps", "longest gap / ms"), rows)
 
 
-def diagnostics_line(status: Any) -> str:
+def format_diagnostics(status: Any) -> str:
     """Return one line for a diagnostic status: its name, its message, and all values except zeros.
 
     Args:

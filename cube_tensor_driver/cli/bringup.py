@@ -87,7 +87,7 @@ def run(options: argparse.Namespace) -> int:
 
     # The results of all cubes are printed, even if one of them prevents that the file is written.
     for cube, explanation in explanations.items():
-        data["cubes"][cube]["pose"]["rpy"] = rpy(explanation.rotation)
+        data["cubes"][cube]["pose"]["rpy"] = compute_rpy(explanation.rotation)
         show_explanation(names[cube], explanation, pads)
     if any(each.swapped or not each.is_clear for each in explanations.values()):
         say("no file written: swap the wires, or press again, and run this command again", "red")
@@ -114,7 +114,7 @@ def skin_of_hub(options: argparse.Namespace) -> tuple[dict[str, Any], Skin]:
     from pathlib import Path
 
     from ..config.calibration import find_calibration, read_calibration
-    from ..config.grid import grid
+    from ..config.grid import describe_grid
     from ..config.skin import check_skin_data
     from ..core.errors import ConfigError, CubeError
     from ..core.layout import LAYOUTS
@@ -145,7 +145,7 @@ def skin_of_hub(options: argparse.Namespace) -> tuple[dict[str, Any], Skin]:
     calibration = read_calibration(file)
     # The cubes are written as one row at the default pitch: the hub does not know how they are
     # arranged, and the user replaces the positions.
-    data = grid(
+    data = describe_grid(
         options.name,
         nx=hello.n_cubes,
         ny=1,
@@ -228,9 +228,9 @@ def press_cubes(source: LinkSource, rest: PadsAtRest) -> dict[int, Explanation]:
     from ..calibrate.presses import (
         SIDES,
         PressDetector,
-        cube_rotations,
-        expected_presses,
+        compute_expected_presses,
         explain_presses,
+        list_cube_rotations,
     )
     from ..core.oscillator import pad_stress
     from ..views.terminal.output import say
@@ -240,7 +240,7 @@ def press_cubes(source: LinkSource, rest: PadsAtRest) -> dict[int, Explanation]:
     detector = PressDetector(rest.frequency, rest.noise, rest.works)
     means = average_over_time(source, len(cubes), AVERAGE_S)
     waiting = set(np.flatnonzero(rest.works.any(axis=1)).tolist())
-    expected = expected_presses(calibration, cube_rotations())
+    expected = compute_expected_presses(calibration, list_cube_rotations())
     explanations: dict[int, Explanation] = {}
 
     def wait_for_press(allowed: set[int], where: str) -> SteadyPress:
@@ -338,7 +338,7 @@ def show_explanation(name: str, explanation: Explanation, pads: Sequence[str]) -
         return
     findings = []
     if explanation.is_rotated:
-        findings.append(f"turned, rpy {rotation_text(explanation.rotation)}")
+        findings.append(f"turned, rpy {format_rotation(explanation.rotation)}")
     if explanation.swapped:
         pairs = [
             f"{pads[wire]} is {pads[explanation.places[wire]]}" for wire in explanation.swapped
@@ -348,7 +348,7 @@ def show_explanation(name: str, explanation: Explanation, pads: Sequence[str]) -
     say(f"{name}: {'; '.join(findings) or 'as it should be'}", style)
 
 
-def rpy(rotation: np.ndarray) -> list[float]:
+def compute_rpy(rotation: np.ndarray) -> list[float]:
     """Return roll, pitch and yaw of a rotation matrix, in radians, as in a skin file.
 
     Args:
@@ -362,7 +362,7 @@ def rpy(rotation: np.ndarray) -> list[float]:
     return [round(float(angle) + 0.0, 9) for angle in angles]
 
 
-def rotation_text(rotation: np.ndarray) -> str:
+def format_rotation(rotation: np.ndarray) -> str:
     """Return roll, pitch and yaw of a rotation as text in degrees, such as "0° 0° 90°".
 
     Args:
@@ -370,5 +370,5 @@ def rotation_text(rotation: np.ndarray) -> str:
     """
     import math
 
-    degrees = [math.degrees(angle) for angle in rpy(rotation)]
+    degrees = [math.degrees(angle) for angle in compute_rpy(rotation)]
     return " ".join(f"{angle:.0f}°" for angle in degrees)

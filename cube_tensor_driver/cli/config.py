@@ -59,8 +59,8 @@ def write_grid(options: argparse.Namespace) -> int:
     Raises:
         ConfigError: `./cube config check` would find a mistake in the file.
     """
-    from ..config.grid import grid
-    from ..config.pose_check import pose_doubts
+    from ..config.grid import describe_grid
+    from ..config.pose_check import find_pose_doubts
     from ..config.skin import check_skin_data
     from ..config.yaml import write_yaml
     from ..core.errors import ConfigError
@@ -68,10 +68,10 @@ def write_grid(options: argparse.Namespace) -> int:
 
     # Each option has the name of its argument of `grid`.
     names = "name", "nx", "ny", "pitch", "links", "calibration", "layout", "rate", "port"
-    skin = grid(**{name: getattr(options, name) for name in names})
+    skin = describe_grid(**{name: getattr(options, name) for name in names})
     checked, mistakes = check_skin_data(skin, options.output.parent)
     if checked is not None:
-        mistakes = list(pose_doubts(checked))
+        mistakes = list(find_pose_doubts(checked))
     if mistakes:
         raise ConfigError(f"grid: {mistakes[0]}")
     size = f"{options.nx} x {options.ny} cubes, {1e3 * options.pitch:g} mm apart"
@@ -89,7 +89,7 @@ def check_file(path: Path) -> int:
     Returns:
         The exit code: 1 if there are mistakes, otherwise 0.
     """
-    from ..config.pose_check import pose_doubts
+    from ..config.pose_check import find_pose_doubts
     from ..config.skin import check_skin
     from ..device.links.line_load import find_slow_lines
     from ..views.terminal.output import counted, working
@@ -100,7 +100,7 @@ def check_file(path: Path) -> int:
         # Implausible poses, and serial lines that are too slow for the sampling rate, can only be
         # found if the file describes a valid skin.
         if skin is not None:
-            mistakes = [*pose_doubts(skin), *find_slow_lines(skin)]
+            mistakes = [*find_pose_doubts(skin), *find_slow_lines(skin)]
     for mistake in mistakes:
         print(f"cube: {path}: {mistake}", file=sys.stderr)
     if skin is None or mistakes:

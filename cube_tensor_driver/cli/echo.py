@@ -31,7 +31,7 @@ def run(options: argparse.Namespace) -> int:
     for items in listen(options.topic, options.once):
         for item in items:
             if isinstance(item, StressReading):
-                print(reading_json(item) if options.json else reading_line(item))
+                print(encode_reading(item) if options.json else format_reading(item))
             elif options.json:
                 print(to_json(item))
             else:
@@ -41,7 +41,7 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def reading_line(reading: StressReading) -> str:
+def format_reading(reading: StressReading) -> str:
     """Return a line of text: time, cube, observed components with units, residual and status.
 
     Args:
@@ -59,12 +59,12 @@ def reading_line(reading: StressReading) -> str:
             parts.append(f"{'  '.join(texts)} {unit}")
     if not math.isnan(reading.residual):
         parts.append(f"residual {reading.residual:.2f}")
-    words = status_words(reading.status)
+    words = name_conditions(reading.status)
     parts.append(", ".join(words) or "ok")
     return "  ".join(parts)
 
 
-def reading_json(reading: StressReading) -> str:
+def encode_reading(reading: StressReading) -> str:
     """Return a row of a stress message as a JSON object on one line.
 
     Args:
@@ -78,12 +78,12 @@ def reading_json(reading: StressReading) -> str:
         "stress_pa": reading.stress,
         "gradient_pa_per_m": reading.gradient,
         "residual": reading.residual,
-        "status": status_words(reading.status),
+        "status": name_conditions(reading.status),
     }
     return to_json(content)
 
 
-def status_words(status: int) -> list[str]:
+def name_conditions(status: int) -> list[str]:
     """Return the status bits of a row in words, with the names in SkinStress.msg.
 
     The last words are the reasons for which pads were left out of the computation, if any were.

@@ -94,7 +94,7 @@ def run(options: argparse.Namespace) -> int:
 
     # All bags become one data set with the same choices. Each field of `Choices` has the value of
     # the option with the same name.
-    options.overrides = reprocess.overrides_of(options)
+    options.overrides = reprocess.read_overrides(options)
     choices = Choices(**{field.name: getattr(options, field.name) for field in fields(Choices)})
     with progress_bar() as report:
         exported = export_lerobot(options.bags, options.output, choices, report)

@@ -94,7 +94,7 @@ def run(options: argparse.Namespace) -> int:
         return run_rest(options)
 
     from ..calibrate.fit import fit, measured_stress
-    from ..config.calibration import named_layout
+    from ..config.calibration import find_named_layout
     from ..config.output_files import write_json
     from ..core.errors import ConfigError
     from ..core.symmetry import find_structure
@@ -106,7 +106,7 @@ def run(options: argparse.Namespace) -> int:
             "./cube fit needs a table of loads and --layout, or --weight BAG, --creep BAG or "
             "--rest BAG"
         )
-    layout = named_layout(options.layout)
+    layout = find_named_layout(options.layout)
     loads, base, rest, rest_source = read_inputs(options, layout)
     # A calibration with a uid (unique id of a cube) can only be used for that cube.
     base = replace(base, rest_frequency=rest, uid=options.uid)
@@ -201,14 +201,14 @@ def run_weight(options: argparse.Namespace) -> int:
 
 def run_creep(options: argparse.Namespace) -> int:
     """Fit the creep of the foam to a bag with one press, print it and write the calibration."""
-    from ..calibrate.creep import fit_recorded_creep, reading_after_step
+    from ..calibrate.creep import compute_step_reading, fit_recorded_creep
     from ..views.figures.calibration import draw_correction
     from ..views.figures.style import save
     from ..views.terminal.output import print_table, say
 
     result, calibration = fit_recorded_creep(options.creep, options.cube)
     rows = []
-    at_once, *later = (reading_after_step(result.model, time) for time in (1.0, 600.0, 3600.0))
+    at_once, *later = (compute_step_reading(result.model, time) for time in (1.0, 600.0, 3600.0))
     for pad, load, *readings in zip(
         calibration.layout.pads, result.load, at_once, *later, strict=True
     ):
@@ -247,10 +247,10 @@ def read_inputs(
     from ..bags.read import is_bag
     from ..calibrate.load_table import read_loads
     from ..calibrate.recorded_loads import read_recorded_loads
-    from ..config.calibration import find_calibration, read_calibration, shipped_calibration
+    from ..config.calibration import find_calibration, find_shipped_calibration, read_calibration
     from ..core.errors import ConfigError
 
-    base = shipped_calibration(layout)
+    base = find_shipped_calibration(layout)
     rest: Array | None
     if options.reference is not None:
         loads, base = read_recorded_loads(

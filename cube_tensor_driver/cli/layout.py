@@ -34,19 +34,19 @@ def run(options: argparse.Namespace) -> int:
     """Show what a layout's pads measure: ranks, unobservable modes."""
     from ..config.calibration import (
         find_calibration,
-        named_layout,
+        find_named_layout,
+        find_shipped_calibration,
         read_calibration,
-        shipped_calibration,
     )
     from ..config.output_files import write_json
     from ..core.estimator import summarize_response
-    from ..core.response import generic_response
-    from ..core.symmetry import find_structure, largest_symmetry
+    from ..core.response import make_generic_response
+    from ..core.symmetry import find_largest_symmetry, find_structure
     from ..views.figures.calibration import draw_layout
     from ..views.figures.style import save
 
-    layout = named_layout(options.name)
-    calibration = shipped_calibration(layout)
+    layout = find_named_layout(options.name)
+    calibration = find_shipped_calibration(layout)
     if options.calibration is not None:
         calibration = read_calibration(find_calibration(options.calibration, Path()))
         # A calibration for another layout is refused.
@@ -56,13 +56,13 @@ def run(options: argparse.Namespace) -> int:
     elif calibration is not None:
         symmetry = calibration.symmetry
     else:
-        symmetry = largest_symmetry(layout)
+        symmetry = find_largest_symmetry(layout)
     # The symmetry determines how many independent coefficients the response matrix has.
     structure = find_structure(layout, symmetry)
     if calibration is None:
         # Almost every response matrix with this symmetry has the same ranks, so they can be given
         # without a calibration. Condition numbers and noise depend on the values of the matrix.
-        result = summarize_response(structure, generic_response(structure))
+        result = summarize_response(structure, make_generic_response(structure))
         result |= {
             "condition_uniform": None,
             "condition_gradient": None,
@@ -89,14 +89,14 @@ def show_layout(layout: Layout, symmetry: str, result: dict[str, Any], source: s
         result: Result of `core.estimator.summarize_response`; unknown values are None.
         source: Origin of the response matrix, in words.
     """
-    from ..core.symmetry import coefficient_counts
+    from ..core.symmetry import count_coefficients
     from ..views.terminal.output import print_table, say
 
     pads = " ".join(layout.pads)
     say(f"layout {layout.name}: {layout.n_pads} pads   {pads}")
     counts = [
         f"{name} {'not possible' if count is None else count}"
-        for name, count in coefficient_counts(layout)
+        for name, count in count_coefficients(layout)
     ]
     say(f"coefficients by symmetry: {', '.join(counts)}")
     say(f"symmetry {symmetry}; {source}")
@@ -107,11 +107,11 @@ def show_layout(layout: Layout, symmetry: str, result: dict[str, Any], source: s
         say(f"{part + ':':10} rank {result[f'rank_{part}']}, condition {text}")
     say(f"unobservable: {', '.join(result['unobservable']) or 'nothing'}")
     say("noise of each mode per unit of pad noise (gradients times the half side):")
-    rows = [(name, noise_text(result, name)) for name in result["modes"]]
+    rows = [(name, describe_noise(result, name)) for name in result["modes"]]
     print_table(("mode",), ("noise",), rows)
 
 
-def noise_text(result: dict[str, Any], mode: str) -> str:
+def describe_noise(result: dict[str, Any], mode: str) -> str:
     """Return the standard deviation of a mode per unit of pad noise as text, or why it is unknown.
 
     Args:

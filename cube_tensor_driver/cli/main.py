@@ -78,13 +78,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except ModuleNotFoundError as error:
         # Libraries that only some commands need are not installed with the package.
-        print(f"cube: {missing_module_text(error.name or '')}", file=sys.stderr)
+        print(f"cube: {explain_missing_module(error.name or '')}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         return INTERRUPTED
 
 
-def missing_module_text(name: str) -> str:
+def explain_missing_module(name: str) -> str:
     """Return an error message of one line that tells how to install a missing Python module."""
     module = name.partition(".")[0]
     needs = f"this command needs the Python module {module}, which is not installed: "
@@ -114,7 +114,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     if words[:1] == ["help"]:
         words = [*words[1:], "--help"]
     if not words or words[0] in ("-h", "--help"):
-        print(help_text())
+        print(make_help_text())
         raise SystemExit(0)
     if words[0] == "--version":
         print(f"cube_tensor_driver {version()}")
@@ -157,7 +157,7 @@ def command_parser(name: str) -> Parser:
     return parser
 
 
-def help_text() -> str:
+def make_help_text() -> str:
     """Return the text of ./cube --help: all commands in groups, wrapped to the terminal's width."""
     width = columns()
     indent = max(map(len, COMMANDS)) + 4

@@ -37,10 +37,10 @@ def run(options: argparse.Namespace) -> int:
     """Draw frequencies, stress, gradient and residual of one cube."""
     from ..bags.source import open_bag
     from ..views.figures.style import save
-    from ..views.figures.time_series import cube_series, draw_series
+    from ..views.figures.time_series import draw_series, read_cube_series
 
     with open_bag(options.bag) as source:
-        series = cube_series(source, options.cube, options.start, options.end)
+        series = read_cube_series(source, options.cube, options.start, options.end)
     save(draw_series(series, options.bag.resolve().name), options.output)
     print(f"wrote {options.output}: cube {series.name}, {len(series.seconds)} samples")
     return 0

@@ -59,10 +59,10 @@ def run(options: argparse.Namespace) -> int:
             task = bar.add_task("replaying", total=length_s)
 
             # `replay` calls this function repeatedly in the main thread, between two messages.
-            def each(player: Player) -> None:
+            def update_display(player: Player) -> None:
                 children.check()
                 if has_keys:
-                    obey(pressed_key(), player)
+                    obey(read_pressed_key(), player)
                 text = "paused" if player.paused else "replaying"
                 bar.update(task, completed=player.position, description=text)
 
@@ -76,7 +76,7 @@ def run(options: argparse.Namespace) -> int:
                 # stress is published.
                 stress=options.stress or options.view,
                 hold=options.view,
-                each=each,
+                on_step=update_display,
             )
     return 0
 
@@ -124,7 +124,7 @@ def single_keys() -> Iterator[bool]:
         termios.tcsetattr(number, termios.TCSADRAIN, before)
 
 
-def pressed_key() -> str:
+def read_pressed_key() -> str:
     """Return the character of the next key that was pressed, or an empty text if there is none."""
     if not select.select([sys.stdin], [], [], 0)[0]:
         return ""

@@ -51,7 +51,7 @@ def add_arguments(parser: Parser) -> None:
 def add_overrides(parser: Parser) -> None:
     """Add the options that replace recorded calibrations or the recorded tare (rest frequencies).
 
-    `overrides_of` reads them.
+    `read_overrides` reads them.
 
     Args:
         parser: The parser of a command that reprocesses bags.
@@ -90,7 +90,7 @@ def run(options: argparse.Namespace) -> int:
     from ..core.errors import CubeError
     from ..views.terminal.output import progress_bar
 
-    overrides, contacts = overrides_of(options), contacts_of(options)
+    overrides, contacts = read_overrides(options), read_contact_options(options)
     jobs = make_jobs(options.bags, options.output, options.format, overrides, contacts)
     write_recipe(options.output, jobs[0])
     # A bag whose result exists is skipped, so that an interrupted run can be continued.
@@ -110,7 +110,7 @@ def run(options: argparse.Namespace) -> int:
                     failed += 1
                     console.print(f"cube: {result}", style="red", markup=False)
                 else:
-                    console.print(result_line(job.output, result))
+                    console.print(format_result(job.output, result))
     finally:
         # If no bag was completed, the folder is removed, so that the command can be given again.
         remove_without_results(options.output)
@@ -119,7 +119,7 @@ def run(options: argparse.Namespace) -> int:
     return 1 if failed else 0
 
 
-def result_line(output: Path, result: ReprocessResult) -> str:
+def format_result(output: Path, result: ReprocessResult) -> str:
     """Return a line with the numbers of messages and rows computed from a bag, and its duration.
 
     Args:
@@ -132,7 +132,7 @@ def result_line(output: Path, result: ReprocessResult) -> str:
     )
 
 
-def overrides_of(options: argparse.Namespace) -> Overrides:
+def read_overrides(options: argparse.Namespace) -> Overrides:
     """Return the calibrations and the tare that the options set instead of the recorded ones.
 
     Args:
@@ -162,7 +162,7 @@ def overrides_of(options: argparse.Namespace) -> Overrides:
     return Overrides(calibration, skin, tare)
 
 
-def contacts_of(options: argparse.Namespace) -> ContactOptions | None:
+def read_contact_options(options: argparse.Namespace) -> ContactOptions | None:
     """Return the options with which contacts are computed; None without the option --contacts.
 
     Raises:

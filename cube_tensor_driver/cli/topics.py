@@ -27,11 +27,11 @@ def run(options: argparse.Namespace) -> int:
     for topic in topics:
         rate = "not installed here" if topic.rate is None else f"{topic.rate:.0f} Hz"
         kinds = ", ".join(topic.kinds)
-        print(f"{topic.name:{width}}  {rate:>8}  {kinds}{cubes_text(topic.cubes)}")
+        print(f"{topic.name:{width}}  {rate:>8}  {kinds}{describe_cubes(topic.cubes)}")
     return 0
 
 
-def cubes_text(cubes: list[str]) -> str:
+def describe_cubes(cubes: list[str]) -> str:
     """Return the number and names of the cubes that have a topic of the same kind, as a text.
 
     Args:

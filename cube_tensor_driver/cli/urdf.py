@@ -23,7 +23,7 @@ def add_arguments(parser: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Print the URDF of a skin: one link per cube under its parent frame."""
     from ..config.skin import read_skin
-    from ..config.urdf import skin_urdf
+    from ..config.urdf import make_skin_urdf
 
-    print(skin_urdf(read_skin(options.file, options.frame_prefix)), end="")
+    print(make_skin_urdf(read_skin(options.file, options.frame_prefix)), end="")
     return 0

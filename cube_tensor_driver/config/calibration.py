@@ -55,12 +55,12 @@ def write_calibration(path: Path, calibration: Calibration, header: str = "") ->
     write_yaml(path, calibration.to_dict(), header)
 
 
-def calibration_text(calibration: Calibration) -> str:
+def format_calibration(calibration: Calibration) -> str:
     """Return a calibration as YAML text, with the same keys as a calibration file."""
     return to_yaml(calibration.to_dict())
 
 
-def named_layout(name: str) -> Layout:
+def find_named_layout(name: str) -> Layout:
     """Return a layout (number, faces and shapes of the pads of a cube).
 
     Args:
@@ -76,7 +76,7 @@ def named_layout(name: str) -> Layout:
     return find_layout(name)
 
 
-def shipped_calibration(layout: Layout) -> Calibration | None:
+def find_shipped_calibration(layout: Layout) -> Calibration | None:
     """Return the calibration that the package contains for a built-in layout.
 
     The calibration was computed with finite elements, not measured. Its list of neglected modes

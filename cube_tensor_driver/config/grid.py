@@ -19,7 +19,7 @@ LINK_NUMBER = "{}"
 link, from 0 up."""
 
 
-def grid(
+def describe_grid(
     name: str = "skin",
     *,
     nx: int,

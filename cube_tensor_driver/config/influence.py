@@ -30,7 +30,7 @@ def find_influence(name: str) -> Path:
     return find_shipped("influence/*.npz", name, Path(), advice)
 
 
-def influence_problem(name: str) -> str:
+def find_influence_problem(name: str) -> str:
     """Return an error message if there is no file of influence functions of this name; else "".
 
     Args:

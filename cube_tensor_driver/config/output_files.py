@@ -22,7 +22,7 @@ YAML_SUFFIXES = (".yaml", ".yml")
 
 
 @contextmanager
-def atomic_write(path: Path) -> Iterator[Path]:
+def write_atomically(path: Path) -> Iterator[Path]:
     """Yield the path of a temporary file, which replaces `path` when the `with` block ends.
 
     If the block raises an error, the temporary file is removed and `path` stays as it was. Several
@@ -41,7 +41,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
 
 def check_writable(path: Path) -> None:
-    """Raise ConfigError if `atomic_write` could not write this file.
+    """Raise ConfigError if `write_atomically` could not write this file.
 
     A temporary file is made in the same folder and removed. Checking permissions is not sufficient:
     the user root passes every such check, even for /proc and for read-only file systems.
@@ -137,11 +137,11 @@ def write_json(path: Path, value: object) -> None:
     Raises:
         ConfigError: The file cannot be written.
     """
-    with atomic_write(path) as temporary:
+    with write_atomically(path) as temporary:
         temporary.write_text(to_json(value, indent=2) + "\n", encoding="utf-8")
 
 
-def temporary_folder(prefix: str) -> Path:
+def make_temporary_folder(prefix: str) -> Path:
     """Make a temporary folder that is removed, with its content, when this process exits.
 
     Args:

@@ -15,14 +15,14 @@ from typing import Any, NamedTuple
 
 from ..core.defaults import CONTACT_METHODS, CONTACT_PRESSURE, POISSONS_RATIO, SURFACE_DEPTH
 from ..core.modes import STRESS
-from .influence import influence_problem
-from .port import port_problem
+from .influence import find_influence_problem
+from .port import find_port_problem
 
 QUANTITIES = ("pressure", "shear", "gradient", *STRESS, "residual")
 """Names of the quantities that the colours of the cubes can show in RViz and Foxglove."""
 
 
-def hardware_problem(name: str) -> str:
+def find_hardware_problem(name: str) -> str:
     """Return an error message for the name of a ros2_control hardware component, "" if it is valid.
 
     Names of topics contain this name, with each "/" replaced by "_".
@@ -126,7 +126,7 @@ DRIVER = (
         "",
         "Port that replaces the one in the skin file, which must have a single link. An empty text "
         "keeps the ports of the skin file.",
-        problem=port_problem,
+        problem=find_port_problem,
     ),
     Parameter(
         "port_directory",
@@ -191,7 +191,7 @@ RECONSTRUCTION = (
         "Name of a hardware component of ros2_control (cm_topic_hardware_component) in the URDF of "
         "the robot. It gets the wrenches of all cubes, and of the whole skin, as state interfaces. "
         "With an empty text they are not published.",
-        problem=hardware_problem,
+        problem=find_hardware_problem,
     ),
     Parameter(
         "publish_period",
@@ -323,7 +323,7 @@ CONTACTS = (
         "made by `./cube fem MODEL --surface`. The table then replaces the parameters depth, "
         "thickness and poisson. With an empty text each cube is taken as a point in a homogeneous "
         "elastomer.",
-        problem=influence_problem,
+        problem=find_influence_problem,
     ),
 )
 """Declarations of the ROS parameters of the node `contacts`, which computes positions and forces of

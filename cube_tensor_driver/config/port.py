@@ -16,7 +16,7 @@ ALLOWED = "a device path, a pattern such as /dev/ttyACM*, or socket://host:port"
 """Description of the texts that are allowed as the port of a link, for error messages."""
 
 
-def tcp_address(url: str) -> tuple[str, int] | None:
+def parse_tcp_address(url: str) -> tuple[str, int] | None:
     """Return host and port number of ``socket://host:port``, or None if the text has another form.
 
     An IPv6 address must be written in brackets, as in ``socket://[::1]:7000``.
@@ -35,7 +35,7 @@ def tcp_address(url: str) -> tuple[str, int] | None:
     return host, port
 
 
-def port_problem(port: str) -> str:
+def find_port_problem(port: str) -> str:
     """Return an error message for the text of a port, or "" if it is valid.
 
     URLs of pyserial other than socket:// are refused, because some of them write files or connect
@@ -43,7 +43,7 @@ def port_problem(port: str) -> str:
     """
     if not port.strip() or not port.isprintable():
         return f"found {port!r}, allowed: {ALLOWED}"
-    if port.startswith(TCP) and tcp_address(port) is None:
+    if port.startswith(TCP) and parse_tcp_address(port) is None:
         return f"{port!r} is no TCP address: write socket://host:port with a port from 1 to 65535"
     if "://" in port and not port.startswith(TCP):
         return f"found {port!r}, allowed: {ALLOWED}; other URLs are not opened"

@@ -38,7 +38,7 @@ MAX_NAMES = 4
 """Maximum number of cubes with the same position that a warning names; the others are counted."""
 
 
-def pose_doubts(skin: Skin) -> Iterator[str]:
+def find_pose_doubts(skin: Skin) -> Iterator[str]:
     """Yield a warning (one line) for each probable mistake in the poses of the cubes.
 
     Probable mistakes are several cubes at one position, and positions in mm instead of m.

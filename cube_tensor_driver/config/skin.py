@@ -22,7 +22,7 @@ from ..core.errors import ConfigError, CubeError
 from ..core.poses import CubePoses
 from ..core.tensor import rotation_from_rpy
 from .calibration import find_calibration, read_calibration
-from .port import port_problem
+from .port import find_port_problem
 from .schema import NAME, TEXT, TRIPLE, JsonSchema, Schema, integer, list_of, mapping, real
 from .yaml import read_yaml
 
@@ -416,7 +416,7 @@ def _find_contradictions(
 
 def _find_link_mistakes(links: tuple[SkinLink, ...]) -> Iterator[str]:
     for link in links:
-        problem = port_problem(link.port)
+        problem = find_port_problem(link.port)
         if problem:
             yield f"links: port of {link.name}: {problem}"
     yield from _find_repeated("links", "name", [repr(link.name) for link in links])

@@ -13,7 +13,7 @@ CUBE_COLOUR = "0.35 0.38 0.42 1"
 """Colour of the cubes in a URDF: red, green, blue and opacity, each from 0 to 1."""
 
 
-def skin_urdf(skin: Skin) -> str:
+def make_skin_urdf(skin: Skin) -> str:
     """Return the URDF of a skin as XML text.
 
     The root link has the name of the skin's parent frame. Each cube is a link (rigid body) with the

@@ -15,7 +15,7 @@ import yaml
 
 from ..core.errors import ConfigError
 from .input_files import read_bounded
-from .output_files import atomic_write
+from .output_files import write_atomically
 
 MAX_DEPTH = 100
 """Maximum number of nested lists and mappings in a YAML text.
@@ -141,5 +141,5 @@ def write_yaml(path: Path, value: object, header: str = "") -> None:
     """
     comment = "".join(f"# {line}".rstrip() + "\n" for line in header.splitlines())
     text = comment + to_yaml(value)
-    with atomic_write(path) as temporary:
+    with write_atomically(path) as temporary:
         temporary.write_text(text, "utf-8")

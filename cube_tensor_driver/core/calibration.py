@@ -22,7 +22,7 @@ from .layout import LAYOUTS, Layout, find_layout
 from .modes import COMPONENTS, STRESS, Modes
 from .oscillator import TemperatureModel
 from .response import illustrative_coefficients, response
-from .symmetry import Structure, default_modes, find_structure, largest_symmetry
+from .symmetry import Structure, default_modes, find_largest_symmetry, find_structure
 
 SCHEMA = 1
 """Version of the format of calibration files, which each file states under the key "schema"."""
@@ -367,7 +367,7 @@ def illustrative(
         uid: Unique id of the cube; None means any cube.
     """
     layout = find_layout(layout_name)
-    symmetry = largest_symmetry(layout)
+    symmetry = find_largest_symmetry(layout)
     structure = find_structure(layout, symmetry)
     return Calibration(
         layout=layout,

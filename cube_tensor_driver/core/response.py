@@ -18,7 +18,7 @@ from .arguments import join_names
 from .arrays import Array
 from .errors import CalibrationError, LayoutError
 from .layout import LAYOUTS
-from .symmetry import Structure, find_structure, largest_symmetry
+from .symmetry import Structure, find_largest_symmetry, find_structure
 
 ILLUSTRATIVE = {
     "a": 1.4,
@@ -92,13 +92,13 @@ def illustrative_coefficients(structure: Structure) -> dict[str, float]:
 
     # A smaller symmetry has more coefficients. They are computed from the response matrix of the
     # largest symmetry, whose coefficients are known.
-    symmetric = find_structure(layout, largest_symmetry(layout))
+    symmetric = find_structure(layout, find_largest_symmetry(layout))
     matrix = response(symmetric, illustrative_coefficients(symmetric))
     coefficients, _ = project(structure, matrix)
     return coefficients
 
 
-def generic_response(structure: Structure) -> Array:
+def make_generic_response(structure: Structure) -> Array:
     """Return a response matrix (P, M) with random coefficients.
 
     Its rank is that of almost every response with this structure, so it shows which modes a layout

@@ -290,7 +290,7 @@ def _read_signed_permutations(matrices: Array) -> tuple[Index, Index]:
     return magnitude.argmax(axis=1), signs.astype(int)
 
 
-def coefficient_counts(layout: Layout) -> Iterator[tuple[str, int | None]]:
+def count_coefficients(layout: Layout) -> Iterator[tuple[str, int | None]]:
     """Count the coefficients of a layout's response under each symmetry group.
 
     Yields:
@@ -304,9 +304,9 @@ def coefficient_counts(layout: Layout) -> Iterator[tuple[str, int | None]]:
             yield name, None
 
 
-def largest_symmetry(layout: Layout) -> str:
+def find_largest_symmetry(layout: Layout) -> str:
     """Return the name of the largest symmetry group that maps the pads of a layout onto each other.
 
     Groups under which all responses of the layout would be zero are skipped.
     """
-    return next(name for name, count in coefficient_counts(layout) if count)
+    return next(name for name, count in count_coefficients(layout) if count)

@@ -14,7 +14,7 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..config.grid import grid
+from ..config.grid import describe_grid
 from ..config.package_data import package_data
 from ..config.yaml import read_yaml, write_yaml
 from ..core.errors import ConfigError
@@ -141,9 +141,9 @@ def choose_skin_file(settings: DemoSettings, folder: Path) -> Path:
             raise ConfigError(
                 "--cubes makes a skin that no scene knows; name its file with --config"
             )
-        from ..simulation.mujoco.scene import scene_skin
+        from ..simulation.mujoco.scene import find_scene_skin
 
-        return scene_skin(settings.mujoco)
+        return find_scene_skin(settings.mujoco)
     if settings.cubes is not None:
         rate = settings.rate or DEFAULT_RATE
         return write_grid(folder / "skin.yaml", settings.cubes, rate)
@@ -172,7 +172,7 @@ def write_grid(
     nx = math.ceil(math.sqrt(cubes))
     ny = math.ceil(cubes / nx)
     links = math.ceil(cubes / cubes_per_hub)
-    skin = grid(nx=nx, ny=ny, links=links, rate=rate)
+    skin = describe_grid(nx=nx, ny=ny, links=links, rate=rate)
     # Surplus cubes of the last row are removed, and with them links (hubs) without any cube.
     skin["cubes"] = skin["cubes"][:cubes]
     used = {cube["link"] for cube in skin["cubes"]}

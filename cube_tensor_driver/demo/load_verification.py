@@ -19,7 +19,7 @@ from ..core.errors import MessageError
 from ..core.modes import COMPONENTS
 from ..core.pipeline import Pipeline
 from ..core.rows import StressRows
-from ..simulation.cubes import skin_components
+from ..simulation.cubes import compute_skin_components
 from ..simulation.load import AnyLoad, total
 from ..simulation.sample_log import SampleLog
 from ..touch.surface import Surface
@@ -284,7 +284,7 @@ class LoadVerification:
         Args:
             seconds: Time after the start of the simulator, in s.
         """
-        return skin_components(self._skin, *self.load.at(seconds))
+        return compute_skin_components(self._skin, *self.load.at(seconds))
 
 
 def rms(values: AnyArray) -> float:

@@ -17,7 +17,7 @@ from ..config.skin import Skin
 from ..core.arrays import Array, Index
 from ..core.matching import NO_MATCH, SampleKeys
 from ..core.rows import FrequencyRows, StressRows
-from ..simulation.cubes import hub_cubes
+from ..simulation.cubes import make_hub_cubes
 from ..simulation.sample_log import SampleTable
 
 NS_TO_MS = 1e-6
@@ -50,7 +50,7 @@ class Arrivals:
         self.row_count = np.ones(len(skin.cubes), np.int64)
         if one_per_hub:
             self.row_count[:] = 0
-            for hub in hub_cubes(skin):
+            for hub in make_hub_cubes(skin):
                 members = hub.skin_cubes
                 self.row_count[members[0]] = len(members)
         self.rows = 0

@@ -22,7 +22,7 @@ from ..msg import SkinFrequencies, SkinStress
 from ..processes.children import Children
 from ..ros.commands.services import ANNOUNCE_S
 from ..ros.qos import batch_profile
-from ..ros.session import domain_text, node_session, spin_until
+from ..ros.session import describe_domain, node_session, spin_until
 from ..simulation.imperfections import read_imperfections
 from ..simulation.load import read_load
 from ..views.terminal.live_table import LiveTable
@@ -165,13 +165,13 @@ def check_no_skin() -> None:
     """
     with node_session("demo") as (node, executor):
         if spin_until(executor, lambda: node.count_publishers("stress"), ANNOUNCE_S):
-            raise other_skin_error()
+            raise make_other_skin_error()
 
 
-def other_skin_error() -> CubeError:
+def make_other_skin_error() -> CubeError:
     """Return the error that a demo raises because another skin publishes in its DDS domain."""
     return CubeError(
-        f"another skin publishes stress in {domain_text()}: "
+        f"another skin publishes stress in {describe_domain()}: "
         "end it, or set another ROS_DOMAIN_ID for this one"
     )
 
@@ -323,7 +323,7 @@ class SkinWatcher:
         # Messages of a smaller skin look like those of this skin, so publishers are counted, too.
         publishers = self._observer.node.count_publishers("stress")
         if self._sees_other_skin or publishers > 1:
-            raise other_skin_error()
+            raise make_other_skin_error()
 
     def _on_stress(self, data: bytes) -> None:
         received_ns = time.time_ns()

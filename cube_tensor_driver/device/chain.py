@@ -27,7 +27,7 @@ from .links.link_log import LinkLogger, Log
 from .links.reader import LOGGED_ERRORS, LinkFrames, Reader
 from .scans.cube_table import CubeAddress
 from .scans.row_counts import RowCounts
-from .scans.scan import MakeRows, ScanBuilder, empty_rows
+from .scans.scan import MakeRows, ScanBuilder, make_empty_rows
 from .scans.sequence import Arrival, SampleAccount
 from .track import LinkTrack
 from .wire.decoder import unpack_all
@@ -138,7 +138,7 @@ class LiveLinks:
         *,
         rate: float | None = None,
         scans_per_call: int = 1,
-        make_rows: MakeRows = empty_rows,
+        make_rows: MakeRows = make_empty_rows,
         clock_ns: Callable[[], int] = time.time_ns,
         is_host_clock: Callable[[], bool] = lambda: True,
         log: Log | None = None,

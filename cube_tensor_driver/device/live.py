@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from ..config.port import port_problem
+from ..config.port import find_port_problem
 from ..config.skin import Skin, as_skin
 from ..core.arguments import check_number
 from ..core.errors import ConfigError
@@ -60,11 +60,11 @@ def open_links(
     if rate is not None:
         allowed = f"{MIN_RATE:g} to {MAX_RATE:g} samples per second"
         check_number("rate", rate, lambda x: MIN_RATE <= x <= MAX_RATE, allowed)
-    links = link_configs(skin, port, port_directory)
+    links = make_link_configs(skin, port, port_directory)
     return LinkSource(skin, links, skin.rate if rate is None else rate)
 
 
-def link_configs(
+def make_link_configs(
     skin: Skin,
     port: str = "",
     port_directory: str | Path = "",
@@ -92,14 +92,14 @@ def link_configs(
         path = port or link.port
         if is_simulated:
             path = str(Path(port_directory) / link.name)
-        problem = port_problem(path)
+        problem = find_port_problem(path)
         if problem:
             raise ConfigError(f"link {link.name}: port: {problem}")
         configs.append(LinkConfig(link.name, path, link.baud, link.hub_uid, is_simulated))
     return configs
 
 
-def cube_addresses(skin: Skin) -> list[CubeAddress]:
+def make_cube_addresses(skin: Skin) -> list[CubeAddress]:
     """Return how each cube of a skin is found on a hub, in the order of the skin.
 
     A cube is found by its unique number, or by its link and its index on the hub of this link.
@@ -154,7 +154,7 @@ class LinkSource:
         self._given = 0
         self._dropped = 0
         self._links = LiveLinks(
-            links, cube_addresses(skin), self._put, rate=rate, on_end=self._on_end
+            links, make_cube_addresses(skin), self._put, rate=rate, on_end=self._on_end
         )
         self._links.start()
 

@@ -24,7 +24,7 @@ from ..core.errors import BagError
 from ..core.modes import COMPONENTS
 from ..core.rows import StressRows
 from .data_set import RESIDUAL, DataSet
-from .images import ImageStream, image_pixels
+from .images import ImageStream, decode_image
 from .plan import BagPlan, Choices, Episode, Report, plan_bag
 from .topics import Signal, Topic, find_topics
 from .windows import TACTILE, Windows
@@ -237,7 +237,7 @@ class EpisodeWriter:
             # Every stride-th frame of the episode is chosen. `values` begins with frame `first`, so
             # its first chosen frame has the index -first % stride in it.
             for image in values[-first % stride :: stride]:
-                pixels = image_pixels(image)[::PIXEL_STRIDE, ::PIXEL_STRIDE]
+                pixels = decode_image(image)[::PIXEL_STRIDE, ::PIXEL_STRIDE]
                 # LeRobot normalises images of the shape (bands, height, width), to which statistics
                 # of the shape (bands, 1, 1) are broadcast.
                 bands = pixels.shape[2]

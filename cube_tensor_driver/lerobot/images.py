@@ -188,7 +188,7 @@ def encode_raw(message: Any) -> bytes:
     return _as_png(image)
 
 
-def image_pixels(file: bytes) -> Single:
+def decode_image(file: bytes) -> Single:
     """Decode an image file and return its pixels (height, width, bands), scaled to 0 to 1."""
     with Image.open(io.BytesIO(file)) as image:
         values = np.asarray(image, np.float32)

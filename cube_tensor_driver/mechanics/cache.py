@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from ..config.input_files import read_arrays
-from ..config.output_files import atomic_write
+from ..config.output_files import write_atomically
 from ..core.arrays import AnyArray
 from ..core.errors import ConfigError
 
@@ -129,7 +129,7 @@ def _store(path: Path, arrays: Arrays) -> None:
         return
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(path) as partial, partial.open("wb") as file:
+    with write_atomically(path) as partial, partial.open("wb") as file:
         content = {_CONTENT: _describe(arrays)}
         np.savez(file, allow_pickle=False, **content, **arrays)
     _make_room(path)

@@ -293,7 +293,7 @@ def _airy(
     h2 = f_dot_d * chi3 - fz * log2
     h3 = f_dot_d * chi4 - fz * log3
 
-    def second(
+    def differentiate(
         i: int,
         j: int,
         t2: Array,
@@ -348,13 +348,13 @@ def _airy(
     stress = np.zeros((*points, n_components))
     gradient = np.zeros((*points, n_components, 3))
     for component, i, j, sign in _AIRY_COMPONENTS:
-        in_plane = second(i, j, chi2, chi3, log1, log2)
+        in_plane = differentiate(i, j, chi2, chi3, log1, log2)
         stress[..., component] = sign * in_plane
         for axis in (0, 1):
             i1, i2, i3 = sorted((i, j, axis))
             derivative = third_derivatives[i1, i2, i3]
             gradient[..., component, axis] = sign * derivative
-        by_z = second(i, j, log2, log3, inv1, inv2)
+        by_z = differentiate(i, j, log2, log3, inv1, inv2)
         gradient[..., component, 2] = -sign * by_z
     return stress, gradient
 

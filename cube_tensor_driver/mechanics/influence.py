@@ -15,7 +15,7 @@ import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
 from ..config.input_files import read_arrays
-from ..config.output_files import atomic_write
+from ..config.output_files import write_atomically
 from ..core.arrays import Array
 from ..core.errors import ConfigError, CubeError
 from ..core.layout import Layout
@@ -121,7 +121,7 @@ def write_influence(
     # package and should be small.
     step = np.abs(influence.pads).max() / MAX_INTEGER
     layout = influence.layout
-    with atomic_write(path) as partial, partial.open("wb") as file:
+    with write_atomically(path) as partial, partial.open("wb") as file:
         np.savez_compressed(
             file,
             schema=SCHEMA,

@@ -19,7 +19,7 @@ from ..core.errors import BagError
 from ..touch.slip import NO_CONTACTS, SLIP, Slip
 from ..touch.surface import Contact
 from ..touch.tracker.contact_tracker import TrackedContact
-from .point_cloud import MakeMessage, cloud_message, make_header
+from .point_cloud import MakeMessage, make_cloud_message, make_header
 from .types import CONTACTS
 
 CLOUD = ("x", "y", "z", "pressure", "shear", "sigma")
@@ -52,7 +52,7 @@ _VECTORS = {
 """Name of a vector of a contact -> its type in geometry_msgs."""
 
 
-def contacts_message(
+def make_contacts_message(
     make: MakeMessage,
     stamp_ns: int,
     frame_id: str,
@@ -87,7 +87,7 @@ def contacts_message(
     return make(CONTACTS, header=header, **fields)
 
 
-def traction_message(
+def make_traction_message(
     make: MakeMessage,
     stamp_ns: int,
     frame_id: str,
@@ -102,7 +102,7 @@ def traction_message(
         cloud: Points (M, 6) with the columns of `CLOUD`: position in m, pressure, shear stress and
             standard deviation of the pressure in Pa.
     """
-    return cloud_message(make, stamp_ns, frame_id, CLOUD, cloud)
+    return make_cloud_message(make, stamp_ns, frame_id, CLOUD, cloud)
 
 
 def decode_contacts(message: Any) -> list[Contact]:

@@ -24,7 +24,7 @@ FLOAT32_SIZE = 4
 """Size of a number of this type, in bytes."""
 
 
-def cloud_message(
+def make_cloud_message(
     make: MakeMessage,
     stamp_ns: int,
     frame_id: str,

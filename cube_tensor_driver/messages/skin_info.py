@@ -20,7 +20,7 @@ from ..core.poses import CubePoses
 from ..core.tensor import rotation_from_quaternion
 
 
-def cube_poses(info: Any) -> CubePoses:
+def read_cube_poses(info: Any) -> CubePoses:
     """Return the poses (in the skin's parent frame) and half sides of the cubes, in m.
 
     Args:
@@ -60,7 +60,7 @@ def cube_poses(info: Any) -> CubePoses:
     return poses
 
 
-def cube_calibrations(info: Any) -> tuple[Calibration, ...]:
+def read_cube_calibrations(info: Any) -> tuple[Calibration, ...]:
     """Return the calibration of each cube. Cubes with the same calibration id share one object.
 
     Args:
@@ -99,7 +99,7 @@ def _parse_calibration(name: str, text: str) -> Calibration:
     return Calibration.from_dict(parse_yaml(text, f"calibration {name}"))
 
 
-def skin_elastomer(info: Any) -> Elastomer | None:
+def read_skin_elastomer(info: Any) -> Elastomer | None:
     """Return the elastomer around the cubes; None if the skin file does not describe it.
 
     Args:
@@ -119,4 +119,4 @@ def geometry(info: Any) -> list[object]:
     computed anew.
     """
     cubes = [(cube.name, cube.pose, cube.half_side) for cube in info.cubes]
-    return [info.header.frame_id, skin_elastomer(info), *cubes]
+    return [info.header.frame_id, read_skin_elastomer(info), *cubes]

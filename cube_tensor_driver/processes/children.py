@@ -82,7 +82,7 @@ class Children:
         # go on and keep its ports open.
         command = [*end_with_parent(), *program, *process.arguments]
         if process.node:
-            command += ["--ros-args", *ros_arguments(process.parameters)]
+            command += ["--ros-args", *format_ros_arguments(process.parameters)]
         with self._log_file(process.executable).open("ab") as log:
             self._processes[process.executable] = subprocess.Popen(
                 command,
@@ -179,7 +179,7 @@ class Children:
         return self._logs / f"{executable}.log"
 
 
-def ros_arguments(parameters: dict[str, Value]) -> list[str]:
+def format_ros_arguments(parameters: dict[str, Value]) -> list[str]:
     """Return the command-line arguments `-p name:=value` that set parameters of a ROS node.
 
     Args:

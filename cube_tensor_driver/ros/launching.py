@@ -24,14 +24,14 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.utilities.namespace_utils import make_namespace_absolute, prefix_namespace
 
 from ..config.load_script import read_script
-from ..config.output_files import temporary_folder
+from ..config.output_files import make_temporary_folder
 from ..config.package_data import package_data
 from ..config.parameters import DRIVER, RECONSTRUCTION
-from ..config.rviz import rviz_view
+from ..config.rviz import make_rviz_view
 from ..config.skin import Skin, read_skin
 from ..config.yaml import read_yaml, write_yaml
 from ..core.errors import ConfigError
-from ..device.live import link_configs
+from ..device.live import make_link_configs
 from ..processes.skin_processes import Value
 
 _CONFIG = package_data() / "config"
@@ -130,21 +130,21 @@ class SkinArguments(NamedTuple):
     parameters: dict[str, Value]
 
 
-def parameter_file(parameters: dict[str, Value]) -> str:
+def write_parameter_file(parameters: dict[str, Value]) -> str:
     """Write a parameter file of ROS, which is temporary, and return its path.
 
     Args:
         parameters: Name of a parameter of a node -> its value.
     """
-    path = temporary_folder("cube_parameters_") / "given.yaml"
+    path = make_temporary_folder("cube_parameters_") / "given.yaml"
     write_yaml(path, {"/**": {"ros__parameters": parameters}})
     return str(path)
 
 
-def rviz_file(skin: Skin) -> str:
+def write_rviz_file(skin: Skin) -> str:
     """Write a configuration file of RViz for a skin, which is temporary, and return its path."""
-    path = temporary_folder("cube_rviz_") / "skin.rviz"
-    write_yaml(path, rviz_view(skin))
+    path = make_temporary_folder("cube_rviz_") / "skin.rviz"
+    write_yaml(path, make_rviz_view(skin))
     return str(path)
 
 
@@ -165,7 +165,7 @@ def record_skin(context: LaunchContext, namespace: str, skin_name: str) -> Execu
     relative = prefix_namespace(outer_namespace, namespace)
     full_namespace = (make_namespace_absolute(relative) or "").strip("/")
     qualities = _recorded_topics(surroundings, full_namespace)
-    overrides = temporary_folder("cube_record_") / "qos.yaml"
+    overrides = make_temporary_folder("cube_record_") / "qos.yaml"
     write_yaml(overrides, qualities)
 
     time = f"{datetime.now():%Y_%m_%d-%H_%M_%S}"
@@ -255,7 +255,7 @@ def check_arguments(context: LaunchContext, declared: Iterable[str]) -> SkinArgu
         if refusal:
             raise ConfigError(f"{name}:={text}: {refusal}")
     # This call raises an error if the argument `port` is set for a skin with several links.
-    link_configs(skin, texts["port"])
+    make_link_configs(skin, texts["port"])
     for name, packages in NEEDED_PACKAGES.items():
         if name in switched_on:
             _check_installed(name, packages)

@@ -29,7 +29,7 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from std_msgs.msg import Header
 
-from ..config.calibration import calibration_text
+from ..config.calibration import format_calibration
 from ..config.skin import Elastomer, Skin, SkinCube
 from ..core.arrays import AnyArray, Array, Real
 from ..core.compensation.motion import UNKNOWN_MOTION, Motion
@@ -133,7 +133,7 @@ class CheckedSubscription:
             self._decode(data)
 
 
-def message_class(topic: str, type_name: str) -> Any:
+def find_message_class(topic: str, type_name: str) -> Any:
     """Return the class of a message type.
 
     Args:
@@ -168,10 +168,10 @@ def make_message(type_name: str, **fields: object) -> Any:
         for name, value in fields.items()
         if isinstance(value, np.ndarray)
     }
-    return message_class("make_message", type_name)(**fields | arrays)
+    return find_message_class("make_message", type_name)(**fields | arrays)
 
 
-def compensation_message(
+def make_compensation_message(
     frame_id: str,
     stamp_ns: int,
     motion: Motion | None,
@@ -223,7 +223,7 @@ def to_ns(stamp: Time) -> int:
     return int(stamp.sec) * SECOND + int(stamp.nanosec)
 
 
-def tensor_message(
+def make_tensor_message(
     header: Header,
     rows: StressRows,
     row: int,
@@ -250,7 +250,7 @@ def tensor_message(
     return StressTensorStamped(header=header, tensor=tensor)
 
 
-def wrench_message(
+def make_wrench_message(
     header: Header,
     force_n: Array,
     torque_nm: Array,
@@ -272,7 +272,7 @@ def _make_vector(kind: type, values: Real) -> Any:
     return kind(**dict(zip("xyzw", values.tolist(), strict=False)))
 
 
-def info_message(
+def make_info_message(
     skin: Skin,
     pipeline: Pipeline,
     stamp_ns: int,
@@ -313,7 +313,7 @@ def info_message(
         # it by its id.
         if calibration.id not in message.calibration_ids:
             message.calibration_ids.append(calibration.id)
-            message.calibrations.append(calibration_text(calibration))
+            message.calibrations.append(format_calibration(calibration))
             covariances.append(pipeline.covariance(number))
     message.covariance = pack_array("d", np.array(covariances))
     return message

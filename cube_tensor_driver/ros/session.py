@@ -111,6 +111,6 @@ def spin_until(
     return True
 
 
-def domain_text() -> str:
+def describe_domain() -> str:
     """Return a text such as "DDS domain 0" with the domain of this process, for messages."""
     return f"DDS domain {os.environ.get(VARIABLE) or 0}"

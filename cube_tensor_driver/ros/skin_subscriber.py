@@ -21,7 +21,7 @@ from ..core.latest_stress import STALE_S, LatestStress
 from ..core.poses import CubePoses
 from ..core.rows import StressRows
 from ..messages.codec import stress_codec
-from ..messages.skin_info import cube_poses, geometry
+from ..messages.skin_info import geometry, read_cube_poses
 from ..msg import SkinInfo, SkinStress
 from .callbacks import CallbackErrors
 from .messages import CheckedSubscription, log_refused_message
@@ -98,7 +98,7 @@ class SkinSubscriber:
             return
         try:
             newest = LatestStress(len(info.cubes))
-            skin = FollowedSkin(info, cube_poses(info), newest)
+            skin = FollowedSkin(info, read_cube_poses(info), newest)
             self._on_skin(skin)
         except CubeError as error:
             log_refused_message(self._node, "info", error)

@@ -78,7 +78,7 @@ class SimulatedCubes:
         noise, self._drift, imperfections = errors
         self.n_pads = calibrations[0].layout.n_pads
         self._random = np.random.default_rng(seed)
-        self._groups = calibration_groups(calibrations)
+        self._groups = group_by_calibration(calibrations)
 
         self._law = [
             tabulate_pads(calibrations, name, self.n_pads, fill=np.nan)
@@ -127,7 +127,7 @@ class SimulatedCubes:
         """
         pad_stress = np.empty((len(stress), self.n_pads))
         for calibration, rows in self._groups:
-            state = true_state(calibration, stress[rows], gradient[rows])
+            state = compute_true_state(calibration, stress[rows], gradient[rows])
             pad_stress[rows] = state @ calibration.response.T
         drifted = 1 + self._drift * seconds
         warm = np.ones_like(pad_stress)
@@ -212,7 +212,7 @@ def frequency_noise(calibration: Calibration) -> Array:
     return np.asarray(calibration.noise / stress_per_change)
 
 
-def hub_cubes(
+def make_hub_cubes(
     skin: Skin,
     errors: PadErrors = NO_ERRORS,
 ) -> list[HubCubes]:
@@ -230,7 +230,7 @@ def hub_cubes(
     hubs = []
     poses = skin.poses
     for number, link in enumerate(skin.links):
-        members = hub_members(skin, link.name)
+        members = find_hub_members(skin, link.name)
         present = members[members != ABSENT]
         calibrations = [skin.calibrations[cube] for cube in present]
         if not calibrations:
@@ -252,7 +252,7 @@ def hub_cubes(
     return hubs
 
 
-def hub_members(skin: Skin, link: str) -> Index:
+def find_hub_members(skin: Skin, link: str) -> Index:
     """Return the indices in the skin of the cubes (hub cubes,) of the hub on a link.
 
     A cube whose index on the hub is given in the skin file has this index. Cubes for which the skin
@@ -286,7 +286,7 @@ def hub_members(skin: Skin, link: str) -> Index:
     return members
 
 
-def calibration_groups(
+def group_by_calibration(
     calibrations: Sequence[Calibration],
 ) -> list[tuple[Calibration, Index]]:
     """Group cubes by calibration.
@@ -305,7 +305,7 @@ def calibration_groups(
     ]
 
 
-def true_state(
+def compute_true_state(
     calibration: Calibration,
     stress: Array,
     gradient: Array,
@@ -328,7 +328,7 @@ def true_state(
     return calibration.modes.state(stress, change)
 
 
-def skin_components(
+def compute_skin_components(
     skin: Skin,
     stress: Array,
     gradient: Array,
@@ -344,8 +344,8 @@ def skin_components(
         Components (cubes, 15): six stresses in Pa, then nine gradients in Pa/m.
     """
     components = np.empty((len(skin.cubes), len(COMPONENTS)))
-    for calibration, rows in calibration_groups(skin.calibrations):
-        state = true_state(calibration, stress[rows], gradient[rows])
+    for calibration, rows in group_by_calibration(skin.calibrations):
+        state = compute_true_state(calibration, stress[rows], gradient[rows])
         in_pascal = state @ calibration.modes.components.T
         components[rows] = in_pascal * calibration.component_scale
     return components

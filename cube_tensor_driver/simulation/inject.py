@@ -51,11 +51,11 @@ def inject(ports: Path | None, words: Sequence[str]) -> str:
         sizes = read_yaml(folder / HUBS_FILE)
         hubs = {name: HubSize(**size) for name, size in sizes.items()}
         links = check_target(parsed, hubs)
-        stream.write(fault_line(fault))
+        stream.write(format_fault(fault))
     return f"{', '.join(links)}: {_describe(parsed)}"
 
 
-def fault_line(fault: dict[str, object]) -> str:
+def format_fault(fault: dict[str, object]) -> str:
     """Return a fault as one line of YAML, which a simulator reads from its pipe.
 
     Args:

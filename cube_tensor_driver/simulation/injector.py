@@ -197,7 +197,7 @@ class Injector:
             sound = int(frequency[pad])
             if broken.reading is None:
                 broken.reading = sound
-            frequency[pad] = broken_reading(broken.fault, sound, broken.reading, now_us)
+            frequency[pad] = compute_broken_reading(broken.fault, sound, broken.reading, now_us)
         no_cubes, pads_behind = (0, 0), (0, hub.extra_pads)
         return np.pad(frequency, (no_cubes, pads_behind))
 
@@ -366,7 +366,7 @@ class Injector:
         heapq.heappush(self._schedule, (at_us, begins, next(self._numbers), fault))
 
 
-def broken_reading(
+def compute_broken_reading(
     fault: Fault,
     sound: int,
     first: int,

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ..config.output_files import atomic_write
+from ..config.output_files import write_atomically
 from ..core.arrays import Index, Times
 from ..core.errors import ConfigError
 from ..core.matching import NO_MATCH, SampleKeys, SampleRows, match_rows
@@ -119,7 +119,7 @@ class SampleLog:
         Raises:
             ConfigError: The file cannot be written.
         """
-        with atomic_write(path) as partial:
+        with write_atomically(path) as partial:
             partial.write_text(json.dumps(asdict(self)))
 
     @classmethod

@@ -22,7 +22,7 @@ from pathlib import Path
 from ..config.skin import Skin, SkinLink
 from ..config.yaml import parse_yaml, write_yaml
 from ..core.errors import ConfigError
-from .cubes import NO_ERRORS, HubCubes, Millihertz, PadErrors, hub_cubes
+from .cubes import NO_ERRORS, HubCubes, Millihertz, PadErrors, make_hub_cubes
 from .faults import Fault
 from .hub import SimulatedHub
 from .injector import Injector, SimulatedLink
@@ -130,7 +130,7 @@ class Simulator:
         self._links: list[PlayedLink] = []
         try:
             ports.mkdir(parents=True, exist_ok=True)
-            for carried in hub_cubes(skin, errors):
+            for carried in make_hub_cubes(skin, errors):
                 line = self._make_line(carried.link)
                 self._links.append(_connect(skin, carried, line))
             sizes = {link.name: asdict(link.size) for link in self._links}

@@ -17,7 +17,7 @@ from ..core.arguments import check_number
 from ..core.arrays import Array
 from ..core.rows import COUNTER_RANGE, FrequencyRows
 from ..device.wire.protocol import to_hertz
-from .cubes import NO_ERRORS, PadErrors, hub_cubes
+from .cubes import NO_ERRORS, PadErrors, make_hub_cubes
 from .hub import PERIOD_LIMITS_US, SimulatedHub
 from .imperfections import Imperfections
 from .load import AnyLoad, LoadMemory, read_load
@@ -70,7 +70,7 @@ def simulate(
 
     # The cubes are created again in each iteration. Creating them here, too, raises errors of the
     # skin before the first iteration.
-    hub_cubes(skin)
+    make_hub_cubes(skin)
     errors = PadErrors(noise, drift, imperfections)
     return SimulatedSource(skin, load, round(1e6 / rate), duration, errors)
 
@@ -151,7 +151,7 @@ class SkinPads:
         Raises:
             ConfigError: Cubes of one hub have different numbers of pads.
         """
-        self._hubs = hub_cubes(skin, errors)
+        self._hubs = make_hub_cubes(skin, errors)
         # The rows are sorted link by link, as the driver delivers them.
         cubes = [hub.skin_cubes for hub in self._hubs]
         self._cube = np.concatenate(cubes).astype(np.uint16)

@@ -22,7 +22,7 @@ from ..mechanics.influence import read_influence
 from ..mechanics.layer import Layer
 from .inverse import SurfaceInverse
 from .pad_measurement import model_pads
-from .pad_noise import noise_by_pad, noise_of_all_pads
+from .pad_noise import compute_noise_by_pad, compute_noise_of_all_pads
 from .slip import NO_CONTACTS, Slip, SlipEstimator
 from .surface import Contact, Surface
 from .tracker.contact_tracker import ContactTracker, TrackedContact
@@ -202,7 +202,7 @@ class _InverseFinder:
             depth = influence.depth
             model = model_pads(influence, calibrations)
 
-        by_pad = noise_of_all_pads(calibrations)
+        by_pad = compute_noise_of_all_pads(calibrations)
         self._pipeline = Pipeline(calibrations)
         self._left_out = np.zeros(len(calibrations), np.uint32)
         self._inverse = SurfaceInverse.from_poses(poses, by_pad, layer, depth, model=model)
@@ -219,7 +219,7 @@ class _InverseFinder:
         # computed again for cubes whose pads in use have changed since the last scan.
         changed = np.flatnonzero(left_out != self._left_out)
         if len(changed):
-            by_pad = noise_by_pad(self._pipeline, changed, left_out[changed])
+            by_pad = compute_noise_by_pad(self._pipeline, changed, left_out[changed])
             self._inverse.leave_out(changed, by_pad)
             self._left_out = left_out.copy()
         self.contacts = self._tracker.update(values, status & COMPENSATION != 0)

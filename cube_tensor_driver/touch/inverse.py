@@ -26,7 +26,7 @@ from ..mechanics.layer import Layer
 from ..mechanics.measurement_model import CubeMeasurement, MeasurementModel
 from ..mechanics.traction_prior import TractionPrior
 from .pad_measurement import model_pads
-from .pad_noise import GAIN_ERROR, noise_of_all_pads, stress_matrices
+from .pad_noise import GAIN_ERROR, compute_noise_of_all_pads, stress_matrices
 from .posterior import ObservationModel, WindowPosteriors
 from .prediction import MissingValuePrediction
 from .surface import patches
@@ -128,7 +128,7 @@ class SurfaceInverse:
                 functions belong to other cubes.
         """
         skin = as_skin(skin)
-        by_pad = noise_of_all_pads(skin.calibrations)
+        by_pad = compute_noise_of_all_pads(skin.calibrations)
         elastomer = skin.elastomer or Elastomer(SURFACE_DEPTH, np.inf)
         depth = elastomer.depth if depth is None else depth
         layer = Layer(
@@ -156,7 +156,7 @@ class SurfaceInverse:
 
         Args:
             poses: Poses of the cubes.
-            by_pad: Noise matrices (cubes, 15, P) as from `noise_of_all_pads`.
+            by_pad: Noise matrices (cubes, 15, P) as from `compute_noise_of_all_pads`.
             layer: Elastic layer that contains the cubes.
             depth: Distance from the centres of the cubes to the surface, in m.
             side: Number of points along a side of the patch of each cube, as for `SurfaceInverse`.
@@ -283,7 +283,7 @@ class SurfaceInverse:
 
         Args:
             cubes: Indices (n,) of the cubes.
-            by_pad: Noise matrices (n, 15, P) as from `noise_by_pad`, with the pads in use.
+            by_pad: Noise matrices (n, 15, P) as from `compute_noise_by_pad`, with the pads in use.
         """
         self.revision += 1
         observed = by_pad[:, self.columns]

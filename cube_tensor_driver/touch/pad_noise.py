@@ -27,7 +27,7 @@ GAIN_ERROR = 0.01
 """Standard deviation of the relative error of a pad's calibrated gain (sensitivity): 1 %."""
 
 
-def noise_by_pad(
+def compute_noise_by_pad(
     pipeline: Pipeline,
     cubes: Index,
     left_out: PadMasks,
@@ -55,7 +55,7 @@ def noise_by_pad(
     return by_pad
 
 
-def noise_of_all_pads(calibrations: Sequence[Calibration]) -> Array:
+def compute_noise_of_all_pads(calibrations: Sequence[Calibration]) -> Array:
     """Return the noise matrices of all cubes of a skin if every cube uses all of its P pads.
 
     Args:
@@ -63,11 +63,11 @@ def noise_of_all_pads(calibrations: Sequence[Calibration]) -> Array:
 
     Returns:
         Change (cubes, 15, P) of each component, in Pa or Pa/m, for one standard deviation of the
-        noise of each pad, as from `noise_by_pad`.
+        noise of each pad, as from `compute_noise_by_pad`.
     """
     n = len(calibrations)
     no_pads = np.zeros(n, np.uint32)
-    return noise_by_pad(Pipeline(calibrations), np.arange(n), no_pads)
+    return compute_noise_by_pad(Pipeline(calibrations), np.arange(n), no_pads)
 
 
 def stress_matrices(by_pad: Array, known: Mask) -> Array:

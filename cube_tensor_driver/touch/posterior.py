@@ -37,7 +37,7 @@ from ..mechanics.cache import Arrays, load_or_compute
 from ..mechanics.traction_prior import TractionPrior
 from .nearest_cubes import find_nearest_cubes
 from .prior import AMPLITUDE, covariance_matrix
-from .surface import square_points
+from .surface import make_square_points
 from .unrolled_skin import unroll
 
 WINDOW_CUBES = 25
@@ -68,9 +68,9 @@ class ObservationModel(NamedTuple):
     Attributes:
         columns: Indices (C,) in `COMPONENTS` of the components that some cube of the skin observes.
         known: Whether each cube observes each of these components (n, C).
-        by_pad: Noise matrices (n, C, P) as from `noise_by_pad`: change of each component, in Pa,
-            for one standard deviation of the noise of each pad. Gradients are multiplied by half
-            the side of a cube, so that they are in Pa, too.
+        by_pad: Noise matrices (n, C, P) as from `compute_noise_by_pad`: change of each component,
+            in Pa, for one standard deviation of the noise of each pad. Gradients are multiplied by
+            half the side of a cube, so that they are in Pa, too.
         variant: Index (n,) of each cube's calibration in the measurement model.
     """
 
@@ -149,7 +149,7 @@ class WindowPosteriors:
             angle[first],
         ]
         inputs += [example.columns, example.by_pad, example.variant]
-        points = square_points(spacing, side)
+        points = make_square_points(spacing, side)
 
         def solve_kinds() -> Arrays:
             """Compute the arrays of `_Window` for all kinds of windows.

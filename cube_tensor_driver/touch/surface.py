@@ -368,7 +368,7 @@ class _LoadedSurface(NamedTuple):
     sees_shear: bool
 
 
-def square_points(spacing: float, side: int) -> Array:
+def make_square_points(spacing: float, side: int) -> Array:
     """Return a square grid of points that is centred on the origin of the x-y plane.
 
     Args:
@@ -401,7 +401,7 @@ def patches(
         plane of its cube.
     """
     in_plane = poses.rotation[:, :, :2]
-    grid = square_points(spacing, side)
+    grid = make_square_points(spacing, side)
     offset = np.einsum("nij,qj->nqi", in_plane, grid)
     return np.asarray(poses.position[:, None] + offset)
 

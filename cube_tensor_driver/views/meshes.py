@@ -59,7 +59,7 @@ def make_cube() -> Mesh:
     return join_squares(np.array(faces))
 
 
-def corner_lines(rotation: Array, side: float) -> Array:
+def make_corner_lines(rotation: Array, side: float) -> Array:
     """Return the lines (8, 2, 3) that mark the four corners of a square around the origin.
 
     Args:
@@ -108,7 +108,7 @@ def find_hit_cube(
     return int(distance.argmin())
 
 
-def square_corners(points: Array, rotation: Array, side: Array) -> AnyArray:
+def compute_square_corners(points: Array, rotation: Array, side: Array) -> AnyArray:
     """Return the corners (M, 4, 3) of M squares, in units of the scene.
 
     Args:

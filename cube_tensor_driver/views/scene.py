@@ -173,7 +173,7 @@ range of colours, in SI units.
 """
 
 
-def component_unit(name: str) -> tuple[float, str]:
+def find_component_unit(name: str) -> tuple[float, str]:
     """Return the unit in which users see a component of stress or gradient, or the residual.
 
     Returns:
@@ -184,7 +184,7 @@ def component_unit(name: str) -> tuple[float, str]:
     return (1e6, "kPa/mm") if "_" in name else (1e3, "kPa")
 
 
-def automatic_top(
+def choose_automatic_top(
     quantity: Quantity,
     values: Array,
     last_top: float = 0.0,
@@ -229,10 +229,10 @@ class Ranges(NamedTuple):
             colours: Upper end of the colour scale of the next picture, in SI units.
         """
         # Columns 2 to 4 are the stress components zz, yz and zx, which act on the upper face.
-        traction = automatic_top(QUANTITIES["shear"], values[:, 2:5], self.traction)
+        traction = choose_automatic_top(QUANTITIES["shear"], values[:, 2:5], self.traction)
         gradient = QUANTITIES["gradient"]
         magnitude = gradient.of(values, residual)
-        longest_gradient = automatic_top(gradient, magnitude, self.gradient)
+        longest_gradient = choose_automatic_top(gradient, magnitude, self.gradient)
         return Ranges(colours, traction, longest_gradient)
 
 
@@ -261,7 +261,7 @@ def colours(
     return np.where(is_known[:, None], mixed, GREY)
 
 
-def linear_light(colours: Array) -> NDArray[np.uint8]:
+def convert_to_linear_light(colours: Array) -> NDArray[np.uint8]:
     """Convert sRGB colours (N, 3) from 0 to 1 into linear intensities from 0 to 255.
 
     The browser interprets the colours of batched meshes as linear intensities of light. The
@@ -284,7 +284,7 @@ def above(poses: CubePoses, factor: float) -> Array:
     return np.asarray(poses.position + height * z_axis)
 
 
-def traction_arrows(
+def make_traction_arrows(
     poses: CubePoses,
     values: Array,
     length: float,
@@ -313,7 +313,7 @@ def traction_arrows(
     return np.stack([tail, tail + arrow], axis=1)
 
 
-def gradient_arrows(
+def make_gradient_arrows(
     poses: CubePoses,
     values: Array,
     length: float,
@@ -340,7 +340,7 @@ def gradient_arrows(
     return np.stack([tail, tail + arrow], axis=1)
 
 
-def principal_crosses(
+def make_principal_crosses(
     poses: CubePoses,
     values: Array,
     length: float,
@@ -371,7 +371,7 @@ def principal_crosses(
     return lines, np.asarray(principal > 0)
 
 
-def fault_crosses(poses: CubePoses, health: AnyArray) -> Array:
+def make_fault_crosses(poses: CubePoses, health: AnyArray) -> Array:
     """Return two crossed lines over the upper face (+z) of each cube whose health is not `FINE`.
 
     Args:

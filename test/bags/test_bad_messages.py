@@ -14,7 +14,7 @@ pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 
 from bag_maker import make_bag
 
-from cube_tensor_driver.bags.metadata import typestore
+from cube_tensor_driver.bags.metadata import make_typestore
 from cube_tensor_driver.bags.read import Bag
 from cube_tensor_driver.bags.reprocess.job import ReprocessJob, reprocess
 from cube_tensor_driver.bags.write import BagWriter
@@ -44,9 +44,9 @@ def changed(kind: str, change) -> object:
     """A message that can be read, of which something is wrong."""
 
     def apply(data: bytes) -> bytes:
-        message = typestore().deserialize_cdr(data, kind)
+        message = make_typestore().deserialize_cdr(data, kind)
         change(message)
-        return bytes(typestore().serialize_cdr(message, kind))
+        return bytes(make_typestore().serialize_cdr(message, kind))
 
     return apply
 

@@ -14,7 +14,7 @@ pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 
 from bag_maker import START_NS, frequencies_of, info_of, loads, make_bag
 
-from cube_tensor_driver.bags.metadata import typestore
+from cube_tensor_driver.bags.metadata import make_typestore
 from cube_tensor_driver.bags.reprocess.job import reconstruct
 from cube_tensor_driver.bags.reprocess.recorded_reconstruction import RecordedReconstruction
 from cube_tensor_driver.bags.source import open_bag
@@ -135,7 +135,7 @@ def test_messages_whose_scans_would_join_come_one_by_one(tmp_path):
     """A message has cubes 1, 2, 0: joined, 0 1 2 of two messages would be a scan."""
     skin = read_skin(SKIN)
     pipeline = Pipeline([cube.calibration for cube in skin.cubes], np.float32)
-    store = typestore()
+    store = make_typestore()
     with BagWriter(tmp_path / "bag") as writer:
         for topic, kind in (("/frequencies", FREQUENCIES), ("/info", INFO)):
             writer.add_topic(topic, kind)
@@ -164,7 +164,12 @@ def test_what_is_wrong_is_said(bag, tmp_path):
     with BagWriter(tmp_path / "bare") as writer:
         writer.add_topic("/frequencies", FREQUENCIES)
         row = frequencies_of(0, START_NS, np.full((1, 8), 1e5))
-        writer.write("/frequencies", START_NS, bytes(typestore().serialize_cdr(row, FREQUENCIES)))
+        writer.write(
+            "/frequencies", START_NS, bytes(make_typestore().serialize_cdr(row, FREQUENCIES))
+        )
     with pytest.raises(BagError, match="no message on /info"):
         open_bag(tmp_path / "bare")
-    assert frequency_codec.decode(bytes(typestore().serialize_cdr(row, FREQUENCIES))).rows.cube == 0
+    assert (
+        frequency_codec.decode(bytes(make_typestore().serialize_cdr(row, FREQUENCIES))).rows.cube
+        == 0
+    )

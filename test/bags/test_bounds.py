@@ -16,7 +16,7 @@ pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 
 from mcap.writer import CompressionType, IndexType, Writer
 
-from cube_tensor_driver.bags.metadata import typestore
+from cube_tensor_driver.bags.metadata import make_typestore
 from cube_tensor_driver.bags.read import MAX_MESSAGE_BYTES, Bag
 from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.config.yaml import read_yaml, write_yaml
@@ -56,7 +56,7 @@ def a_large_chunk(folder: Path) -> Path:
 
 def a_folder(folder: Path) -> Path:
     bag = folder / "bag"
-    data = bytes(typestore().serialize_cdr(typestore().types[TEXT](data="x"), TEXT))
+    data = bytes(make_typestore().serialize_cdr(make_typestore().types[TEXT](data="x"), TEXT))
     with BagWriter(bag) as writer:
         writer.add_topic("/text", TEXT)
         writer.write("/text", 1, data)

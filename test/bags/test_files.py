@@ -31,7 +31,7 @@ from rosbags.rosbag2 import Reader
 
 from conftest import ROOT
 from cube_tensor_driver.bags import summary
-from cube_tensor_driver.bags.metadata import typestore
+from cube_tensor_driver.bags.metadata import make_typestore
 from cube_tensor_driver.bags.read import Bag, report_damage
 from cube_tensor_driver.bags.repair import repair
 from cube_tensor_driver.bags.reprocess import job as job_module
@@ -142,7 +142,7 @@ def test_a_written_bag_is_read_by_rosbag2(tmp_path, options):
     with Bag(path) as bag:
         assert messages == [(entry.topic, entry.data, entry.time_ns) for entry in bag.entries()]
         assert topics == {
-            one.topic: (one.msgtype, typestore().hash_rihs01(one.msgtype))
+            one.topic: (one.msgtype, make_typestore().hash_rihs01(one.msgtype))
             for one in bag.connections
         }
         assert (metadata.starting_time.nanoseconds, metadata.message_count) == (
@@ -225,7 +225,7 @@ def test_type_hashes_are_those_of_ros():
     installed = Path(os.environ["AMENT_PREFIX_PATH"].split(":")[0]) / "share/cube_tensor_driver/msg"
     for kind in (FREQUENCIES, STRESS, INFO):
         text = (installed / f"{kind.split('/')[-1]}.json").read_text()
-        assert typestore().hash_rihs01(kind) in text
+        assert make_typestore().hash_rihs01(kind) in text
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
@@ -257,7 +257,7 @@ def test_tare_in_the_middle_counts_from_its_time_on(tmp_path):
     pipeline = Pipeline([cube.calibration for cube in skin.cubes], np.float32)
     tared = Pipeline([cube.calibration for cube in skin.cubes], np.float32)
     tared.rest_frequency = pipeline.rest_frequency * 1.001
-    store, middle = typestore(), START_NS + 500_000_000
+    store, middle = make_typestore(), START_NS + 500_000_000
     with BagWriter(tmp_path / "bag") as writer:
         for topic, kind in (("/frequencies", FREQUENCIES), ("/info", INFO)):
             writer.add_topic(topic, kind)
@@ -581,7 +581,7 @@ def test_another_version_is_refused(tmp_path):
         writer.write(
             "/info",
             1,
-            bytes(typestore().serialize_cdr(info_of(skin, pipeline, 1, version=7), INFO)),
+            bytes(make_typestore().serialize_cdr(info_of(skin, pipeline, 1, version=7), INFO)),
         )
     with Bag(tmp_path / "bag") as bag, pytest.raises(BagError, match="/info has version 7; this"):
         bag.infos("/info")
@@ -621,7 +621,7 @@ def test_fit_from_a_bag(tmp_path, capsys):
     zero = message("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
 
     def put(topic: str, stamp: int, one: object) -> None:
-        writer.write(topic, stamp, bytes(typestore().serialize_cdr(one, one.__msgtype__)))
+        writer.write(topic, stamp, bytes(make_typestore().serialize_cdr(one, one.__msgtype__)))
 
     with BagWriter(tmp_path / "bag") as writer:
         for topic, of in (

@@ -20,7 +20,7 @@ from PIL import Image
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from cube_tensor_driver.browser.charts import csv_of
+from cube_tensor_driver.browser.charts import format_csv
 from cube_tensor_driver.browser.controls import ColourControls
 from cube_tensor_driver.browser.gate import check_host, guarded_server, refusal
 from cube_tensor_driver.browser.history import History
@@ -147,7 +147,7 @@ def test_saved_tables_and_pictures_hold_what_the_cubes_showed() -> None:
         values = np.full((2, len(COMPONENTS)), np.nan)
         values[1, [zz, zz_x]] = -1000.0 * number, 2e6
         history.add(10 + 0.5 * number, values, np.array([np.nan, 1.25]))
-    table = list(csv.reader(io.StringIO(csv_of(history, [1], ["c0", "c1"]).decode())))
+    table = list(csv.reader(io.StringIO(format_csv(history, [1], ["c0", "c1"]).decode())))
     assert table == [
         ["time / s", "c1 zz / Pa", "c1 zz_x / Pa/m", "c1 residual / 1"],
         ["-1", "-2000", "2e+06", "1.25"],

@@ -23,7 +23,7 @@ from cube_tensor_driver.core.errors import BagError
 from cube_tensor_driver.core.modes import COMPONENTS
 from cube_tensor_driver.core.poses import CubePoses
 from cube_tensor_driver.core.rows import StressRows
-from cube_tensor_driver.messages.contacts import decode_traction, traction_message
+from cube_tensor_driver.messages.contacts import decode_traction, make_traction_message
 from cube_tensor_driver.ros.messages import make_message
 from cube_tensor_driver.simulation.load import Load, default_script
 from cube_tensor_driver.touch.inverse import SurfaceInverse
@@ -191,7 +191,7 @@ class Buffer:
 
 
 def test_a_point_cloud_in_a_rosidl_buffer_is_read(poses):
-    message = traction_message(make_message, 5, "skin_base", cloud_of(poses))
+    message = make_traction_message(make_message, 5, "skin_base", cloud_of(poses))
     expected = decode_traction(message)
     # The messages of older releases refuse such a value.
     received = SimpleNamespace(
@@ -201,7 +201,7 @@ def test_a_point_cloud_in_a_rosidl_buffer_is_read(poses):
 
 
 def test_another_point_cloud_is_refused_in_words(poses):
-    message = traction_message(make_message, 5, "skin_base", cloud_of(poses))
+    message = make_traction_message(make_message, 5, "skin_base", cloud_of(poses))
     message.fields = message.fields[:3]
     with pytest.raises(BagError, match="has the fields x, y, z; those of the topic traction are"):
         decode_traction(message)

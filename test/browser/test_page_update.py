@@ -32,10 +32,10 @@ from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rows import StressRows
-from cube_tensor_driver.messages.contacts import contacts_message, traction_message
+from cube_tensor_driver.messages.contacts import make_contacts_message, make_traction_message
 from cube_tensor_driver.msg import SkinContacts, SkinInfo, SkinStress
 from cube_tensor_driver.ros.compat import make_executor
-from cube_tensor_driver.ros.messages import info_message, make_message
+from cube_tensor_driver.ros.messages import make_info_message, make_message
 from cube_tensor_driver.ros.qos import LATCHED
 from cube_tensor_driver.ros.session import spin_until
 from cube_tensor_driver.touch.surface import Contact
@@ -160,7 +160,7 @@ class Source:
     def __init__(self, ros) -> None:
         node = ros.node
         self._info = node.create_publisher(SkinInfo, "info", LATCHED)
-        self._info.publish(info_message(SKIN, Pipeline(SKIN.calibrations), START_NS))
+        self._info.publish(make_info_message(SKIN, Pipeline(SKIN.calibrations), START_NS))
         self._stress = node.create_publisher(SkinStress, "stress", 100)
         self._contacts = node.create_publisher(SkinContacts, "contacts", 10)
         self._traction = node.create_publisher(PointCloud2, "traction", 10)
@@ -196,8 +196,8 @@ class Source:
         of = self.stamp_ns[number], "skin_base"
         ones = np.ones(N)
         cloud = np.column_stack([self._points, STEP_PA * number * ones, 0 * ones, ones])
-        self._traction.publish(traction_message(make_message, *of, cloud))
-        self._contacts.publish(contacts_message(make_message, *of, [contact]))
+        self._traction.publish(make_traction_message(make_message, *of, cloud))
+        self._contacts.publish(make_contacts_message(make_message, *of, [contact]))
 
 
 @pytest.fixture
@@ -242,7 +242,7 @@ def test_all_that_a_browser_receives_at_once_is_of_one_scan(page, ros):
         assert state.surface == pytest.approx(-state.zz, abs=5.1)
         assert state.top == pytest.approx(TOP_PA)
         colour = scene.colours(scene.QUANTITIES["pressure"], np.array([-state.zz]), TOP_PA)
-        assert state.colour == scene.linear_light(colour)[0].tolist()
+        assert state.colour == scene.convert_to_linear_light(colour)[0].tolist()
     # viser applies at most 128 messages at once.
     assert max(page.reader.windows) < 128
 

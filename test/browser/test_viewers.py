@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from conftest import ROOT
-from cube_tensor_driver.config.rviz import rviz_view
+from cube_tensor_driver.config.rviz import make_rviz_view
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.views.scene import QUANTITIES, colours
 
@@ -213,7 +213,7 @@ def test_rviz_reads_every_name_of_ours():
 
 def test_rviz_gets_the_frame_a_wrench_and_a_view_of_any_skin():
     skin = read_skin(ROOT / "config" / "examples" / "sole.yaml")
-    manager = rviz_view(skin)["Visualization Manager"]
+    manager = make_rviz_view(skin)["Visualization Manager"]
     assert manager["Global Options"]["Fixed Frame"] == skin.parent_frame
     displays = {display["Name"]: display for display in manager["Displays"]}
     topic = displays["Wrench"]["Topic"]["Value"]

@@ -22,12 +22,12 @@ from cube_tensor_driver.calibrate.pad_rest import measure_pads_at_rest
 from cube_tensor_driver.calibrate.presses import (
     SIDES,
     PressDetector,
-    cube_rotations,
-    expected_presses,
+    compute_expected_presses,
     explain_presses,
+    list_cube_rotations,
 )
 from cube_tensor_driver.cli.main import main
-from cube_tensor_driver.config.calibration import named_layout, shipped_calibration
+from cube_tensor_driver.config.calibration import find_named_layout, find_shipped_calibration
 from cube_tensor_driver.config.skin import Skin, SkinCube, SkinLink, read_skin
 from cube_tensor_driver.core.calibration import Calibration
 from cube_tensor_driver.core.layout import Layout
@@ -37,7 +37,7 @@ from cube_tensor_driver.mechanics import contact
 from cube_tensor_driver.simulation.cubes import PadErrors
 from cube_tensor_driver.simulation.simulator import FIRST_UID, Simulator, StopRequest
 
-TURNS = cube_rotations()
+TURNS = list_cube_rotations()
 OTHER_DEPTH = {"depth": 3.5e-3, "distances": [1.3]}
 """Presses that are not those that are expected: another depth, another distance."""
 
@@ -77,9 +77,9 @@ def test_a_press_is_read_once_and_only_when_it_is_steady():
 def test_turned_cubes_and_swapped_pads_are_told_apart(name):
     """All 24 turns, with pads in their order and with two of them swapped, presses elsewhere than
     expected and gains that differ by 3 %."""
-    calibration = shipped_calibration(named_layout(name))
-    expected = expected_presses(calibration, TURNS)
-    given = expected_presses(calibration, TURNS, **OTHER_DEPTH)[:, :, 0]
+    calibration = find_shipped_calibration(find_named_layout(name))
+    expected = compute_expected_presses(calibration, TURNS)
+    given = compute_expected_presses(calibration, TURNS, **OTHER_DEPTH)[:, :, 0]
     random = np.random.default_rng(0)
     right = 0
     for number, turn in enumerate(TURNS[:: 1 if name == "planar" else 6]):
@@ -101,10 +101,10 @@ def test_turned_cubes_and_swapped_pads_are_told_apart(name):
 
 
 def test_a_broken_pad_is_left_out():
-    calibration = shipped_calibration(named_layout("planar"))
-    measured = expected_presses(calibration, TURNS, **OTHER_DEPTH)[3, :, 0]
+    calibration = find_shipped_calibration(find_named_layout("planar"))
+    measured = compute_expected_presses(calibration, TURNS, **OTHER_DEPTH)[3, :, 0]
     measured[:, 2] = np.nan
-    found = explain_presses(measured, expected_presses(calibration, TURNS))
+    found = explain_presses(measured, compute_expected_presses(calibration, TURNS))
     assert np.array_equal(found.rotation, TURNS[3]) and not found.swapped
 
 
@@ -204,7 +204,7 @@ def bring_up(folder: Path, person: Person, order: list[int]) -> tuple[int, str]:
 
 
 def test_a_turned_cube_is_found_and_written(tmp_path):
-    planar = shipped_calibration(named_layout("planar"))
+    planar = find_shipped_calibration(find_named_layout("planar"))
     skin = row([planar, planar])
     person = Person(skin, [np.eye(3, dtype=int), TURNS[3]])
     assert np.allclose(TURNS[3], rotation_from_rpy(0, 0, np.pi))
@@ -219,7 +219,7 @@ def test_a_turned_cube_is_found_and_written(tmp_path):
 
 
 def test_swapped_pads_are_found_and_no_file_is_written(tmp_path):
-    planar = shipped_calibration(named_layout("planar"))
+    planar = find_shipped_calibration(find_named_layout("planar"))
     person = Person(row([planar]), [np.eye(3, dtype=int)])
     with played(tmp_path, [with_swapped_pads(planar, 0, 3)], person):
         code, output = bring_up(tmp_path, person, [0])

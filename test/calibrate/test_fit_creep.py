@@ -19,9 +19,9 @@ pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 from bag_maker import START_NS, info_of
 
 from conftest import encoded
-from cube_tensor_driver.bags.metadata import quality, typestore
+from cube_tensor_driver.bags.metadata import make_typestore, quality
 from cube_tensor_driver.bags.write import BagWriter
-from cube_tensor_driver.calibrate.creep import CreepFit, add_creep, fit_creep, reading_after_step
+from cube_tensor_driver.calibrate.creep import CreepFit, add_creep, compute_step_reading, fit_creep
 from cube_tensor_driver.calibrate.fit import measured_stress
 from cube_tensor_driver.cli import main as cli
 from cube_tensor_driver.config.calibration import read_calibration
@@ -130,7 +130,7 @@ def test_gains_are_those_of_loads_a_second_after_they_began():
     time, amplitude = 0.7, np.linspace(0.05, 0.4, 8)
     model = CreepModel(np.array([time]), amplitude[:, None])
     expected = (1 - amplitude * np.exp(-(1 - amplitude) / time)) / (1 - amplitude)
-    np.testing.assert_allclose(reading_after_step(model, 1.0), expected, rtol=1e-5)
+    np.testing.assert_allclose(compute_step_reading(model, 1.0), expected, rtol=1e-5)
     older = add_creep(PLAIN, model)
     np.testing.assert_allclose(older.gain, PLAIN.gain / expected, rtol=1e-5)
     again = add_creep(older, model)
@@ -180,7 +180,7 @@ def test_three_commands_lead_from_a_bag_to_a_calibration(tmp_path, capsys):
         for name, kind in {"info": INFO, "frequencies": FREQUENCIES}.items():
             writer.add_topic(f"/{name}", kind, [quality(latched=name == "info")])
         info = info_of(skin, Pipeline([PLAIN]), START_NS)
-        writer.write("/info", START_NS, bytes(typestore().serialize_cdr(info, INFO)))
+        writer.write("/info", START_NS, bytes(make_typestore().serialize_cdr(info, INFO)))
         for n, pads in enumerate(frequency.astype(np.float32)):
             stamp_ns = START_NS + n * 100_000_000
             number = np.zeros(1, np.uint16)

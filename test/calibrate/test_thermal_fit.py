@@ -15,11 +15,11 @@ pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 from bag_maker import START_NS, info_of
 
 from conftest import encoded
-from cube_tensor_driver.bags.metadata import quality, typestore
+from cube_tensor_driver.bags.metadata import make_typestore, quality
 from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.calibrate.thermal import Warming, fit_thermal
 from cube_tensor_driver.cli import main as cli
-from cube_tensor_driver.config.calibration import read_calibration, shipped_calibration
+from cube_tensor_driver.config.calibration import find_shipped_calibration, read_calibration
 from cube_tensor_driver.config.skin import Elastomer
 from cube_tensor_driver.core.errors import FitError
 from cube_tensor_driver.core.layout import LAYOUTS
@@ -33,7 +33,7 @@ from cube_tensor_driver.simulation.cubes import PadErrors, SimulatedCubes
 from cube_tensor_driver.simulation.imperfections import Imperfections
 from cube_tensor_driver.touch.contact_finder import ContactSettings, contact_finder
 
-CUBE = shipped_calibration(LAYOUTS["cube"])
+CUBE = find_shipped_calibration(LAYOUTS["cube"])
 LOAD = np.array([-2e3, -1500.0, -5000.0, 0.0, 300.0, 0.0])  # Pa
 N_CUBES = 2
 
@@ -73,7 +73,7 @@ def make_bag(folder, knots, faces="both", seconds=600.0, measured=True):
             for k, name in enumerate(names)
         ],
     )
-    store = typestore()
+    store = make_typestore()
     with BagWriter(folder) as writer:
         for topic, kind in (("info", INFO), ("frequencies", FREQUENCIES)):
             writer.add_topic(f"/{topic}", kind, [quality(latched=topic == "info")])

@@ -15,13 +15,13 @@ pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 from bag_maker import START_NS, header, info_of, message
 
 from conftest import encoded
-from cube_tensor_driver.bags.metadata import quality, typestore
+from cube_tensor_driver.bags.metadata import make_typestore, quality
 from cube_tensor_driver.bags.reprocess.job import Overrides, choose_settings
 from cube_tensor_driver.bags.source import open_bag
 from cube_tensor_driver.bags.write import BagWriter
 from cube_tensor_driver.calibrate.weight import fit_weight
 from cube_tensor_driver.cli import main as cli
-from cube_tensor_driver.config.calibration import read_calibration, shipped_calibration
+from cube_tensor_driver.config.calibration import find_shipped_calibration, read_calibration
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.config.yaml import write_yaml
 from cube_tensor_driver.core.calibration import illustrative
@@ -87,7 +87,7 @@ def make_bag(folder, poses=POSES, spread=0.0, cubes=3, motion=True, **changes):
 
 def write_bag(folder, skin, scans, motion=True):
     """A bag of scans from the time 0 on, with the specific force of their first cube."""
-    store = typestore()
+    store = make_typestore()
     topics = {"info": INFO, "frequencies": FREQUENCIES}
     if motion:
         topics["compensation"] = COMPENSATION_TYPE
@@ -208,7 +208,10 @@ def test_a_simulated_arm_yields_the_response_by_finite_elements(tmp_path):
         cubes.append({"name": f"c{k}", "index": k, "pose": pose, **shared})
     data = {"name": "skin", "links": [{"name": "hub0", "port": "/dev/none"}], "cubes": cubes}
     write_yaml(tmp_path / "skin.yaml", data | {"parent_frame": "base"})
-    skin, calibration = read_skin(tmp_path / "skin.yaml"), shipped_calibration(LAYOUTS["planar"])
+    skin, calibration = (
+        read_skin(tmp_path / "skin.yaml"),
+        find_shipped_calibration(LAYOUTS["planar"]),
+    )
     noise = dict(noise=8e-6, rate=25.0)
     still = [(5.0 * k + t, 0, 0, 0, *c, 0) for k, c in enumerate(CORNERS) for t in (0.0, 4.0)]
     arm = Imperfections(poses=tuple(still), weight="planar_slab")

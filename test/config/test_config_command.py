@@ -13,7 +13,7 @@ import pytest
 
 from conftest import ROOT
 from cube_tensor_driver.cli.config import check_file
-from cube_tensor_driver.config.grid import grid
+from cube_tensor_driver.config.grid import describe_grid
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.config.yaml import write_yaml
 from cube_tensor_driver.core.tensor import rotation_from_rpy
@@ -102,7 +102,7 @@ def test_a_grid_of_another_layout_has_its_calibration_and_replaces_no_file(tmp_p
 
 def written(tmp_path, **changes):
     """A skin file of 3 x 1 cubes on 3 links, with changes."""
-    skin = grid(nx=3, ny=1, pitch=0.012, rate=100.0, links=3)
+    skin = describe_grid(nx=3, ny=1, pitch=0.012, rate=100.0, links=3)
     for key, values in changes.items():
         for item, value in zip(skin["cubes" if key == "xyz" else "links"], values, strict=False):
             if key == "xyz":

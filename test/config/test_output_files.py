@@ -9,19 +9,19 @@ import stat
 
 import pytest
 
-from cube_tensor_driver.config.output_files import atomic_write, check_writable
+from cube_tensor_driver.config.output_files import check_writable, write_atomically
 from cube_tensor_driver.core.errors import ConfigError
 
 
 def test_each_of_two_writers_has_its_own_temporary_file(tmp_path):
     path = tmp_path / "tare.yaml"
-    with atomic_write(path) as one:
+    with write_atomically(path) as one:
         one.write_text("one" * 1000)
-        with atomic_write(path) as other:
+        with write_atomically(path) as other:
             other.write_text("other")
         assert path.read_text() == "other"
     assert path.read_text() == "one" * 1000
-    with pytest.raises(ZeroDivisionError), atomic_write(path) as failed:
+    with pytest.raises(ZeroDivisionError), write_atomically(path) as failed:
         failed.write_text(f"{1 / 0}")
     check_writable(path)
     assert path.read_text() == "one" * 1000 and list(tmp_path.iterdir()) == [path]
@@ -31,7 +31,7 @@ def test_no_link_is_followed_and_permissions_are_those_of_any_new_file(tmp_path)
     path, victim = tmp_path / "tare.yaml", tmp_path / "victim"
     victim.write_text("mine")
     (tmp_path / "tare.yaml.part").symlink_to(victim)
-    with atomic_write(path) as temporary:
+    with write_atomically(path) as temporary:
         temporary.write_text("new")
     assert victim.read_text() == "mine" and path.read_text() == "new"
     (tmp_path / "plain").touch()
@@ -46,7 +46,7 @@ def test_the_content_is_on_the_disk_before_the_name(tmp_path, monkeypatch):
         synced.append((os.fstat(number).st_size, path.exists()))
 
     monkeypatch.setattr(os, "fsync", fsync)
-    with atomic_write(path) as temporary:
+    with write_atomically(path) as temporary:
         temporary.write_text("content")
     assert synced == [(7, False)]
 

@@ -15,14 +15,14 @@ import yaml
 
 from cube_tensor_driver.calibrate.load_table import read_loads
 from cube_tensor_driver.config.calibration import read_calibration
-from cube_tensor_driver.config.grid import grid
+from cube_tensor_driver.config.grid import describe_grid
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import Elastomer, check_skin, read_skin
 from cube_tensor_driver.config.yaml import parse_yaml, write_yaml
 from cube_tensor_driver.core.errors import ConfigError, FitError
 from cube_tensor_driver.touch.inverse import SurfaceInverse
 
-GOOD = grid(nx=3, ny=2, pitch=0.012, links=2, rate=100.0)
+GOOD = describe_grid(nx=3, ny=2, pitch=0.012, links=2, rate=100.0)
 
 
 def read(tmp_path: Path, data: object):
@@ -47,7 +47,7 @@ def test_shipped_calibrations_have_their_id():
 
 def test_grid_deals_every_cube_once():
     # 7 cubes on 3 links are 3, 2 and 2. Indices begin with 0 on each link. Positions are centred.
-    data = grid(nx=7, ny=1, pitch=0.5, links=3, rate=10.0, port="p{}")
+    data = describe_grid(nx=7, ny=1, pitch=0.5, links=3, rate=10.0, port="p{}")
     assert [(cube["link"], cube["index"]) for cube in data["cubes"]] == [
         ("hub0", 0),
         ("hub0", 1),

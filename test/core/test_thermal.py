@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from cube_tensor_driver.config.calibration import shipped_calibration
+from cube_tensor_driver.config.calibration import find_shipped_calibration
 from cube_tensor_driver.core.calibration import Calibration
 from cube_tensor_driver.core.compensation.models import ThermalModel
 from cube_tensor_driver.core.compensation.thermal import LOST_KELVIN, START_KELVIN
@@ -22,7 +22,7 @@ from cube_tensor_driver.core.reconstructor import Reconstructor
 from cube_tensor_driver.core.rows import FrequencyRows, concatenate
 from cube_tensor_driver.core.status import COMPENSATION, THERMAL
 
-PLANAR = shipped_calibration(LAYOUTS["planar"])
+PLANAR = find_shipped_calibration(LAYOUTS["planar"])
 LINEAR = np.array([50.0, 60.0, 130.0, 120.0, -200.0, -190.0, -195.0, -205.0])  # Pa/K
 KNOTS = np.array([0.0, 100.0, 130.0, 600.0]), np.array([25.0, 25.0, 40.0, 32.0])  # s, °C
 

@@ -43,7 +43,7 @@ from cube_tensor_driver.msg import (
     SkinTouch,
     StressTensorStamped,
 )
-from cube_tensor_driver.processes.children import Children, ros_arguments
+from cube_tensor_driver.processes.children import Children, format_ros_arguments
 from cube_tensor_driver.processes.skin_processes import SimulatedHubs, skin_processes
 from cube_tensor_driver.ros.messages import to_ns
 from cube_tensor_driver.views.terminal.live_table import LiveTable
@@ -327,7 +327,7 @@ def test_a_node_that_cannot_start_says_why_and_ends(domain, executable, paramete
         "-m",
         f"cube_tensor_driver.ros.nodes.{executable}",
         "--ros-args",
-        *ros_arguments(parameters),
+        *format_ros_arguments(parameters),
     ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
     assert done.returncode == os.EX_CONFIG

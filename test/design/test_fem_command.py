@@ -30,7 +30,7 @@ from cube_tensor_design.paper import rod_parts, rod_shear
 from cube_tensor_design.studies.layout_study import LayoutStudy
 from cube_tensor_driver.cli import main as cli
 from cube_tensor_driver.cli.table import PACKAGES
-from cube_tensor_driver.config.calibration import read_calibration, shipped_calibration
+from cube_tensor_driver.config.calibration import find_shipped_calibration, read_calibration
 from cube_tensor_driver.config.yaml import read_yaml
 from cube_tensor_driver.core.errors import ElasticError
 from cube_tensor_driver.core.layout import LAYOUTS
@@ -112,7 +112,9 @@ def test_thermal_stress_is_shown_and_written(fem, tmp_path, capsys):
     # Twice the expansion of the default has twice the stress.
     usual = compute_thermal_stress(bodies.Body(width=12e-3), LAYOUTS["planar"], 2).pads
     np.testing.assert_allclose(stress["pads"], 2 * usual, atol=1e-3)
-    components = Pipeline([shipped_calibration(LAYOUTS["planar"])]).matrix(0) @ (2 * usual[:, 0])
+    components = Pipeline([find_shipped_calibration(LAYOUTS["planar"])]).matrix(0) @ (
+        2 * usual[:, 0]
+    )
     assert f"shipped calibration: xx {components[0]:+.1f} Pa/K" in shown
     assert f"zz_z {1e-3 * components[14]:+.1f} Pa/mm/K" in shown
 
@@ -121,7 +123,7 @@ def test_weight_is_shown_and_added_to_a_calibration(fem, tmp_path, capsys):
     saved, model = tmp_path / "heavy.yaml", "body: {width: 0.012, density: 2140.0}\n"
     assert fem(model, "--weight", "--meshes", 1, "-o", saved) == 0
     shown = capsys.readouterr().out
-    shipped, heavy = shipped_calibration(LAYOUTS["planar"]), read_calibration(saved)
+    shipped, heavy = find_shipped_calibration(LAYOUTS["planar"]), read_calibration(saved)
     assert replace(heavy, weight=None).id == shipped.id != heavy.id
     expected = compute_weight(bodies.Body(width=12e-3, density=2140.0), LAYOUTS["planar"]).pads
     np.testing.assert_allclose(heavy.weight.response, expected)

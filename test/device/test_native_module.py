@@ -107,7 +107,7 @@ def test_rows_have_the_same_bits(pads: tuple[int, ...], monkeypatch: pytest.Monk
 @needs_the_module
 def test_rows_are_made_of_samples_only() -> None:
     sample = random_sample(np.random.default_rng(1), 2, 3)
-    rows = scan.empty_rows(2, 3)
+    rows = scan.make_empty_rows(2, 3)
     columns = rows.stamp_ns, rows.sequence, rows.pad_fault, rows.temperature, rows.frequency
     addresses = tuple(column.ctypes.data for column in columns)
 

@@ -22,7 +22,7 @@ pytest.importorskip("skfem", reason="needs skfem: pip install scikit-fem")
 from test_python_page import blocks
 
 from conftest import ROOT
-from cube_tensor_design.studies.pads_example import planar_calibration
+from cube_tensor_design.studies.pads_example import read_planar_calibration
 from cube_tensor_driver.core.defaults import FOAM_MODULUS, FREQUENCY_NOISE, POISSONS_RATIO
 from cube_tensor_driver.core.estimator import make_estimator
 from cube_tensor_driver.core.modes import COMPONENTS
@@ -129,7 +129,7 @@ def test_quoted_messages_are_those_of_the_package():
 
 def test_computed_numbers_of_the_build_page_are_right():
     page = (ROOT / "docs" / "build.md").read_text()
-    planar = planar_calibration()
+    planar = read_planar_calibration()
     every_pad = make_estimator(planar.response, planar.noise, planar.modes)
     pressed = every_pad.matrix * planar.response[:, planar.modes.names.index("zz")]
     zz, zx = (100 * 0.01 * np.linalg.norm(pressed[COMPONENTS.index(name)]) for name in ("zz", "zx"))

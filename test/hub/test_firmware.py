@@ -33,7 +33,7 @@ from cube_tensor_driver.device.wire.decoder import Decoder
 from cube_tensor_driver.device.wire.protocol import Command, Request, Sample, Time, encode
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import skin_processes
-from cube_tensor_driver.simulation.cubes import hub_cubes, skin_components
+from cube_tensor_driver.simulation.cubes import compute_skin_components, make_hub_cubes
 from cube_tensor_driver.simulation.load import Load, default_script
 from cube_tensor_hub.captures import COUNTER_HZ, WINDOW_US, Oscillators, edges
 from cube_tensor_hub.check import Checked, check
@@ -168,7 +168,7 @@ def simulated_hub(folder: Path) -> Iterator[str]:
 @contextlib.contextmanager
 def emulated_hub(image: Path, skin: Skin) -> Iterator[tuple[str, Oscillators]]:
     """The port of an emulated hub, and its pads under a load."""
-    (hub,) = hub_cubes(skin)
+    (hub,) = make_hub_cubes(skin)
     pads = Oscillators(hub, Load(skin, default_script()))
     with Emulator(image) as emulator:
         server = threading.Thread(target=pads.serve, args=(emulator.pads,))
@@ -290,7 +290,7 @@ def test_the_load_on_the_pads_comes_out_as_tensors(out, ros, tmp_path):
     middles = np.array(pads.windows)[rows.sequence]
     truth = np.array(
         [
-            skin_components(skin, *load.at(1e-6 * middle))[cube]
+            compute_skin_components(skin, *load.at(1e-6 * middle))[cube]
             for middle, cube in zip(middles.tolist(), rows.cube.tolist(), strict=True)
         ]
     )

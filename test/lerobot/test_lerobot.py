@@ -18,7 +18,7 @@ import pytest
 from bag_maker import START_NS, header, make_bag, message
 from PIL import Image
 
-from cube_tensor_driver.bags.metadata import typestore
+from cube_tensor_driver.bags.metadata import make_typestore
 from cube_tensor_driver.bags.read import Bag
 from cube_tensor_driver.bags.reprocess.job import ReprocessJob, make_table, reprocess
 from cube_tensor_driver.bags.write import BagWriter
@@ -97,7 +97,7 @@ def others() -> list[tuple[str, int, object]]:
 
 def with_others(plain: Path, folder: Path, added: list[tuple[str, int, object]]) -> Path:
     """A copy of a bag, with more messages in it: topic, time of recording, message."""
-    store = typestore()
+    store = make_typestore()
     with Bag(plain) as bag:
         entries = list(bag.entries())
     entries = [(one.topic, one.msgtype, one.time_ns, one.data) for one in entries]

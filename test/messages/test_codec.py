@@ -15,7 +15,7 @@ pytest.importorskip("rosbags", reason="needs rosbags: pip install rosbags")
 
 from bag_maker import FREQUENCIES, STRESS, header, message
 
-from cube_tensor_driver.bags.metadata import typestore
+from cube_tensor_driver.bags.metadata import make_typestore
 from cube_tensor_driver.core.errors import MessageError
 from cube_tensor_driver.core.rows import FrequencyRows, StressRows
 from cube_tensor_driver.messages.codec import frequency_codec, stress_codec
@@ -75,7 +75,7 @@ def by_rosbags(kind: str, rows: FrequencyRows | StressRows, frame_id: str) -> by
     if kind == FREQUENCIES:
         fields["n_pads"] = rows.frequency.shape[1]
     one = message(kind, header=header(STAMP_NS, frame_id), **fields)
-    return bytes(typestore().serialize_cdr(one, kind))
+    return bytes(make_typestore().serialize_cdr(one, kind))
 
 
 def assert_equal(one: FrequencyRows | StressRows, other: FrequencyRows | StressRows) -> None:

@@ -15,8 +15,8 @@ from bag_maker import START_NS, make_bag
 
 from cube_tensor_driver.bags.read import Bag, make_message
 from cube_tensor_driver.bags.reprocess.job import Overrides, ReprocessJob, reprocess
-from cube_tensor_driver.browser.markup import newtons
-from cube_tensor_driver.config.calibration import shipped_calibration
+from cube_tensor_driver.browser.markup import format_newtons
+from cube_tensor_driver.config.calibration import find_shipped_calibration
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import Elastomer, Skin, SkinCube, SkinLink, read_skin
 from cube_tensor_driver.config.yaml import parse_yaml
@@ -26,13 +26,17 @@ from cube_tensor_driver.core.layout import LAYOUTS
 from cube_tensor_driver.core.pipeline import Pipeline
 from cube_tensor_driver.core.rows import FrequencyRows, StressRows
 from cube_tensor_driver.messages.compensation import read_motion
-from cube_tensor_driver.messages.contacts import contacts_message, decode_contacts, traction_message
-from cube_tensor_driver.messages.skin_info import skin_elastomer
+from cube_tensor_driver.messages.contacts import (
+    decode_contacts,
+    make_contacts_message,
+    make_traction_message,
+)
+from cube_tensor_driver.messages.skin_info import read_skin_elastomer
 from cube_tensor_driver.touch.slip import SLIP, STICK, UNKNOWN, Slip
 from cube_tensor_driver.touch.surface import Contact
 from cube_tensor_driver.touch.tracker.contact_tracker import TrackedContact
 
-PLANAR, CUBE = (shipped_calibration(LAYOUTS[name]) for name in ("planar", "cube"))
+PLANAR, CUBE = (find_shipped_calibration(LAYOUTS[name]) for name in ("planar", "cube"))
 DRAWS = 40_000
 SKIN_FILE = package_data() / "config" / "skin_demo.yaml"
 
@@ -69,7 +73,7 @@ def rotated(quaternion: object, vector: np.ndarray) -> np.ndarray:
 
 def test_info_says_what_the_skin_is():
     pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
-    from cube_tensor_driver.ros.messages import info_message
+    from cube_tensor_driver.ros.messages import make_info_message
 
     cubes = (
         SkinCube("c0", "left", 3, None, (0.1, 0.2, 0.3), (0.0, 0.0, 0.0), PLANAR),
@@ -82,14 +86,14 @@ def test_info_says_what_the_skin_is():
     rest = pipeline.rest_frequency
     rest[2] *= 1.01
     pipeline.rest_frequency = rest
-    info = info_message(skin, pipeline, START_NS + 7, {0: 0xA0, 1: 0xA1}, "driver")
+    info = make_info_message(skin, pipeline, START_NS + 7, {0: 0xA0, 1: 0xA1}, "driver")
 
     assert info.version == info.VERSION == 4 and info.header.frame_id == "wrist"
     assert info.header.stamp.sec * 10**9 + info.header.stamp.nanosec == START_NS + 7
     assert (info.sender, info.name) == ("driver", "hand")
     elastomer = (info.elastomer_depth, info.elastomer_thickness, info.elastomer_poisson)
     assert elastomer == (4e-3, 9e-3, 0.46)
-    assert skin_elastomer(info) == skin.elastomer
+    assert read_skin_elastomer(info) == skin.elastomer
     assert info.calibration_ids == [PLANAR.id, CUBE.id]
     for text, calibration in zip(info.calibrations, (PLANAR, CUBE), strict=True):
         read = Calibration.from_dict(parse_yaml(text, "info"))
@@ -145,7 +149,7 @@ def test_each_number_of_a_tensor_and_a_wrench_is_in_its_field():
     pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
     from std_msgs.msg import Header
 
-    from cube_tensor_driver.ros.messages import tensor_message, wrench_message
+    from cube_tensor_driver.ros.messages import make_tensor_message, make_wrench_message
 
     stress, gradient = np.arange(12.0).reshape(2, 6), 100 + np.arange(18.0).reshape(2, 9)
     rows = StressRows.of(
@@ -157,7 +161,7 @@ def test_each_number_of_a_tensor_and_a_wrench_is_in_its_field():
         observed=np.array([7, 0x7FFF]),
     )
     covariance = np.arange(225.0).reshape(15, 15)
-    message = tensor_message(Header(frame_id="hand_c1"), rows, 1, covariance)
+    message = make_tensor_message(Header(frame_id="hand_c1"), rows, 1, covariance)
     tensor = message.tensor
     assert message.header.frame_id == "hand_c1"
     # In the order xx yy zz yz zx xy of SkinStress.
@@ -167,7 +171,7 @@ def test_each_number_of_a_tensor_and_a_wrench_is_in_its_field():
     np.testing.assert_array_equal(tensor.covariance, covariance.ravel())
     assert (tensor.residual, tensor.status, tensor.observed) == (0.75, 2050, 0x7FFF)
 
-    message = wrench_message(Header(frame_id="hand_c1"), np.arange(3.0), 10 + np.arange(3.0))
+    message = make_wrench_message(Header(frame_id="hand_c1"), np.arange(3.0), 10 + np.arange(3.0))
     force, torque = message.wrench.force, message.wrench.torque
     assert message.header.frame_id == "hand_c1"
     assert (force.x, force.y, force.z, torque.x, torque.y, torque.z) == (0, 1, 2, 10, 11, 12)
@@ -175,18 +179,18 @@ def test_each_number_of_a_tensor_and_a_wrench_is_in_its_field():
 
 def test_a_compensation_says_whether_and_when_the_weight_is_known():
     pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
-    from cube_tensor_driver.ros.messages import compensation_message
+    from cube_tensor_driver.ros.messages import make_compensation_message
 
     motion = Motion(START_NS + np.array([-7, 9]), np.arange(6.0), np.arange(18.0))
     states = {"thermal": np.arange(3.0)}
-    message = compensation_message("wrist", START_NS + 5, motion, states)
+    message = make_compensation_message("wrist", START_NS + 5, motion, states)
     assert message.header.frame_id == "wrist" and message.weight
     assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == START_NS + 5
     assert message.time_offset.tolist() == [-12, 4]
     assert message.specific_force.tolist() == list(range(6))
     assert message.gradient.tolist() == list(range(18))
     assert (list(message.creep), message.thermal.tolist()) == ([], [0, 1, 2])
-    without = compensation_message("wrist", START_NS, None, {})
+    without = make_compensation_message("wrist", START_NS, None, {})
     assert not without.weight and read_motion(without, START_NS) is None
 
 
@@ -215,7 +219,7 @@ def test_each_number_of_a_contact_is_in_its_field(kind):
     contacts = [distinct(kind, number) for number in range(3)]
     numbers = np.arange(1.0, 10).reshape(3, 3) / 7
     slip = Slip(np.array([UNKNOWN, STICK, SLIP]), *numbers, numbers + 5)
-    message = contacts_message(make_message, START_NS + 5, "wrist", contacts, slip)
+    message = make_contacts_message(make_message, START_NS + 5, "wrist", contacts, slip)
     assert message.header.frame_id == "wrist"
     assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == START_NS + 5
     for name in ("position", "normal", "force"):
@@ -235,14 +239,14 @@ def test_each_number_of_a_contact_is_in_its_field(kind):
     read = decode_contacts(message)
     assert [one.slips for one in read] == [False, False, True]
     is_tracked = kind is TrackedContact
-    assert [newtons(one)[0] == "~" for one in read] == [is_tracked, False, is_tracked]
-    without = contacts_message(make_message, START_NS, "wrist", contacts)
+    assert [format_newtons(one)[0] == "~" for one in read] == [is_tracked, False, is_tracked]
+    without = make_contacts_message(make_message, START_NS, "wrist", contacts)
     assert not any(one.slips for one in decode_contacts(without))
 
 
 def test_each_number_of_a_point_is_in_its_field():
     cloud = np.arange(30.0).reshape(5, 6) / 7
-    message = traction_message(make_message, START_NS + 5, "wrist", cloud)
+    message = make_traction_message(make_message, START_NS + 5, "wrist", cloud)
     assert message.header.frame_id == "wrist" and message.header.stamp.nanosec == 5
     assert (message.height, message.width, message.is_dense, message.is_bigendian) == (
         1,

@@ -25,9 +25,9 @@ from played_hub import PlayedHub, greeting
 from serial.tools import list_ports
 
 from conftest import free_domain
-from cube_tensor_driver.cli.echo import reading_json, reading_line
+from cube_tensor_driver.cli.echo import encode_reading, format_reading
 from cube_tensor_driver.cli.main import BROKEN_PIPE, main
-from cube_tensor_driver.config.grid import grid
+from cube_tensor_driver.config.grid import describe_grid
 from cube_tensor_driver.config.yaml import parse_yaml, write_yaml
 from cube_tensor_driver.core.modes import GRADIENT, STRESS
 from cube_tensor_driver.device.wire.protocol import Command
@@ -54,7 +54,7 @@ def skin(tmp_path_factory):
     """A skin of two cubes, c0 and c1, under a load that does not change; gives the folder of
     its ports."""
     folder = tmp_path_factory.mktemp("skin")
-    write_yaml(folder / "skin.yaml", grid(nx=2, ny=1, pitch=0.012, links=1, rate=50.0))
+    write_yaml(folder / "skin.yaml", describe_grid(nx=2, ny=1, pitch=0.012, links=1, rate=50.0))
     write_yaml(folder / "load.yaml", STILL)
     hubs = SimulatedHubs(folder / "ports", load=folder / "load.yaml")
     with free_domain(), pytest.MonkeyPatch.context() as patch, Children(folder) as children:
@@ -125,10 +125,10 @@ def test_a_reading_as_a_line_and_as_json():
     stress = dict.fromkeys(STRESS, np.nan) | {"zz": -1234.56, "zx": 7.0}
     gradient = dict.fromkeys(GRADIENT, np.nan) | {"zz_z": 3e5}
     reading = StressReading(12_345_000_000, "c05", stress, gradient, np.nan, status=1 | 16)
-    assert reading_line(reading) == (
+    assert format_reading(reading) == (
         "12.345 s  c05  zz   -1234.6  zx       7.0 Pa  zz_z     300000 Pa/m  PAD_FAULT, pad open"
     )
-    read = json.loads(reading_json(reading))
+    read = json.loads(encode_reading(reading))
     assert read["stress_pa"] == dict.fromkeys(["xx", "yy", "yz", "xy"]) | {"zz": -1234.56, "zx": 7}
     assert read["gradient_pa_per_m"]["zz_z"] == 3e5 and read["residual"] is None
     assert read["status"] == ["PAD_FAULT", "pad open"] and read["stamp_ns"] == 12_345_000_000

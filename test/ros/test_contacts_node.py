@@ -125,7 +125,7 @@ def test_pads_in_a_thin_layer_out_of_a_bag(tmp_path, one_process):
     from rclpy.serialization import deserialize_message, serialize_message
 
     from cube_tensor_driver.msg import SkinContacts
-    from cube_tensor_driver.ros.messages import info_message
+    from cube_tensor_driver.ros.messages import make_info_message
 
     skin = read_skin(package_data() / "config" / "skin_demo.yaml")
     influence = read_influence(find_influence("cube_11mm"))
@@ -137,7 +137,7 @@ def test_pads_in_a_thin_layer_out_of_a_bag(tmp_path, one_process):
         for cube in skin.cubes
     ]
     law = calibration.rest_frequency, calibration.beta, calibration.modulus
-    described = info_message(skin, Pipeline(skin.calibrations), time.time_ns())
+    described = make_info_message(skin, Pipeline(skin.calibrations), time.time_ns())
     described.sender = "reconstruction"
     info = serialize_message(described)
     bag = bag_of(tmp_path / "bag", skin, info, [pad_frequency(np.array(pads), *law)])
@@ -196,11 +196,11 @@ def test_contacts_and_traction_of_a_pressed_skin_live_and_out_of_a_bag(ros, tmp_
     from cube_tensor_driver.msg import SkinContacts, SkinInfo, SkinStress
     from cube_tensor_driver.processes.children import Children
     from cube_tensor_driver.processes.skin_processes import Process
-    from cube_tensor_driver.ros.messages import info_message
+    from cube_tensor_driver.ros.messages import make_info_message
 
     skin = replace(read_skin(package_data() / "config" / "skin_demo.yaml"), elastomer=ELASTOMER)
     middle = np.array([cube.xyz for cube in skin.cubes])[:, :2].mean(axis=0)
-    described = info_message(skin, Pipeline(skin.calibrations), time.time_ns())
+    described = make_info_message(skin, Pipeline(skin.calibrations), time.time_ns())
     described.sender = "reconstruction"
     scans = [frequencies(skin, middle + np.array([2e-4 * number, 0])) for number in range(SCANS)]
     bag = bag_of(tmp_path / "bag", skin, serialize_message(described), scans)

@@ -26,8 +26,8 @@ from cube_tensor_driver.device.wire.decoder import MAX_RUN, Decoder
 from cube_tensor_driver.device.wire.protocol import Ack, Request, Stats, encode
 from cube_tensor_driver.msg import SkinInfo
 from cube_tensor_driver.ros import messages
-from cube_tensor_driver.ros.markers.legend import four_characters
-from workshop.bench.decode import INTACT_COBS, LATE_FAILURE, READ, clean_frames
+from cube_tensor_driver.ros.markers.legend import format_in_four_characters
+from workshop.bench.decode import INTACT_COBS, LATE_FAILURE, READ, make_clean_frames
 
 EACH = 2_000_000
 SHIPPED = {
@@ -39,7 +39,7 @@ SHIPPED = {
 def damaged_frames(size: int) -> bytes:
     """Frames of which one byte in a hundred was replaced."""
     random = np.random.default_rng(2)
-    data = np.frombuffer(clean_frames(size), np.uint8).copy()
+    data = np.frombuffer(make_clean_frames(size), np.uint8).copy()
     where = random.integers(0, len(data), len(data) // 100)
     data[where] = random.integers(0, 256, len(where))
     return bytes(data)
@@ -170,4 +170,4 @@ def test_many_bad_messages_are_one_line_and_the_newest_good_one_is_taken(ros, ca
 
 @pytest.mark.parametrize("value", [-5000.0, -1e-9, float("nan"), 1e38])
 def test_the_legend_has_four_characters_for_any_number(value):
-    assert four_characters(value) == "----"
+    assert format_in_four_characters(value) == "----"

@@ -72,8 +72,8 @@ def test_every_executable_of_the_list_is_installed_and_runs_its_module(monkeypat
 
 def test_temporary_folders_end_with_the_process(tmp_path):
     program = """
-from cube_tensor_driver.config.output_files import temporary_folder
-print(temporary_folder("cube_").is_dir())
+from cube_tensor_driver.config.output_files import make_temporary_folder
+print(make_temporary_folder("cube_").is_dir())
 """
     done = subprocess.run(
         [sys.executable, "-c", program],

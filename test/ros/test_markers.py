@@ -36,7 +36,7 @@ def rows(values: np.ndarray, status: object = 0, cube: object = None) -> StressR
 def test_traction_pushes_to_the_face_and_pulls_away_from_it():
     values = np.full((2, 15), np.nan)
     values[0, 2], values[1, 2] = -1e3, 2e3
-    (pushed, pulled) = scene.traction_arrows(places(2), values, 1e-5)
+    (pushed, pulled) = scene.make_traction_arrows(places(2), values, 1e-5)
     np.testing.assert_allclose(pushed, [[0, 0, 0.012], [0, 0, 0.002]])
     np.testing.assert_allclose(pulled, [[0.01, 0, 0.002], [0.01, 0, 0.022]])
 
@@ -46,18 +46,18 @@ def test_arrows_turn_with_their_cube():
     values[0, 2:5] = -1e3, 300, 500
     values[0, 12:14] = 2e5, -1e5
     turn = rotation_from_rpy(0.4, 0.9, -2.0)
-    for draw, length in ((scene.traction_arrows, 1e-5), (scene.gradient_arrows, 1e-8)):
+    for draw, length in ((scene.make_traction_arrows, 1e-5), (scene.make_gradient_arrows, 1e-8)):
         straight, turned = draw(places(1), values, length), draw(places(1, turn), values, length)
         np.testing.assert_allclose(turned, straight @ turn.T, atol=1e-15)
     # pressure −σzz grows against the gradient of σzz
-    tail, tip = scene.gradient_arrows(places(1), values, 1e-8)[0]
+    tail, tip = scene.make_gradient_arrows(places(1), values, 1e-8)[0]
     np.testing.assert_allclose(tip - tail, [-2e-3, 1e-3, 0], atol=1e-15)
 
 
 def test_principal_cross_of_pure_shear_lies_at_45_degrees():
     values = np.full((1, 15), np.nan)
     values[0, [0, 2, 4]] = 0, 0, 1e3
-    lines, pulls = scene.principal_crosses(places(1), values, 1e-5)
+    lines, pulls = scene.make_principal_crosses(places(1), values, 1e-5)
     assert pulls[0].tolist() == [True, False, False]
     along = lines[0, 0, 1] - lines[0, 0, 0]
     np.testing.assert_allclose(np.abs(along), np.array([1, 0, 1]) * 0.01 / np.sqrt(2), atol=1e-9)
@@ -80,12 +80,12 @@ def test_the_parameter_quantity_allows_what_can_be_drawn():
 
 def test_automatic_range_rises_at_once_and_falls_slowly():
     quantity = QUANTITIES["pressure"]
-    top = scene.automatic_top(quantity, np.array([np.nan, 9e3, -2e3]))
+    top = scene.choose_automatic_top(quantity, np.array([np.nan, 9e3, -2e3]))
     assert top == 9e3
-    assert scene.automatic_top(quantity, np.array([1.0]), top) == pytest.approx(
+    assert scene.choose_automatic_top(quantity, np.array([1.0]), top) == pytest.approx(
         9e3 * scene.RANGE_DECAY
     )
-    assert scene.automatic_top(quantity, np.array([np.nan])) == quantity.min_top
+    assert scene.choose_automatic_top(quantity, np.array([np.nan])) == quantity.min_top
 
 
 def test_health_says_doubtful_no_tensor_and_stale():
@@ -108,7 +108,7 @@ def test_health_says_doubtful_no_tensor_and_stale():
     ]
     believed = newest.usable_values(newest.health(10.6, 1.0))
     assert np.isnan(believed).all(axis=1).tolist() == [False, False, True, True]
-    crosses = scene.fault_crosses(places(4), newest.health(10.6, 1.0))
+    crosses = scene.make_fault_crosses(places(4), newest.health(10.6, 1.0))
     assert (np.ptp(crosses[0], axis=1) == 0).all() and (
         np.ptp(crosses[1:], axis=2).max(axis=(1, 2)) > 0.004
     ).all()
@@ -147,14 +147,14 @@ def test_markers_node_draws_what_comes(ros, tmp_path):
     from cube_tensor_driver.msg import SkinContacts, SkinInfo, SkinStress
     from cube_tensor_driver.processes.children import Children
     from cube_tensor_driver.processes.skin_processes import Process
-    from cube_tensor_driver.ros.messages import info_message
+    from cube_tensor_driver.ros.messages import make_info_message
 
     skin = read_skin(package_data() / "config" / "skin_demo.yaml")
     n, pressed, silent = len(skin.cubes), 6, 15
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     info = ros.node.create_publisher(SkinInfo, "info", latched)
     info.publish(
-        info_message(skin, Pipeline([cube.calibration for cube in skin.cubes]), time.time_ns())
+        make_info_message(skin, Pipeline([cube.calibration for cube in skin.cubes]), time.time_ns())
     )
     publisher = ros.node.create_publisher(SkinStress, "stress", 10)
     pictures, contacts = ros.listen(MarkerArray, "markers"), ros.listen(SkinContacts, "contacts")

@@ -22,7 +22,7 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Imu
 
 from conftest import encoded
-from cube_tensor_driver.bags.metadata import quality, typestore
+from cube_tensor_driver.bags.metadata import make_typestore, quality
 from cube_tensor_driver.bags.read import Bag
 from cube_tensor_driver.bags.reprocess.job import ReprocessJob, reconstruct, reprocess
 from cube_tensor_driver.bags.reprocess.table import frequency_table, reprocess_table
@@ -277,7 +277,7 @@ def as_sent(one) -> bytes:
     lists = {name: np.array(getattr(one, name)) for name in names}
     stamped = header(to_ns(one.header.stamp), one.header.frame_id)
     made = message(COMPENSATION_TYPE, header=stamped, weight=one.weight, **lists)
-    return bytes(typestore().serialize_cdr(made, COMPENSATION_TYPE))
+    return bytes(make_typestore().serialize_cdr(made, COMPENSATION_TYPE))
 
 
 def write_bag(folder, node, rows: FrequencyRows, dropped: range) -> None:

@@ -27,7 +27,7 @@ pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 from cube_tensor_driver.bags.read import Bag
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.messages.types import STRESS
-from cube_tensor_driver.processes.children import ros_arguments
+from cube_tensor_driver.processes.children import format_ros_arguments
 from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, skin_processes
 from cube_tensor_driver.simulation.sample_log import SampleLog
 
@@ -88,7 +88,7 @@ class Hosts:
         ]
         command += [
             *process.arguments,
-            *(["--ros-args", *ros_arguments(process.parameters)] if process.node else []),
+            *(["--ros-args", *format_ros_arguments(process.parameters)] if process.node else []),
         ]
         with (self.folder / f"{process.executable}.log").open("wb") as log:
             self._running[process.executable] = subprocess.Popen(

@@ -16,7 +16,7 @@ from rcl_interfaces.srv import SetParameters
 from rclpy_without import FEATURES
 
 from conftest import ROOT, decoded
-from cube_tensor_driver.config.grid import grid
+from cube_tensor_driver.config.grid import describe_grid
 from cube_tensor_driver.config.yaml import write_yaml
 from cube_tensor_driver.msg import SkinFrequencies, SkinStress
 from cube_tensor_driver.processes.children import Children
@@ -28,7 +28,7 @@ def test_nodes_run_where_rclpy_lacks_what_humble_lacks(ros, tmp_path, monkeypatc
     is set takes effect, and the log says once that the executor is the slow one."""
     monkeypatch.setenv("PYTHONPATH", str(ROOT / "test"), prepend=":")
     skin = tmp_path / "skin.yaml"
-    write_yaml(skin, grid(nx=2, ny=1, pitch=0.01, links=1, rate=100.0))
+    write_yaml(skin, describe_grid(nx=2, ny=1, pitch=0.01, links=1, rate=100.0))
     stress = ros.listen(SkinStress, "stress")
     frequencies = ros.listen(SkinFrequencies, "frequencies")
     hubs = SimulatedHubs(tmp_path / "ports")

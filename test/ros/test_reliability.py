@@ -39,7 +39,7 @@ from cube_tensor_driver.config.tare import write_tare
 from cube_tensor_driver.config.yaml import read_yaml, write_yaml
 from cube_tensor_driver.core.oscillator import pad_frequency
 from cube_tensor_driver.msg import SkinFrequencies, SkinInfo, SkinStress
-from cube_tensor_driver.processes.children import Children, ros_arguments
+from cube_tensor_driver.processes.children import Children, format_ros_arguments
 from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, skin_processes
 from cube_tensor_driver.srv import Tare
 
@@ -125,9 +125,9 @@ def loaded(pascal):
     """Frequencies under a uniform zz."""
     stress, gradient = np.zeros((1, 6)), np.zeros((1, 6, 3))
     stress[0, 2] = pascal
-    from cube_tensor_driver.simulation.cubes import true_state
+    from cube_tensor_driver.simulation.cubes import compute_true_state
 
-    v = true_state(CALIBRATION, stress, gradient) @ CALIBRATION.response.T
+    v = compute_true_state(CALIBRATION, stress, gradient) @ CALIBRATION.response.T
     return pad_frequency(v[0], CALIBRATION.rest_frequency, CALIBRATION.beta, CALIBRATION.modulus)
 
 
@@ -467,7 +467,7 @@ def test_what_cannot_be_opened_is_said_with_the_fix_and_shut_down_at_once(
         "deaf": deaf,
     }.get(what, tty)
     command = [sys.executable, "-u", "-m", "cube_tensor_driver.ros.nodes.driver", "--ros-args"]
-    command += ros_arguments({"config": str(SINGLE), "port": port})
+    command += format_ros_arguments({"config": str(SINGLE), "port": port})
     if what == "forbidden":
         Path(tty).chmod(0)
         if os.geteuid() == 0:  # root without what lets it pass
@@ -501,7 +501,13 @@ def test_a_driver_that_cannot_read_any_more_ends_with_an_error(domain):
         "Reader._plan_gathering = lambda *_: 1 / 0\n"
         "main()"
     )
-    command = [sys.executable, "-c", code, "--ros-args", *ros_arguments({"config": str(SINGLE)})]
+    command = [
+        sys.executable,
+        "-c",
+        code,
+        "--ros-args",
+        *format_ros_arguments({"config": str(SINGLE)}),
+    ]
     process = subprocess.run(
         command, capture_output=True, text=True, env=os.environ, timeout=30, check=False
     )

@@ -18,7 +18,7 @@ pytest.importorskip("rclpy", reason="needs rclpy: run this with ./cube test")
 from rclpy.qos import qos_profile_sensor_data
 
 from conftest import ROOT
-from cube_tensor_driver.config.grid import grid
+from cube_tensor_driver.config.grid import describe_grid
 from cube_tensor_driver.config.parameters import RECONSTRUCTION
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.config.yaml import read_yaml, write_yaml
@@ -41,7 +41,7 @@ STALE_S = 0.2
 @pytest.fixture
 def skin_file(tmp_path):
     path = tmp_path / "skin.yaml"
-    description = grid(nx=2, ny=2, pitch=0.012, links=2, rate=100.0)
+    description = describe_grid(nx=2, ny=2, pitch=0.012, links=2, rate=100.0)
     description["cubes"][3]["pose"] = {"xyz": [0.02, -0.01, 0.03], "rpy": [0.4, -1.0, 2.0]}
     write_yaml(path, description)
     return path

@@ -14,15 +14,15 @@ import pytest
 
 from conftest import ROOT
 from cube_tensor_driver.cli.main import main
-from cube_tensor_driver.config.grid import grid
+from cube_tensor_driver.config.grid import describe_grid
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import Skin, check_skin_data, read_skin
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.mechanics import contact
 from cube_tensor_driver.mechanics.contact_tables import CONTACT_SIZES, DiscTables, PolygonTables
 from cube_tensor_driver.mechanics.layer import Layer
-from cube_tensor_driver.simulation.mujoco.patches import Polygon, flat_contact
-from cube_tensor_driver.simulation.mujoco.scene import MujocoLoad, scene_skin
+from cube_tensor_driver.simulation.mujoco.patches import Polygon, make_flat_contact
+from cube_tensor_driver.simulation.mujoco.scene import MujocoLoad, find_scene_skin
 from cube_tensor_driver.simulation.mujoco.source import MujocoSkin
 from cube_tensor_driver.simulation.source import simulate
 from cube_tensor_driver.touch.inverse import SurfaceInverse
@@ -52,7 +52,9 @@ ALONG = np.array([np.cos(np.pi / 6), np.sin(np.pi / 6), 0.0])
 
 
 def pad(body: str = "pad") -> Skin:
-    data = grid(nx=7, ny=7, pitch=PITCH, rate=1000.0, layout="cube") | {"parent_frame": body}
+    data = describe_grid(nx=7, ny=7, pitch=PITCH, rate=1000.0, layout="cube") | {
+        "parent_frame": body
+    }
     skin, mistakes = check_skin_data(data, Path())
     assert not mistakes
     return skin
@@ -190,7 +192,7 @@ def test_a_flat_contact_keeps_force_and_moments_and_nothing_pulls(count):
     points = random.uniform(-0.02, 0.02, (count, 3))
     points -= np.outer(points @ normal - 0.05, normal)
     forces = random.normal(size=(count, 3)) - 4 * normal
-    polygon = flat_contact(points, forces, normal, DEPTH / 4)
+    polygon = make_flat_contact(points, forces, normal, DEPTH / 4)
     places, parts = point_forces(polygon, 3)
     np.testing.assert_allclose(parts.sum(axis=0), forces.sum(axis=0), rtol=1e-12)
     moment = np.cross(points, forces).sum(axis=0)
@@ -257,7 +259,7 @@ def test_the_back_of_a_body_feels_nothing(mujoco):
 def test_shipped_scenes(mujoco, scene, seconds, force):
     """They play, bear the weight, and are the same whenever they are asked for a time."""
     path = SCENES / f"{scene}.xml"
-    skin = read_skin(scene_skin(path))
+    skin = read_skin(find_scene_skin(path))
     load = MujocoLoad(path, skin)
     np.testing.assert_allclose(load.total(seconds)[0], force, atol=0.02 * np.linalg.norm(force))
     once = np.concatenate(load.at(seconds), axis=None)
@@ -302,7 +304,7 @@ def test_what_does_not_fit_is_named(mujoco, tmp_path, text, said):
         if "body" in text:
             MujocoLoad(path, pad())
         else:
-            scene_skin(path)
+            find_scene_skin(path)
     assert "\n" not in str(caught.value)
 
 
@@ -335,7 +337,7 @@ def test_the_gripper_of_the_page_holds_a_cup_with_little_force(mujoco, monkeypat
 def test_without_mujoco_the_install_line_is_given(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(ConfigError, match=r"pip install 'cube-tensor-driver\[mujoco\]'"):
-        scene_skin(SCENES / "ball.xml")
+        find_scene_skin(SCENES / "ball.xml")
 
 
 def test_the_demo_says_in_one_line_why_it_does_not_start(mujoco, capfd):

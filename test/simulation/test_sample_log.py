@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cube_tensor_driver.config.grid import grid
+from cube_tensor_driver.config.grid import describe_grid
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.config.yaml import write_yaml
 from cube_tensor_driver.core.errors import ConfigError
@@ -62,7 +62,7 @@ def everything():
 @pytest.fixture(scope="module")
 def skin(tmp_path_factory):
     path = tmp_path_factory.mktemp("skin") / "skin.yaml"
-    write_yaml(path, grid(nx=4, ny=1, pitch=0.012, links=2, rate=500.0))
+    write_yaml(path, describe_grid(nx=4, ny=1, pitch=0.012, links=2, rate=500.0))
     return read_skin(path)
 
 

@@ -9,7 +9,7 @@ import select
 import threading
 import time
 
-from cube_tensor_driver.config.grid import grid
+from cube_tensor_driver.config.grid import describe_grid
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.config.yaml import write_yaml
 from cube_tensor_driver.device.wire.decoder import Decoder
@@ -27,7 +27,7 @@ N_CUBES = 1600
 
 def test_a_large_sample_arrives_before_the_next_is_taken(tmp_path):
     path = tmp_path / "skin.yaml"
-    write_yaml(path, grid(nx=N_CUBES, ny=1, pitch=0.01, rate=1 / PERIOD_S))
+    write_yaml(path, describe_grid(nx=N_CUBES, ny=1, pitch=0.01, rate=1 / PERIOD_S))
     skin = read_skin(path)
     load = Load(skin, default_script())
     simulator = Simulator(skin, load, tmp_path / "ports", instants=1)

@@ -34,9 +34,9 @@ from cube_tensor_driver.device.wire.protocol import Sample
 from cube_tensor_driver.simulation.cubes import (
     PadErrors,
     SimulatedCubes,
-    hub_cubes,
-    skin_components,
-    true_state,
+    compute_skin_components,
+    compute_true_state,
+    make_hub_cubes,
 )
 from cube_tensor_driver.simulation.hub import SimulatedHub
 from cube_tensor_driver.simulation.load import Load, default_script
@@ -65,7 +65,7 @@ def test_the_load_comes_out_again():
         found = reconstruct(rows)
         stress, gradient = load.at(1e-9 * rows.stamp_ns[0])
         frequency = pad_frequency(
-            true_state(calibration, stress, gradient) @ calibration.response.T, *law
+            compute_true_state(calibration, stress, gradient) @ calibration.response.T, *law
         )
         rounding = 0.5e-3 + 2.0**-24 * frequency
         slope = modulus * (1 + beta) / (rest * (1 - beta * (frequency / rest - 1)) ** 2)
@@ -73,7 +73,7 @@ def test_the_load_comes_out_again():
         # 1e-6 of the bound: the law is not straight over a rounding.
         bound = (pad_error @ np.abs(matrix).T) * (1 + 1e-6) / unit
         components = np.concatenate([found.stress, found.gradient], axis=1)
-        error = np.abs(components - skin_components(SKIN, stress, gradient))
+        error = np.abs(components - compute_skin_components(SKIN, stress, gradient))
         seen = np.isfinite(components)
         assert (error[seen] <= bound[seen]).all()
         assert seen.any(axis=0).sum() == 7 and not found.status.any()
@@ -82,7 +82,7 @@ def test_the_load_comes_out_again():
 
 
 def test_values_are_those_that_a_hub_sends():
-    hubs = hub_cubes(SKIN, PadErrors(1e-5, 1e-4))
+    hubs = make_hub_cubes(SKIN, PadErrors(1e-5, 1e-4))
     load = Load(SKIN, default_script())
     source = simulate(SKIN, load, rate=100.0, noise=1e-5, drift=1e-4)
     for number, rows in enumerate(islice(source, 20)):

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cube_tensor_driver.config.calibration import shipped_calibration
+from cube_tensor_driver.config.calibration import find_shipped_calibration
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.yaml import read_yaml
 from cube_tensor_driver.core.errors import ConfigError
@@ -27,7 +27,7 @@ UNLOADED = np.zeros((2, 6)), np.zeros((2, 6, 3))
 
 
 def cubes(**imperfections: object) -> SimulatedCubes:
-    calibration = shipped_calibration(LAYOUTS["cube"])
+    calibration = find_shipped_calibration(LAYOUTS["cube"])
     assert calibration is not None
     return SimulatedCubes(
         [calibration] * 2, PadErrors(imperfections=Imperfections(**imperfections))
@@ -35,7 +35,7 @@ def cubes(**imperfections: object) -> SimulatedCubes:
 
 
 def read_stress(hertz: np.ndarray) -> np.ndarray:
-    calibration = shipped_calibration(LAYOUTS["cube"])
+    calibration = find_shipped_calibration(LAYOUTS["cube"])
     assert calibration is not None
     rest, beta, modulus = calibration.rest_frequency, calibration.beta, calibration.modulus
     return pad_stress(hertz * 1e-3, rest, beta, modulus)
@@ -103,7 +103,7 @@ def test_layers_and_drift_differ_by_the_asked_spread():
     wanted = Imperfections(
         temperature=warm, air=warm, pad_drift_spread=0.2, thermal_stress="cube_11mm", seed=3
     )
-    calibration = shipped_calibration(LAYOUTS["cube"])
+    calibration = find_shipped_calibration(LAYOUTS["cube"])
     assert calibration is not None
     many = SimulatedCubes([calibration] * 50, PadErrors(imperfections=wanted))
     zero = np.zeros((50, 6)), np.zeros((50, 6, 3))

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from point_loads import below, below_ball
 
-from cube_tensor_design.studies.field_study import flat_skin
-from cube_tensor_design.studies.traction_study import CUBES, Setting, TractionBench, flat_punch
+from cube_tensor_design.studies.field_study import make_flat_skin
+from cube_tensor_design.studies.traction_study import CUBES, Setting, TractionBench, make_flat_punch
 from cube_tensor_driver.core.modes import STRESS
 from cube_tensor_driver.core.poses import CubePoses
 from cube_tensor_driver.core.tensor import rotation_from_rpy
@@ -20,7 +20,7 @@ from cube_tensor_driver.touch.tracker import contact_tracker
 from cube_tensor_driver.touch.tracker.contact_tracker import ContactTracker
 from cube_tensor_driver.touch.tracker.local_values import CubeNoise, LocalValues
 from cube_tensor_driver.touch.tracker.tracked_region import TrackedRegion
-from workshop.bench.contacts import BALL, bar, ellipse, values_under
+from workshop.bench.contacts import BALL, bar, compute_values_under, ellipse
 
 DEPTH, PITCH, COUNT, LEAST = 4e-3, 12e-3, 7, 300.0
 PADS_NOISE = np.where(np.arange(15) < len(STRESS), 3.0, 3.0 / 2e-3)
@@ -28,7 +28,7 @@ PADS_NOISE = np.where(np.arange(15) < len(STRESS), 3.0, 3.0 / 2e-3)
 
 @pytest.fixture(scope="module")
 def inverse():
-    poses = flat_skin(PITCH, (COUNT - 1) * PITCH)
+    poses = make_flat_skin(PITCH, (COUNT - 1) * PITCH)
     by_pad = np.tile(np.diag(PADS_NOISE), (COUNT**2, 1, 1))  # one pad for each component
     return SurfaceInverse.from_poses(poses, by_pad, Layer(), DEPTH)
 
@@ -39,7 +39,7 @@ def ball(inverse, width, centre, force) -> np.ndarray:
 
 def punch(inverse, width, centre, force) -> np.ndarray:
     """Pressure 1 / sqrt(a^2 - r^2), infinite at the edge: no Hertz contact at all."""
-    load = flat_punch(width / 2, np.array(force), np.array(centre), 12)
+    load = make_flat_punch(width / 2, np.array(force), np.array(centre), 12)
     return below(inverse.poses, DEPTH, load)
 
 
@@ -323,7 +323,10 @@ def test_ten_balls_on_planar_cubes_have_their_forces(seed):
             places.append(place)
     shapes = [ellipse(6e-3, 6e-3, order=6) + np.array([*place, 0]) for place in places]
     load = np.concatenate(shapes), np.zeros(2), np.array([0, 0.9, -3.0])
-    values, tracker = values_under(bench, *load, random), ContactTracker(bench.inverse, LEAST)
+    values, tracker = (
+        compute_values_under(bench, *load, random),
+        ContactTracker(bench.inverse, LEAST),
+    )
     for _ in range(36):
         found = tracker.update(values)
     assert len(found) == len(places)
@@ -403,7 +406,7 @@ def test_fingertips_edges_and_rods_have_their_force_and_place(shape, cubes, pitc
     for angle in (0.3, 2.0):
         turned = shape @ rotation_from_rpy(0, 0, angle).T * [1, 1, 0] + shape * [0, 0, 1]
         centre = pitch * (random.random(2) - 0.5)
-        values = values_under(bench, turned, centre, np.array([0.6, -0.6, -3.0]), random)
+        values = compute_values_under(bench, turned, centre, np.array([0.6, -0.6, -3.0]), random)
         found = ContactTracker(bench.inverse, LEAST).update(values, max_work=np.inf)
         force = sum(one.normal_force for one in found)
         place = sum(one.normal_force * one.position[:2] for one in found) / force
@@ -423,7 +426,7 @@ def test_beyond_the_outermost_cubes_the_stated_deviation_grows(shape, limit, out
     outermost = np.abs(bench.poses.position[:, 0]).max()
     stated = []
     for x in (0.0, outermost + outside * 8e-3):
-        values = values_under(bench, shape, np.array([x, 2e-3]), force, random)
+        values = compute_values_under(bench, shape, np.array([x, 2e-3]), force, random)
         tracker = ContactTracker(bench.inverse, LEAST)
         tracker.update(values, max_work=np.inf)
         (found,) = tracker.update(values, max_work=0)
@@ -443,7 +446,9 @@ def test_a_ball_at_the_worst_places_of_a_wide_pitch_is_one_contact(cubes, place)
     corner = bench.poses.position[:, :2].max(axis=0)
     offsets = {"above a cube": 0 * corner, "beside a cube": 0 * corner + 0.5e-3}
     centre = offsets.get(place, corner + 3e-3)
-    values = values_under(bench, BALL, centre, np.array([0, 0, -1.0]), np.random.default_rng(1))
+    values = compute_values_under(
+        bench, BALL, centre, np.array([0, 0, -1.0]), np.random.default_rng(1)
+    )
     tracker = ContactTracker(bench.inverse, LEAST)
     for _ in range(5):
         (found,) = tracker.update(values)
@@ -457,7 +462,7 @@ def test_what_a_scan_has_no_time_for_is_done_in_the_next_ones(monkeypatch):
     places = [(x, y) for x in (-27e-3, -9e-3, 9e-3, 27e-3) for y in (-27e-3, -9e-3, 9e-3, 27e-3)]
     random, ball_shape = np.random.default_rng(2), ellipse(5e-3, 5e-3)
     shape = np.concatenate([ball_shape + np.array([*place, 0]) for place in places])
-    values = values_under(bench, shape, np.zeros(2), np.array([0.0, 0.3, -1.5]), random)
+    values = compute_values_under(bench, shape, np.zeros(2), np.array([0.0, 0.3, -1.5]), random)
     tracker, made = ContactTracker(bench.inverse, LEAST), []
     monkeypatch.setattr(TrackedRegion, "_accept", counted(TrackedRegion._accept, made))
     first = tracker.update(values)
@@ -478,7 +483,7 @@ def test_what_a_scan_has_no_time_for_is_done_in_the_next_ones(monkeypatch):
 def test_a_fit_that_waits_for_its_turn_follows_the_pressure_as_coarse(monkeypatch):
     """Its force changes with the pressure, and the whole change is stated as uncertain."""
     bench = TractionBench(Setting(), side=2)
-    values = values_under(
+    values = compute_values_under(
         bench,
         bar(24e-3, 2e-3),
         np.zeros(2),

@@ -14,7 +14,7 @@ import pytest
 
 from cube_tensor_design.studies.pads_study import LayerBench
 from cube_tensor_design.studies.traction_study import CUBES, Setting
-from cube_tensor_driver.config.calibration import shipped_calibration
+from cube_tensor_driver.config.calibration import find_shipped_calibration
 from cube_tensor_driver.config.influence import find_influence
 from cube_tensor_driver.core.errors import ConfigError, ElasticError
 from cube_tensor_driver.core.layout import LAYOUTS
@@ -27,10 +27,10 @@ from cube_tensor_driver.mechanics.measurement_model import CubeMeasurement
 from cube_tensor_driver.mechanics.traction_prior import PRIOR_LENGTHS, SHEAR_RATIO, TractionPrior
 from cube_tensor_driver.touch.contact_finder import ContactSettings, contact_finder
 from cube_tensor_driver.touch.pad_measurement import model_pads
-from cube_tensor_driver.touch.pad_noise import noise_by_pad
+from cube_tensor_driver.touch.pad_noise import compute_noise_by_pad
 from cube_tensor_driver.touch.tracker.contact_tracker import ContactTracker
 
-PLANAR, CUBE = (shipped_calibration(LAYOUTS[name]) for name in ("planar", "cube"))
+PLANAR, CUBE = (find_shipped_calibration(LAYOUTS[name]) for name in ("planar", "cube"))
 SCALE = 2e-3
 UNITS = np.where(np.arange(len(COMPONENTS)) < len(STRESS), 1.0, SCALE)
 LEFT_OUT = 0.015
@@ -158,9 +158,9 @@ def test_in_the_field_a_cube_without_a_pad_counts_as_missing(influence):
     cube, lost = np.array([n // 2]), values.copy()
     lost[cube] = np.nan
     before, expected = inverse.field(values), inverse.field(lost)
-    inverse.leave_out(cube, noise_by_pad(pipeline, cube, np.array([1], np.uint32)))
+    inverse.leave_out(cube, compute_noise_by_pad(pipeline, cube, np.array([1], np.uint32)))
     np.testing.assert_array_equal(inverse.field(values).traction, expected.traction)
-    inverse.leave_out(cube, noise_by_pad(pipeline, cube, np.array([0], np.uint32)))
+    inverse.leave_out(cube, compute_noise_by_pad(pipeline, cube, np.array([0], np.uint32)))
     np.testing.assert_array_equal(inverse.field(values).traction, before.traction)
 
 

@@ -9,7 +9,7 @@ import pytest
 from curved_skin import cylinder_stress, flat_error
 from point_loads import below_ball
 
-from cube_tensor_design.studies.field_study import field_below, flat_skin
+from cube_tensor_design.studies.field_study import compute_field_below, make_flat_skin
 from cube_tensor_driver.core.calibration import illustrative
 from cube_tensor_driver.core.defaults import POISSONS_RATIO
 from cube_tensor_driver.core.errors import ElasticError
@@ -22,7 +22,7 @@ from cube_tensor_driver.touch.inverse import SurfaceInverse
 from cube_tensor_driver.touch.surface import Surface
 
 DEPTH, PITCH, COUNT = 5e-3, 8e-3, 7
-FLAT = flat_skin(PITCH, (COUNT - 1) * PITCH)
+FLAT = make_flat_skin(PITCH, (COUNT - 1) * PITCH)
 ACROSS = [k for k, name in enumerate(COMPONENTS) if "y" in name]
 
 
@@ -39,7 +39,7 @@ def ball(poses: CubePoses, width: float, centre, force=(0.6, 0.3, -3.0)) -> np.n
 def true_stress(inverse: SurfaceInverse, width: float, centre) -> np.ndarray:
     """(M,) sigma_zz below the points of the surface."""
     load = contact.hertz(width / 2, (0.6, 0.3, -3.0), centre, 12)
-    return field_below(inverse.points, DEPTH, load, POISSONS_RATIO)[:, 2]
+    return compute_field_below(inverse.points, DEPTH, load, POISSONS_RATIO)[:, 2]
 
 
 def noisy(values: np.ndarray, seed: int = 1) -> np.ndarray:

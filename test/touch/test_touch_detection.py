@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from point_loads import below_ball
 
-from cube_tensor_design.studies.field_study import field_below
-from cube_tensor_driver.config.grid import grid
+from cube_tensor_design.studies.field_study import compute_field_below
+from cube_tensor_driver.config.grid import describe_grid
 from cube_tensor_driver.config.skin import Elastomer, Skin, read_skin
 from cube_tensor_driver.config.yaml import write_yaml
 from cube_tensor_driver.core.defaults import POISSONS_RATIO
@@ -25,7 +25,7 @@ from cube_tensor_driver.mechanics.contact_response import ContactResponse
 from cube_tensor_driver.mechanics.layer import Layer
 from cube_tensor_driver.mechanics.load_response import LoadResponse
 from cube_tensor_driver.mechanics.measurement_model import CubeMeasurement
-from cube_tensor_driver.touch.pad_noise import GAIN_ERROR, noise_of_all_pads
+from cube_tensor_driver.touch.pad_noise import GAIN_ERROR, compute_noise_of_all_pads
 from cube_tensor_driver.touch.touch_detection import MAX_DRIFT, OVERSHOOT, REFERENCE, Touch
 
 DEPTH = 5e-3
@@ -42,7 +42,7 @@ def make_skin(tmp_path_factory):
         """Return a skin of side x side cubes; if known, the file states that they are 5 mm deep in
         a half space."""
         path = tmp_path_factory.mktemp("skin") / "skin.yaml"
-        write_yaml(path, grid(nx=side, ny=side, pitch=pitch, rate=RATE, layout=layout))
+        write_yaml(path, describe_grid(nx=side, ny=side, pitch=pitch, rate=RATE, layout=layout))
         return replace(read_skin(path), elastomer=Elastomer(DEPTH, np.inf) if known else None)
 
     return make
@@ -53,7 +53,7 @@ class Run:
 
     def __init__(self, skin: Skin, false_alarms: float = 1.0) -> None:
         self.skin, self.touch = skin, Touch(skin, false_alarms)
-        self.by_pad = noise_of_all_pads(skin.calibrations)
+        self.by_pad = compute_noise_of_all_pads(skin.calibrations)
         self.random = np.random.default_rng(1)
         self.scans = 0
 
@@ -280,7 +280,7 @@ def test_response_of_a_small_load_is_that_of_point_forces_and_of_the_tables():
     random = np.random.default_rng(3)
     offset, angle = random.uniform(-0.03, 0.03, (200, 2)), random.uniform(-3, 3, 200)
     loads = [contact.hertz(2.5e-3, force, (0, 0), 12) for force in np.eye(3)]
-    fields = [field_below(offset, DEPTH, load, POISSONS_RATIO) for load in loads]
+    fields = [compute_field_below(offset, DEPTH, load, POISSONS_RATIO) for load in loads]
     expected = np.stack(fields, axis=-1)[:, :15]
     layer = Layer(11e-3)
     responses = ContactResponse(CubeMeasurement(layer, DEPTH, 1.0))

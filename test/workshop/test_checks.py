@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from cube_tensor_driver.config.grid import grid
+from cube_tensor_driver.config.grid import describe_grid
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.config.yaml import write_yaml
 from cube_tensor_driver.core.reconstructor import Reconstructor
@@ -19,13 +19,13 @@ from cube_tensor_driver.core.status import STUCK
 from cube_tensor_driver.device.wire.protocol import TEMPERATURE_UNKNOWN
 from cube_tensor_driver.simulation.cubes import SimulatedCubes
 from cube_tensor_driver.simulation.faults import PAD_FAULTS, Fault
-from cube_tensor_driver.simulation.injector import broken_reading
+from cube_tensor_driver.simulation.injector import compute_broken_reading
 from cube_tensor_driver.simulation.load import Load, default_script
 from cube_tensor_driver.simulation.sample_log import FaultRecord, LinkLog, SampleLog, SampleRun
 from workshop.checks.all_checks import check_all
 from workshop.checks.record import NodeAction, Received, Record, Samples
 from workshop.checks.rest import TRANSPORT_S
-from workshop.checks.sent_readings import SentReadings, reading_type
+from workshop.checks.sent_readings import SentReadings, make_reading_type
 
 INSTANTS, COUNT, PERIOD_US, EACH = 400, 2000, 2000, 2
 FAULTS = {
@@ -54,7 +54,7 @@ def played(tmp_path_factory):
     """A log and a record of 4 s of two hubs with a restart, four broken pads and a dropped sample,
     as a program without a fault would leave them."""
     path = tmp_path_factory.mktemp("skin") / "skin.yaml"
-    write_yaml(path, grid(nx=4, ny=1, pitch=0.012, links=2, rate=500.0))
+    write_yaml(path, describe_grid(nx=4, ny=1, pitch=0.012, links=2, rate=500.0))
     skin = read_skin(path)
     run = SampleRun(first=0, last=COUNT - 1, start_us=PERIOD_US, period_us=PERIOD_US)
     half = COUNT // 2
@@ -86,7 +86,7 @@ def sent_readings(skin, log):
         )
     instant = load_us // PERIOD_US % INSTANTS
     cube = EACH * samples.link[:, None] + np.arange(EACH)
-    readings = np.zeros(len(samples), reading_type(EACH, 8))
+    readings = np.zeros(len(samples), make_reading_type(EACH, 8))
     readings["millihertz"] = sound_readings(skin)[instant[:, None], cube]
     readings["centi_celsius"] = TEMPERATURE_UNKNOWN
     for fault in samples.faults(*PAD_FAULTS):
@@ -97,7 +97,7 @@ def sent_readings(skin, log):
         else:
             sound = readings["millihertz"][place].tolist()
             readings["millihertz"][place] = [
-                broken_reading(fault.fault, one, sound[0], time_us)
+                compute_broken_reading(fault.fault, one, sound[0], time_us)
                 for one, time_us in zip(sound, times_us[rows].tolist(), strict=True)
             ]
     return readings

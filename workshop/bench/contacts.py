@@ -17,8 +17,8 @@ import numpy as np
 from cube_tensor_design.studies.field_study import (
     FORCE,
     FRICTION,
+    compute_field_below,
     draw_force,
-    field_below,
 )
 from cube_tensor_design.studies.traction_study import (
     CUBES,
@@ -26,8 +26,8 @@ from cube_tensor_design.studies.traction_study import (
     ContactErrors,
     Setting,
     TractionBench,
-    contact_errors,
-    flat_punch,
+    make_flat_punch,
+    sum_contact_errors,
 )
 from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.defaults import CONTACT_PRESSURE
@@ -99,7 +99,7 @@ def punch(width: float) -> Array:
     Args:
         width: Diameter of the punch, in m.
     """
-    sources, forces = flat_punch(width / 2, np.array([0, 0, 1.0]), np.zeros(2), 14)
+    sources, forces = make_flat_punch(width / 2, np.array([0, 0, 1.0]), np.zeros(2), 14)
     return np.column_stack([sources[:, :2], forces[:, 2]])
 
 
@@ -157,7 +157,7 @@ TrackingResults = dict[tuple[str, str], list[TrackingResult]]
 """Results of all loads by the names of skin and shape."""
 
 
-def values_under(
+def compute_values_under(
     bench: TractionBench,
     forces: Array,
     centre: Array,
@@ -189,12 +189,12 @@ def _pads_under(
     depth_error: float = 0.0,
     poisson_error: float = 0.0,
 ) -> Array:
-    """Return the pad stresses (cubes, P) in Pa; the arguments are those of `values_under`."""
+    """Return the pad stresses (cubes, P) in Pa; arguments as of `compute_values_under`."""
     place = np.column_stack([forces[:, :2] + centre, np.zeros(len(forces))])
     load = place, forces[:, 2:] * force
     depth = bench.setting.depth * (1 + depth_error)
     poisson = min(bench.setting.poisson + poisson_error, 0.5)
-    return bench.pads_in(field_below(bench.poses.position, depth, load, poisson))
+    return bench.pads_in(compute_field_below(bench.poses.position, depth, load, poisson))
 
 
 def bench_shapes(loads: int) -> TrackingResults:
@@ -225,7 +225,7 @@ def _bench_load(
     turned = np.column_stack([forces[:, :2] @ turn, forces[:, 2]])
     force = draw_force(random)
     errors = random.standard_normal(2) * [DEPTH_DEVIATION, POISSON_DEVIATION]
-    values = values_under(bench, turned, centre, force, random, *errors)
+    values = compute_values_under(bench, turned, centre, force, random, *errors)
 
     tracker = ContactTracker(bench.inverse, CONTACT_PRESSURE)
     times_ms = []
@@ -233,7 +233,7 @@ def _bench_load(
         start_s = time.process_time()
         found = tracker.update(values)
         times_ms.append(1e3 * (time.process_time() - start_s))
-    return TrackingResult(contact_errors(found, centre), len(found), times_ms[0], times_ms[-1])
+    return TrackingResult(sum_contact_errors(found, centre), len(found), times_ms[0], times_ms[-1])
 
 
 def summarise(results: TrackingResults) -> dict[str, dict[str, float]]:

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cube_tensor_design.studies.field_study import FORCE
-from cube_tensor_driver.views.figures.style import curve_style, print_style
+from cube_tensor_driver.views.figures.style import choose_curve_style, print_style
 
 from .contacts import SHAPES, SKINS, TrackingResults, summarise
 
@@ -27,7 +27,7 @@ def draw_shapes(results: TrackingResults) -> Figure:
     by_shape, by_load = figure.subplots(1, 2, width_ratios=[3, 2])
     summary = summarise(results)
     for row, skin in enumerate(SKINS):
-        style = curve_style(row) | {"linestyle": "none", "alpha": 0.8}
+        style = choose_curve_style(row) | {"linestyle": "none", "alpha": 0.8}
         errors = [summary[f"{name}, {skin}"]["force_error_percent"] for name in SHAPES]
         by_shape.semilogx(errors, list(SHAPES), label=skin, **style)
         _draw_loads(by_load, results, skin, style)

@@ -31,7 +31,7 @@ ROUNDS = 5
 """Number of measurements, of which the fastest is given: other processes only slow one down."""
 
 
-def clean_frames(size: int) -> bytes:
+def make_clean_frames(size: int) -> bytes:
     """Return at least `size` bytes of intact SAMPLE frames of 8 cubes with 8 pads."""
     random = np.random.default_rng(1)
     no_fault, no_temperature = np.zeros(8, "<u4"), np.zeros(8, "<i2")
@@ -57,7 +57,7 @@ def bench_decode() -> dict[str, Any]:
         decoders = {"c": wire.Decoder, **decoders}
     worst = LATE_FAILURE + INTACT_COBS
     data = {
-        "clean frames": clean_frames(BYTES),
+        "clean frames": make_clean_frames(BYTES),
         "random": np.random.default_rng(3).bytes(BYTES),
         "late failures, sound ones between": worst * (BYTES // len(worst)),
     }

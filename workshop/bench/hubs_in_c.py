@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cube_tensor_driver.config.grid import grid
+from cube_tensor_driver.config.grid import describe_grid
 from cube_tensor_driver.config.yaml import write_yaml
 from cube_tensor_driver.core.errors import CubeError
 from cube_tensor_driver.processes.skin_processes import Process
@@ -71,7 +71,7 @@ class HubLoad:
     def write_skin(self, folder: Path, rate: float) -> Path:
         """Write the file of a skin of these hubs, sampled `rate` times a second."""
         path = folder / "skin.yaml"
-        data = grid(
+        data = describe_grid(
             nx=self.cubes,
             ny=1,
             links=self.hubs,

@@ -18,8 +18,8 @@ from cube_tensor_driver.core.arrays import Array
 from cube_tensor_driver.core.errors import CubeError
 from cube_tensor_driver.core.rows import FrequencyRows
 from cube_tensor_driver.device.chain import LiveLinks
-from cube_tensor_driver.device.live import cube_addresses, link_configs
-from cube_tensor_driver.device.scans.scan import empty_rows
+from cube_tensor_driver.device.live import make_cube_addresses, make_link_configs
+from cube_tensor_driver.device.scans.scan import make_empty_rows
 from cube_tensor_driver.processes.children import Children
 
 from .hubs_in_c import HubLoad
@@ -68,12 +68,12 @@ def bench_links(
             children.start(hubs)
             _wait(lambda: len(list(folder.glob("hub[0-9]*"))) == load.hubs)
             links = LiveLinks(
-                link_configs(skin, port_directory=folder),
-                cube_addresses(skin),
+                make_link_configs(skin, port_directory=folder),
+                make_cube_addresses(skin),
                 on_rows,
                 rate=rate,
                 # The arrays for rows are used again, as a node does with the memory of messages.
-                make_rows=lru_cache(maxsize=8)(empty_rows),
+                make_rows=lru_cache(maxsize=8)(make_empty_rows),
             )
 
             def read_counters() -> Array:

@@ -30,7 +30,7 @@ HERTZ_PER_MILLIHERTZ = 1e-3
 """Factor from the unit of frequencies on the wire (mHz) to that of messages (Hz)."""
 
 
-def reading_type(n_cubes: int, n_pads: int) -> np.dtype[np.void]:
+def make_reading_type(n_cubes: int, n_pads: int) -> np.dtype[np.void]:
     """Return the format of the readings of a hub in one sample.
 
     The fields are frequencies in mHz (0: none), temperature in 0.01 °C, and one bit for each pad
@@ -58,7 +58,8 @@ def read_readings(
         n_pads: Number of pads of each cube.
     """
     parts = [
-        np.fromfile(folder / link.name, reading_type(len(link.cubes), n_pads)) for link in log.links
+        np.fromfile(folder / link.name, make_reading_type(len(link.cubes), n_pads))
+        for link in log.links
     ]
     return np.concatenate(parts)
 

@@ -19,17 +19,17 @@ from cube_tensor_design.figures.experiments import draw_prototype
 from cube_tensor_design.figures.field import draw_field_study, draw_methods, draw_traction
 from cube_tensor_design.figures.pads_example import draw_pads, draw_sweep
 from cube_tensor_design.paper.experiments import experiments
-from cube_tensor_design.studies.field_study import field_example, field_study
-from cube_tensor_design.studies.pads_example import planar_calibration, sweep
+from cube_tensor_design.studies.field_study import compute_field_example, field_study
+from cube_tensor_design.studies.pads_example import read_planar_calibration, sweep
 from cube_tensor_design.studies.pads_study import coarse_influence, layer_example
-from cube_tensor_design.studies.traction_study import traction_example
+from cube_tensor_design.studies.traction_study import compute_traction_example
 from cube_tensor_driver.config.output_files import write_json
 from cube_tensor_driver.config.package_data import package_data
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.errors import ConfigError
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import VIEW, SimulatedHubs, skin_processes
-from cube_tensor_driver.simulation.mujoco.scene import MujocoLoad, scene_skin
+from cube_tensor_driver.simulation.mujoco.scene import MujocoLoad, find_scene_skin
 from cube_tensor_driver.simulation.mujoco.source import load_mujoco
 from cube_tensor_driver.views.figures.style import save
 
@@ -101,18 +101,18 @@ def make_pictures(folder: Path) -> None:
         print(f"no gripper.png: {error}", file=sys.stderr)
     scale = bench_scale(COUNTS, Bench(RATE, MEASURE_S), folder / "scale.png")
     write_json(folder / "scale.json", scale)
-    save(draw_pads(planar_calibration()), folder / "pads.png")
+    save(draw_pads(read_planar_calibration()), folder / "pads.png")
     save(draw_sweep(sweep()), folder / "mistaken_shear.png")
     a, _, b, _, c, _ = experiments()
     save(draw_prototype([a, b, c]), folder / "prototype.png")
-    save(draw_methods(field_example()), folder / "field.png")
+    save(draw_methods(compute_field_example()), folder / "field.png")
     study = field_study()
     save(draw_field_study(study), folder / "field_error.png")
     saved = {
         f"cubes saved at an error of {level}": study.cubes_saved(level) for level in ERROR_LEVELS
     }
     write_json(folder / "field.json", vars(study) | saved)
-    save(draw_traction(traction_example()), folder / "traction.png")
+    save(draw_traction(compute_traction_example()), folder / "traction.png")
     true_pads = coarse_influence()
     save(
         draw_methods(layer_example(true_pads), "cubes as "),
@@ -133,7 +133,7 @@ def _draw_gripper(path: Path) -> None:
     """
     os.environ.setdefault("MUJOCO_GL", "egl")
     scene = package_data() / "config" / "mujoco" / "gripper.xml"
-    skin = read_skin(scene_skin(scene))
+    skin = read_skin(find_scene_skin(scene))
     load = MujocoLoad(scene, skin, noise=None)
     load.at(SHAKEN_S)  # computes the scene up to this time
     pixels = _render(load)

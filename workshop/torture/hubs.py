@@ -26,7 +26,7 @@ from cube_tensor_driver.simulation.load import Fields
 from cube_tensor_driver.simulation.main import main
 from cube_tensor_driver.simulation.simulator import Simulator
 
-from ..checks.sent_readings import reading_type
+from ..checks.sent_readings import make_reading_type
 
 READINGS = "readings"
 """Name of the folder, beside that of the ports, for what the hubs send."""
@@ -131,7 +131,7 @@ class StoringInjector(Injector):
         """Return the frequencies that a hub measures, and store them with what the hub states."""
         millihertz = super().measured(link, frequency, now_us)
         size = link.size
-        reading = np.zeros((), reading_type(size.cubes, size.pads))
+        reading = np.zeros((), make_reading_type(size.cubes, size.pads))
         # The fault "pads" adds a pad, and no host takes its samples.
         reading["millihertz"] = millihertz[:, : size.pads]
         reading["centi_celsius"] = link.hub.celsius

@@ -48,7 +48,7 @@ NEEDS_RESTART = ("tare not restored",)
 """Names of the mutations that show only when the reconstruction starts again."""
 
 
-def mutated(process: Process, name: str) -> Process:
+def apply_mutation(process: Process, name: str) -> Process:
     """Return the process with a mutation, or as it is if the mutation is of another process."""
     if not name or MUTATIONS[name].node != process.executable:
         return process

@@ -16,7 +16,7 @@ from pathlib import Path
 from threading import Event
 from typing import Any, NamedTuple
 
-from cube_tensor_driver.config.grid import grid
+from cube_tensor_driver.config.grid import describe_grid
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.config.yaml import write_yaml
 from cube_tensor_driver.core.arrays import AnyArray
@@ -24,7 +24,7 @@ from cube_tensor_driver.core.errors import CubeError
 from cube_tensor_driver.demo.running import Observer, end_simulator
 from cube_tensor_driver.processes.children import Children
 from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, skin_processes
-from cube_tensor_driver.simulation.inject import fault_line
+from cube_tensor_driver.simulation.inject import format_fault
 from cube_tensor_driver.simulation.sample_log import SampleLog
 from cube_tensor_driver.simulation.simulator import FAULT_PIPE
 
@@ -34,7 +34,7 @@ from .actions import MAX_START_S, Actions
 from .hubs import READINGS
 from .memory import MemoryMonitor
 from .mix import CUBES_PER_HUB, HUBS, PADS, RATE, schedule
-from .mutations import mutated
+from .mutations import apply_mutation
 from .recorder import recording
 
 CUBES_PER_ROW = 8
@@ -196,7 +196,7 @@ def _make_processes(
             process.parameters["tare_folder"] = str(skin_path.parent / "tare")
         if process.executable == "simulator":
             process = replace(process, module="workshop.torture.hubs")
-        processes[process.executable] = mutated(process, mutation)
+        processes[process.executable] = apply_mutation(process, mutation)
     return processes
 
 
@@ -206,7 +206,7 @@ def _write_skin(folder: Path, ports: Path) -> Path:
     The last hub is connected by TCP instead of a port, and has the same faults.
     """
     rows = HUBS * CUBES_PER_HUB // CUBES_PER_ROW
-    data = grid(
+    data = describe_grid(
         nx=CUBES_PER_ROW,
         ny=rows,
         links=HUBS,
@@ -239,6 +239,6 @@ def _carry_out(
             if "action" in event:
                 actions.do(event, time.monotonic() - began_s - at_s)
             else:
-                pipe.write(fault_line(event))
+                pipe.write(format_fault(event))
                 pipe.flush()
     observer.spin(began_s + duration - time.monotonic())

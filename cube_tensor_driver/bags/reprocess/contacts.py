@@ -12,12 +12,12 @@ from ...core.errors import BagError
 from ...core.latest_stress import STALE_S, LatestStress
 from ...core.rows import StressRows
 from ...messages.codec import Decoded
-from ...messages.contacts import contacts_message, traction_message
+from ...messages.contacts import make_contacts_message, make_traction_message
 from ...messages.skin_info import (
-    cube_calibrations,
-    cube_poses,
     geometry,
-    skin_elastomer,
+    read_cube_calibrations,
+    read_cube_poses,
+    read_skin_elastomer,
 )
 from ...messages.types import CONTACTS, TRACTION
 from ...touch.contact_finder import ContactFinder, ContactSettings, contact_finder
@@ -85,9 +85,9 @@ class ContactWriter:
             return
         self._finder = contact_finder(
             self._settings,
-            cube_poses(info),
-            cube_calibrations(info),
-            skin_elastomer(info),
+            read_cube_poses(info),
+            read_cube_calibrations(info),
+            read_skin_elastomer(info),
         )
         self._latest = LatestStress(len(info.cubes))
         self._geometry = geometry(info)
@@ -150,7 +150,7 @@ class ContactWriter:
             finder.update(time_s, values, self._latest.left_out, self._latest.status)
         elif not begins_to_slip:
             return
-        message = contacts_message(
+        message = make_contacts_message(
             make_message,
             stamp_ns,
             self._frame_id,
@@ -160,5 +160,5 @@ class ContactWriter:
         self._writer.write(self._contacts, recorded_ns, serialise(message))
         cloud = finder.cloud(values) if is_due else None
         if cloud is not None:
-            message = traction_message(make_message, stamp_ns, self._frame_id, cloud)
+            message = make_traction_message(make_message, stamp_ns, self._frame_id, cloud)
             self._writer.write(self._traction, recorded_ns, serialise(message))

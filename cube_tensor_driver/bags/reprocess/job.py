@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ...config.calibration import calibration_text
+from ...config.calibration import format_calibration
 from ...config.skin import Skin
 from ...core.arrays import Array
 from ...core.calibration import Calibration
@@ -456,7 +456,7 @@ def _replace_settings(infos: list[Any], settings: list[Settings]) -> Iterator[An
                 strict=True,
             )
         ]
-        texts = [calibration_text(current.calibrations[cube]) for cube in first_cube.values()]
+        texts = [format_calibration(current.calibrations[cube]) for cube in first_cube.values()]
         covariance = np.array([covariances[name] for name in first_cube])
         yield replace(
             info,

@@ -21,7 +21,7 @@ from ...core.reconstructor import CalibratedSkin, Reconstructor, RecordedHealth
 from ...core.rows import FrequencyRows
 from ..recording import reconstruct_rows
 from ..source import BagSource
-from ..tables import STRESS_SCHEMA, as_array, as_column, cube_column, stress_batch
+from ..tables import STRESS_SCHEMA, as_array, as_column, make_cube_column, make_stress_batch
 
 COLUMNS = {
     "cube": "cube",
@@ -95,7 +95,7 @@ def frequency_table(source: BagSource) -> pyarrow.Table:
         for name, attribute in COLUMNS.items():
             if attribute in values:
                 columns[name] = as_column(values[attribute])
-        columns["cube"] = cube_column(rows, cubes)
+        columns["cube"] = make_cube_column(rows, cubes)
         for name, change in changes.items():
             others = [None] * (len(rows) - 1)
             lists = pyarrow.array([change.ravel(), *others], NUMBER_LIST)
@@ -172,7 +172,7 @@ def reprocess_table(frequencies: pyarrow.Table, skin: CalibratedSkin) -> pyarrow
         rows = FrequencyRows.of(**attributes)
         health = _recorded_health(columns)
         stress = reconstruct_rows(reconstructor, rows, health)
-        batches.append(stress_batch(stress, cubes))
+        batches.append(make_stress_batch(stress, cubes))
     return pyarrow.Table.from_batches(batches, STRESS_SCHEMA)
 
 

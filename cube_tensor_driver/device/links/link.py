@@ -26,7 +26,7 @@ from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from ...config.port import TCP, port_problem
+from ...config.port import TCP, find_port_problem
 from ...core.errors import LinkError
 from ..track import LinkTrack
 from ..wire.decoder import Decoder
@@ -171,7 +171,7 @@ class Link:
         self._out = bytearray()
         self._pause = MIN_PAUSE_S
         self._first_match = 0  # index, among the paths that match the pattern, of the next to try
-        problem = port_problem(config.port)
+        problem = find_port_problem(config.port)
         if problem:
             raise LinkError(f"link {config.name!r}: port: {problem}", "bad_port")
 

@@ -13,7 +13,7 @@ import os
 import socket
 import threading
 
-from ...config.port import port_problem, tcp_address
+from ...config.port import find_port_problem, parse_tcp_address
 from ...core.errors import LinkError
 
 CONNECT_TIMEOUT_S = 2.0
@@ -27,9 +27,9 @@ def parse_url(url: str) -> tuple[str, int]:
     Raises:
         LinkError: With the kind `bad_port`: the text is not such a URL.
     """
-    address = tcp_address(url)
+    address = parse_tcp_address(url)
     if address is None:
-        raise LinkError(port_problem(url), "bad_port")
+        raise LinkError(find_port_problem(url), "bad_port")
     return address
 
 

@@ -37,7 +37,7 @@ MakeRows = Callable[[int, int], FrequencyRows]
 largest number of pads of a cube."""
 
 
-def empty_rows(n_rows: int, n_pads: int) -> FrequencyRows:
+def make_empty_rows(n_rows: int, n_pads: int) -> FrequencyRows:
     """Return new rows in uninitialised memory, for the caller to fill."""
     return FrequencyRows(
         cube=np.empty(n_rows, np.uint16),
@@ -83,7 +83,7 @@ class ScanBuilder:
         self,
         n_links: int,
         addresses: Sequence[CubeAddress],
-        make_rows: MakeRows = empty_rows,
+        make_rows: MakeRows = make_empty_rows,
     ) -> None:
         self.counts = RowCounts()
         self.cubes = CubeTable(n_links, addresses, self.counts)

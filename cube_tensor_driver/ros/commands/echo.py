@@ -19,9 +19,9 @@ from ...core.rows import StressRows
 from ...messages.codec import stress_codec
 from ...msg import SkinInfo, SkinStress, StressTensorStamped
 from ...processes.stop_signals import stop_event
-from ..messages import log_refused_message, message_class, to_ns
-from ..qos import LATCHED, offered_profile
-from ..session import domain_text, node_session, spin_until
+from ..messages import find_message_class, log_refused_message, to_ns
+from ..qos import LATCHED, match_offered_profile
+from ..session import describe_domain, node_session, spin_until
 from .services import discover
 
 QUEUE_DEPTH = 100
@@ -88,7 +88,7 @@ def listen(topic: str, once: bool) -> Iterator[list[Item]]:
 
         if not discover(executor, is_published):
             raise CubeError(
-                f"nobody publishes {name} in {domain_text()}; ./cube topics lists what there is"
+                f"nobody publishes {name} in {describe_domain()}; ./cube topics lists what there is"
             )
         listener.subscribe()
         spin_until(executor, lambda: stop.is_set() or listener.has_names, MAX_INFO_S)
@@ -167,7 +167,7 @@ class _Listener:
         if what == "stress" and cubes.endswith("/cubes"):
             # On a large skin the publisher of a single cube's topic is made only when somebody
             # subscribes, so the subscription comes before the search for the publisher.
-            profile = offered_profile([], QUEUE_DEPTH)
+            profile = match_offered_profile([], QUEUE_DEPTH)
             self._early_subscription = node.create_subscription(
                 StressTensorStamped, topic, self._on_message, profile
             )
@@ -196,13 +196,13 @@ class _Listener:
             raise CubeError(
                 f"{self._topic} has publishers of {' and '.join(kinds)}; end those of the wrong one"
             )
-        kind = message_class(self._topic, kinds[0])
+        kind = find_message_class(self._topic, kinds[0])
         if self._early_subscription is not None:
             if kind is StressTensorStamped:
                 return
             self._node.destroy_subscription(self._early_subscription)
 
-        profile = offered_profile(offers, QUEUE_DEPTH)
+        profile = match_offered_profile(offers, QUEUE_DEPTH)
         if kind is SkinStress:
             # SkinStress contains only the indices of cubes; their names are in the topic `info`.
             self._needs_names = True

@@ -24,9 +24,9 @@ from ...bags.repair import repair
 from ...bags.write import BagWriter
 from ...core.errors import BagError
 from ...processes.stop_signals import stop_event
-from ..messages import message_class
-from ..qos import offered_profile
-from ..session import domain_text, node_session, spin_until
+from ..messages import find_message_class
+from ..qos import match_offered_profile
+from ..session import describe_domain, node_session, spin_until
 from .echo import resolve_topics
 
 QUEUE_DEPTH = 2000
@@ -189,7 +189,7 @@ class Recorder:
 
     def _subscribe(self, topic: str, offers: list[TopicEndpointInfo]) -> None:
         type_name = offers[0].topic_type
-        profile = offered_profile(offers, QUEUE_DEPTH)
+        profile = match_offered_profile(offers, QUEUE_DEPTH)
         recorded_profile = quality(
             latched=profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
             reliable=profile.reliability == ReliabilityPolicy.RELIABLE,
@@ -215,7 +215,7 @@ class Recorder:
             self._received_bytes += len(data)
             self._waiting.append((topic, clock.now().nanoseconds, data))
 
-        kind = message_class(topic, type_name)
+        kind = find_message_class(topic, type_name)
         subscription = self._node.create_subscription(kind, topic, receive, profile, raw=True)
         self._subscriptions.append(subscription)
         self._unconnected[topic] = subscription
@@ -318,7 +318,7 @@ def _why_nothing(recorder: Recorder) -> str:
     if recorder.counts:
         return f"no message came on {', '.join(sorted(recorder.counts))}"
     missing = ", ".join(recorder.missing)
-    return f"nobody offers {missing} in {domain_text()}; start the skin, or correct --topics"
+    return f"nobody offers {missing} in {describe_domain()}; start the skin, or correct --topics"
 
 
 def _close(recorder: Recorder, folder: Path) -> None:

@@ -25,7 +25,7 @@ from ...messages.types import COMPENSATION, FREQUENCIES, PACKAGE, STRESS, TOUCH
 from ...msg import ReplayState
 from ...processes.stop_signals import on_stop_signal
 from ...srv import SteerReplay
-from ..messages import message_class, to_time
+from ..messages import find_message_class, to_time
 from ..qos import NEWEST, make_profile
 from ..session import node_session, spin_until
 
@@ -233,7 +233,7 @@ class Player:
             is_latched=connection.is_latched,
             is_best_effort=connection.is_best_effort,
         )
-        kind = message_class(topic, connection.msgtype)
+        kind = find_message_class(topic, connection.msgtype)
         self._publishers[topic] = self._node.create_publisher(kind, topic, profile)
         if connection.is_latched:
             self._latched.add(topic)
@@ -413,7 +413,7 @@ def replay(
     clock: bool,
     stress: bool,
     hold: bool,
-    each: Callable[[Player], None],
+    on_step: Callable[[Player], None],
 ) -> None:
     """Publish a bag until its end, or until a signal asks the process to end.
 
@@ -426,8 +426,8 @@ def replay(
         stress: Whether to publish the recorded topics of a reconstruction (stress and wrenches) as
             well.
         hold: Whether the replay pauses at the end of the bag and waits for the service `~/steer`.
-        each: Called in the main thread with the player after each step of the executor, which lasts
-            0.05 s at most, and at the end.
+        on_step: Called in the main thread with the player after each step of the executor, which
+            lasts 0.05 s at most, and at the end.
 
     Raises:
         BagError: The bag cannot be read, or has no topic to publish.
@@ -450,11 +450,11 @@ def replay(
             spin_until(
                 executor,
                 lambda: not thread.is_alive(),
-                on_step=lambda: each(player),
+                on_step=lambda: on_step(player),
             )
         finally:
             player.end()
             thread.join()
-        each(player)
+        on_step(player)
     if errors:
         raise errors[0]

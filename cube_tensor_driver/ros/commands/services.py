@@ -21,7 +21,7 @@ from std_srvs.srv import Trigger
 
 from ...core.errors import ConfigError, CubeError, TareError
 from ...srv import Tare
-from ..session import NodeSession, domain_text, node_session, spin_until
+from ..session import NodeSession, describe_domain, node_session, spin_until
 
 MAX_DISCOVERY_S = 5.0
 """Maximum time, in seconds, to search for topics and services of other nodes."""
@@ -88,7 +88,8 @@ def request_tare(cubes: Sequence[str], clear: bool) -> list[TareAnswer]:
         services = find_services(session, "cube_tensor_driver/srv/Tare")
         if not services:
             raise TareError(
-                f"no reconstruction runs in {domain_text()}; start ./cube demo or the launch file"
+                f"no reconstruction runs in {describe_domain()}; start ./cube demo or the launch "
+                "file"
             )
         answers = []
         for service in services:
@@ -175,7 +176,7 @@ class _NodeParameters:
         nodes = _find_nodes(session, f"{self._name}{LIST_SERVICE}")
         if self._name not in nodes:
             others = ", ".join(nodes)
-            raise ConfigError(f"no node {self._name} in {domain_text()}; its nodes: {others}")
+            raise ConfigError(f"no node {self._name} in {describe_domain()}; its nodes: {others}")
 
     def names(self) -> list[str]:
         """Return the sorted names of all parameters of the node."""
@@ -250,7 +251,7 @@ def _find_nodes(session: NodeSession, wanted_service: str = "") -> list[str]:
     services = find_services(session, kind, wanted_service)
     nodes = [service.removesuffix(LIST_SERVICE) for service in services]
     if not nodes:
-        raise ConfigError(f"no node runs in {domain_text()}; start ./cube demo or a skin")
+        raise ConfigError(f"no node runs in {describe_domain()}; start ./cube demo or a skin")
     return nodes
 
 
@@ -296,7 +297,7 @@ def call_service(session: NodeSession, service_type: type, name: str, request: o
     client = session.node.create_client(service_type, name)
     try:
         if not discover(session.executor, client.service_is_ready):
-            raise CubeError(f"{name}: nobody offers this service in {domain_text()}")
+            raise CubeError(f"{name}: nobody offers this service in {describe_domain()}")
         futures: list[Any] = []
 
         def has_answer() -> bool:

@@ -13,9 +13,9 @@ from rclpy.node import Node
 from rclpy.subscription import Subscription
 
 from ...core.errors import BagError, CubeError
-from ..messages import message_class
-from ..qos import offered_profile
-from ..session import NodeSession, domain_text, node_session, spin_until
+from ..messages import find_message_class
+from ..qos import match_offered_profile
+from ..session import NodeSession, describe_domain, node_session, spin_until
 from .echo import QUEUE_DEPTH
 from .services import SETTLE_S, discover
 
@@ -72,7 +72,7 @@ def list_topics() -> list[ListedTopic]:
     with node_session("topic_list") as session:
         node, executor = session
         if not discover(executor, lambda: _find_topics(node)):
-            raise CubeError(f"nobody publishes in {domain_text()}; start ./cube demo or a skin")
+            raise CubeError(f"nobody publishes in {describe_domain()}; start ./cube demo or a skin")
         for _ in range(MAX_TRIES):
             topics = _find_topics(node)
             _measure_rates(session, topics)
@@ -135,12 +135,12 @@ def _subscribe(node: Node, topic: ListedTopic, counts: dict[str, int]) -> Subscr
     Raises:
         BagError: The type of the messages is not installed.
     """
-    kind = message_class(topic.counted_topic, topic.kinds[0])
+    kind = find_message_class(topic.counted_topic, topic.kinds[0])
     counts[topic.name] = 0
 
     def receive(_: bytes) -> None:
         counts[topic.name] += 1
 
     offers = node.get_publishers_info_by_topic(topic.counted_topic)
-    profile = offered_profile(offers, QUEUE_DEPTH)
+    profile = match_offered_profile(offers, QUEUE_DEPTH)
     return node.create_subscription(kind, topic.counted_topic, receive, profile, raw=True)

@@ -22,7 +22,7 @@ from .legend import (
     LegendPlace,
     draw_arrows,
     draw_legend,
-    four_characters,
+    format_in_four_characters,
 )
 from .serialised import Colour, Shape, make_lines, make_text, serialise
 
@@ -138,7 +138,7 @@ class Canvas:
             ranges: Traction and gradient of the longest arrows.
         """
         normal = self._poses.rotation[:, :, 2]
-        functions = (scene.traction_arrows, scene.gradient_arrows)
+        functions = (scene.make_traction_arrows, scene.make_gradient_arrows)
         longest = (ranges.traction, ranges.gradient)
         shapes = []
         for scale, make_arrows, value in zip(SCALES, functions, longest, strict=True):
@@ -151,7 +151,7 @@ class Canvas:
         # Health seldom changes, so the last shape is kept.
         if self._health is None or not np.array_equal(health, self._health):
             self._health = health
-            lines = scene.fault_crosses(self._poses, health)
+            lines = scene.make_fault_crosses(self._poses, health)
             shape = make_lines("faults", lines, LINE_WIDTH * self._pitch)
             # A cross consists of two lines, thus of four end points, each of which has a colour.
             self._fault_crosses = shape._replace(colours=np.repeat(scene.MARK[health], 4, axis=0))
@@ -166,7 +166,7 @@ class Canvas:
             longest_pa: Stress, in Pa, whose line is as long as the pitch (distance of neighbouring
                 cubes).
         """
-        lines, is_pull = scene.principal_crosses(self._poses, values, self._pitch / longest_pa)
+        lines, is_pull = scene.make_principal_crosses(self._poses, values, self._pitch / longest_pa)
         shape = make_lines("crosses", lines, LINE_WIDTH * self._pitch)
         colours = np.where(is_pull.reshape(-1, 1), PULL_COLOUR, PUSH_COLOUR)
         return shape._replace(colours=np.repeat(colours, 2, axis=0))
@@ -200,9 +200,9 @@ class Canvas:
             slips = has_slip and contacts.slip[number] == SkinContacts.SLIP
             has_fit_state = number < len(contacts.refined)
             is_coarse = has_fit_state and not contacts.refined[number]
-            normal_n = four_characters(contacts.normal_force[number])
+            normal_n = format_in_four_characters(contacts.normal_force[number])
             # The shear force is NaN if it is not observed.
-            shear_n = four_characters(contacts.shear_force[number])
+            shear_n = format_in_four_characters(contacts.shear_force[number])
             shown = label._replace(
                 colour=SLIP_COLOUR if slips else CONTACT_COLOUR,
                 opacity=COARSE_OPACITY if is_coarse else 1.0,

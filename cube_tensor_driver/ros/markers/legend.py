@@ -206,7 +206,7 @@ def draw_legend(
     for number, position in enumerate(NUMBER_POSITIONS):
         value = (low + position * (top - low)) / quantity.size
         sign = "-" if value < 0 else "+" if quantity.signed else ""
-        text = sign + four_characters(abs(value))
+        text = sign + format_in_four_characters(abs(value))
         centre = place.point(position, NUMBERS_LINE)
         shapes.append(make_text(f"legend number {number}", text, height, centre))
 
@@ -218,7 +218,7 @@ def draw_legend(
         tip = tail + np.array([scale.length * place.pitch, 0, 0])
         arrow = np.stack([tail, tip])[np.newaxis]
         shapes.append(draw_arrows(scale, f"{scale.name} arrow", arrow, upwards, place.pitch))
-        text = f"{scale.name} {four_characters(value / scale.unit_si)} {scale.unit}"
+        text = f"{scale.name} {format_in_four_characters(value / scale.unit_si)} {scale.unit}"
         # The text begins to the right of the longest arrow. The position of a text marker is the
         # centre of the text. To compute it, letters are assumed to be half as wide as high.
         begin = (TRACTION_LENGTH + 0.3) * place.pitch / place.width
@@ -229,7 +229,7 @@ def draw_legend(
     return [*shapes, make_text("legend", title, height, place.point(0.5, TITLE_LINE))]
 
 
-def four_characters(value: float) -> str:
+def format_in_four_characters(value: float) -> str:
     """Return a number that is not negative in exactly four characters.
 
     Examples are 0.25, 18.7 and "250.". NaN and numbers that are negative or too large give "----".
@@ -251,7 +251,7 @@ def _title(quantity: scene.Quantity, top: float, health: Index) -> str:
         top: Value at the upper end of the colour scale, in SI units.
         health: Health of each cube, (cubes,).
     """
-    high = four_characters(top / quantity.size)
+    high = format_in_four_characters(top / quantity.size)
     low = f"-{high}" if quantity.signed else "0"
     label = quantity.label.translate(PLAIN_LETTERS)
     unit = quantity.unit.replace("σ", "sigma")

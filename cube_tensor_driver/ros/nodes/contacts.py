@@ -15,8 +15,8 @@ from sensor_msgs.msg import PointCloud2
 
 from ...config.parameters import CONTACTS
 from ...core.arrays import Index
-from ...messages.contacts import contacts_message, traction_message
-from ...messages.skin_info import cube_calibrations, skin_elastomer
+from ...messages.contacts import make_contacts_message, make_traction_message
+from ...messages.skin_info import read_cube_calibrations, read_skin_elastomer
 from ...msg import SkinContacts
 from ...touch.contact_finder import ContactFinder, ContactSettings, contact_finder
 from ..diagnostics.updater import Diagnostics, make_status
@@ -67,8 +67,8 @@ class Contacts(SkinSubscriberNode):
             contact_finder,
             settings,
             skin.poses,
-            cube_calibrations(skin.info),
-            skin_elastomer(skin.info),
+            read_cube_calibrations(skin.info),
+            read_skin_elastomer(skin.info),
         )
         self._future_finder = self._worker.submit(self._set_up)
 
@@ -86,7 +86,7 @@ class Contacts(SkinSubscriberNode):
         if self._has_traction_listeners():
             cloud = finder.cloud(values)
             if cloud is not None:
-                message = traction_message(
+                message = make_traction_message(
                     make_message,
                     skin.stamp_ns,
                     frame_id,
@@ -105,7 +105,9 @@ class Contacts(SkinSubscriberNode):
 
     def _make_message(self, skin: FollowedSkin, finder: ContactFinder) -> SkinContacts:
         frame_id = skin.info.header.frame_id
-        return contacts_message(make_message, skin.stamp_ns, frame_id, finder.contacts, finder.slip)
+        return make_contacts_message(
+            make_message, skin.stamp_ns, frame_id, finder.contacts, finder.slip
+        )
 
     def _take_finder(self) -> ContactFinder | None:
         """Return the contact finder; None while it is being set up, or if the set-up has failed.

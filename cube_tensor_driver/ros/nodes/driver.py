@@ -14,12 +14,12 @@ from ...config.parameters import DRIVER
 from ...core.pipeline import Pipeline
 from ...core.rows import FrequencyRows
 from ...device.chain import LiveLinks
-from ...device.live import cube_addresses, link_configs
+from ...device.live import make_cube_addresses, make_link_configs
 from ...messages.codec import MessageBuffer, frequency_codec
 from ...msg import SkinFrequencies, SkinInfo
 from ..diagnostics.links import LinkDiagnostics
 from ..diagnostics.updater import Diagnostics
-from ..messages import info_message
+from ..messages import make_info_message
 from ..node import (
     MAX_BUFFERS,
     CubeNode,
@@ -66,8 +66,8 @@ class Driver(CubeNode):
         )
         self._info = self.own(self.create_publisher(SkinInfo, "driver/info", LATCHED))
         self._links = LiveLinks(
-            link_configs(skin, self.value("port"), self.value("port_directory")),
-            cube_addresses(skin),
+            make_link_configs(skin, self.value("port"), self.value("port_directory")),
+            make_cube_addresses(skin),
             self._publish,
             rate=rate_hz,
             # Gathering several scans (samples of all cubes) in a message saves CPU time, but adds
@@ -115,7 +115,7 @@ class Driver(CubeNode):
         now_ns = self.get_clock().now().nanoseconds
         uids = self._published_uids
         self._info.publish(
-            info_message(
+            make_info_message(
                 self._skin,
                 self._pipeline,
                 now_ns,

@@ -50,7 +50,7 @@ class Markers(SkinSubscriberNode):
         shown = self._quantity.of(values, residual)
         fixed = float(self.value("range"))
         last = self._ranges.colours
-        top = fixed or scene.automatic_top(self._quantity, shown, last)
+        top = fixed or scene.choose_automatic_top(self._quantity, shown, last)
         ranges = self._ranges = self._ranges.follow(values, residual, top)
         contacts = self._newest_contacts(skin)
         return self._canvas.draw(self._quantity, shown, values, ranges, health, contacts)

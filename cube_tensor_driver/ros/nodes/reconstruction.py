@@ -18,7 +18,7 @@ from ...core.errors import BagError, CubeError, MessageError
 from ...core.reconstructor import Reconstructor
 from ...core.rows import FrequencyRows
 from ...messages.codec import SECOND, frequency_codec
-from ...messages.skin_info import cube_poses
+from ...messages.skin_info import read_cube_poses
 from ...msg import SkinCompensation, SkinFrequencies, SkinInfo
 from ..callbacks import LOG_PERIOD_S
 from ..compat import with_number
@@ -30,9 +30,9 @@ from ..diagnostics.reconstruction import (
 from ..diagnostics.updater import Diagnostics
 from ..messages import (
     CheckedSubscription,
-    compensation_message,
-    info_message,
     log_refused_message,
+    make_compensation_message,
+    make_info_message,
 )
 from ..motion import MissingMotion, make_motion_source
 from ..node import CubeNode, run
@@ -138,7 +138,7 @@ class Reconstruction(CubeNode):
             )
             self.own(frequencies)
         info_now = self._publish_info()
-        self._forces = ForcesAtCubes(cube_poses(info_now))
+        self._forces = ForcesAtCubes(read_cube_poses(info_now))
         self._motion = make_motion_source(self, skin.parent_frame)
         self._compensation = self.own(
             self.create_publisher(SkinCompensation, "compensation", profile)
@@ -252,7 +252,7 @@ class Reconstruction(CubeNode):
                 states = compensation.states()
             if motion is not None or states:
                 frame_id = self._skin.parent_frame
-                message = compensation_message(frame_id, stamp_ns, motion, states)
+                message = make_compensation_message(frame_id, stamp_ns, motion, states)
                 self._compensation.publish(message)
         return rows if motion is None else self._forces.add_to(rows, motion)
 
@@ -287,7 +287,7 @@ class Reconstruction(CubeNode):
         newest_ns = self._reconstructor.health.newest_ns
         since_ns = newest_ns + 1 if newest_ns else self.get_clock().now().nanoseconds
         self._published_rest_changes = self._reconstructor.rest_changes
-        info = info_message(
+        info = make_info_message(
             self._skin,
             self._reconstructor.pipeline,
             since_ns,

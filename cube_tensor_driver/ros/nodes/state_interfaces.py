@@ -28,7 +28,7 @@ from ...core.rows import StressRows
 from ...core.status import INVALID
 from ...core.tensor import contact_wrench
 from ...device.links.session import SILENT_S
-from ..messages import message_class, pack_array, to_time
+from ..messages import find_message_class, pack_array, to_time
 from ..node import CubeNode
 from ..qos import DEFAULT_RATE_HZ
 
@@ -185,7 +185,9 @@ class StateInterfaces:
         # name of the component by the same rule.
         topic = component.lower().replace("/", "_")
         kinds = [
-            message_class("parameter hardware_name", f"pal_statistics_msgs/msg/Statistics{what}")
+            find_message_class(
+                "parameter hardware_name", f"pal_statistics_msgs/msg/Statistics{what}"
+            )
             for what in ("Names", "Values")
         ]
         self._names_publisher, self._publisher = (

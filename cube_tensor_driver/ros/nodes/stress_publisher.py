@@ -25,9 +25,9 @@ from ...core.rows import FrequencyRows, StressRows
 from ...core.status import INVALID
 from ...core.tensor import contact_wrench
 from ...messages.codec import stress_codec
-from ...messages.point_cloud import cloud_message
+from ...messages.point_cloud import make_cloud_message
 from ...msg import SkinStress, StressTensorStamped
-from ..messages import make_message, pack_array, tensor_message, to_time, wrench_message
+from ..messages import make_message, make_tensor_message, make_wrench_message, pack_array, to_time
 from ..node import MAX_BUFFERS, CubeNode
 
 LISTENERS_PERIOD_S = 0.5
@@ -132,7 +132,7 @@ class ForceCloud:
         # The message is made once, and later only its data and stamp are replaced. The description
         # of its fields consists of many Python objects that never change.
         points = np.zeros((len(skin.cubes), len(FORCE_FIELDS)))
-        self._message = cloud_message(make_message, 0, skin.parent_frame, FORCE_FIELDS, points)
+        self._message = make_cloud_message(make_message, 0, skin.parent_frame, FORCE_FIELDS, points)
 
     def publish(self, rows: StressRows, stamp_ns: int) -> None:
         """Publish the force of the last row of each cube; it is NaN for cubes without a row.
@@ -200,7 +200,7 @@ class CubeTopics:
             left_out = int(rows.left_out[row])
             covariance = self._reconstructor.covariance(cube, left_out)
             header = self._header(rows, row, cube)
-            message = tensor_message(header, rows, row, covariance)
+            message = make_tensor_message(header, rows, row, covariance)
             self._tensors.publish(cube, message)
 
     def _publish_wrenches(self, rows: StressRows, listened: list[int]) -> None:
@@ -223,7 +223,7 @@ class CubeTopics:
         )
         for row, cube, force, torque in each:
             header = self._header(rows, row, cube)
-            message = wrench_message(header, force, torque)
+            message = make_wrench_message(header, force, torque)
             self._wrenches.publish(cube, message)
 
     def _header(self, rows: StressRows, row: int, cube: int) -> Header:

@@ -73,7 +73,7 @@ def hertz_radius(
     return float(np.cbrt(cube_of_radius))
 
 
-def flat_contact(
+def make_flat_contact(
     points: Array,
     forces: Array,
     normal: Array,

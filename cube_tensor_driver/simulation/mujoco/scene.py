@@ -54,7 +54,7 @@ def read_scene(path: Path) -> MjModel:
         raise ConfigError(f"{path}: MuJoCo cannot read it: {reason}") from None
 
 
-def scene_skin(path: Path) -> Path:
+def find_scene_skin(path: Path) -> Path:
     """Return the skin file that a scene names.
 
     Raises:

@@ -48,7 +48,7 @@ from ..cubes import PadErrors
 from ..imperfections import Imperfections
 from ..load import ContactLoad, StressField, surface_normal
 from ..source import SkinPads
-from .patches import Polygon, flat_contact, hertz_radius, next_corners
+from .patches import Polygon, hertz_radius, make_flat_contact, next_corners
 
 if TYPE_CHECKING:
     from mujoco import MjData, MjModel
@@ -265,7 +265,7 @@ class MujocoSkin:
         if len(place) > 1:
             # A round contact of the same area also describes the flat one, for uses that need only
             # its centre and force.
-            polygon = flat_contact(place, force, normal, MIN_WIDTH_DEPTHS * self.depth)
+            polygon = make_flat_contact(place, force, normal, MIN_WIDTH_DEPTHS * self.depth)
             pressure = -float(polygon.traction @ normal)
             radius = math.sqrt(pressing / pressure / math.pi)
             load = ContactLoad("disc", polygon.centre, normal, total, radius)

@@ -34,7 +34,7 @@ from ...core.arrays import Array, Index
 from ...mechanics.traction_prior import SHEAR_RATIO
 from ..inverse import SurfaceInverse
 from ..prior import AMPLITUDE
-from ..surface import square_points
+from ..surface import make_square_points
 from .contact_estimate import ContactEstimate, ContactSum, Discs, discs_of, estimate_contact
 from .local_values import LocalValues, unroll_points
 from .pressure_regions import split_peaks
@@ -406,7 +406,7 @@ def _place_nodes(region: Array, around: Array, inverse: SurfaceInverse) -> tuple
     while True:
         steps_each_way = int(np.ceil(extent / step))
         side = 2 * steps_each_way + 1
-        nodes = centre + square_points(step, side)
+        nodes = centre + make_square_points(step, side)
         to_region = cdist(nodes, region).min(axis=1)
         is_within_reach = to_region < reach
         nodes = nodes[is_within_reach]

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ...core.arrays import AnyArray, Array
-from .style import curve_style, print_style
+from .style import choose_curve_style, print_style
 
 Panel = tuple[str, Mapping[str, AnyArray]]
 """A panel: label of its value axis; name of each line -> its values (M,), in the unit of the label.
@@ -60,7 +60,7 @@ def draw_panels(times: Array, time_label: str, panels: Sequence[Panel]) -> Figur
                 np.insert(values, gaps, np.nan),
                 label=name,
                 markevery=(first_marker, spacing),
-                **curve_style(number) | {"linewidth": 0.9},
+                **choose_curve_style(number) | {"linewidth": 0.9},
             )
         axis.set_ylabel(label)
         axis.legend(

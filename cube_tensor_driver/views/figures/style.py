@@ -18,7 +18,7 @@ import matplotlib
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from ...config.output_files import atomic_write
+from ...config.output_files import write_atomically
 from ...core.errors import ConfigError
 
 SETTINGS: Any = {
@@ -81,7 +81,7 @@ def symbol(component: str) -> str:
     return rf"$\partial\sigma_{{{stress}}}/\partial {direction}$"
 
 
-def curve_style(number: int) -> dict[str, Any]:
+def choose_curve_style(number: int) -> dict[str, Any]:
     """Return the style of one curve as arguments of matplotlib's `plot`.
 
     Args:
@@ -113,7 +113,7 @@ def save(figure: Figure, path: Path) -> None:
     """
     check_picture(path)
     # An existing file stays until the new picture is complete and replaces it.
-    with atomic_write(path) as partial:
+    with write_atomically(path) as partial:
         figure.savefig(partial, format=path.suffix[1:] or "png")
 
 

@@ -46,7 +46,9 @@ class TimeSeries:
     rows: StressRows
 
 
-def cube_series(source: BagSource, name: str | None, start_s: float, end_s: float) -> TimeSeries:
+def read_cube_series(
+    source: BagSource, name: str | None, start_s: float, end_s: float
+) -> TimeSeries:
     """Read the frequencies of one cube from a bag, and compute the stress from them.
 
     Args:

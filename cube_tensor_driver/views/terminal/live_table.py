@@ -21,7 +21,7 @@ from ...core.latest_stress import LatestStress
 from ...core.modes import COMPONENTS
 from ...core.rows import StressRows
 from ...core.status import describe_status
-from ..scene import component_unit
+from ..scene import find_component_unit
 from .output import counted
 
 DRAW_PERIOD_S = 0.1
@@ -211,7 +211,7 @@ class LiveTable:
         for name in SHOWN:
             values = self._component(name)
             if np.isfinite(values).any():
-                size, unit = component_unit(name)
+                size, unit = find_component_unit(name)
                 stress, _, axis = name.partition("_")
                 label = f"∂{stress}/∂{axis}" if axis else stress
                 columns[f"{label}\n{unit}"] = _numbers(values / size, shown, "+7.2f")
