@@ -134,8 +134,9 @@ class ContactTracker:
         self._last_positions = np.zeros((0, 3))
         self._last_ids: list[int] = []
         self._next_id = 0
-        n_values = (len(inverse.poses.position), len(inverse.columns))
-        self._scaled = np.full(n_values, np.nan)
+        n_cubes = len(inverse.poses.position)
+        n_components = len(inverse.columns)
+        self._scaled = np.full((n_cubes, n_components), np.nan)
 
     def __repr__(self) -> str:
         contacts = f"{len(self._last_ids)} contacts in the newest scan"
@@ -176,7 +177,8 @@ class ContactTracker:
         coarse = {}
         unfitted = [region for region in regions if region.fit is None]
         if unfitted:
-            coarse = dict(zip(unfitted, self._integrate_field(unfitted, field), strict=True))
+            integrals = self._integrate_field(unfitted, field)
+            coarse = dict(zip(unfitted, integrals, strict=True))
             for region, contact in coarse.items():
                 region.start = self._start_of_fit(contact)
         if max_work > 0:
@@ -190,7 +192,13 @@ class ContactTracker:
             is_refined = region.has_fitted_neighbours and region.is_updated
             for one in region.estimate_contacts():
                 contacts.append(self._to_parent_frame(one, region.fit, is_refined))
-        return self._number_contacts([one for one in contacts if one.normal_force > 0])
+        pressing = [one for one in contacts if one.normal_force > 0]
+        return self._number_contacts(pressing)
+
+    @property
+    def _fitted(self) -> list[TrackedRegion]:
+        """Regions that are fitted."""
+        return [region for region in self._regions if region.fit is not None]
 
     @property
     def _fits(self) -> list[HertzFit | NodeFit]:
@@ -212,7 +220,8 @@ class ContactTracker:
         It is computed when it is read, which takes several milliseconds for each contact.
         """
         residual = self._scaled - self._response_to_fits()
-        return add_fits(self._inverse, self._inverse.field_of_scaled(residual), self._fits)
+        residual_field = self._inverse.field_of_scaled(residual)
+        return add_fits(self._inverse, residual_field, self._fits)
 
     def deviation(self, values: Array) -> FieldDeviation:
         """Compute the standard deviations of `field`.
@@ -226,7 +235,8 @@ class ContactTracker:
         inverse = self._inverse
         residual = self._scaled - self._response_to_fits()
         deviation = inverse.residual_deviation(residual, inverse.scaled(values))
-        variance = np.stack(deviation, axis=1) ** 2 + fit_variances(inverse, self._fits)
+        residual_variance = np.stack(deviation, axis=1) ** 2
+        variance = residual_variance + fit_variances(inverse, self._fits)
         return FieldDeviation(*np.sqrt(variance).T)
 
     def _response_to_fits(self) -> Array:
@@ -235,7 +245,7 @@ class ContactTracker:
         It consists of the C components of stress and gradient (times d0, half the side of a cube)
         that the pads determine (cubes, C), in Pa; NaN where the value of a cube is unknown.
         """
-        fitted = [region for region in self._regions if region.fit is not None]
+        fitted = self._fitted
         all_cubes = np.arange(len(self._scaled))
         update_responses(self._inverse, fitted, all_cubes)
         total = 0 * self._scaled
@@ -268,7 +278,8 @@ class ContactTracker:
             old = unmatched[best] if n_common[best] else None
             unmatched[best] = None
             region = old or TrackedRegion(self._inverse, self._noise)
-            region.begin_scan(points, float(pressure[points].max()))
+            peak = float(pressure[points].max())
+            region.begin_scan(points, peak)
             regions.append(region)
         self._regions = regions
         distances = self._region_distances(found)
@@ -291,8 +302,10 @@ class ContactTracker:
         sizes = [len(one) for one in found]
         starts = np.cumsum([0, *sizes[:-1]])
         points = self._inverse.points[np.concatenate(found)]
-        to_points = np.minimum.reduceat(cdist(points, points), starts, axis=0)
-        return np.asarray(np.minimum.reduceat(to_points, starts, axis=1))
+        distances = cdist(points, points)
+        to_points = np.minimum.reduceat(distances, starts, axis=0)
+        to_regions = np.minimum.reduceat(to_points, starts, axis=1)
+        return np.asarray(to_regions)
 
     def _choose_updates(self, max_work: float) -> list[TrackedRegion]:
         """Return the regions whose fits are computed for the newest values: all fits of Hertz
@@ -301,13 +314,12 @@ class ContactTracker:
         Args:
             max_work: Largest work of the scan; infinite: all regions are chosen.
         """
-        nodes = [region for region in self._regions if isinstance(region.fit, NodeFit)]
+        nodes = [region for region in self._fitted if isinstance(region.fit, NodeFit)]
         waiting = []
         if np.isfinite(max_work):
             nodes.sort(key=lambda region: -region.age)
             waiting = nodes[MAX_NODE_UPDATES:]
-        fitted = [region for region in self._regions if region.fit is not None]
-        return [region for region in fitted if region not in waiting]
+        return [region for region in self._fitted if region not in waiting]
 
     def _update_fits(self, chosen: list[TrackedRegion]) -> None:
         """Compute fits for the newest values.
@@ -320,7 +332,7 @@ class ContactTracker:
         fits = [region.fit for region in chosen]
         moved = [fit for fit in fits if isinstance(fit, HertzFit) and fit.needs_linearisation]
         linearise(self._inverse, moved)
-        fitted = [region for region in self._regions if region.fit is not None]
+        fitted = self._fitted
         if len(fitted) > 1:
             update_responses(self._inverse, fitted, self._fitted_cubes)
         total, deviation = self._sum_responses()
@@ -363,11 +375,14 @@ class ContactTracker:
             flat for the fit), and the Hertz contact from which the fit begins, in its frame.
         """
         inverse = self._inverse
-        above = inverse.poses.position + inverse.depth * inverse.poses.rotation[:, :, 2]
-        distance = np.linalg.norm(above - contact.position, axis=1)
+        normals = inverse.poses.rotation[:, :, 2]
+        above = inverse.poses.position + inverse.depth * normals
+        offset = contact.position - above
+        distance = np.linalg.norm(offset, axis=1)
         home = int(distance.argmin())
         rotation = inverse.poses.rotation[home]
-        place = (contact.position - above[home]) @ rotation[:, :2]
+        tangential_axes = rotation[:, :2]
+        place = offset[home] @ tangential_axes
         # The area of the contact is that of its region of pressure at the depth of the cubes, where
         # the squared radius of a contact is larger by about the squared depth.
         squared_radius = contact.area / np.pi - inverse.depth**2
@@ -409,8 +424,9 @@ class ContactTracker:
         """
         due = [region for region in self._regions if region.needs_hertz_fit]
         due.sort(key=lambda region: -region.waited)
-        n_fits = min(len(due), max(max_work // FIRST_FIT_WORK, 1))
-        due = due[: int(n_fits)]
+        limit = max(max_work // FIRST_FIT_WORK, 1)
+        n_fits = int(min(len(due), limit))
+        due = due[:n_fits]
         if not due:
             return 0
         homes = [region.start[0] for region in due]
@@ -454,12 +470,15 @@ class ContactTracker:
         rotation = inverse.poses.rotation[inverse.cube[own]]
         force = inverse.area * field.traction[own]
         pressing = -force[:, 2:]
-        shear = np.einsum("nij,nj->ni", rotation[:, :, :2], force[:, :2])
+        tangential_axes = rotation[:, :, :2]
+        tangential = force[:, :2]
+        shear = np.einsum("nij,nj->ni", tangential_axes, tangential)
         moments = pressing * inverse.points[own]
         normals = pressing * rotation[:, :, 2]
         rows = np.hstack([pressing, shear, moments, normals])
         order = np.argsort(owner, kind="stable")
-        firsts = np.searchsorted(owner[order], np.arange(len(regions)))
+        every_number = np.arange(len(regions))
+        firsts = np.searchsorted(owner[order], every_number)
         sums = np.add.reduceat(rows[order], firsts)
         return [
             self._coarse_contact(sums[number], sizes[number])
@@ -514,7 +533,8 @@ class ContactTracker:
         inverse = self._inverse
         around = fit.values
         offset = estimate.place - around.place
-        nearest = int((offset**2).sum(axis=1).argmin())
+        squared_distance = (offset**2).sum(axis=1)
+        nearest = int(squared_distance.argmin())
         to_cube = rotations_about_normal(around.angle[nearest])
         cube = around.cubes[nearest]
         rotation = inverse.poses.rotation[cube]
@@ -549,13 +569,15 @@ class ContactTracker:
         Returns:
             The contacts with their ids, the one with the largest normal force first.
         """
-        positions = np.array([one.position for one in contacts]).reshape(-1, 3)
+        positions = np.array([one.position for one in contacts])
+        positions = positions.reshape(-1, 3)
         distance = cdist(positions, self._last_positions)
         ids = [-1] * len(contacts)
         rows, columns = np.nonzero(distance < MATCH_PITCHES * self._inverse.pitch)
         nearest_first = np.argsort(distance[rows, columns], kind="stable")
         for pair in nearest_first.tolist():
-            row, number = int(rows[pair]), self._last_ids[columns[pair]]
+            row = int(rows[pair])
+            number = self._last_ids[columns[pair]]
             if ids[row] < 0 and number not in ids:
                 ids[row] = number
         for row, number in enumerate(ids):

@@ -84,7 +84,8 @@ class CubeNoise:
         if is_outdated.any():
             outdated = cubes[is_outdated]
             self._replace_pads(outdated, known[is_outdated])
-        stresses = self._to_pads[cubes] @ values[:, :, None]
+        columns = values[:, :, None]
+        stresses = self._to_pads[cubes] @ columns
         stresses = stresses[:, :, 0]
 
         # The predicted stress of a pad is wrong by interpolation errors of the tabulated response
@@ -95,7 +96,9 @@ class CubeNoise:
         largest_around = self._peak[around].max(axis=1)
         model_deviation = MODEL_ERROR * largest_around
         gain_deviation = GAIN_ERROR * stresses
-        variance = 1 + gain_deviation**2 + model_deviation[:, None] ** 2
+        gain_variance = gain_deviation**2
+        model_variance = model_deviation**2
+        variance = 1 + gain_variance + model_variance[:, None]
 
         before = self._variance[cubes]
         larger = np.maximum(variance, before)
@@ -114,7 +117,8 @@ class CubeNoise:
             known: Whether each of the C components is known (n, C).
         """
         by_pad = self._inverse.by_pad[cubes]
-        known_by_pad = np.where(known[:, :, None], by_pad, 0.0)
+        is_known = known[:, :, None]
+        known_by_pad = np.where(is_known, by_pad, 0.0)
         self.known[cubes] = known
         self._by_pad[cubes] = known_by_pad
         self._to_pads[cubes] = stress_matrices(by_pad, known)
@@ -259,7 +263,8 @@ class LocalValues:
         offset = offset.reshape(-1, 2)
         angle = np.repeat(self.angle, count)
         variant = np.repeat(self.variant, count)
-        response = self._inverse.contact_response.response(offset, angle, variant, size)
+        contact_response = self._inverse.contact_response
+        response = contact_response.response(offset, angle, variant, size)
         response = response[:, self._inverse.columns]
         by_contact = response.reshape(n, count, -1, 3)
         by_axis = by_contact.transpose(0, 2, 3, 1)
@@ -293,7 +298,8 @@ class LocalValues:
         all_forces = np.tile(forces.T, (n, 1))
         changes = response.sensitivity(offset, angle, sizes, all_forces)
         changes = changes[:, :, self._inverse.columns]
-        by_contact = changes.reshape(n, count, *changes.shape[1:])
+        shape = n, count, *changes.shape[1:]
+        by_contact = changes.reshape(shape)
         total = by_contact.sum(axis=1)
         return np.asarray(total.swapaxes(1, 2), float)
 
