@@ -516,8 +516,8 @@ def counted(function, calls):
 
 
 def test_a_new_contact_above_uncertain_cubes_needs_more_pressure(inverse):
-    """The field at the depth of the cubes has 0.41, 0.50 and 0.83 kPa under these forces."""
-    forces = (0.1, 0.12, 0.2)
+    """The field at the depth of the cubes has 0.83, 1.00 and 1.66 kPa under these forces."""
+    forces = (0.2, 0.24, 0.4)
     light, kept, firm = (ball(inverse, 4e-3, (0, 0), (0, 0, -force)) for force in forces)
     uncertain = np.ones(COUNT**2, bool)
     tracker = ContactTracker(inverse, LEAST)
@@ -527,7 +527,7 @@ def test_a_new_contact_above_uncertain_cubes_needs_more_pressure(inverse):
     assert later.id == begun.id
     assert not tracker.update(light, uncertain) and not tracker.update(kept, uncertain)
     (found,) = tracker.update(firm, uncertain)
-    assert found.normal_force == pytest.approx(0.2, rel=0.05)
+    assert found.normal_force == pytest.approx(0.4, rel=0.05)
     uncertain[COUNT**2 // 2] = False
     (above_certain,) = ContactTracker(inverse, LEAST).update(light, uncertain)
-    assert above_certain.normal_force == pytest.approx(0.1, rel=0.05)
+    assert above_certain.normal_force == pytest.approx(0.2, rel=0.05)
