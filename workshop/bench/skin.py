@@ -26,7 +26,7 @@ from rich.progress import Progress
 from cube_tensor_driver.config.skin import read_skin
 from cube_tensor_driver.core.arrays import Array, Index
 from cube_tensor_driver.core.errors import CubeError
-from cube_tensor_driver.demo.running import end_simulator, observing
+from cube_tensor_driver.demo.running import observing
 from cube_tensor_driver.demo.usage import Usage
 from cube_tensor_driver.demo.verification import Arrivals, compare, percentile
 from cube_tensor_driver.messages.codec import stress_codec
@@ -37,18 +37,13 @@ from cube_tensor_driver.processes.skin_processes import Process, SimulatedHubs, 
 from cube_tensor_driver.ros.qos import batch_profile
 from cube_tensor_driver.simulation.sample_log import SampleTable
 from cube_tensor_driver.views.figures.style import save
-from cube_tensor_hub.firmware import FirmwareError
 
 from ..torture.memory import median_slope
 from .hubs_in_c import HubLoad, read_samples
 from .scale import draw_scale
 
-INSTANTS = 16
-"""Number of instants of the load that the simulator repeats. The number is small, because the
-simulator must take little processor time here."""
-
-LOADS = ("hubs", "simulator")
-"""Processes that send the samples: hubs in C, or the simulator where they cannot be built."""
+LOAD = "hubs"
+"""Name of the process that sends the samples. It is not part of what a robot runs."""
 
 MAX_START_S = 30.0
 """Longest time, in seconds, from the start of the processes until the first tensor arrives."""
@@ -119,7 +114,7 @@ def bench_echo(cubes: int, bench: Bench) -> dict[str, Any]:
 def bench_skin(cubes: int, bench: Bench) -> dict[str, Any]:
     """Measure the driver and the reconstruction, and the echo (only messages) before and after.
 
-    Hubs in C (`firmware/`) send the samples, or the simulator where they cannot be built.
+    Hubs in C (`firmware/`) send the samples.
 
     Args:
         cubes: Number of cubes, rounded up so that all hubs have the same number.
@@ -183,9 +178,8 @@ def _measure_both(
     after = _measure_echo(cubes, bench, progress)
     # The speed of the machine may have changed meanwhile.
     echo = (before["echo_cpu_percent"] + after["echo_cpu_percent"]) / 2
-    loads = [f"cpu_{load}_percent" for load in LOADS]
-    # The load is not part of what a robot runs.
-    used = [skin[name] for name in skin if name.startswith("cpu_") and name not in loads]
+    used = [value for name, value in skin.items() if name.startswith("cpu_")]
+    robot_percent = sum(used) - skin[f"cpu_{LOAD}_percent"]
     return {
         "cubes": cubes,
         "rate_hz": bench.rate,
@@ -194,7 +188,7 @@ def _measure_both(
         "echo_cpu_percent": round(echo, 1),
         # In a measurement of a fraction of a second, the echo can take less processor time than the
         # system resolves. Its time is then 0.
-        "ratio_to_echo": round(sum(used) / echo, 3) if echo else None,
+        "ratio_to_echo": round(robot_percent / echo, 3) if echo else None,
     }
 
 
@@ -208,7 +202,7 @@ def _measure_skin(
         log = folder / "log"
         load = HubLoad.of(cubes, bench.pads)
         path = load.write_skin(folder, bench.rate)
-        processes = _make_processes(path, log, load, bench, progress)
+        processes = _make_processes(path, log, load, bench)
         arrivals = Arrivals(read_skin(path), one_per_hub=True)
         touches: list[tuple[int, int]] = []
 
@@ -223,7 +217,7 @@ def _measure_skin(
         with Children(folder) as children:
             name = f"skin of {load.cubes} cubes"
             measured = _measure(processes, children, bench, receive, progress, name, receive_touch)
-            taken, skipped = _end_load(processes[0].executable, children, log, load)
+            taken, skipped = _end_load(children, log, load)
     # Only rows of the first cube of each hub were stored, because storing all would delay this
     # process. They are counted for all cubes of the hub.
     comparison = compare(taken, arrivals, measured.start_ns, measured.end_ns)
@@ -273,7 +267,6 @@ def _make_processes(
     log: Path,
     load: HubLoad,
     bench: Bench,
-    progress: Progress,
 ) -> list[Process]:
     """Return the process of the load (hubs that send samples), followed by those of the nodes."""
     ports = path.parent / "ports"
@@ -281,31 +274,20 @@ def _make_processes(
         path,
         publish_period=bench.publish_period,
         composed=bench.composed,
-        simulated=SimulatedHubs(ports, sample_log=log, instants=INSTANTS),
+        simulated=SimulatedHubs(ports),
     )
+    processes[0] = load.make_process(path.parent / "firmware", ports, bench.rate, log)
     if bench.finds_touch:
         for process in processes[1:]:
             process.parameters["touch_false_alarms"] = 1.0
-    try:
-        processes[0] = load.make_process(path.parent / "firmware", ports, bench.rate, log)
-    except FirmwareError as error:
-        progress.console.print(f"The Python simulator is the load, which takes more: {error}")
     return processes
 
 
-def _end_load(
-    executable: str,
-    children: Children,
-    log: Path,
-    load: HubLoad,
-) -> tuple[SampleTable, int]:
+def _end_load(children: Children, log: Path, load: HubLoad) -> tuple[SampleTable, int]:
     """End the hubs; return their samples, and the number that they dropped from full queues."""
-    if executable == "simulator":
-        sample_log = end_simulator(children, log)
-        return sample_log.table, sample_log.dropped
-    children.end([executable])
+    children.end([LOAD])
     # The program prints how many samples it took and dropped when it ends.
-    dropped = re.findall(r" taken, (\d+) dropped", children.log(executable))
+    dropped = re.findall(r" taken, (\d+) dropped", children.log(LOAD))
     return read_samples(log, load), sum(map(int, dropped))
 
 
@@ -403,9 +385,7 @@ def summarise_memory(memory_mb: dict[str, list[float]]) -> dict[str, float]:
     If the measurement took a minute or more, the growth of the process that grows fastest after the
     first fifth of the time is returned as well.
     """
-    nodes: list[Array] = [
-        np.array(values) for name, values in memory_mb.items() if name not in LOADS
-    ]
+    nodes: list[Array] = [np.array(values) for name, values in memory_mb.items() if name != LOAD]
     result = {"rss_mb": round(float(np.max(nodes)), 1)}
     times_s: Array = MEMORY_PERIOD_S * np.arange(len(nodes[0]), dtype=np.float64)
     if times_s[-1] + MEMORY_PERIOD_S < MIN_GROWTH_DURATION_S:
