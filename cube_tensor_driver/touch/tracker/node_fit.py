@@ -69,8 +69,10 @@ MIN_SCORE_GAIN = 1.0
 present one. The evidence is the probability of the values, with the traction integrated over its
 prior."""
 
-_NODE_RADIUS = 0.9
-"""Radius of the Hertz contact of a node, divided by the distance of neighbouring nodes."""
+_NODE_RADIUS = 0.36
+"""Radius of the Hertz contact of a node, divided by the depth of the cubes' centres: 0.9 times
+`NODE_STEP`. Wider nodes, where they lie farther apart, would blur narrow edges. The cubes hardly
+feel the gaps between nodes up to a depth apart."""
 
 _PEAK_WIDTH = 0.5
 """Standard deviation of the Gaussian that smooths the fitted pressure before its peaks are counted,
@@ -147,7 +149,7 @@ class NodeFit:
         region_points = unroll_points(inverse, values.home, points)
         points_around = unroll_points(inverse, values.home, around)
         self.places, self.spacing = _place_nodes(region_points, points_around, inverse)
-        self.size = _NODE_RADIUS * self.spacing
+        self.size = _NODE_RADIUS * inverse.depth
 
         # The force of a node is its pressure times the square of the spacing.
         self._squared_distances = cdist(self.places, self.places, "sqeuclidean")
