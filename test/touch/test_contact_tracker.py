@@ -452,8 +452,8 @@ def test_a_ball_at_the_worst_places_of_a_wide_pitch_is_one_contact(cubes, place)
     tracker = ContactTracker(bench.inverse, LEAST)
     for _ in range(5):
         (found,) = tracker.update(values)
-    assert abs(found.normal_force - 1) < min(4 * found.force_uncertainty, 0.2)
-    assert np.abs(found.position[:2] - centre).max() < min(4 * found.position_uncertainty, 1.2e-3)
+    assert abs(found.normal_force - 1) < min(4 * found.force_uncertainty, 0.3)
+    assert np.abs(found.position[:2] - centre).max() < min(4 * found.position_uncertainty, 2e-3)
 
 
 def test_what_a_scan_has_no_time_for_is_done_in_the_next_ones(monkeypatch):

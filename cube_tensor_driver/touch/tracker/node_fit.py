@@ -48,11 +48,14 @@ MAX_NODES = 80
 """Largest number of nodes (small contacts that make up the traction) of a fit, whose time grows
 with its third power. The nodes of larger regions lie farther apart."""
 
-BORDER_REACH_DEPTHS = 2.4
-"""Distance from a region of contact at the border of the skin, divided by the depth of the cubes'
-centres, up to which nodes (small contacts) are placed beyond the border. The region itself ends
-there, because it consists of points of the skin, but the contact may not. Cubes do not feel the
-force of nodes much farther away, which would make the force of the contact arbitrary."""
+BORDER_REACH_PITCHES = 1.5
+"""Distance from a region of contact at the border of the skin, divided by the pitch (distance of
+neighbouring cubes), up to which nodes (small contacts) are placed beyond the border. The region
+itself ends there, because it consists of points of the skin, but the contact may not."""
+
+MAX_BORDER_REACH_DEPTHS = 4.0
+"""Largest such distance, divided by the depth of the cubes' centres. Cubes do not feel the force of
+nodes much farther away, which would make the force of the contact arbitrary."""
 
 ENVELOPE_FLOOR = 0.03
 """Smallest prior standard deviation of the force of a node (one of the small contacts whose sum is
@@ -321,6 +324,8 @@ class NodeFit:
         """Return force, centre, moment and area of each contact of the region, by integration."""
         if self._estimates is not None:
             return self._estimates
+        # Second moments count the force of a node as spread over the distance of nodes.
+        radius = _NODE_RADIUS / NODE_STEP * self.spacing
         estimates = []
         n_contacts = self.labels.max() + 1
         for label in range(n_contacts):
@@ -328,7 +333,7 @@ class NodeFit:
             places = self.places[own]
             forces = self.posterior.forces[:, own]
             root = self.posterior.root[:, own]
-            estimate = estimate_contact(places, forces, root, self.size)
+            estimate = estimate_contact(places, forces, root, radius)
             estimates.append(estimate)
         self._estimates = estimates
         return estimates
@@ -399,7 +404,8 @@ def _place_nodes(region: Array, around: Array, inverse: SurfaceInverse) -> tuple
     Returns:
         Positions (q, 2) of at most `MAX_NODES` nodes in m, and their distance in m.
     """
-    reach = BORDER_REACH_DEPTHS * inverse.depth
+    farthest = MAX_BORDER_REACH_DEPTHS * inverse.depth
+    reach = min(BORDER_REACH_PITCHES * inverse.pitch, farthest)
     margin = _POINT_MARGIN * inverse.spacing
     centre = region.mean(axis=0)
     radius = np.abs(region - centre).max()
