@@ -8,8 +8,9 @@ fitted to the values of the cubes around it (tracked_region.py): as Hertz contac
 on nodes with a prior that is zero outside the region. Force, position, moment and area follow from
 this fit.
 
-Fits take a few milliseconds, so their number per scan is limited. A Hertz contact that moves only
-needs one further Gauss-Newton step. A region that has no fit yet is reported with the integrals of
+Fits take a few milliseconds, so their number per scan is limited. First fits of Hertz contacts are
+made together, and a Hertz contact that moves only needs one further Gauss-Newton step. If there are
+many fits on nodes, they take turns. A region that has no fit yet is reported with the integrals of
 the field, which are less exact.
 """
 
@@ -95,7 +96,8 @@ class TrackedContact(NamedTuple):
         moment_uncertainty: Standard deviation of the moment, in N m.
         area_uncertainty: Standard deviation of the area, in m^2.
         refined: Whether force, position and moment come from a fit of the traction in the region of
-            contact; if not, they are integrals of the linear field (`COARSE_DEVIATION`).
+            contact to the newest values. If not, they are integrals of the linear field
+            (`COARSE_DEVIATION`), or those of an earlier fit, scaled with the pressure.
     """
 
     id: int
