@@ -91,8 +91,10 @@ def measure_pads_at_rest(frequency: Array, seconds: Array) -> PadsAtRest:
     has_frequency = ~silent & (mean > 0)
     scale = np.where(has_frequency, mean, np.nan)
     relative_noise = noise / scale
-    of_varying = np.ma.array(relative_noise, mask=~varies)
-    usual = np.ma.median(of_varying, axis=1, keepdims=True).filled(np.inf)
+    # Infinity where no pad of the cube varies, because such a cube has no noisy pad.
+    left_out = np.where(others_vary, np.nan, np.inf)
+    of_varying = np.where(varies, relative_noise, left_out)
+    usual = np.nanmedian(of_varying, axis=1, keepdims=True)
     noisy = varies & (relative_noise > NOISY_ENTER * usual)
     return PadsAtRest(
         frequency=scale,

@@ -118,7 +118,7 @@ def compute_square_corners(points: Array, rotation: Array, side: Array) -> AnyAr
         side: (M,) length of the sides of each square, in units of the scene.
     """
     offset = side[:, None, None] * _SQUARE
-    rotated = np.einsum("mij,mqj->mqi", rotation[:, :, :2], offset)
+    rotated: Array = np.einsum("mij,mqj->mqi", rotation[:, :, :2], offset)
     corners = points[:, None] + rotated
     return corners.astype(np.float32)
 
