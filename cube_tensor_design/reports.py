@@ -106,7 +106,7 @@ def _show_response(result: Response) -> None:
         names = modes[start : start + count]
         numbers = result.matrix[:, start : start + count]
         left = [f"{100 * result.mode_residual[name]:.2f}" for name in names]
-        rows = _rows(labels, numbers, 4)
+        rows = _make_rows(labels, numbers, 4)
         print_table(("pad",), names, rows, title=title, footer=[["left, %", *left]])
         title = ""
     _show_convergence(result)
@@ -216,12 +216,12 @@ def _show_surface(study: SurfaceStudy) -> None:
     print_table(
         ("load",),
         ("width, mm", "at x, mm", *heads),
-        [_surface_cells(row, unit, digits) for row in study.rows],
+        [_make_surface_cells(row, unit, digits) for row in study.rows],
         title=f"stress in kPa under {force}: measured by the cube, and true",
     )
 
 
-def _surface_cells(
+def _make_surface_cells(
     row: SurfaceRow,
     unit: float,
     digits: int,
@@ -251,7 +251,7 @@ def _show_volume(result: VolumeResponse) -> None:
         by_axis = STANDARD_GRAVITY * result.pads.T
         cases = [(f"{axis} up, ", pads, "") for axis, pads in zip("xyz", by_axis, strict=True)]
 
-    rows = _rows(result.layout.pads, result.pads, digits)
+    rows = _make_rows(result.layout.pads, result.pads, digits)
     print_table(("pad",), heads, rows, title=title)
     if result.change is not None:
         say(f"change from the mesh before: {100 * result.change:.2g} %")
@@ -339,7 +339,7 @@ def _format_width(width: float) -> str:
     return "never" if math.isinf(width) else f"{1e3 * width:g}"
 
 
-def _rows(
+def _make_rows(
     names: Iterable[str],
     values: Array,
     digits: int,

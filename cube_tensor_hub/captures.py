@@ -102,7 +102,7 @@ class Oscillators:
                 continue
             self._unread = self._unread[_QUESTION.size :]
             self.windows.append(middle_us)
-            body = struct.pack("<I", number) + self._edges(middle_us).tobytes()
+            body = struct.pack("<I", number) + self._find_edges(middle_us).tobytes()
             answers += body + struct.pack("<I", zlib.crc32(body))
         return answers
 
@@ -112,7 +112,7 @@ class Oscillators:
             while data := line.recv(4096):
                 line.sendall(self.answer(data))
 
-    def _edges(self, middle_us: int) -> NDArray[np.void]:
+    def _find_edges(self, middle_us: int) -> NDArray[np.void]:
         """Return what the counter captures of all pads in one measuring window.
 
         Args:

@@ -181,9 +181,9 @@ class Conversation:
             self._ask("opened", seconds=SECOND_S)
             self._ask("hello", Command.HELLO)
             if self._n_frames:
-                self._requests()
+                self._send_requests()
                 self._samples()
-                self._host_that_does_not_read()
+                self._stop_reading()
                 self._leave_as_found()
         except LinkError as error:
             raise LinkError(
@@ -200,7 +200,7 @@ class Conversation:
         self._transcript.other_version = self._listener.decoder.other_version
         return self._transcript
 
-    def _requests(self) -> None:
+    def _send_requests(self) -> None:
         """Send all kinds of requests and bytes that are no requests to a stopped hub."""
         self._ask("stop", Command.STOP)
         self._ask("quiet", seconds=QUIET_S)
@@ -213,8 +213,10 @@ class Conversation:
         )
         self._ask_time("stopped")
         self._ask("unknown request", Request(UNKNOWN, ANY_ARGUMENT))
-        self._send_bytes("damaged", _damaged_requests(), AFTER_DAMAGE)
-        self._send_bytes("wrong way", b"".join(map(encode, _frames_of_hubs())), AFTER_WRONG_WAY)
+        self._send_bytes("damaged", _make_damaged_requests(), AFTER_DAMAGE)
+        self._send_bytes(
+            "wrong way", b"".join(map(encode, _make_frames_of_hubs())), AFTER_WRONG_WAY
+        )
         self._send_bytes("XOFF", XOFF, Command.STOP)
         # A hub with flow control would stay silent for the rest of the check without an XON.
         self._send_bytes("XON", XON, Command.STOP)
@@ -236,7 +238,7 @@ class Conversation:
         self._ask("stop again", Command.STOP)
         self._ask("start after stop", Command.START, seconds=SECOND_S)
 
-    def _host_that_does_not_read(self) -> None:
+    def _stop_reading(self) -> None:
         """Let buffers overflow without reading, then close and open the port."""
         self._ask("fast", Request(Command.SET_PERIOD, FAST_US), seconds=SECOND_S)
         # At this rate the buffers overflow while nobody reads.
@@ -333,7 +335,7 @@ class Conversation:
         step.end_s = self._wire.now()
 
 
-def _damaged_requests() -> bytes:
+def _make_damaged_requests() -> bytes:
     """Return the requests of `DAMAGED`, behind noise that is longer than any request."""
     cut, wrong_crc, version = DAMAGED
     flipped = bytearray(encode(Request(wrong_crc)))
@@ -351,7 +353,7 @@ def _damaged_requests() -> bytes:
     )
 
 
-def _frames_of_hubs() -> list[Frame]:
+def _make_frames_of_hubs() -> list[Frame]:
     """Return one frame of each kind that only hubs send, with the uid of no hub."""
     no_fault, unknown = np.zeros(1, "<u4"), np.full(1, -32768, "<i2")
     return [

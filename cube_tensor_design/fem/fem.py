@@ -151,7 +151,7 @@ def compute_response(
         matrix=matrix,
         coefficients=coefficients,
         structure_residual=residual,
-        mode_residual=_mode_residual(structure, matrix, coefficients),
+        mode_residual=_compute_mode_residual(structure, matrix, coefficients),
         rank=estimator.rank,
         unobservable=tuple(unobservable.tolist()),
         convergence=tuple(rows),
@@ -243,7 +243,7 @@ def solve_meshes(
     return results
 
 
-def _mode_residual(
+def _compute_mode_residual(
     structure: Structure,
     matrix: Array,
     coefficients: dict[str, float],

@@ -79,7 +79,7 @@ def mesh_quarter(
     centres = base.p[:, base.t].mean(axis=1)
     from_corner = np.abs(centres - 1.0)
     outside_rings = np.any(from_corner > rho, axis=0)
-    ring_points, ring_triangles = _rings(rho, 0.25 if level == 0 else 0.5, smallest)
+    ring_points, ring_triangles = _make_rings(rho, 0.25 if level == 0 else 0.5, smallest)
     points = np.concatenate([base.p.T, ring_points])
     # The points of the rings are numbered after those of the grid.
     ring_triangles = ring_triangles + base.nvertices
@@ -177,14 +177,14 @@ def mesh_box(
         largest: Size of a brick far away from the cube.
     """
     inner = sorted({0.0, *(s for s in stops if 0.0 < s < 1.0)})
-    from_edge = _graded(1.0 - inner[-1], smallest, growth)
+    from_edge = _grade_nodes(1.0 - inner[-1], smallest, growth)
     to_edge = 1.0 - from_edge[::-1]
     to_last_pad = _split(inner, inner[-1], size)
     face = np.concatenate([to_last_pad, to_edge[1:]])
 
     def half_line(end: float) -> Array:
         decay_end = min(end - 1.0, DECAY_DISTANCE)
-        near = 1.0 + _graded(decay_end, smallest, growth)
+        near = 1.0 + _grade_nodes(decay_end, smallest, growth)
         # The first brick far away continues from the last one that is near.
         last_step = near[-1] - near[-2]
         far = _grow_to(near[-1], end, last_step, FAR_GROWTH, largest)
@@ -226,11 +226,11 @@ def _grow_to(
     factor `growth` up to `largest`."""
     if start == end:
         return np.array([start])
-    points = start + _graded(end - start, first * growth, growth)
+    points = start + _grade_nodes(end - start, first * growth, growth)
     return points if np.isinf(largest) else _split(points.tolist(), end, largest)
 
 
-def _graded(
+def _grade_nodes(
     length: float,
     first: float,
     growth: float,
@@ -250,7 +250,7 @@ def _graded(
     return points
 
 
-def _rings(
+def _make_rings(
     rho: float,
     ratio: float,
     smallest: float,

@@ -125,7 +125,7 @@ def interval_weights(
     n = len(nodes)
     mass = np.zeros((n, n))
     integral = np.zeros(n)
-    element_mass, element_integral = _line_element(order)
+    element_mass, element_integral = _make_line_element(order)
     for first in range(0, n - 1, order):
         own = slice(first, first + order + 1)
         begin, end = nodes[[first, first + order]]
@@ -147,7 +147,7 @@ def interval_weights(
     return weights
 
 
-def _line_element(order: int) -> tuple[Array, Array]:
+def _make_line_element(order: int) -> tuple[Array, Array]:
     """Return integrals int phi_i phi_j and int phi_i on [0, 1] of the polynomials phi_i that are 1
     at one of order + 1 equally spaced nodes and 0 at the others."""
     points, weight = np.polynomial.legendre.leggauss(order + 1)

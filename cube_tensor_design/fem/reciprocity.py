@@ -54,7 +54,7 @@ def compute_influence(
     check_memory(grid)
     solid = make_solid(body, layout, grid)
     d0 = body.side / 2
-    place, pads = _surface_influence(solid, layout)
+    place, pads = _compute_surface_influence(solid, layout)
     return Influence(
         layout=layout,
         side=body.side,
@@ -67,7 +67,7 @@ def compute_influence(
     )
 
 
-def _surface_influence(solid: Solid, layout: Layout) -> tuple[Array, Array]:
+def _compute_surface_influence(solid: Solid, layout: Layout) -> tuple[Array, Array]:
     """Return positions (n, dim - 1) of the nodes on the surface, and the stress (P, n, dim) of P
     pads under unit forces there; lengths in d0 (half the side of the cube)."""
     dim = solid.dim

@@ -206,7 +206,7 @@ class Solid:
             face = skfem.FacetBasis(mesh, self.basis.elem, facets=outer, intorder=6)
             x = np.asarray(face.default_parameters()["x"])
             points = x.reshape(self.dim, -1).T
-            stress = _parity_part(field, points, parity)
+            stress = _select_parity_part(field, points, parity)
             traction = sign * stress[..., axis]  # (q, n, dim)
             by_point = traction.reshape(face.dx.size, -1)
             # A quadrature point loads the nodes whose functions are not zero there.
@@ -338,7 +338,7 @@ class Solid:
         return held
 
 
-def _parity_part(
+def _select_parity_part(
     field: Callable[[Array], Array],
     x: Array,
     parity: Parity,

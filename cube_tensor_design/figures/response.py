@@ -136,7 +136,7 @@ def draw_influence(
     unit, force = (1.0, "1 N/mm") if layout.planar else (1e3, "1 N")
     figure = Figure(figsize=(10, 4.5))
     titles = (f"a force of {force} pressing", f"a force of {force} along x")
-    groups = _equal_curves(stress)
+    groups = _find_equal_curves(stress)
     for axis, title, direction in zip(figure.subplots(1, 2), titles, stress.T, strict=True):
         curves = {}
         for pads in groups:
@@ -153,7 +153,7 @@ def draw_influence(
     return figure
 
 
-def _equal_curves(stress: Array) -> list[list[int]]:
+def _find_equal_curves(stress: Array) -> list[list[int]]:
     """Group the numbers of pads (P, ...) that have the same values."""
     groups: list[list[int]] = []
     tolerance = SAME_CURVE * np.abs(stress).max()

@@ -83,11 +83,11 @@ def _draw_errors(
     for number, component in enumerate(COMPONENTS):
         is_observed = not np.isnan(errors[0, number])
         if is_observed:
-            style = _component_style(number)
+            style = _choose_component_style(number)
             axis.loglog(widths, errors[:, number], label=symbol(component), **style)
 
 
-def _component_style(number: int) -> dict[str, Any]:
+def _choose_component_style(number: int) -> dict[str, Any]:
     """Return the style of a component: six stresses, then the gradients xx_x, xx_y, xx_z, ..."""
     if number < len(STRESS):
         return choose_curve_style(number) | {"linestyle": "-"}

@@ -113,8 +113,8 @@ def experiments(
     # Experiment (a) is the first half of experiment (b).
     bonded, sliding = found[:2]
     return [
-        _first_half(bonded, "a, top plate pressed, bonded"),
-        _first_half(sliding, "a, top plate pressed, sliding"),
+        _take_first_half(bonded, "a, top plate pressed, bonded"),
+        _take_first_half(sliding, "a, top plate pressed, sliding"),
         *found,
     ]
 
@@ -137,7 +137,7 @@ def _protocols(body: Body) -> list[_Protocol]:
     return protocols
 
 
-def _first_half(experiment: Experiment, name: str) -> Experiment:
+def _take_first_half(experiment: Experiment, name: str) -> Experiment:
     """Return the first half of the steps of an experiment, in which a plate presses, under another
     name."""
     count = len(DISPLACEMENTS)

@@ -119,13 +119,13 @@ class RodContact:
 
     def energy(self, u: Array) -> float:
         """Return the energy at displacements u (dofs,)."""
-        p = self._penetration(u).p
+        p = self._compute_penetration(u).p
         density = self._stiffness / 2 * p**2
         return float((density * self._facets.dx).sum())
 
     def force(self, u: Array) -> Array:
         """Return the nodal forces (dofs,) at displacements u (dofs,)."""
-        at = self._penetration(u)
+        at = self._compute_penetration(u)
         pressure = self._stiffness * at.p * at.dp
         return _PUSH.assemble(self._facets, pressure=pressure, slope=at.slope)
 
@@ -136,7 +136,7 @@ class RodContact:
             u: (dofs,) displacements.
             curved: Whether the rod's curvature counts, which can make the tangent indefinite.
         """
-        at = self._penetration(u)
+        at = self._compute_penetration(u)
         # The pressure is k p dp/dg, with the stiffness k, the penetration p and the gap g. `normal`
         # is its derivative by g; `bending` comes from the change of the rod's slope along x.
         normal = self._stiffness * (at.dp**2 + at.p * at.ddp)
@@ -146,8 +146,8 @@ class RodContact:
 
     def secant(self, u: Array, v: Array) -> sp.csr_matrix:
         """Return S, sparse (dofs, dofs), with S (u - v) = force(u) - force(v); linear theory."""
-        at = self._penetration(u)
-        other = self._penetration(v)
+        at = self._compute_penetration(u)
+        other = self._compute_penetration(v)
         moved = np.asarray(self._facets.interpolate(u - v))
         change = moved[1]
         has_moved = np.abs(change) > SAME_DISPLACEMENT
@@ -173,7 +173,7 @@ class RodContact:
             bending=bending,
         )
 
-    def _penetration(self, u: Array) -> _Penetration:
+    def _compute_penetration(self, u: Array) -> _Penetration:
         x = np.asarray(self._facets.default_parameters()["x"])
         moved = np.asarray(self._facets.interpolate(u))
         position = x[0] + self._finite * moved[0]

@@ -175,10 +175,10 @@ def split_signals(
         raise ElasticError("the load is too large for one step; press less")
 
     free = bench.free(step)
-    matrix = _superposed_matrix(bench, step, with_cube, u, field)
+    matrix = _superpose_matrix(bench, step, with_cube, u, field)
     solver = factorise(matrix)
     dofs = np.unique(bench.section.basis.element_dofs[:, in_cube])
-    polynomials, part = _polynomials(bench)
+    polynomials, part = _make_polynomials(bench)
     polynomials = polynomials[:, dofs]
     # Columns of equal norm keep the fit well conditioned.
     size = np.linalg.norm(polynomials, axis=1)
@@ -193,13 +193,13 @@ def split_signals(
         # w of each polynomial, the transposed (symmetric) system is solved once, with the weights
         # of the signal on the right. The matrix has one row more if the rod's force is held.
         n_free = len(free)
-        forces = _forces(bench, weights, ~in_cube)
+        forces = _compute_forces(bench, weights, ~in_cube)
         right = np.zeros(matrix.shape[0])
         right[:n_free] = -forces[free]
         adjoint[free] = solver.solve(right)[:n_free]
         # The signal is the product of `response` and the displacements without the cube (`field`).
-        response = _forces(empty, weights + adjoint, in_cube)
-        response -= _forces(bench, adjoint, in_cube)
+        response = _compute_forces(empty, weights + adjoint, in_cube)
+        response -= _compute_forces(bench, adjoint, in_cube)
         per_amplitude = polynomials @ response[dofs]
         each = per_amplitude * amplitude
         parts = np.bincount(part, each, len(PARTS))
@@ -209,7 +209,7 @@ def split_signals(
     return np.array(rows)
 
 
-def _superposed_matrix(
+def _superpose_matrix(
     bench: VirtualBench,
     step: LoadStep,
     with_cube: LoadStep,
@@ -249,7 +249,7 @@ def _superposed_matrix(
     return sp.bmat(blocks)
 
 
-def _forces(
+def _compute_forces(
     bench: VirtualBench,
     u: Array,
     elements: Mask,
@@ -260,7 +260,7 @@ def _forces(
     return section.forces(stress, elements)
 
 
-def _polynomials(bench: VirtualBench) -> tuple[Array, Index]:
+def _make_polynomials(bench: VirtualBench) -> tuple[Array, Index]:
     """Return n polynomial displacements (n, dofs) that are in balance without a cube, and the
     number in `PARTS` of the part (n,) to which each belongs."""
     body = bench.body

@@ -94,8 +94,8 @@ def rod_shear(
     tensor_kernel = line_load(layer, x, depth, body.side / 2)
     pad_kernel = influence.at(x[:, None])
     shear_kernel = tensor_kernel[zx]
-    from_tensor = _shear_weights(tensor_kernel, shear_kernel, x, depth)
-    from_pads = _shear_weights(pad_kernel, shear_kernel, x, depth)
+    from_tensor = _compute_shear_weights(tensor_kernel, shear_kernel, x, depth)
+    from_pads = _compute_shear_weights(pad_kernel, shear_kernel, x, depth)
 
     eq_4_gain = SHEAR_SIGNS @ response[:4, zx]
     report = count_steps(progress, len(places))
@@ -125,7 +125,7 @@ def rod_shear(
     return RodShear(**columns)
 
 
-def _shear_weights(
+def _compute_shear_weights(
     kernel: Array,
     shear_kernel: Array,
     x: Array,

@@ -162,7 +162,7 @@ class VirtualBench:
         self.layout = layout or LAYOUTS["planar"]
         self._half_side = body.side / 2
 
-        mesh = _bench_mesh(body, self.layout, cube, size)
+        mesh = _make_bench_mesh(body, self.layout, cube, size)
         check_memory(mesh, BYTES_PER_CORNER)
         centres = mesh.p[:, mesh.t].mean(axis=1)
         self.in_cube = np.all(np.abs(centres) < 1.0, axis=0)
@@ -173,9 +173,9 @@ class VirtualBench:
         self.section = Section(mesh, material)
 
         top = body.height / 2 / self._half_side
-        self._top = self._horizontal_facets(top)
+        self._top = self._find_horizontal_facets(top)
         along_x = skfem.LinearForm(lambda w, _: w[0])
-        bottom_mean = along_x.assemble(self._horizontal_facets(-top))
+        bottom_mean = along_x.assemble(self._find_horizontal_facets(-top))
         # Numbers of the size of the stiffness keep the equations well conditioned.
         self._bottom_mean = bottom_mean * body.young
 
@@ -199,14 +199,14 @@ class VirtualBench:
         rows = []
         for number, step in enumerate(steps, 1):
             guess = 2 * position.u - before.u  # As if the body moved on as in the last step.
-            task = self._task(step, loose)
+            task = self._make_task(step, loose)
             reached = self._advance(position, guess, task, number)
             before = position
             position = reached
             u = position.u
             if not step.gripped:
                 loose = u
-            results = self._pad_stresses(u), self._state(u), self._rotation(u)
+            results = self._pad_stresses(u), self._state(u), self._compute_rotation(u)
             rows.append(results)
             report()
         columns = zip(*rows, strict=True)
@@ -216,7 +216,7 @@ class VirtualBench:
         """Return the displacements (dofs,) under one step from rest; None if the step is too
         large."""
         rest = np.zeros(self.section.basis.N)
-        return self._newton(rest, self._task(step, rest))
+        return self._newton(rest, self._make_task(step, rest))
 
     def rod_pressure(self, step: LoadStep) -> tuple[Array, Array]:
         """Return the nodal forces with which a rod presses on the body in one step of a linear
@@ -259,7 +259,7 @@ class VirtualBench:
     def free(self, step: LoadStep) -> Index:
         """Return the numbers of the unknown displacements that a step from rest does not
         prescribe."""
-        task = self._task(step, np.zeros(self.section.basis.N))
+        task = self._make_task(step, np.zeros(self.section.basis.N))
         return np.flatnonzero(np.isnan(task.prescribed))
 
     def rod_contact(self, rod: Rod) -> RodContact:
@@ -298,7 +298,7 @@ class VirtualBench:
             stress_zz=result[1, 1].mean(axis=1),
         )
 
-    def _horizontal_facets(self, z: float) -> skfem.FacetBasis:
+    def _find_horizontal_facets(self, z: float) -> skfem.FacetBasis:
         """Return the facets of the surface at the height z."""
         mesh = self.section.mesh
 
@@ -308,7 +308,7 @@ class VirtualBench:
         facets = mesh.facets_satisfying(is_at_height, boundaries_only=True)
         return skfem.FacetBasis(mesh, self.section.basis.elem, facets=facets, intorder=8)
 
-    def _task(self, step: LoadStep, loose: Array) -> _Task:
+    def _make_task(self, step: LoadStep, loose: Array) -> _Task:
         """Return the constraints and the rod of a step; `loose` (dofs,) are the displacements after
         the last step without a grip."""
         basis = self.section.basis
@@ -341,13 +341,13 @@ class VirtualBench:
                 f"step {number} of the load is too large even in {parts} parts; press less"
             )
         # First to the middle of the step, then on from there in the same direction.
-        half = self._half_task(start, task)
+        half = self._make_half_task(start, task)
         guess = (start.u + guess) / 2
         middle = self._advance(start, guess, half, number, halvings + 1)
         guess = 2 * middle.u - start.u
         return self._advance(middle, guess, task, number, halvings + 1)
 
-    def _half_task(self, start: _Position, task: _Task) -> _Task:
+    def _make_half_task(self, start: _Position, task: _Task) -> _Task:
         """Return the task half of the way from the displacements and the rod at the start to a
         task."""
         rod = task.rod
@@ -386,7 +386,7 @@ class VirtualBench:
         energy = inner.energy + contact.energy(u)
         return Balance(force, energy)
 
-    def _rotation(self, u: Array) -> float:
+    def _compute_rotation(self, u: Array) -> float:
         """Return the rotation, in rad, of the line between the centres of the cube's two sides."""
         section = self.section
         ends = [section.node(x, 0.0) for x in (-1.0, 1.0)]
@@ -403,7 +403,7 @@ class VirtualBench:
         section = self.section
         stress = section.material.stress(section.deformation(u))
         force = -section.forces(stress, ~self.in_cube)
-        angle = self._rotation(u) if self.finite else 0.0  # Linear theory has no rotation.
+        angle = self._compute_rotation(u) if self.finite else 0.0  # Linear theory has no rotation.
         return self.pad_weights(self.layout, angle) @ force
 
     def _state(self, u: Array) -> Array:
@@ -424,7 +424,7 @@ class VirtualBench:
         return np.array([zz, zx, xx, zz_x, zz_z, xx_z, xx_x])
 
 
-def _bench_mesh(
+def _make_bench_mesh(
     body: Body,
     layout: Layout,
     cube: bool,

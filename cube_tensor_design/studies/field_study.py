@@ -74,13 +74,13 @@ class FieldStudy:
         """
         saved = np.full((len(self.widths), len(SKIN_KINDS)), np.nan)
         for row, curves in enumerate(self.error):
-            pitches = [self._pitch_for(error, curve) for curve in curves.T]
+            pitches = [self._find_pitch_for(error, curve) for curve in curves.T]
             ratio = np.array(pitches) / pitches[0]
             # The number of cubes per area falls with the square of the pitch.
             saved[row] = ratio**2
         return saved
 
-    def _pitch_for(self, error: float, curve: Array) -> float:
+    def _find_pitch_for(self, error: float, curve: Array) -> float:
         """Return the pitch at which a curve of errors (pitches,) reaches an error; NaN if none
         does."""
         # Noise may make a curve fall for a step, and np.interp needs it to rise.

@@ -161,7 +161,7 @@ def layout_study(
     error = {}
     for name, layout in LAYOUTS.items():
         # The pads of quad and planar are the first ones of the cube.
-        estimate = pads[: layout.n_pads].T @ _recovery_matrix(matrix, name).T
+        estimate = pads[: layout.n_pads].T @ _compute_recovery_matrix(matrix, name).T
         difference = estimate.reshape(shape) - truth
         largest = np.abs(difference).max(axis=2)
         error[name] = largest / np.ptp(truth, axis=2)
@@ -209,7 +209,7 @@ def _solve_box(
     return matrix, pads
 
 
-def _recovery_matrix(matrix: Array, name: str) -> Array:
+def _compute_recovery_matrix(matrix: Array, name: str) -> Array:
     """Return the matrix (15, pads) from the pad stresses of a layout to `COMPONENTS`."""
     layout = LAYOUTS[name]
     modes = PLANE if layout.planar else SPACE

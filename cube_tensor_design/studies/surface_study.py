@@ -123,7 +123,7 @@ def study_surface(
         )
     report = count_steps(progress, 2)
     report("response matrix")
-    inverse = _inverse_rows(body, layout, meshes, neglect)
+    inverse = _compute_inverse_rows(body, layout, meshes, neglect)
     report("influence functions")
     influence = compute_influence(replace(body, ground=True), layout, meshes - 1)
 
@@ -136,16 +136,16 @@ def study_surface(
         pads = influence.at(points)[:, :, axis] @ (sign * parts)
         measured = {name: float(row @ pads) for name, row in inverse.items()}
         if layout.planar:
-            field = _true_stress_in_plane(body, points[:, 0], parts)
+            field = _compute_stress_in_plane(body, points[:, 0], parts)
         else:
-            field = _true_stress_in_space(body, width, offset)
+            field = _compute_stress_in_space(body, width, offset)
         true = {name: sign * float(field[name][axis]) for name in inverse}
         rows.append(SurfaceRow(load, width, offset, measured, true))
     report("done")
     return SurfaceStudy(body, layout, influence, tuple(rows))
 
 
-def _inverse_rows(
+def _compute_inverse_rows(
     body: Body,
     layout: Layout,
     meshes: int,
@@ -169,7 +169,7 @@ def _inverse_rows(
     return rows
 
 
-def _true_stress_in_plane(
+def _compute_stress_in_plane(
     body: Body,
     x: Array,
     parts: Array,
@@ -190,7 +190,7 @@ def _true_stress_in_plane(
     return {name: parts @ modes[PLANE.names.index(name)] for name in COMPONENTS}
 
 
-def _true_stress_in_space(
+def _compute_stress_in_space(
     body: Body,
     width: float,
     offset: float,

@@ -308,7 +308,7 @@ class TractionBench:
     ) -> Errors:
         """Return the errors for random loads of this width; a seed gives the same loads."""
         random = np.random.default_rng(seed)
-        results = [self._case_errors(width, random) for _ in range(cases)]
+        results = [self._compute_case_errors(width, random) for _ in range(cases)]
         field, found, below, surface, is_single = zip(*results, strict=True)
         force, force_deviation, position, position_deviation = np.moveaxis(np.array(found), 2, 0)
         ratio = [force / force_deviation, position / position_deviation]
@@ -323,7 +323,7 @@ class TractionBench:
             found=float(np.mean(is_single)),
         )
 
-    def _case_errors(
+    def _compute_case_errors(
         self,
         width: float,
         random: np.random.Generator,

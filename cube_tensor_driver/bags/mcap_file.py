@@ -161,7 +161,7 @@ class McapReader:
         # Several channels can stand for the same topic, for example after a recorder was restarted.
         channels = [number for number, one in self.connections.items() if one.topic in topics]
         if not self._index.chunk_indexes:
-            yield from self._unindexed_messages(topics, start_ns, stop_ns)
+            yield from self._read_unindexed_messages(topics, start_ns, stop_ns)
             return
         chunks = [
             chunk
@@ -242,7 +242,7 @@ class McapReader:
             data, message_begin, message_end, head["recorded_ns"], head["channel"]
         ).select(chosen)
 
-    def _unindexed_messages(
+    def _read_unindexed_messages(
         self,
         topics: Collection[str],
         start_ns: int,

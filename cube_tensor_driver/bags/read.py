@@ -113,12 +113,12 @@ def report_damage(path: Path) -> Iterator[None]:
         raise BagError(f"{path}: {error.strerror or error}; name a bag that can be read") from None
     except READ_ERRORS as error:
         raise BagError(
-            f"{path}: damaged, or no bag ({_one_line(error)}); "
+            f"{path}: damaged, or no bag ({_join_lines(error)}); "
             f"./cube bag repair {path} may help if it was cut off"
         ) from None
 
 
-def _one_line(error: Exception) -> str:
+def _join_lines(error: Exception) -> str:
     """Return the text of a library's error, joined to one line of at most 200 characters.
 
     Such texts can have several lines or quote many damaged bytes.
@@ -304,12 +304,12 @@ class Bag:
             BagError: A file of the bag is damaged, or has another number of messages than its
                 summary states.
         """
-        for file, messages in self._stored(topics, start_ns, stop_ns):
+        for file, messages in self._read_stored(topics, start_ns, stop_ns):
             for channel, time_ns, data in messages:
                 connection = file.connections[channel]
                 yield Entry(connection.topic, connection.msgtype, time_ns, data)
 
-    def _stored(
+    def _read_stored(
         self,
         topics: set[str] | None,
         start_ns: int = 0,
@@ -393,7 +393,7 @@ class Bag:
                 self.path,
                 topic,
                 seconds,
-                _one_line(error),
+                _join_lines(error),
             )
         self.skipped[topic] += count
 
@@ -432,7 +432,7 @@ class Bag:
         Raises:
             BagError: A file of the bag is damaged.
         """
-        return self._decoded(topic, frequency_codec, frequency_codec.decode)
+        return self._decode_batches(topic, frequency_codec, frequency_codec.decode)
 
     def stress(self, topic: str) -> Iterator[tuple[Decoded[StressRows], Times]]:
         """Read the recorded stress on a topic in the order of recording.
@@ -443,7 +443,7 @@ class Bag:
             M messages, and an array (M,) of the times at which they were recorded, in ns since the
             Unix epoch.
         """
-        return self._decoded(topic, stress_codec, stress_codec.decode)
+        return self._decode_batches(topic, stress_codec, stress_codec.decode)
 
     def columns(
         self, topic: str, codec: MessageCodec[Any], names: Sequence[str]
@@ -458,10 +458,10 @@ class Bag:
         Yields:
             For each batch of N rows: `stamp_ns` (N,), then the named columns in their order.
         """
-        for columns, _ in self._decoded(topic, codec, partial(codec.decode_columns, names)):
+        for columns, _ in self._decode_batches(topic, codec, partial(codec.decode_columns, names)):
             yield columns
 
-    def _decoded(
+    def _decode_batches(
         self,
         topic: str,
         codec: MessageCodec[Any],
@@ -498,7 +498,7 @@ class Bag:
                     except MessageError as error:
                         self.skip(topic, time_ns, error)
 
-        for _, stored in self._stored({topic}):
+        for _, stored in self._read_stored({topic}):
             for at_ns, messages in stored.equally_long():
                 first = messages[0].tobytes()
                 new_shape = len(first), codec.shape_bytes(first)
@@ -552,7 +552,7 @@ class Bag:
             if not one.msgtype.startswith(PACKAGE) or not one.definition:
                 continue
             with report_damage(self.path):
-                different = _differing_type(one.msgtype, one.definition)
+                different = _find_differing_type(one.msgtype, one.definition)
             if different:
                 self._refuse_version(f"{one.topic} has another definition of {different}")
 
@@ -578,7 +578,7 @@ def message_fields(msgtype: str) -> list[tuple[str, Any]]:
 
 
 @lru_cache
-def _differing_type(msgtype: str, definition: str) -> str:
+def _find_differing_type(msgtype: str, definition: str) -> str:
     """Return the first type of this package that a bag defines with other fields; "" if none is.
 
     Parsing a definition takes longer than reading a bag of a few seconds. Bags of the same version

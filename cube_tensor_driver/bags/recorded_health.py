@@ -93,7 +93,7 @@ class RecordedHealthReader:
             return health
         begin_ns = int(rows.stamp_ns.min())
         end_ns = int(rows.stamp_ns.max())
-        for batch in self._batches_between(begin_ns, end_ns):
+        for batch in self._read_batches_between(begin_ns, end_ns):
             # Usually a batch of stress has exactly the rows of the batch of frequencies, so that no
             # search is needed.
             has_same_stamps = np.array_equal(batch.stamp_ns, rows.stamp_ns)
@@ -105,7 +105,7 @@ class RecordedHealthReader:
                 break
         return health
 
-    def _batches_between(self, begin_ns: int, end_ns: int) -> Iterator[_StressBatch]:
+    def _read_batches_between(self, begin_ns: int, end_ns: int) -> Iterator[_StressBatch]:
         """Yield the batches of recorded stress that can contain rows with stamps in a span of time.
 
         Batches already in memory come first. The bag is read further only while the caller takes

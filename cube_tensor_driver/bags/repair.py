@@ -116,11 +116,11 @@ def _repair_folder(folder: Path, keep_rest: bool) -> Repaired:
     # Files that metadata.yaml describes as complete are checked, too, because the disk may have
     # lost their ends after the recording.
     cut = damaged = 0
-    for path in _storage_files(folder):
+    for path in _find_storage_files(folder):
         cut_here, damaged_here = _repair_file(path, keep_rest)
         cut += cut_here
         damaged += damaged_here
-    paths = _storage_files(folder)  # files without a complete chunk have been removed
+    paths = _find_storage_files(folder)  # files without a complete chunk have been removed
     existing = {path.suffix for path in paths}
     storages = [name for name, suffix in SUFFIXES.items() if suffix in existing]
     if not storages:
@@ -135,7 +135,7 @@ def _repair_folder(folder: Path, keep_rest: bool) -> Repaired:
     return Repaired(messages, cut, damaged)
 
 
-def _storage_files(folder: Path) -> list[Path]:
+def _find_storage_files(folder: Path) -> list[Path]:
     """Return the storage files of a folder in the order in which they were written.
 
     Files that metadata.yaml names come first, in its order. The other files, which are all of them
@@ -447,12 +447,12 @@ def _encode_summary(salvaged: _SalvagedChunks, name: str) -> bytes:
     # topics from the summary.
     about = rosbag2_metadata(summarise(name, index))
     metadata = Metadata(ROSBAG2_RECORD, about)
-    metadata_length = len(_bytes_of([metadata]))
+    metadata_length = len(_encode_record([metadata]))
     metadata_index = MetadataIndex(salvaged.end, metadata_length, ROSBAG2_RECORD)
-    data_end = _bytes_of([metadata, DataEnd(0)])
+    data_end = _encode_record([metadata, DataEnd(0)])
 
     summary_start = salvaged.end + len(data_end)
-    summary = _bytes_of(
+    summary = _encode_record(
         [
             *index.schemas.values(),
             *index.channels.values(),
@@ -464,7 +464,7 @@ def _encode_summary(salvaged: _SalvagedChunks, name: str) -> bytes:
     # The checksum covers the summary and that part of the footer which precedes the checksum.
     # The offsets of groups of records, which may stand between summary and footer, are left out
     # (0), because readers find these records without them.
-    footer = _bytes_of([Footer(summary_start, 0, 0)])
+    footer = _encode_record([Footer(summary_start, 0, 0)])
     footer = footer[:-CHECKSUM_BYTES]
     checksum = struct.pack("<I", crc32(summary + footer))
     return data_end + summary + footer + checksum + MCAP_MAGIC
@@ -500,7 +500,7 @@ def _parse(read: Callable[[ReadDataStream], Any], content: bytes) -> Any:
     return read(ReadDataStream(BytesIO(content)))
 
 
-def _bytes_of(records: Sequence[McapRecord]) -> bytes:
+def _encode_record(records: Sequence[McapRecord]) -> bytes:
     """Return MCAP records as bytes, one after the other, each with its opcode and length."""
     builder = RecordBuilder()
     for record in records:

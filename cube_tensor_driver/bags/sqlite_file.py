@@ -129,9 +129,9 @@ class SqliteReader:
         """Read the topics of the file by their ids in the table ``topics``."""
         # Older versions of rosbag2 stored neither quality of service profiles nor definitions of
         # message types.
-        has_qos = "offered_qos_profiles" in self._columns("topics")
+        has_qos = "offered_qos_profiles" in self._list_columns("topics")
         definitions: dict[str, str] = {}
-        if self._columns("message_definitions"):
+        if self._list_columns("message_definitions"):
             definitions = dict(
                 self._database.execute(
                     "SELECT topic_type, encoded_message_definition FROM message_definitions"
@@ -158,7 +158,7 @@ class SqliteReader:
             for number, topic, msgtype, qos in topics
         }
 
-    def _columns(self, table: str) -> set[str]:
+    def _list_columns(self, table: str) -> set[str]:
         """Return the names of a table's columns; an empty set if the table does not exist."""
         return {row[1] for row in self._database.execute(f"PRAGMA table_info({table})")}
 

@@ -226,7 +226,7 @@ class Charts:
                 (uplot.Series(label="s"), *series),
                 height=CHART_HEIGHT,
                 axes=axes,
-                scales=_scales(0.0, 1.0),
+                scales=_make_scales(0.0, 1.0),
                 padding=(10, 12, 0, 0),
                 # Plots with the same key share one cursor: both show the values of one instant.
                 cursor={"sync": {"key": "skin"}},
@@ -290,10 +290,10 @@ def make_chart_properties(history: History, chart: Chart) -> dict[str, Any]:
     low, high = round_range(finite.min(initial=0.0), finite.max(initial=0.0))
     if history.count // RELAYOUT_PERIOD % 2:
         high += 1e-9 * (high - low)
-    return {"data": (history.times, *values), "scales": _scales(low, high)}
+    return {"data": (history.times, *values), "scales": _make_scales(low, high)}
 
 
-def _scales(low: float, high: float) -> dict[str, uplot.Scale]:
+def _make_scales(low: float, high: float) -> dict[str, uplot.Scale]:
     return {"x": TIME_SCALE, "y": uplot.Scale(auto=False, range=(low, high))}
 
 

@@ -127,7 +127,7 @@ def _answer(
     host = request.headers.get("Host", "")
     problem = refusal(host, request.headers.get("Origin"), local=not token)
     if problem:
-        return _refused(problem)
+        return _make_refusal(problem)
     # A browser sends a cookie to every port of a host. Two servers on one host therefore need
     # cookies with different names, and the name contains the port.
     cookie = f"cube_view_{_split(host)[1]}={token}"
@@ -137,7 +137,7 @@ def _answer(
 
     query = request.path.partition("?")[2]
     if not _contains(parse_qs(query).get("token", []), token):
-        return _refused(MISSING_TOKEN)
+        return _make_refusal(MISSING_TOKEN)
     answer = process_request(connection, request)
     if answer is not None:
         answer.headers["Set-Cookie"] = f"{cookie}; HttpOnly; SameSite=Lax"
@@ -171,7 +171,7 @@ def _contains(texts: list[str], wanted: str) -> bool:
     )
 
 
-def _refused(problem: str) -> Response:
+def _make_refusal(problem: str) -> Response:
     headers = Headers({"Content-Type": "text/plain; charset=utf-8"})
     text = f"refused: {problem}\n".encode()
     return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", headers, text)

@@ -124,7 +124,7 @@ def waiting(domain: str) -> str:
 
 def box(content: str) -> str:
     """Return HTML content inside a box with the margins that all texts of the page have."""
-    return _div(BOX_STYLE, content)
+    return _make_div(BOX_STYLE, content)
 
 
 def label(name: str) -> str:
@@ -213,8 +213,8 @@ def legend(
     middle = (LEGEND_STEPS - 1) // 2
     ticks = "".join(f"<span>{value / quantity.size:.3g}</span>" for value in values[::middle])
     meaning = f"{quantity.label} in {quantity.unit}; grey: unknown"
-    bar = _div(BAR_STYLE.format(stops), "")
-    return box(bar + _div(TICKS_STYLE, ticks) + _div("text-align:center", meaning))
+    bar = _make_div(BAR_STYLE.format(stops), "")
+    return box(bar + _make_div(TICKS_STYLE, ticks) + _make_div("text-align:center", meaning))
 
 
 def explanation(
@@ -238,7 +238,7 @@ def explanation(
     ]
     lines = [f"<div><b style='color:{colour}'>➜</b> {text}</div>" for colour, text in arrows]
     lines += [
-        f"<div><b>▦</b> field: {field.source}{_typical(field.sigma)}</div>",
+        f"<div><b>▦</b> field: {field.source}{_find_typical(field.sigma)}</div>",
         "<div><b>⌜⌟</b> the chosen cube; click another one to choose it</div>",
         "<div><b style='color:#c828a0'>◯</b> contacts; the first line has the strongest</div>",
         "<div><b>┼</b> principal stresses: <b style='color:#d22828'>red</b> pulls, "
@@ -248,7 +248,7 @@ def explanation(
     return box("".join(lines))
 
 
-def _typical(sigma: Array | None) -> str:
+def _find_typical(sigma: Array | None) -> str:
     """Return the median of the standard deviation of the pressure as text, such as ", ± 0.1 kPa".
 
     Args:
@@ -282,7 +282,7 @@ def numbers(scan: Scan, cube: int, above: Array | None) -> str:
     rows.append(
         ("state", describe_status(scan.status[cube]) or HEALTH_WORDS[scan.health[cube]], "")
     )
-    return box(_table(rows))
+    return box(_make_table(rows))
 
 
 def contacts(scan: Scan) -> str:
@@ -291,7 +291,7 @@ def contacts(scan: Scan) -> str:
     for contact in scan.contacts:
         x, y, z = 1e3 * contact.position
         rows.append((f"{x:.1f}, {y:.1f}, {z:.1f} mm", format_newtons(contact), ""))
-    return box(_table(rows) if rows else "none")
+    return box(_make_table(rows) if rows else "none")
 
 
 def conditions(names: list[str], scan: Scan) -> str:
@@ -308,17 +308,17 @@ def conditions(names: list[str], scan: Scan) -> str:
     with_fault = np.flatnonzero(health)[:MAX_LISTED_CUBES].tolist()
     rows = [(names[cube], HEALTH_WORDS[health[cube]], "") for cube in with_fault]
     lines = "".join(
-        _div(f"color:{LEVEL_COLOURS[level]}", escape(line))
+        _make_div(f"color:{LEVEL_COLOURS[level]}", escape(line))
         for line, level in (*scan.links, (counts, 0))
     )
-    return box(lines + _table(rows))
+    return box(lines + _make_table(rows))
 
 
-def _div(style: str, content: str) -> str:
+def _make_div(style: str, content: str) -> str:
     return f"<div style='{style}'>{content}</div>"
 
 
-def _table(rows: Iterable[tuple[str, str, str]]) -> str:
+def _make_table(rows: Iterable[tuple[str, str, str]]) -> str:
     """Return an HTML table of rows with three cells each: name, value and unit."""
     cells = "".join(
         f"<tr><td>{name}</td><td style='{VALUE_STYLE}'>{value}</td><td>&nbsp;{unit}</td></tr>"

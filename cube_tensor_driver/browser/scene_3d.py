@@ -286,21 +286,21 @@ class Scene:
             chosen: Index of the chosen cube.
             ranges: Upper ends of the ranges of colours and arrows.
         """
-        update = self._colours(colouring, "field" in parts)
+        update = self._choose_colours(colouring, "field" in parts)
         update["names"] = {"visible": "names" in parts}
         lines = dict.fromkeys(LINES, NO_LINES)
-        traction, gradient = self._arrow_lengths(ranges)
+        traction, gradient = self._find_arrow_lengths(ranges)
         if "traction" in parts:
-            lines["traction"] = self._arrows(scene.make_traction_arrows, scan.values, traction)
+            lines["traction"] = self._draw_arrows(scene.make_traction_arrows, scan.values, traction)
         if "gradient" in parts:
-            lines["gradient"] = self._arrows(scene.make_gradient_arrows, scan.values, gradient)
+            lines["gradient"] = self._draw_arrows(scene.make_gradient_arrows, scan.values, gradient)
         if "principal" in parts:
-            lines |= self._crosses(scan.values, ranges.traction)
+            lines |= self._draw_crosses(scan.values, ranges.traction)
         crosses = scene.make_fault_crosses(self._placement.poses, scan.health)
         for state in FAULT_COLOURS:
             lines[f"fault {state}"] = crosses[scan.health == state]
-        lines["chosen"] = self._chosen_cube(chosen)
-        lines["contacts"] = self._contacts(scan.contacts)
+        lines["chosen"] = self._draw_chosen_cube(chosen)
+        lines["contacts"] = self._draw_contacts(scan.contacts)
         for name, ends in lines.items():
             points = ends.reshape(-1, 2, 3) if len(ends) else NO_LINES
             update[name] = {"points": points.astype(np.float32)}
@@ -317,16 +317,16 @@ class Scene:
             along the skin, in Pa/m.
         """
         bar = self.bar * self._placement.unit
-        traction, gradient = self._arrow_lengths(ranges)
+        traction, gradient = self._find_arrow_lengths(ranges)
         return bar / traction, bar / gradient
 
-    def _arrow_lengths(self, ranges: scene.Ranges) -> tuple[float, float]:
+    def _find_arrow_lengths(self, ranges: scene.Ranges) -> tuple[float, float]:
         """Return the lengths of the arrows of traction, in units of the scene per Pa, and of those
         of the gradient, in units of the scene per Pa/m."""
         unit = self._placement.arrow
         return TRACTION_LENGTH * unit / ranges.traction, GRADIENT_LENGTH * unit / ranges.gradient
 
-    def _colours(self, colouring: Colouring, with_field: bool) -> Update:
+    def _choose_colours(self, colouring: Colouring, with_field: bool) -> Update:
         """Return the properties of the cubes and of the field."""
         quantity, top = colouring.quantity, colouring.top
         values, visible = colouring.field, np.full(len(colouring.field), with_field)
@@ -346,7 +346,7 @@ class Scene:
             update[f"field/{step}"] = {"vertices": vertices, "faces": faces, "color": colour}
         return update
 
-    def _arrows(
+    def _draw_arrows(
         self,
         lines: ArrowLines,
         values: Array,
@@ -367,7 +367,7 @@ class Scene:
         arrows = arrows[size > MIN_ARROW * self._placement.arrow]
         return scene.heads(arrows, np.broadcast_to(VIEW_DIRECTION, (len(arrows), 3)))
 
-    def _crosses(self, values: Array, longest: float) -> dict[str, Array]:
+    def _draw_crosses(self, values: Array, longest: float) -> dict[str, Array]:
         """Return the lines of the principal stresses: a cross of three lines above each cube.
 
         Each line lies along a principal direction; its colour tells tension from compression.
@@ -387,7 +387,7 @@ class Scene:
         lines = lines + lift[:, None, None]
         return {"tension": lines[is_tension], "compression": lines[~is_tension]}
 
-    def _chosen_cube(self, cube: int) -> Array:
+    def _draw_chosen_cube(self, cube: int) -> Array:
         """Return the lines of the marks at the corners of the chosen cube."""
         placement = self._placement
         # The marks stand a little outside of the face; on a large skin they have a minimum size.
@@ -395,7 +395,7 @@ class Scene:
         lines = make_corner_lines(placement.poses.rotation[cube], side)
         return np.asarray(lines + scene.above(placement.poses, 1.1)[cube])
 
-    def _contacts(self, contacts: Sequence[Contact]) -> Array:
+    def _draw_contacts(self, contacts: Sequence[Contact]) -> Array:
         """Return the lines of a ring around each contact, which has the area of the contact."""
         placement = self._placement
         rings = [np.zeros((0, 2, 3))]

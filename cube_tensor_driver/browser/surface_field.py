@@ -77,7 +77,7 @@ class FieldModel:
             calibrations: Calibration of each cube.
         """
         self._surface = surface
-        # Points of the last interpolation, and its weights (see `_interpolation_weights`).
+        # Points of the last interpolation, and its weights (see `_compute_interpolation_weights`).
         self._points: Array = np.empty((0, 3))
         self._nearest: Index = np.empty((0, 1), np.intp)
         self._weight: Array = np.empty((0, 1))
@@ -126,7 +126,7 @@ class FieldModel:
         # The points of a skin do not move, so the weights of the interpolation are computed once.
         if not np.array_equal(points, self._points):
             self._points = points
-            self._nearest, self._weight = _interpolation_weights(self._surface, points)
+            self._nearest, self._weight = _compute_interpolation_weights(self._surface, points)
         return np.asarray(np.einsum("pk,pkc->pc", self._weight, columns[self._nearest]))
 
 
@@ -141,7 +141,7 @@ def _make_inverse(surface: Surface, calibrations: Sequence[Calibration]) -> Surf
     )
 
 
-def _interpolation_weights(surface: Surface, points: Array) -> tuple[Index, Array]:
+def _compute_interpolation_weights(surface: Surface, points: Array) -> tuple[Index, Array]:
     """Return the weights of an interpolation to all N points of a surface.
 
     They are the inverse squared distances to the nearest `INTERPOLATION_POINTS` points (Shepard's

@@ -127,10 +127,10 @@ def build_update(
     update |= {name: {"content": text} for name, text in texts.items()}
     for number, chart in enumerate(settings.charts):
         update[f"chart {number}"] = make_chart_properties(history, chart)
-    return update | _options(history, scan, settings), ranges
+    return update | _list_options(history, scan, settings), ranges
 
 
-def _options(
+def _list_options(
     history: History,
     scan: Scan,
     settings: ViewSettings,

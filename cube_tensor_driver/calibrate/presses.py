@@ -316,13 +316,13 @@ def _find_order(
     places = np.arange(n_pads)
     first, second = np.triu_indices(n_pads, 1)
     swaps = np.arange(len(first))
-    (lowest,) = _misfit(measured, expected, places[None])
+    (lowest,) = _compute_misfit(measured, expected, places[None])
     while len(swaps):
         copies = (len(swaps), 1)
         candidates = np.tile(places, copies)
         candidates[swaps, first] = places[second]
         candidates[swaps, second] = places[first]
-        misfits = _misfit(measured, expected, candidates)
+        misfits = _compute_misfit(measured, expected, candidates)
         best = int(misfits.argmin())
         # If two wires really are swapped, correcting them reduces the misfit a lot. A smaller
         # reduction comes from noise.
@@ -333,7 +333,7 @@ def _find_order(
     return places, float(lowest)
 
 
-def _misfit(
+def _compute_misfit(
     measured: Array,
     expected: Array,
     places: Index,

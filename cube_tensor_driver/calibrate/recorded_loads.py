@@ -268,11 +268,13 @@ def _read_reference(
         stamps = [header_stamp_ns(message) for message in messages]
         stamp_ns = np.array(stamps, np.int64)
         if msgtype == WRENCH_TYPE:
-            rows = [_axes(message.wrench.force) for message in messages]
+            rows = [_find_axes(message.wrench.force) for message in messages]
         else:
             tensors = [message.tensor for message in messages]
             # The 15 components in the order of `COMPONENTS`, in Pa and Pa/m.
-            rows = [[*_axes(t.normal), *_axes(t.shear), *t.normal_gradient] for t in tensors]
+            rows = [
+                [*_find_axes(t.normal), *_find_axes(t.shear), *t.normal_gradient] for t in tensors
+            ]
         values = np.array(rows)
     else:
         topics = ", ".join(sorted(types))
@@ -331,7 +333,7 @@ def _read_batches(
     return rows.stamp_ns, rows.components.astype(float)
 
 
-def _axes(vector: Any) -> list[float]:
+def _find_axes(vector: Any) -> list[float]:
     """Return the numbers x, y, z of a Vector3 message."""
     return [vector.x, vector.y, vector.z]
 

@@ -166,7 +166,7 @@ class Parser(argparse.ArgumentParser):
             self.exit()
         # argparse itself does not report a missing word: it returns an empty list.
         if self._missing and not words:
-            self.exit(2, f"{self._prefix()}{self._missing}\n")
+            self.exit(2, f"{self._make_prefix()}{self._missing}\n")
         namespace, _ = super().parse_known_args([], namespace)
         namespace.words = words
         return namespace, []
@@ -204,10 +204,10 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print an error message and the command that prints the help, and exit with code 2."""
-        message = self._prefix() + message.removeprefix("argument ")
+        message = self._make_prefix() + message.removeprefix("argument ")
         self.exit(2, f"{message}\n      {self.prog} --help lists what is possible\n")
 
-    def _prefix(self) -> str:
+    def _make_prefix(self) -> str:
         name = self.prog.partition(" ")[2]
         return f"cube: {name}: " if name else "cube: "
 

@@ -66,7 +66,7 @@ _PATH = list_of(TRIPLE, "positions [x, y, z]", 2)
 """Schema of the positions on the surface along which an indenter moves."""
 
 
-def _action_schema(optional: JsonSchema, **required: JsonSchema) -> JsonSchema:
+def _make_action_schema(optional: JsonSchema, **required: JsonSchema) -> JsonSchema:
     """Return the JSON schema of an action of an indenter.
 
     Args:
@@ -82,10 +82,10 @@ def _action_schema(optional: JsonSchema, **required: JsonSchema) -> JsonSchema:
 
 
 _ACTIONS: JsonSchema = {
-    "press": _action_schema({"shear": _SHEAR}, at=TRIPLE, force=_FORCE),
-    "slide": _action_schema({}, path=_PATH, force=_FORCE),
-    "roll": _action_schema({"shear": _SHEAR}, path=_PATH, force=_FORCE),
-    "tap": _action_schema({"times": _TIMES}, at=TRIPLE, force=_PEAK_FORCE),
+    "press": _make_action_schema({"shear": _SHEAR}, at=TRIPLE, force=_FORCE),
+    "slide": _make_action_schema({}, path=_PATH, force=_FORCE),
+    "roll": _make_action_schema({"shear": _SHEAR}, path=_PATH, force=_FORCE),
+    "tap": _make_action_schema({"times": _TIMES}, at=TRIPLE, force=_PEAK_FORCE),
 }
 """Kind of an action -> schema of its keys."""
 _ACTION = mapping((), _ACTIONS) | {
@@ -298,12 +298,12 @@ def _find_action_mistakes(action: Action, friction: float, period: float | None)
         yield "has no force; give one greater than 0"
     if period is not None and action.end > period:
         yield f"is not over when the script begins again; the period is {period:g} s"
-    ratio = _max_shear_ratio(action)
+    ratio = _find_max_shear_ratio(action)
     if ratio > friction * (1 + SLIP_TOLERANCE):
         yield f"would slip: shear is up to {ratio:.3g} of the force, friction is {friction:g}"
 
 
-def _max_shear_ratio(action: Action) -> float:
+def _find_max_shear_ratio(action: Action) -> float:
     """Return the maximum ratio of tangential to normal force during the action.
 
     It is infinite where an indenter has a tangential but no normal force.

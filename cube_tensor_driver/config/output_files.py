@@ -116,18 +116,18 @@ def to_json(value: object, indent: int | None = None) -> str:
         value: Numbers, texts, arrays of numpy, lists and mappings.
         indent: Number of spaces per level of nesting; None: the text is one line.
     """
-    return json.dumps(_without_nan(value), indent=indent, allow_nan=False)
+    return json.dumps(_replace_nan(value), indent=indent, allow_nan=False)
 
 
-def _without_nan(value: object) -> object:
+def _replace_nan(value: object) -> object:
     if hasattr(value, "tolist"):
         value = value.tolist()
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, Mapping):
-        return {name: _without_nan(one) for name, one in value.items()}
+        return {name: _replace_nan(one) for name, one in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_without_nan(one) for one in value]
+        return [_replace_nan(one) for one in value]
     return value
 
 

@@ -165,14 +165,14 @@ def _sort_key(mistake: tuple[KeyPath, str]) -> list[tuple[bool, str | int]]:
     return [(isinstance(part, str), part) for part in path]
 
 
-def _key_name(path: Iterable[str | int]) -> str:
+def _format_key(path: Iterable[str | int]) -> str:
     """Return a path of keys in the notation of error messages, as in cubes[3].pose."""
     parts = [f"[{part}]" if isinstance(part, int) else f".{part}" for part in path]
     return "".join(parts).lstrip(".") or "top level"
 
 
 def _describe(error: jsonschema.ValidationError) -> str:
-    key = _key_name(error.absolute_path)
+    key = _format_key(error.absolute_path)
     schema: JsonSchema = error.schema
     if error.validator == "additionalProperties":
         allowed = schema["properties"]

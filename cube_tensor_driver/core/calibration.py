@@ -236,7 +236,7 @@ class Calibration:
         # Sorted keys and fixed separators give the same text, and so the same id, for the same
         # content on every machine.
         text = json.dumps(
-            self._content(),
+            self._make_content(),
             sort_keys=True,
             separators=(",", ":"),
             allow_nan=False,
@@ -267,9 +267,9 @@ class Calibration:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the calibration in types that JSON has, the id first; `from_dict` reads them."""
-        return {"id": self.id, **self._content()}
+        return {"id": self.id, **self._make_content()}
 
-    def _content(self) -> dict[str, Any]:
+    def _make_content(self) -> dict[str, Any]:
         """Return all attributes that have a value, in types that JSON has, without the id."""
         built_in = LAYOUTS.get(self.layout.name)
         is_built_in = built_in is not None and built_in.same_as(self.layout)

@@ -71,8 +71,8 @@ def match_rows(known: SampleRows, wanted: SampleRows) -> Index:
         several times, the known row with the nearest time stamp is chosen. Time stamps need not be
         equal; a caller that needs equal ones compares them afterwards.
     """
-    known_keys = _keys(known)
-    wanted_keys = _keys(wanted)
+    known_keys = _make_keys(known)
+    wanted_keys = _make_keys(wanted)
     order = np.argsort(known_keys, kind="stable")
     sorted_keys = known_keys[order]
     begin = np.searchsorted(sorted_keys, wanted_keys, side="left")
@@ -95,7 +95,7 @@ def match_rows(known: SampleRows, wanted: SampleRows) -> Index:
     return found
 
 
-def _keys(rows: SampleRows) -> AnyArray:
+def _make_keys(rows: SampleRows) -> AnyArray:
     """Return keys (N,) of rows: integers that combine cube number and sequence number.
 
     Two rows have the same key if they have the same cube and the same sequence number.

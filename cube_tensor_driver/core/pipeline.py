@@ -317,7 +317,7 @@ class Pipeline:
             row, request = run(row, task)
             if request == UNKNOWN_CUBE:
                 if watch:
-                    raise self._misfit(rows)
+                    raise self._compute_misfit(rows)
                 _fill_unknown(out, rows, row)
                 row += 1
             elif request == NEEDS_WINDOW and watch:
@@ -430,7 +430,7 @@ class Pipeline:
                 frequency = frequency.astype(self.dtype)
         frequency = np.ascontiguousarray(frequency)
         if frequency.shape != (len(rows), self.n_pads):
-            raise self._misfit(rows)
+            raise self._compute_misfit(rows)
         force = rows.specific_force
         cube = rows.cube
         if cube.dtype != np.uint16:
@@ -447,7 +447,7 @@ class Pipeline:
             None if force is None else np.ascontiguousarray(force, self.dtype),
         )
 
-    def _misfit(self, rows: FrequencyRows) -> LayoutError:
+    def _compute_misfit(self, rows: FrequencyRows) -> LayoutError:
         """Return the error for rows that do not fit the skin."""
         return LayoutError(
             f"pipeline: frequencies of shape {rows.frequency.shape} for {len(rows)} rows of cubes "

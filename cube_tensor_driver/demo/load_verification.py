@@ -162,7 +162,7 @@ class LoadVerification:
 
     def is_complete(self) -> bool:
         """Return whether a tensor has arrived for every sample that was sent in the period."""
-        comparison = self._comparison(self._stress)
+        comparison = self._compare(self._stress)
         return comparison.received >= comparison.sent
 
     def result(self) -> dict[str, object]:
@@ -172,8 +172,8 @@ class LoadVerification:
         relative to the range that each component has under the load, and relative to the standard
         deviation that the noise of the pads causes.
         """
-        frequencies = self._comparison(self.frequencies)
-        stress = self._comparison(self._stress)
+        frequencies = self._compare(self.frequencies)
+        stress = self._compare(self._stress)
         return {
             "samples_sent": stress.sent,
             "samples_received": frequencies.received,
@@ -182,7 +182,7 @@ class LoadVerification:
             "latency_p50_ms": percentile(stress.latency_ms, 50),
             "latency_p99_ms": percentile(stress.latency_ms, 99),
             "stamp_error_p99_ms": percentile(stress.stamp_error_ms, 99),
-            **self._errors(stress),
+            **self._compute_errors(stress),
         }
 
     def forces(self) -> ForceHistory:
@@ -191,7 +191,7 @@ class LoadVerification:
         Raises:
             MessageError: There is no time at which a tensor of every cube has arrived.
         """
-        times_ns, values, is_complete = self._received(self._comparison(self._stress))
+        times_ns, values, is_complete = self._find_received(self._compare(self._stress))
         # The force on the whole skin can be computed at times with a tensor of every cube.
         times_ns = times_ns[is_complete]
         if not len(times_ns):
@@ -200,7 +200,7 @@ class LoadVerification:
             )
 
         # The load is a function of simulated time, which is 0 at the start of the simulator.
-        seconds = self._seconds(times_ns)
+        seconds = self._compute_seconds(times_ns)
         applied = map(self.load.total, seconds.tolist())
         force, centre, normal = map(np.array, zip(*applied, strict=True))
         # The contacts are found by interpolating the pressure between the cubes, as the node
@@ -218,10 +218,10 @@ class LoadVerification:
             measured_centre=measured_centre,
         )
 
-    def _comparison(self, arrivals: Arrivals) -> Comparison:
+    def _compare(self, arrivals: Arrivals) -> Comparison:
         return compare(self._log.table, arrivals, *self._span_ns)
 
-    def _received(self, comparison: Comparison) -> tuple[Index, Array, Mask]:
+    def _find_received(self, comparison: Comparison) -> tuple[Index, Array, Mask]:
         """Return the tensors that arrived, at every n-th sampling time of a long measurement.
 
         Args:
@@ -243,12 +243,12 @@ class LoadVerification:
         n_arrived = np.bincount(time, minlength=len(times_ns))
         return times_ns, values, n_arrived == self._n_cubes
 
-    def _seconds(self, times_ns: Index) -> Array:
+    def _compute_seconds(self, times_ns: Index) -> Array:
         """Return the simulated times, in s after the start of the simulator, of times (T,) in ns
         since the Unix epoch."""
         return np.asarray(1e-9 * (times_ns - self._log.start_time_ns), float)
 
-    def _errors(self, comparison: Comparison) -> dict[str, object]:
+    def _compute_errors(self, comparison: Comparison) -> dict[str, object]:
         """Compute the errors of the tensors that arrived.
 
         Args:
@@ -259,13 +259,15 @@ class LoadVerification:
             error relative to the standard deviation that the noise of the pads causes. All are NaN
             if no tensor arrived.
         """
-        times_ns, values, _ = self._received(comparison)
+        times_ns, values, _ = self._find_received(comparison)
         if not len(times_ns):
             return dict.fromkeys(("error_rel_rms", "error_rel_worst", "error_over_noise"), np.nan)
-        error = values - np.array([self._truth(time) for time in self._seconds(times_ns)])
+        error = values - np.array(
+            [self._compute_truth(time) for time in self._compute_seconds(times_ns)]
+        )
 
         times = np.linspace(0, self.load.period, RANGE_TIMES)
-        script = [self._truth(time) for time in times]
+        script = [self._compute_truth(time) for time in times]
         highest = np.nanmax(script, axis=(0, 1))
         lowest = np.nanmin(script, axis=(0, 1))
         span = highest - lowest
@@ -278,7 +280,7 @@ class LoadVerification:
             "error_over_noise": rms(error / component_noise(self._skin)),
         }
 
-    def _truth(self, seconds: float) -> Array:
+    def _compute_truth(self, seconds: float) -> Array:
         """Return the components (cubes, 15), in Pa and Pa/m, under the load at a simulated time.
 
         Args:

@@ -30,14 +30,14 @@ class Usage:
         """
         self._processes = {name: psutil.Process(children.pid(name)) for name in names}
         self._start_s = time.monotonic()
-        self._start_cpu_s = self._cpu_seconds()
+        self._start_cpu_s = self._sum_cpu_seconds()
 
     def cpu_percent(self) -> dict[str, float]:
         """Return the processor time of each process since this object was made, divided by the
         elapsed time, in percent of one core."""
         elapsed_s = time.monotonic() - self._start_s
         before_s = self._start_cpu_s
-        now_s = self._cpu_seconds()
+        now_s = self._sum_cpu_seconds()
         return {name: 100 * (now_s[name] - before_s[name]) / elapsed_s for name in now_s}
 
     def memory_mb(self) -> dict[str, float]:
@@ -51,7 +51,7 @@ class Usage:
         """Return the number of threads of each process."""
         return {name: process.num_threads() for name, process in self._processes.items()}
 
-    def _cpu_seconds(self) -> dict[str, float]:
+    def _sum_cpu_seconds(self) -> dict[str, float]:
         # System time counts as well, because messages are sent and received in the kernel.
         times = {name: process.cpu_times() for name, process in self._processes.items()}
         return {name: time.user + time.system for name, time in times.items()}

@@ -186,7 +186,7 @@ class LiveLinks:
             on_frames=self.receive,
             on_state=self._on_state,
             clock_ns=self._read_clock,
-            period_us=_period_us(self._rate),
+            period_us=_compute_period_us(self._rate),
             on_end=self._on_end,
             tracks=[record.track for record in self._records],
         )
@@ -204,7 +204,7 @@ class LiveLinks:
         With None nothing is sent, and after the next `start` the hubs keep their own rate.
         """
         self._rate = rate
-        period_us = _period_us(rate)
+        period_us = _compute_period_us(rate)
         if period_us is not None:
             for link in range(len(self._configs)):
                 self._reader.set_period(link, period_us)
@@ -465,7 +465,7 @@ def _report(link: Link, record: _LinkRecord, lag_s: float) -> LinkReport:
     """
     counters = record.account.counters()
     notes = [] if link.error is None else [str(link.error)]
-    notes += _loss_notes(record.reported, counters, lag_s)
+    notes += _describe_losses(record.reported, counters, lag_s)
     notes += record.problems
     record.reported = counters
     if link.period_problem:
@@ -502,12 +502,12 @@ def _report(link: Link, record: _LinkRecord, lag_s: float) -> LinkReport:
     )
 
 
-def _period_us(rate: float | None) -> int | None:
+def _compute_period_us(rate: float | None) -> int | None:
     """Return the sample period, in µs, for a sample rate in Hz; None for None."""
     return None if rate is None else round(1e6 / rate)
 
 
-def _loss_notes(
+def _describe_losses(
     before: dict[str, int],
     now: dict[str, int],
     lag_s: float,

@@ -203,7 +203,7 @@ class DataSet:
         episodes = pyarrow.Table.from_pylist(self.episodes)
         path = FILE_NAME.format(chunk_index=0, file_index=0)
         pyarrow.parquet.write_table(episodes, meta / "episodes" / path)
-        tasks = _task_table(self._tasks)
+        tasks = _make_task_table(self._tasks)
         pyarrow.parquet.write_table(tasks, meta / "tasks.parquet")
         _write_json(
             meta / "info.json",
@@ -220,7 +220,7 @@ class DataSet:
                 "splits": {"train": f"0:{len(self.episodes)}"},
                 "data_path": f"data/{FILE_NAME}",
                 "video_path": None,
-                "features": self._features(),
+                "features": self._describe_features(),
             },
         )
         statistics = {key: _as_lists(one, self.frames) for key, one in self._statistics.items()}
@@ -232,7 +232,7 @@ class DataSet:
         chunk, file = divmod(self._file_number, MAX_FILES_PER_CHUNK)
         return {"chunk_index": chunk, "file_index": file}
 
-    def _features(self) -> dict[str, Any]:
+    def _describe_features(self) -> dict[str, Any]:
         """Return the description of all features (columns of the data set) for info.json.
 
         The skin is described under the key ``info`` of the tactile feature, because LeRobot's tools
@@ -243,23 +243,23 @@ class DataSet:
         axes = ["sample", "cube", "component"]
         about = describe_skin(self._skin) | {"calibrations": self.calibrations}
         shape = (*window, len(COMPONENTS))
-        tactile = _feature("float32", shape, axes)
+        tactile = _describe_feature("float32", shape, axes)
         features = {TACTILE: tactile | {"info": about}}
         for name, kind in WINDOW_COLUMNS.items():
             dtype = np.dtype(kind).name
-            features[f"{TACTILE}.{name}"] = _feature(dtype, window, axes[:2])
+            features[f"{TACTILE}.{name}"] = _describe_feature(dtype, window, axes[:2])
         names = list(self._skin.names)
-        features[f"{TACTILE}.count"] = _feature("int64", (cubes,), names)
+        features[f"{TACTILE}.count"] = _describe_feature("int64", (cubes,), names)
         for topic in self._topics:
             if topic.is_image:
                 axes = ["height", "width", "channels"]
-                described = _feature("image", topic.shape, axes)
+                described = _describe_feature("image", topic.shape, axes)
             else:
                 width = len(topic.names)
-                described = _feature("float32", (width,), topic.names)
+                described = _describe_feature("float32", (width,), topic.names)
             features[topic.key] = described
         for key, dtype in COUNTER_FEATURES.items():
-            features[key] = _feature(dtype, (1,), None)
+            features[key] = _describe_feature(dtype, (1,), None)
         return features
 
 
@@ -301,7 +301,7 @@ def describe_skin(skin: Skin) -> dict[str, Any]:
     }
 
 
-def _feature(
+def _describe_feature(
     dtype: str,
     shape: tuple[int, ...],
     names: list[str] | None,
@@ -335,7 +335,7 @@ def _as_lists(
     return {"count": [frames], **lists}
 
 
-def _task_table(tasks: list[str]) -> pyarrow.Table:
+def _make_task_table(tasks: list[str]) -> pyarrow.Table:
     """Return the table of tasks: the index of each task, and its text as the row label in pandas.
 
     Args:

@@ -295,7 +295,7 @@ def _write_bag(
         waiting = [EpisodeWriter(data_set, episode, sources) for episode in plan.episodes]
         total = sum(episode.rows for episode in plan.episodes)
         done = 0
-        for rows in _stress_rows(data_set, plan, choices):
+        for rows in _find_stress_rows(data_set, plan, choices):
             # All unfinished episodes are offered the rows, because rows of a hub whose connection
             # is slow can belong to an earlier episode than those of the other hubs.
             done += sum(writer.add(rows) for writer in waiting)
@@ -307,7 +307,7 @@ def _write_bag(
     data_set.close_file()
 
 
-def _stress_rows(
+def _find_stress_rows(
     data_set: DataSet,
     plan: BagPlan,
     choices: Choices,

@@ -97,9 +97,9 @@ class ImageStream:
         Raises:
             BagError: An image cannot be read, or has another shape than `shape`.
         """
-        return [self._newest_in(episode, frame) for frame in range(first, last)]
+        return [self._find_newest_in(episode, frame) for frame in range(first, last)]
 
-    def _newest_in(self, episode: Episode, frame: int) -> bytes:
+    def _find_newest_in(self, episode: Episode, frame: int) -> bytes:
         """Return the file of the newest image that is stamped before the end of a frame.
 
         The bag is read as far as the first image after the frame. If there is no image before the

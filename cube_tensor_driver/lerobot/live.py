@@ -165,7 +165,7 @@ class LiveWindows:
         # In an assignment with repeated indices numpy keeps the last value, which is the newest.
         stress_zz = rows.stress[:, 2]
         self._pressure[rows.cube] = -stress_zz
-        return self._picture()
+        return self._make_picture()
 
     def close(self) -> None:
         """Close the links and complete the file. Samples after the last frame are left out."""
@@ -203,7 +203,7 @@ class LiveWindows:
             self._writer = pyarrow.ipc.new_stream(str(path), batch.schema)
         self._writer.write_batch(batch)
 
-    def _picture(self) -> AnyArray:
+    def _make_picture(self) -> AnyArray:
         """Return the picture of the newest pressures, with the frame number at the top."""
         level = np.clip(self._pressure / self._full_scale, -1.0, 1.0)
         colours = np.zeros((self._cubes, 3))

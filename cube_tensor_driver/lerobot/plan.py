@@ -252,7 +252,7 @@ def plan_bag(
         total = counts[source.topic]
         spans = [(MIN_NS, MAX_TIME_NS, choices.task)]
         if choices.marks is not None:
-            spans = _marked_spans(source.bag, choices.marks)
+            spans = _find_marked_spans(source.bag, choices.marks)
         n_cubes = len(source.skin.cubes)
         recorded_s = (source.bag.end_ns - source.bag.start_ns) / SECOND
         max_frames = MAX_STAMP_RATIO * recorded_s * choices.fps + ALWAYS_ALLOWED_COUNT
@@ -376,7 +376,7 @@ def _check_depth(
         )
 
 
-def _marked_spans(
+def _find_marked_spans(
     bag: Bag,
     topic: str,
 ) -> list[tuple[int, int, str]]:

@@ -160,7 +160,7 @@ def find_topics(
         with Bag(path) as bag:
             frequencies = choices.frequencies or f"{bag.skin_prefix()}frequencies"
             prefix = frequencies.removesuffix("frequencies")
-            for name, msgtype in _stamped_topics(bag, prefix):
+            for name, msgtype in _find_stamped_topics(bag, prefix):
                 existing.add(name)
                 if choices.topics is not None and name not in wanted:
                     continue
@@ -217,7 +217,7 @@ def _read_numbers(
     paths = _number_paths(topic.msgtype)
     for _, message in bag.decoded({topic.name}):
         if topic.msgtype == JOINT_STATE_TYPE:
-            numbers = _joint_numbers(message, f"{bag.path}: {topic.name}")
+            numbers = _find_joint_numbers(message, f"{bag.path}: {topic.name}")
         else:
             numbers = {}
             for path in paths:
@@ -230,7 +230,7 @@ def _read_numbers(
         yield stamp_ns(message), numbers
 
 
-def _stamped_topics(
+def _find_stamped_topics(
     bag: Bag,
     skin: str,
 ) -> list[tuple[str, str]]:
@@ -265,11 +265,11 @@ def _number_paths(msgtype: str) -> list[str]:
     _, first = fields[0]
     if first != (Nodetype.NAME, HEADER_TYPE):
         return []
-    paths = list(_nested_paths(fields[1:], ""))
+    paths = list(_list_nested_paths(fields[1:], ""))
     return [] if None in paths else [path for path in paths if path]
 
 
-def _nested_paths(
+def _list_nested_paths(
     fields: list[tuple[str, Any]],
     prefix: str,
 ) -> Iterator[str | None]:
@@ -285,7 +285,7 @@ def _nested_paths(
     """
     for name, (node, kind) in fields:
         if node == Nodetype.NAME:
-            yield from _nested_paths(message_fields(kind), f"{prefix}{name}.")
+            yield from _list_nested_paths(message_fields(kind), f"{prefix}{name}.")
             continue
         # For a list of fixed length, `kind` consists of the node and kind of its elements, and the
         # length.
@@ -297,7 +297,7 @@ def _nested_paths(
             yield f"{prefix}{name}"
 
 
-def _joint_numbers(
+def _find_joint_numbers(
     message: Any,
     where: str,
 ) -> dict[str, float]:

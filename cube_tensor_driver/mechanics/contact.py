@@ -93,10 +93,10 @@ def field(
             "a point lies on a point force, where the stress is infinite; move it below the surface"
         )
 
-    stress, gradient = _radial(d, forces, distance)
+    stress, gradient = _compute_radial(d, forces, distance)
     # The second term of the solution vanishes for an incompressible body.
     if poisson != 0.5:
-        airy_stress, airy_gradient = _airy(d, forces, distance)
+        airy_stress, airy_gradient = _compute_airy(d, forces, distance)
         scale = (1.0 - 2.0 * poisson) / (2.0 * np.pi)
         stress += scale * airy_stress
         gradient += scale * airy_gradient
@@ -126,7 +126,7 @@ def disc(
     Raises:
         ElasticError: `radius` is not positive or `order` is below 1.
     """
-    nodes, weights = _gauss_points(order)
+    nodes, weights = _compute_gauss_points(order)
     return _place_rings(radius, np.sqrt(nodes), weights, force, centre)
 
 
@@ -143,7 +143,7 @@ def hertz(
     Arguments, result and exceptions are those of `disc`. The default order is accurate at depths of
     at least half the radius; `hertz_order` returns the order for any depth.
     """
-    nodes, weights = _gauss_points(order)
+    nodes, weights = _compute_gauss_points(order)
     # The Gauss points are placed in t = sqrt(1 - r^2) instead of r. The integrand p r dr = t^2 dt
     # is then smooth at the rim, where the pressure p as a function of r has a vertical slope.
     radii = np.sqrt(1.0 - nodes**2)
@@ -213,7 +213,7 @@ def _check(
         raise ElasticError("a force acts off the surface; sources must have z = 0")
 
 
-def _radial(
+def _compute_radial(
     d: Array,
     forces: Array,
     distance: Array,
@@ -251,7 +251,7 @@ def _radial(
     return stress, gradient
 
 
-def _airy(
+def _compute_airy(
     d: Array,
     forces: Array,
     distance: Array,
@@ -359,7 +359,7 @@ def _airy(
     return stress, gradient
 
 
-def _gauss_points(order: int) -> tuple[Array, Array]:
+def _compute_gauss_points(order: int) -> tuple[Array, Array]:
     """Return Gauss-Legendre nodes (order,) and weights (order,) on the interval from 0 to 1.
 
     Raises:

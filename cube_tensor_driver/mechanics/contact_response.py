@@ -208,7 +208,7 @@ class ContactResponse:
             second derivative by the logarithm of the radius.
         """
         first, by_distance, distance_slope = self._table.weights(distance, 2)
-        size_index = _size_index(size, self._depth)
+        size_index = _find_size_index(size, self._depth)
         size_row, *by_size = cubic_weights(size_index, 3)
 
         # Bicubic interpolation uses 16 rows of the table: four radii times four distances.
@@ -306,7 +306,7 @@ class ContactResponse:
         distance, direction = to_polar(place)
         index, decay = self._table.locate(distance)
         below = index.astype(np.intp)
-        size_index = _size_index(size, self._depth)
+        size_index = _find_size_index(size, self._depth)
         narrower = size_index.astype(np.intp)
 
         # Bilinear interpolation uses two neighbouring distances of two neighbouring radii. The
@@ -409,14 +409,14 @@ class ContactResponse:
         last_step = distance.max(initial=0.0) / self._table.step
         n_distances = int(min(last_step, self._table.last)) + 4
 
-        size_index = _size_index(size, self._depth)
+        size_index = _find_size_index(size, self._depth)
         first, weights = cubic_weights(size_index)
         start = int(first) - 1
         neighbours = discs[start : start + 4, :n_distances]
         return np.asarray(np.tensordot(weights, neighbours, axes=1))
 
 
-def _size_index(size: Array | float, depth: float) -> Array:
+def _find_size_index(size: Array | float, depth: float) -> Array:
     """Return the fractional indices (...) of radii in `DISC_SIZES`, within the table.
 
     Args:

@@ -224,11 +224,11 @@ class DiscTables(_ContactTables):
         weights *= ratio[..., None] ** 2
 
         n_distances = _LAST_DISTANCE + 2
-        first_row = self._nearest_size(radius) * n_distances + below
+        first_row = self._find_nearest_size(radius) * n_distances + below
         rows = first_row[..., None] + np.array([0, 1])
         return self._sum_loads(weights, rows, loads.astype(complex), direction)
 
-    def _nearest_size(self, radius: ArrayLike) -> Index:
+    def _find_nearest_size(self, radius: ArrayLike) -> Index:
         """Return the index (L,) in `CONTACT_SIZES` of the tabulated radius nearest to each radius.
 
         Args:
@@ -368,7 +368,7 @@ class PolygonTables(_ContactTables):
         # triangle of a more distant edge therefore depends only on the angle under which the edge
         # appears from the cube, and the edge can be moved to the largest distance.
         shrink = REACH_DEPTHS / np.maximum(d, REACH_DEPTHS)
-        weights, rows = _triangle_neighbours(d * shrink, t * shrink[..., None])
+        weights, rows = _find_triangle_neighbours(d * shrink, t * shrink[..., None])
 
         tractions = np.asarray(traction, float)
         v = _to_complex(tractions) * direction.conj()
@@ -390,7 +390,7 @@ def _to_complex(vectors: Array) -> Complex:
     return result
 
 
-def _triangle_neighbours(d: Array, t: Array) -> tuple[Single, Index]:
+def _find_triangle_neighbours(d: Array, t: Array) -> tuple[Single, Index]:
     """Return weights and rows with which a polygon's edge is looked up in the tables.
 
     Args:

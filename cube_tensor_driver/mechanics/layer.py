@@ -112,7 +112,7 @@ class Layer:
         ky = np.asarray(ky, float)
         kx, ky = np.broadcast_arrays(kx, ky)
         # L = (cosine, sine, 0) is the unit vector along the wave vector (kx, ky). Where k is 0, its
-        # direction is arbitrary, because `_uniform` replaces the result there.
+        # direction is arbitrary, because `_solve_uniform` replaces the result there.
         k = np.hypot(kx, ky)
         is_zero = k == 0
         k_safe = np.where(is_zero, 1.0, k)
@@ -121,11 +121,11 @@ class Layer:
 
         stress = np.zeros((*k.shape, 6, 3), complex)
         slope = np.zeros_like(stress)
-        waves = self._plane_strain(k_safe, depth) | self._twist(k_safe, depth)
+        waves = self._solve_plane_strain(k_safe, depth) | self._solve_twist(k_safe, depth)
         for name, (value, derivative) in waves.items():
             _add_rotated(stress, cosine, sine, name, value)
             _add_rotated(slope, cosine, sine, name, derivative)
-        stress[is_zero] = self._uniform()
+        stress[is_zero] = self._solve_uniform()
         slope[is_zero] = 0.0
 
         # All stresses vary as exp(i k.x), so that a derivative along x is a product with i kx.
@@ -135,7 +135,7 @@ class Layer:
         gradient = gradient.reshape(*k.shape, 18, 3)
         return np.concatenate([stress, gradient], axis=-2)
 
-    def _plane_strain(self, k: Array, depth: float) -> _WaveStress:
+    def _solve_plane_strain(self, k: Array, depth: float) -> _WaveStress:
         """Return the stress under waves of traction with amplitude 1 Pa along z and along L.
 
         L is the horizontal axis along the wave vector; both tractions cause plane strain.
@@ -147,7 +147,7 @@ class Layer:
         # The first axis of `psi` is for the function psi and its first three derivatives by
         # zeta = k z. The last axis is for the boundary conditions at the surface: psi = 1 and
         # psi' = 0 (normal traction), then psi = 0 and psi' = 1 (shear traction).
-        psi = self._airy(k, -k * depth)
+        psi = self._solve_airy(k, -k * depth)
         by_normal, by_shear = np.moveaxis(psi, -1, 0)
         by_load = {"L": 1j * by_shear, "z": -by_normal}
 
@@ -166,7 +166,7 @@ class Layer:
                 waves[name + load] = (value, k * slope)
         return waves
 
-    def _airy(self, k: Array, zeta: Array) -> Array:
+    def _solve_airy(self, k: Array, zeta: Array) -> Array:
         """Return the amplitude psi of the Airy function of a wave, and its first three derivatives.
 
         The Airy function of the plane strain is psi / k^2, so that psi = -sigma_zz. The derivatives
@@ -220,7 +220,7 @@ class Layer:
 
     @staticmethod
     def _airy_half_space(zeta: Array) -> Array:
-        """Return psi and its derivatives as `_airy`, for a layer of infinite thickness.
+        """Return psi and its derivatives as `_solve_airy`, for a layer of infinite thickness.
 
         Of the four solutions of which psi is a sum, the two that grow with the depth are 0 then.
         """
@@ -234,7 +234,7 @@ class Layer:
             derivatives.append(factor * decay)
         return np.stack(derivatives)
 
-    def _twist(self, k: Array, depth: float) -> _WaveStress:
+    def _solve_twist(self, k: Array, depth: float) -> _WaveStress:
         """Return the stress under a wave of traction with amplitude 1 Pa along the axis T.
 
         T is the horizontal axis across the wave vector; such a traction causes shear stress only.
@@ -259,7 +259,7 @@ class Layer:
             "LTT": (1j * sinh, 1j * k * cosh),
         }
 
-    def _uniform(self) -> Array:
+    def _solve_uniform(self) -> Array:
         """Return the stress (6, 3) in Pa under a uniform traction of 1 Pa along x, y and z."""
         # `lateral` is the ratio of lateral to normal stress. In a half space, it depends on the
         # direction of the wave vector k, and the mean over all directions is taken. In a layer

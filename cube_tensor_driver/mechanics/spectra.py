@@ -138,11 +138,11 @@ class Spectra:
             Covariances (distances, n, n') of the real parts, and of the imaginary parts. For
             positions along x, real parts are independent of imaginary parts.
         """
-        normal = _outer(self.normal, other.normal)
-        plus_plus = _outer(self.plus, other.plus)
-        minus_minus = _outer(self.minus, other.minus)
-        plus_minus = _outer(self.plus, other.minus)
-        minus_plus = _outer(self.minus, other.plus)
+        normal = _multiply_outer(self.normal, other.normal)
+        plus_plus = _multiply_outer(self.plus, other.plus)
+        minus_minus = _multiply_outer(self.minus, other.minus)
+        plus_minus = _multiply_outer(self.plus, other.minus)
+        minus_plus = _multiply_outer(self.minus, other.plus)
         same = plus_plus + minus_minus
         crossed = plus_minus + minus_plus
         half = shear**2 / 2
@@ -188,7 +188,7 @@ class Spectra:
         return result
 
 
-def _outer(first: Array, second: Array) -> Array:
+def _multiply_outer(first: Array, second: Array) -> Array:
     """Return the products of all pairs of two sets of spectra.
 
     Args:

@@ -98,7 +98,7 @@ class TractionPrior:
         points = self._cubes.point_spectra
         depth = self._cubes.depth
         bessel = tabulate_bessel(spectra.k, self._table.distances)
-        prior = _prior_spectrum(spectra.k * depth) * depth**2
+        prior = _compute_prior_spectrum(spectra.k * depth) * depth**2
         shear, normal = SHEAR_RATIO**2, 1.0
         axis_variance = np.array([shear, normal, shear])
         radial = spectra.radial(bessel, prior[None])[0]
@@ -197,7 +197,7 @@ class TractionPrior:
         return np.asarray(measured[:, :, 0])
 
 
-def _prior_spectrum(wavenumber: Array) -> Array:
+def _compute_prior_spectrum(wavenumber: Array) -> Array:
     """Return the spectrum S of the random pressure that serves as prior, divided by depth^2.
 
     The pressure has the variance 1 Pa^2 and the correlation lengths `PRIOR_LENGTHS`.

@@ -257,7 +257,7 @@ class MessageCodec(Generic[AnyRows]):
                 have different frame ids or numbers of rows or pads.
         """
         record, stamp_ns = self._read_records(messages)
-        times_ns = _row_times(record, stamp_ns)
+        times_ns = _compute_row_times(record, stamp_ns)
         rows: AnyRows = self.make_rows(record, times_ns)
         frame_id = record["frame_id"][0].tobytes()
         return Decoded(rows, stamp_ns, frame_id)
@@ -276,7 +276,7 @@ class MessageCodec(Generic[AnyRows]):
             MessageError: See `decode`.
         """
         record, stamp_ns = self._read_records(messages)
-        columns = [_row_times(record, stamp_ns)]
+        columns = [_compute_row_times(record, stamp_ns)]
         for name in names:
             columns.append(_read_column(record, name))
         return columns
@@ -476,7 +476,7 @@ class MessageCodec(Generic[AnyRows]):
         counts_at: list[int] = [_FRAME_LENGTH_AT]
         end = _FRAME_AT + shape.frame
         for field in self._fields:
-            dimensions = _dimensions(field.width, shape)
+            dimensions = _make_dimensions(field.width, shape)
             values = math.prod(dimensions)
             if field.width != PER_MESSAGE:
                 # The values follow their number (4 bytes) without a gap, because CDR aligns values
@@ -507,7 +507,7 @@ class MessageCodec(Generic[AnyRows]):
         )
 
 
-def _dimensions(width: int, shape: _Shape) -> tuple[int, ...]:
+def _make_dimensions(width: int, shape: _Shape) -> tuple[int, ...]:
     """Return the array shape of the values of one field in one message.
 
     Args:
@@ -530,7 +530,7 @@ def _make_struct(offsets: Sequence[int]) -> struct.Struct:
     return struct.Struct(form)
 
 
-def _row_times(record: AnyArray, stamp_ns: Times) -> Times:
+def _compute_row_times(record: AnyArray, stamp_ns: Times) -> Times:
     """Return the times of the rows of all messages, one after the other, in ns since 1970.
 
     Args:

@@ -127,13 +127,13 @@ def skin_processes(
         given["port_directory"] = str(simulated.ports)
     # The reconstruction starts first, so that it has subscribed before the driver publishes.
     names = ["composed"] if composed else ["reconstruction", "driver"]
-    processes += [_node(name, given) for name in names]
+    processes += [_make_node_process(name, given) for name in names]
     if markers:
-        processes.append(_node("markers", {}))
+        processes.append(_make_node_process("markers", {}))
     if contacts:
-        processes.append(_node("contacts", {}))
+        processes.append(_make_node_process("contacts", {}))
     return processes
 
 
-def _node(name: str, parameters: dict[str, Value]) -> Process:
+def _make_node_process(name: str, parameters: dict[str, Value]) -> Process:
     return Process(name, f"cube_tensor_driver.ros.nodes.{name}", parameters=dict(parameters))

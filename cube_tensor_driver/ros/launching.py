@@ -164,7 +164,7 @@ def record_skin(context: LaunchContext, namespace: str, skin_name: str) -> Execu
     outer_namespace = surroundings.get("ros_namespace", "")
     relative = prefix_namespace(outer_namespace, namespace)
     full_namespace = (make_namespace_absolute(relative) or "").strip("/")
-    qualities = _recorded_topics(surroundings, full_namespace)
+    qualities = _list_recorded_topics(surroundings, full_namespace)
     overrides = make_temporary_folder("cube_record_") / "qos.yaml"
     write_yaml(overrides, qualities)
 
@@ -179,7 +179,9 @@ def record_skin(context: LaunchContext, namespace: str, skin_name: str) -> Execu
     return ExecuteProcess(cmd=command, name="recorder", output="screen")
 
 
-def _recorded_topics(surroundings: dict[str, Any], namespace: str) -> dict[str, dict[str, str]]:
+def _list_recorded_topics(
+    surroundings: dict[str, Any], namespace: str
+) -> dict[str, dict[str, str]]:
     """Return the full names of the recorded topics and the quality of service of each.
 
     Args:

@@ -305,7 +305,7 @@ def make_info_message(
     for number, cube in enumerate(skin.cubes):
         calibration = cube.calibration
         n_pads = calibration.layout.n_pads
-        info = _cube_info(cube, skin.frame(cube))
+        info = _make_cube_info(cube, skin.frame(cube))
         info.uid = cube.uid or uids.get(number, 0)
         info.rest_frequency = rest_frequency[number, :n_pads].tolist()
         message.cubes.append(info)
@@ -319,7 +319,7 @@ def make_info_message(
     return message
 
 
-def _cube_info(cube: SkinCube, frame_id: str) -> CubeInfo:
+def _make_cube_info(cube: SkinCube, frame_id: str) -> CubeInfo:
     """Return the part of a SkinInfo message about one cube (name, pose, layout, hub), as stated in
     the skin file."""
     calibration = cube.calibration

@@ -272,8 +272,8 @@ class ImuMotion:
         # The acceleration of a rigid body at the position r, relative to its origin, is
         # alpha x r + omega x (omega x r) = G r, with angular acceleration alpha, angular velocity
         # omega, and the gradient G.
-        turning = _cross_matrices(velocity)
-        gradient = _cross_matrices(acceleration) + turning @ turning
+        turning = _make_cross_matrices(velocity)
+        gradient = _make_cross_matrices(acceleration) + turning @ turning
         time_ns = np.array([sample.time_ns for sample in chosen])
         return Motion(time_ns, force - gradient @ position, gradient)
 
@@ -301,7 +301,7 @@ def _decode(data: bytes) -> tuple[_Sample, str]:
     return sample, data[IMU_HEADER.size : text_end - 1].decode()
 
 
-def _cross_matrices(vectors: Array) -> Array:
+def _make_cross_matrices(vectors: Array) -> Array:
     """Return matrices (K, 3, 3) whose products with any r are the cross products vector x r.
 
     Args:

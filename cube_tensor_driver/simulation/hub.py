@@ -106,7 +106,7 @@ class SimulatedHub:
 
     def stats(self, now_us: int) -> bytes:
         """Return the STATS frame, the hub's counters, at simulated time `now_us`."""
-        uptime_ms = self._positive_device_us(now_us) // 1000
+        uptime_ms = self._compute_positive_device_us(now_us) // 1000
         sequence = self.sequence & _UINT32_MASK
         dropped = self.dropped & _UINT32_MASK
         return encode(Stats(uptime_ms, sequence, dropped, _SUPPLY_MV), self.version)
@@ -116,7 +116,7 @@ class SimulatedHub:
         gained = round(1e-6 * self.drift_ppm * (now_us - self._drift_since_us))
         return self.boot_us + now_us + gained
 
-    def _positive_device_us(self, now_us: int) -> int:
+    def _compute_positive_device_us(self, now_us: int) -> int:
         """Return the hub's clock in µs for a frame, which has 0 instead of negative values."""
         return max(0, self.device_us(now_us))
 
@@ -179,7 +179,7 @@ class SimulatedHub:
         """
         self._log_sample()
         sequence = self.sequence & _UINT32_MASK
-        device_us = self._positive_device_us(self.next_us)
+        device_us = self._compute_positive_device_us(self.next_us)
         self.sequence += 1
         self.next_us += self.period_us
 
@@ -221,7 +221,7 @@ class SimulatedHub:
                 ack = encode(Ack(request.request), self.version)
                 return ack + self.hello()
             case Command.TIME:
-                device_us = self._positive_device_us(now_us)
+                device_us = self._compute_positive_device_us(now_us)
                 return encode(Time(request.argument, device_us), self.version)
             case Command.START:
                 # If the hub takes samples already, another START request must not change the times

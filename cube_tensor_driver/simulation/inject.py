@@ -43,7 +43,7 @@ def inject(ports: Path | None, words: Sequence[str]) -> str:
         for key, value in pairs.items()
     }
     parsed = Fault.parse(fault, "fault")
-    folder = ports or _newest_demo()
+    folder = ports or _find_newest_demo()
 
     with os.fdopen(_open_pipe(folder / FAULT_PIPE), "w") as stream:
         # The simulator writes the file with the sizes of its hubs before it creates the pipe, so
@@ -90,7 +90,7 @@ def _describe(fault: Fault) -> str:
     return text
 
 
-def _newest_demo() -> Path:
+def _find_newest_demo() -> Path:
     """Return the folder of ports of the demo that was started last.
 
     Raises:

@@ -106,7 +106,7 @@ class SimulatedLine:
 
     def flush(self, now_us: int) -> None:
         """Write as many waiting bytes as the line takes at simulated time `now_us`."""
-        if not self.plugged or now_us < self._blocked_until_us(now_us):
+        if not self.plugged or now_us < self._find_blocked_until_us(now_us):
             return
         # During the fault `burst`, waiting bytes are written once per period.
         self._next_burst_us = (now_us // BURST_PERIOD_US + 1) * BURST_PERIOD_US
@@ -130,10 +130,10 @@ class SimulatedLine:
         Returns:
             Time at which `flush` has to be called; None if no bytes wait or they can be sent now.
         """
-        blocked_us = self._blocked_until_us(now_us)
+        blocked_us = self._find_blocked_until_us(now_us)
         return blocked_us if self._queue and now_us < blocked_us else None
 
-    def _blocked_until_us(self, now_us: int) -> int:
+    def _find_blocked_until_us(self, now_us: int) -> int:
         """Return the simulated time in µs before which a stall or burst lets nothing be sent."""
         is_burst = now_us < self.burst_until_us
         return max(self.held_until_us, self._next_burst_us if is_burst else 0)

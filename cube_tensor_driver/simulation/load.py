@@ -216,7 +216,7 @@ class Load:
             is_facing = facing > 0
             for order in np.unique(orders[is_facing]).tolist():
                 rows = np.flatnonzero((orders == order) & is_facing)
-                points, weights = _unit_points(load.shape, order)
+                points, weights = _make_unit_points(load.shape, order)
                 in_plane = local[rows, None, :] * (1.0, 1.0, 0.0)
                 sources = in_plane + load.radius * points
                 forces = force[rows, None, :] * weights
@@ -235,7 +235,7 @@ class Load:
         if self.script.period is not None:
             seconds %= self.script.period
         loads = [
-            self._contact_load(indenter, action, seconds)
+            self._make_contact_load(indenter, action, seconds)
             for indenter in self.script.indenters
             for action in indenter.actions
             if action.start <= seconds < action.end
@@ -255,7 +255,7 @@ class Load:
         `MAX_RADIUS_DEPTHS` allows.
         """
         force = max(action.force.max() for action in indenter.actions)
-        radius = self._contact_radius(indenter, force)
+        radius = self._compute_contact_radius(indenter, force)
         if radius > indenter.radius:
             raise ConfigError(
                 f"{indenter.name}: under {force:g} N the contact's radius is "
@@ -269,7 +269,7 @@ class Load:
                 "times the depth"
             )
 
-    def _contact_load(
+    def _make_contact_load(
         self,
         indenter: Indenter,
         action: Action,
@@ -305,7 +305,7 @@ class Load:
             else:
                 shear = interpolate_knots(action.shear, progress)
             shear = shear - normal * (shear @ normal)
-        radius = self._contact_radius(indenter, size)
+        radius = self._compute_contact_radius(indenter, size)
         return ContactLoad(
             indenter.shape,
             position,
@@ -314,7 +314,7 @@ class Load:
             radius=radius,
         )
 
-    def _contact_radius(self, indenter: Indenter, force: float) -> float:
+    def _compute_contact_radius(self, indenter: Indenter, force: float) -> float:
         """Return the radius of a contact, in m.
 
         Args:
@@ -458,7 +458,7 @@ def _choose_orders(
 
 
 @lru_cache(maxsize=64)
-def _unit_points(shape: str, order: int) -> tuple[Array, Array]:
+def _make_unit_points(shape: str, order: int) -> tuple[Array, Array]:
     """Return the point forces that represent a contact of radius 1.
 
     Args:

@@ -36,7 +36,7 @@ def main(
     Returns:
         Exit code: 0, or 1 if an input file cannot be used.
     """
-    options = _parser().parse_args(arguments)
+    options = _make_parser().parse_args(arguments)
     stop = StopRequest()
     # The signal handlers exist before the files are read, so that a signal in this time also ends
     # the simulator properly.
@@ -56,7 +56,7 @@ def main(
     return 0
 
 
-def _parser() -> argparse.ArgumentParser:
+def _make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line arguments."""
     parser = argparse.ArgumentParser(
         prog="simulator", description="Simulated hubs of a skin on pseudo-terminals."

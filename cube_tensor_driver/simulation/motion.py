@@ -73,7 +73,7 @@ class HeavyPads:
         self._times, *self._columns = np.array(knots).T
         self._numbers = np.arange(len(knots))
 
-    def _pose(self, seconds: float) -> tuple[Array, Array]:
+    def _compute_pose(self, seconds: float) -> tuple[Array, Array]:
         """Return position (3,), in m, and rotation (3, 3) of the parent frame at a time in s."""
         number = np.interp(seconds, self._times, self._numbers)
         begin = np.floor(number)
@@ -84,7 +84,7 @@ class HeavyPads:
     def specific_force(self, seconds: float) -> Array:
         """Return the specific force at each cube in its own frame (cubes, 3), in m/s²."""
         times = seconds - STEP_S, seconds, seconds + STEP_S
-        poses = [self._pose(time) for time in times]
+        poses = [self._compute_pose(time) for time in times]
         before, now, after = (p + self._cubes.position @ rotation.T for p, rotation in poses)
         in_world = (after - 2 * now + before) / STEP_S**2
         in_world[:, 2] += STANDARD_GRAVITY

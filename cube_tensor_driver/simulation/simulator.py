@@ -189,7 +189,7 @@ class Simulator:
             now = self.now_us()
             # A pseudo-terminal takes some 10 kB at a time; large frames wait until the host reads.
             writers = [link.line.fd for link in self._links if link.line.is_waiting(now)]
-            wait_us = self._due_us(report_us) - now
+            wait_us = self._find_due_us(report_us) - now
             wait_s = max(0.0, wait_us * 1e-6)
             # `select` is used, because epoll rounds waiting times to milliseconds.
             readable, _, _ = select.select(readers, writers, [], wait_s)
@@ -247,7 +247,7 @@ class Simulator:
         with contextlib.suppress(OSError):
             self._ports.rmdir()
 
-    def _due_us(self, report_us: int) -> int:
+    def _find_due_us(self, report_us: int) -> int:
         """Return the simulated time in µs at which the simulator has to act next.
 
         It is the time of the next sample, of the next report (HELLO and STATS), of the next begin

@@ -59,16 +59,16 @@ class CubicSpline:
 
     def position(self, time: float) -> Array:
         """Return the position (D,) at a time from 0 to 1."""
-        t, coefficients = self._interval(time)
+        t, coefficients = self._find_interval(time)
         return np.asarray(polyval(t, coefficients))
 
     def velocity(self, time: float) -> Array:
         """Return the derivative (D,) of the position by the time, at a time from 0 to 1."""
-        t, coefficients = self._interval(time)
+        t, coefficients = self._find_interval(time)
         per_interval = polyval(t, polyder(coefficients))
         return np.asarray(per_interval * len(self._coefficients))
 
-    def _interval(self, time: float) -> tuple[float, Array]:
+    def _find_interval(self, time: float) -> tuple[float, Array]:
         """Return the interval between two points in which a time from 0 to 1 lies.
 
         Returns:

@@ -154,7 +154,7 @@ class Interpolation:
         axes = np.swapaxes(columns, 1, 2)[near]
 
         offset = cubes[:, :, None] - cubes[:, None]
-        matrix = _covariance(
+        matrix = _compute_covariance(
             offset,
             axes[:, :, None],
             axes[:, None],
@@ -172,7 +172,7 @@ class Interpolation:
         offset = points[:, :, None] - cubes[:, None]
         n_points = points.shape[1]
         no_axes = np.zeros((n, n_points, 1, 0, 3))
-        to_points = _covariance(offset, no_axes, axes[:, None])
+        to_points = _compute_covariance(offset, no_axes, axes[:, None])
         to_points = to_points.reshape(n, -1, size)
         to_points = to_points * is_known[:, None]
 
@@ -234,7 +234,7 @@ class _Weights:
         )
 
 
-def _covariance(
+def _compute_covariance(
     d: Array,
     u: Array,
     v: Array,

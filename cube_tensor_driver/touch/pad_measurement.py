@@ -179,7 +179,7 @@ def _decompose(influence: Influence) -> tuple[Spectra, Array]:
             (series * root).reshape(len(series), -1),
             full_matrices=False,
         )
-        for series in _fourier_series(influence, r)
+        for series in _compute_fourier_series(influence, r)
     ]
     largest = max(values[0] for _, values, _ in decompositions)
 
@@ -194,7 +194,7 @@ def _decompose(influence: Influence) -> tuple[Spectra, Array]:
         weighted_functions = right[is_kept].reshape(n_kept, 3, -1)
         functions = weighted_functions / root
         orders += [order] * n_kept
-        transforms = _hankel_transforms(functions, order, bessel, r * weight)
+        transforms = _compute_hankel_transforms(functions, order, bessel, r * weight)
         spectra.append(transforms)
         weighted = left[:, is_kept] * values[is_kept]
         pads.append(weighted.reshape(2, -1, n_kept))
@@ -213,7 +213,7 @@ def _decompose(influence: Influence) -> tuple[Spectra, Array]:
     ), to_pads
 
 
-def _hankel_transforms(
+def _compute_hankel_transforms(
     functions: Array,
     order: int,
     bessel: BesselTable,
@@ -243,7 +243,7 @@ def _hankel_transforms(
     return plus, minus, transform(normal, 0)
 
 
-def _fourier_series(influence: Influence, r: Array) -> list[Array]:
+def _compute_fourier_series(influence: Influence, r: Array) -> list[Array]:
     """Compute the Fourier series of the influence functions over the direction from force to cube.
 
     The influence function of a pad is its stress under a force of 1 N, as a function of the force's

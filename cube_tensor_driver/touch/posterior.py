@@ -357,7 +357,7 @@ def _solve_window(
 
     # `known_gain` is the gain matrix G = K_ty (K_yy + N)^-1 for the known values, and `variance`
     # the posterior variance diag(K_tt - G K_yt) of the traction.
-    cross = _cross_covariance(traction_prior, model, place, angle, points)
+    cross = _compute_cross_covariance(traction_prior, model, place, angle, points)
     cross = cross[:, known]
     known_block = np.ix_(known, known)
     # Cholesky takes a quarter of the time of numpy's general solver.
@@ -397,7 +397,7 @@ def _solve_window(
     )
 
 
-def _cross_covariance(
+def _compute_cross_covariance(
     traction_prior: TractionPrior,
     model: ObservationModel,
     place: Array,

@@ -184,7 +184,7 @@ class SlipEstimator:
         n_values = count * len(inverse.columns)
         n_scans = LAGS[-1] + 1
         # These are the fields of a contact. A load consists of force (3) in N and position (3) in
-        # m. `past` has the motion states (`_motion_state`) of the last scans, newest first.
+        # m. `past` has the motion states (`_decide_motion_state`) of the last scans, newest first.
         fields: list[tuple[str, type, tuple[int, ...]]] = [
             ("id", int, ()),
             ("normal", float, (3,)),
@@ -239,10 +239,10 @@ class SlipEstimator:
 
         normal = contacts["normal"]
         followed = self._follow(scaled)
-        before = _motion_state(followed, normal)
+        before = _decide_motion_state(followed, normal)
         contacts["load"] = [[*one.force, *one.position] for one in found]
         contacts["values"] = self._gather(scaled)
-        after = _motion_state(contacts["load"], normal)
+        after = _decide_motion_state(contacts["load"], normal)
         # The tracker has fitted the loads again, which corrects errors of the followed ones. The
         # past states get the same correction, so that it does not look like motion.
         correction = after - before
@@ -255,7 +255,7 @@ class SlipEstimator:
         contacts["sums"][is_new] = 0.0
         contacts["is_fitted"] |= slips
         shear_ratio = after[:, 3:6]
-        ratios = _lengths(shear_ratio)
+        ratios = _compute_lengths(shear_ratio)
         _add_ratio(contacts, slips, ratios, contacts["ratio_deviation"])
 
     def update(self, time_s: float, values: Array) -> bool:
@@ -275,7 +275,7 @@ class SlipEstimator:
         scaled = self._inverse.scaled(values)
         loads = self._follow(scaled)
         self._linearise_changed(loads, scaled)
-        newest = _motion_state(loads, contacts["normal"])
+        newest = _decide_motion_state(loads, contacts["normal"])
         self._remember(time_s, newest)
 
         earlier = contacts["past"][:, LAGS]
@@ -287,7 +287,7 @@ class SlipEstimator:
         contacts["slips"] = slipped
 
         shear_ratio = newest[:, 3:6]
-        ratio = _lengths(shear_ratio)
+        ratio = _compute_lengths(shear_ratio)
         followed_deviation = FOLLOWED_DEVIATION * ratio
         deviation = np.hypot(contacts["ratio_deviation"], followed_deviation)
         is_followed = slipped & ~contacts["is_fitted"]
@@ -332,7 +332,7 @@ class SlipEstimator:
         """Test whether each contact has moved, and whether it has slipped, over each of the `LAGS`.
 
         Args:
-            newest: Motion states (n, 7) in this scan, as from `_motion_state`.
+            newest: Motion states (n, 7) in this scan, as from `_decide_motion_state`.
             change: Changes (n, lags, 7) of the motion states over each lag.
             duration: Durations (lags,) of the lags in s.
 
@@ -341,9 +341,9 @@ class SlipEstimator:
         """
         moved = change[..., :3]
         turned = change[..., 3:6]
-        distance = _lengths(moved)
+        distance = _compute_lengths(moved)
         shear_ratio = newest[:, 3:6]
-        ratio = _lengths(shear_ratio)[:, None]
+        ratio = _compute_lengths(shear_ratio)[:, None]
 
         divisor = np.maximum(distance, 1e-12)
         scalar_product = np.einsum("nlk,nlk->nl", moved, turned)
@@ -351,7 +351,7 @@ class SlipEstimator:
         lever = LEVER_M / (1 + 2 * ratio)
         tilt = lever * np.maximum(growth, 0)
         force_change = change[..., 3:]
-        leak = LEAK_M * _lengths(force_change)
+        leak = LEAK_M * _compute_lengths(force_change)
         # A force that changes and returns within a long lag shows no change over it, but may have
         # left the contact shifted. So each lag is allowed the largest shift of all shorter ones.
         explained = np.maximum.accumulate(tilt + leak, axis=1)
@@ -370,7 +370,7 @@ class SlipEstimator:
         is_along = along > MIN_COSINE * distance * ratio
         largest = MIN_SHARE_OF_LARGEST * self._contacts["largest_ratio"]
         min_ratio = np.maximum(MIN_RATIO, largest)
-        ratio_change = _lengths(turned)
+        ratio_change = _compute_lengths(turned)
         slips = moves & is_along
         slips &= ratio > min_ratio[:, None]
         slips &= ratio_change < MAX_RATIO_CHANGE * ratio
@@ -417,10 +417,10 @@ class SlipEstimator:
         contacts = self._contacts
         change = loads - contacts["linearised"]
         depth = self._inverse.depth
-        force = _lengths(loads[:, :3])
+        force = _compute_lengths(loads[:, :3])
         force = np.maximum(force, MIN_FORCE_N)
-        force_change = _lengths(change[:, :3])
-        shift = _lengths(change[:, 3:])
+        force_change = _compute_lengths(change[:, :3])
+        shift = _compute_lengths(change[:, 3:])
         has_changed = force_change > MAX_FORCE_CHANGE * force
         has_changed |= shift > MAX_SHIFT_DEPTHS * depth
 
@@ -458,7 +458,7 @@ class SlipEstimator:
         positions = loads[:, 3:]
         place = positions[row]
         offset = self._above_cubes - place
-        distance = _lengths(offset)
+        distance = _compute_lengths(offset)
         normals = poses.rotation[:, :, 2]
         cosines = normals @ contact["normal"]
         is_turned_away = cosines < MIN_FACING
@@ -474,7 +474,7 @@ class SlipEstimator:
         # Derivatives are computed in the frame of `home`, the cube nearest to the contact. They are
         # sorted by distance, so that those of this contact come first.
         rotation = poses.rotation[home]
-        apart = _lengths(positions - place)
+        apart = _compute_lengths(positions - place)
         is_near = apart < NEIGHBOUR_PITCHES * inverse.pitch
         n_near = np.sum(is_near)
         near = np.argsort(apart)[:n_near]
@@ -507,13 +507,13 @@ class SlipEstimator:
         contact["linearised"] = loads[row]
 
 
-def _lengths(vectors: Array) -> Array:
+def _compute_lengths(vectors: Array) -> Array:
     """Return the lengths (...) of vectors (..., n)."""
     lengths: Array = np.linalg.norm(vectors, axis=-1)
     return lengths
 
 
-def _motion_state(loads: Array, normal: Array) -> Array:
+def _decide_motion_state(loads: Array, normal: Array) -> Array:
     """Return the motion states (n, 7) of contacts: the quantities whose changes show slip.
 
     They are the position (3) in m, the shear force divided by the normal force (3), and the natural

@@ -164,7 +164,7 @@ class Surface:
             values: Components (cubes, 15) in the order of `COMPONENTS`, in Pa and Pa/m; NaN where
                 unknown. The values around a cube without any come from its neighbours.
         """
-        return Field(self._pressure(values), self._shear(values))
+        return Field(self._interpolate_pressure(values), self._interpolate_shear(values))
 
     def uncertainty(self, values: Array) -> Array:
         """Compute the standard deviation (M,) of the interpolated pressure at each point.
@@ -203,39 +203,39 @@ class Surface:
         """
         # Where neither a cube nor its neighbours have a value, the pressure is unknown (NaN) and
         # counts as zero.
-        pressure = np.nan_to_num(self._pressure(values))
+        pressure = np.nan_to_num(self._interpolate_pressure(values))
         largest = float(pressure.max())
         relative_threshold = RELATIVE_THRESHOLD * largest
         inside = pressure > max(threshold, relative_threshold)
         if not inside.any():
             return []
 
-        shear = np.nan_to_num(self._shear(values))
-        shear_by_patch = [self._by_patch(component) for component in shear.T]
+        shear = np.nan_to_num(self._interpolate_shear(values))
+        shear_by_patch = [self._arrange_by_patch(component) for component in shear.T]
         moment_pressure = -self._interpolation.values(values, PRESSURE[:1])
         moment_pressure = np.nan_to_num(moment_pressure)
         uncertainty = self.uncertainty(values)
         is_shear_known = np.isfinite(values[:, SHEAR])
         loaded = _LoadedSurface(
-            pressure=self._by_patch(pressure),
+            pressure=self._arrange_by_patch(pressure),
             shear=np.stack(shear_by_patch),
-            moment_pressure=self._by_patch(moment_pressure),
-            uncertainty=self._by_patch(uncertainty),
+            moment_pressure=self._arrange_by_patch(moment_pressure),
+            uncertainty=self._arrange_by_patch(uncertainty),
             sees_shear=bool(is_shear_known.any()),
         )
         owner = self._assign_patches(inside)
         numbers = np.unique(owner)
-        contacts = [self._contact(loaded, owner == number) for number in numbers]
+        contacts = [self._make_contact(loaded, owner == number) for number in numbers]
         return sorted(contacts, key=lambda contact: -contact.normal_force)
 
-    def _pressure(self, values: Array) -> Array:
+    def _interpolate_pressure(self, values: Array) -> Array:
         return -self._interpolation.values(values, self._pressure_columns)
 
-    def _shear(self, values: Array) -> Array:
+    def _interpolate_shear(self, values: Array) -> Array:
         columns = [self._interpolation.values(values, [column]) for column in SHEAR]
         return np.stack(columns, axis=1)
 
-    def _by_patch(self, on_points: Array) -> Array:
+    def _arrange_by_patch(self, on_points: Array) -> Array:
         """Group values at all points by patch, the square grid of points around each cube.
 
         Args:
@@ -277,7 +277,7 @@ class Surface:
         touched_component = component[is_touched]
         return np.asarray(touched_component[nearest], np.intp)
 
-    def _contact(self, loaded: _LoadedSurface, chosen: Mask) -> Contact:
+    def _make_contact(self, loaded: _LoadedSurface, chosen: Mask) -> Contact:
         """Compute force, position and uncertainty of a contact.
 
         A patch is a square grid of points above one cube; the patches of all cubes cover the skin.
@@ -294,15 +294,15 @@ class Surface:
         # The normal of the contact is the mean of its cubes' normals, weighted with the pressure.
         cube_normals = rotation[:, :, 2]
         cube_weights = pressure.sum(axis=1)
-        normal = _weighted_sum(cube_weights, cube_normals)
+        normal = _sum_weighted(cube_weights, cube_normals)
         normal /= np.linalg.norm(normal)
 
-        shear = self._shear_force(loaded.shear[:, chosen], rotation)
+        shear = self._compute_shear_force(loaded.shear[:, chosen], rotation)
         shear -= normal * (shear @ normal)
         # The shear force acts on the surface, `depth` above the cubes' plane, and so shifts the
         # centre of pressure in this plane by depth × shear force / normal force.
         total_weight = weight.sum()
-        centre = _weighted_sum(weight, points) / total_weight
+        centre = _sum_weighted(weight, points) / total_weight
         force_direction = normal - shear / total_weight
         position = centre + self.depth * force_direction
 
@@ -331,7 +331,7 @@ class Surface:
             force_uncertainty=float(np.sqrt(variance.sum())),
         )
 
-    def _shear_force(self, shear: Array, rotation: Array) -> Array:
+    def _compute_shear_force(self, shear: Array, rotation: Array) -> Array:
         """Integrate the shear stress over some patches.
 
         Args:
@@ -343,8 +343,8 @@ class Surface:
             Shear force (3,) in N, in the skin's parent frame.
         """
         by_patch = shear.sum(axis=2)
-        along_x = _weighted_sum(by_patch[0], rotation[:, :, 0])
-        along_y = _weighted_sum(by_patch[1], rotation[:, :, 1])
+        along_x = _sum_weighted(by_patch[0], rotation[:, :, 0])
+        along_y = _sum_weighted(by_patch[1], rotation[:, :, 1])
         return (along_x + along_y) * self.area
 
 
@@ -406,7 +406,7 @@ def patches(
     return np.asarray(poses.position[:, None] + offset)
 
 
-def _weighted_sum(weights: Array, vectors: Array) -> Array:
+def _sum_weighted(weights: Array, vectors: Array) -> Array:
     """Return the weighted sum (3,) of vectors (..., 3) with the weights (...).
 
     The function uses einsum, because a BLAS matrix product would start threads that occupy a second

@@ -264,7 +264,7 @@ class Touch:
 
         pressure = -change[:, PRESSURE]
         self._test(cube, pressure, elapsed_s)
-        gain = self._gain(cube, pressure, elapsed_s)
+        gain = self._compute_gain(cube, pressure, elapsed_s)
         self._slow[cube] = slow + gain[:, None] * change
         self._count[cube] += 1
 
@@ -295,7 +295,7 @@ class Touch:
             covariance = self._pipeline.covariance(cube, mask)
             self._deviation[cube] = np.sqrt(covariance[PRESSURE, PRESSURE])
 
-    def _gain(
+    def _compute_gain(
         self,
         cube: Index | slice,
         pressure: Array,

@@ -109,8 +109,8 @@ def estimate_forces(
         return_inverse=True,
     )
 
-    own = _grid(np.linspace(-MAX_PITCHES, MAX_PITCHES, 9))
-    other = _grid(np.arange(-5.0, 6.0))
+    own = _make_grid(np.linspace(-MAX_PITCHES, MAX_PITCHES, 9))
+    other = _make_grid(np.arange(-5.0, 6.0))
     is_apart = np.abs(other).max(axis=1) >= MIN_OTHER_PITCHES
     other = other[is_apart]
     sources = poses.pitch * np.concatenate([own, other])
@@ -133,7 +133,7 @@ def estimate_forces(
     )
 
 
-def _grid(line: Array) -> Array:
+def _make_grid(line: Array) -> Array:
     """Return the points (n^2, 2) of a grid with the coordinates `line` (n,) along both x and y."""
     x, y = np.meshgrid(line, line)
     return np.column_stack([x.ravel(), y.ravel()])
@@ -161,8 +161,8 @@ def _solve(
 
     observed_signal = signal[observed]
     own, other = np.split(observed_signal, [n_own], axis=1)
-    total = FORCE_DEVIATION**2 * _mean_square(own)
-    total += OTHER_FORCE_DEVIATION**2 * _mean_square(other)
+    total = FORCE_DEVIATION**2 * _compute_mean_square(own)
+    total += OTHER_FORCE_DEVIATION**2 * _compute_mean_square(other)
     total += noise
     expected = FORCE_DEVIATION**2 * own.mean(axis=1)
     solution = np.linalg.solve(total, expected)
@@ -177,7 +177,7 @@ def _solve(
     return weights.reshape(-1, 3), np.sqrt(noise_variance), rms_error
 
 
-def _mean_square(signal: Array) -> Array:
+def _compute_mean_square(signal: Array) -> Array:
     """Return the mean <H H'> (n, n) of responses H over S positions of the load.
 
     Args:

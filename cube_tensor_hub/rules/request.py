@@ -107,7 +107,7 @@ def period_is_kept(transcript: Transcript) -> RuleResult:
         return not_tried(f"the hub did not take a period of {PERIOD_US} µs")
     if ack.result != Result.DONE:
         return failed(f"request 4 was answered with result {ack.result}")
-    wrong = _other_period(transcript)
+    wrong = _find_other_period(transcript)
     if wrong:
         return failed(wrong)
     gaps = periods_us(transcript.frames(Sample, "start"))
@@ -121,7 +121,7 @@ def period_is_kept(transcript: Transcript) -> RuleResult:
     return passed(f"{text}, mean {gaps.mean():.1f} µs, jitter {gaps.std():.1f} µs")
 
 
-def _other_period(transcript: Transcript) -> str:
+def _find_other_period(transcript: Transcript) -> str:
     """Return where a HELLO states another sample period than the ACK before it; "" if none does."""
     period_us = 0
     for name in transcript.first_visit:

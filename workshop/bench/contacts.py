@@ -177,11 +177,11 @@ def compute_values_under(
         depth_error: How much deeper the cubes are than the inverse knows, divided by the depth.
         poisson_error: How much larger Poisson's ratio is.
     """
-    pads = _pads_under(bench, forces, centre, force, depth_error, poisson_error)
+    pads = _compute_pads_under(bench, forces, centre, force, depth_error, poisson_error)
     return bench.measured(pads, random)
 
 
-def _pads_under(
+def _compute_pads_under(
     bench: TractionBench,
     forces: Array,
     centre: Array,
@@ -250,17 +250,17 @@ def _summarise(name: str, loads: list[TrackingResult]) -> dict[str, float]:
     expected = 2 if SHAPES[name].apart else 1
     is_right = np.array(contacts) == expected
     return {
-        "force_error_percent": 100 * _rms(force) / FORCE,
-        "force_ratio": _rms(force / force_deviation),
-        "position_error_mm": 1e3 * _rms(place),
-        "position_ratio": _rms(place / place_deviation),
+        "force_error_percent": 100 * _compute_rms(force) / FORCE,
+        "force_ratio": _compute_rms(force / force_deviation),
+        "position_error_mm": 1e3 * _compute_rms(place),
+        "position_ratio": _compute_rms(place / place_deviation),
         "right_number_percent": 100 * float(is_right.mean()),
         "first_scan_cpu_ms": float(np.mean(first_ms)),
         "scan_cpu_ms": float(np.mean(last_ms)),
     }
 
 
-def _rms(values: Array) -> float:
+def _compute_rms(values: Array) -> float:
     """Return the root mean square of the values that are not NaN."""
     return float(np.sqrt(np.nanmean(values**2)))
 
@@ -289,7 +289,7 @@ def _bench_moving(cubes: str) -> dict[str, float]:
             angle = since / RATE_HZ * SPEED / RADIUS_M
             centre = corner + RADIUS_M * np.array([np.cos(angle), np.sin(angle)])
             force = share * FORCE * np.array([FRICTION, 0.0, -1.0])
-            pads = pads + _pads_under(bench, shape, centre, force)
+            pads = pads + _compute_pads_under(bench, shape, centre, force)
             pressing += share * FORCE
         values = bench.measured(pads * gain, random)
         start_s = time.process_time()

@@ -78,7 +78,9 @@ def bench_links(
 
             def read_counters() -> Array:
                 """Return wall clock (s), processor time (s), rows and lost samples so far."""
-                return np.array([time.monotonic(), time.process_time(), delivered, _lost(links)])
+                return np.array(
+                    [time.monotonic(), time.process_time(), delivered, _count_lost(links)]
+                )
 
             links.start()
             try:
@@ -111,7 +113,7 @@ def _wait(done: Callable[[], bool]) -> None:
         time.sleep(POLL_S)
 
 
-def _lost(links: LiveLinks) -> int:
+def _count_lost(links: LiveLinks) -> int:
     """Return the number of samples that the hubs took and that did not arrive so far."""
     names = ("lost_on_the_way", "dropped_in_hub")
     counts = [report.values[name] for report in links.report() for name in names]

@@ -76,7 +76,7 @@ class RestHistory:
 
         current = self._calibrated
         self._epochs = [(Span(0, LATEST_NS), current)]
-        for action in self._changes():
+        for action in self._find_changes():
             current = self._apply(action, current)
             # Until now the span of the earlier values had no end. The change ends it.
             last, rest = self._epochs[-1]
@@ -85,7 +85,7 @@ class RestHistory:
             following = Span(action.end_ns, LATEST_NS)
             self._epochs.append((following, current))
 
-    def _changes(self) -> list[NodeAction]:
+    def _find_changes(self) -> list[NodeAction]:
         actions = self._run.record.actions_of("tare", "clear")
         return [action for action in actions if action.succeeded]
 
@@ -117,6 +117,6 @@ class RestHistory:
         force."""
         record = self._run.record
         is_unclear = record.is_during(RECONSTRUCTION_STOPS, sent_ns, TRANSPORT_S, RESTORE_S)
-        for action in self._changes():
+        for action in self._find_changes():
             is_unclear |= action.contains(sent_ns, TRANSPORT_S, TRANSPORT_S)
         return is_unclear

@@ -172,7 +172,7 @@ class _Reference:
         self._pipeline.rest_frequency = rest.values
         wanted = self._pipeline.process(measured, made.left_out)
 
-        allowed = MAX_NOISE_SHARE * self._deviation(made)
+        allowed = MAX_NOISE_SHARE * self._compute_deviation(made)
         relative_part = MAX_RELATIVE_RESIDUAL_ERROR * wanted.residual
         allowed_residual = MAX_RESIDUAL_ERROR + relative_part
         agrees = agree(made.residual, wanted.residual, allowed_residual)
@@ -191,20 +191,20 @@ class _Reference:
         agrees &= (difference == 0) | ((difference == RESIDUAL) & is_at_limit)
         return agrees
 
-    def _deviation(self, made: StressRows) -> Array:
+    def _compute_deviation(self, made: StressRows) -> Array:
         """Return the standard deviation of each component (N, 15), 0 where it is not observed."""
         # `np.unique` sorts one integer, made of the cube and the mask, much faster than pairs.
         key = made.cube.astype(np.int64) << 32 | made.left_out
         distinct, which = np.unique(key, return_inverse=True)
         rows = [
-            self._deviation_of(cube=value >> 32, left_out=value & 0xFFFFFFFF)
+            self._compute_deviation_of(cube=value >> 32, left_out=value & 0xFFFFFFFF)
             for value in distinct.tolist()
         ]
         # The shape is stated because there may be no rows.
         table = np.array(rows).reshape(-1, len(COMPONENTS))
         return table[which.ravel()]
 
-    def _deviation_of(self, cube: int, left_out: int) -> Array:
+    def _compute_deviation_of(self, cube: int, left_out: int) -> Array:
         if (cube, left_out) not in self._deviations:
             variance = np.diag(self._pipeline.covariance(cube, left_out))
             self._deviations[cube, left_out] = np.sqrt(np.nan_to_num(variance))

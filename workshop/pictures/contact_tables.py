@@ -88,13 +88,13 @@ def contact_tables(true_pads: Influence) -> dict[str, Any]:
     by_form = {f"{setting.cubes} as {form}": errors for (setting, form), errors in forms.items()}
     return {
         "quantities": QUANTITIES,
-        "balls": _table(by_pitch, BALL_LOADS),
-        "wrong assumptions": _table(by_assumption, FEW_LOADS),
-        "cubes as points and as pads in a layer of 11 mm": _table(by_form, PAD_LOADS),
+        "balls": _make_table(by_pitch, BALL_LOADS),
+        "wrong assumptions": _make_table(by_assumption, FEW_LOADS),
+        "cubes as points and as pads in a layer of 11 mm": _make_table(by_form, PAD_LOADS),
     }
 
 
-def _table(results: Mapping[str, Sequence[Errors]], loads: int) -> dict[str, Any]:
+def _make_table(results: Mapping[str, Sequence[Errors]], loads: int) -> dict[str, Any]:
     """Return the table of the errors of each skin and width, from a number of loads for each."""
     rows = {}
     for name, all_widths in results.items():

@@ -88,7 +88,7 @@ def make_pictures(folder: Path) -> None:
             f"{folder}: {error.strerror}; name a folder that can be written"
         ) from None
     if shutil.which("chromedriver"):
-        with _demo_skin() as children:
+        with _run_demo_skin() as children:
             _photograph(children, folder / "view.png")
     else:
         print(
@@ -170,7 +170,7 @@ def _render(load: MujocoLoad) -> NDArray[np.uint8]:
 
 
 @contextmanager
-def _demo_skin() -> Iterator[Children]:
+def _run_demo_skin() -> Iterator[Children]:
     """Run the simulated demo skin under its load, with the browser view."""
     skin = package_data() / "config" / "skin_demo.yaml"
     with (

@@ -170,13 +170,13 @@ def reprocess_table(frequencies: pyarrow.Table, skin: CalibratedSkin) -> pyarrow
             if name in columns
         }
         rows = FrequencyRows.of(**attributes)
-        health = _recorded_health(columns)
+        health = _read_recorded_health(columns)
         stress = reconstruct_rows(reconstructor, rows, health)
         batches.append(make_stress_batch(stress, cubes))
     return pyarrow.Table.from_batches(batches, STRESS_SCHEMA)
 
 
-def _recorded_health(columns: dict[str, Any]) -> RecordedHealth | None:
+def _read_recorded_health(columns: dict[str, Any]) -> RecordedHealth | None:
     """Return the recorded health of the pads from Arrow columns; None if they are missing."""
     if not columns.keys() >= {"recorded_left_out", "recorded_status"}:
         return None

@@ -173,7 +173,7 @@ class Compensation:
         """
         states: dict[str, Array] = {}
         for effect in self._lasting:
-            parts = [part.ravel() for part in self._parts(effect)]
+            parts = [part.ravel() for part in self._collect_parts(effect)]
             states[effect.key] = np.concatenate(parts)
         return states
 
@@ -190,7 +190,7 @@ class Compensation:
         restored = [effect for effect in self._lasting if effect.key in states]
         for effect in restored:
             state = states[effect.key]
-            parts = self._parts(effect)
+            parts = self._collect_parts(effect)
             ends = np.cumsum([part.size for part in parts])
             if len(state) != ends[-1]:
                 raise LayoutError(
@@ -204,7 +204,7 @@ class Compensation:
         if restored:
             self._fill_offsets()
 
-    def _parts(self, effect: Thermal | Creep) -> list[Array]:
+    def _collect_parts(self, effect: Thermal | Creep) -> list[Array]:
         """Return the arrays of the state of an effect. To restore a state, write into them.
 
         The bits of times (int64) are viewed as float64, because a conversion would round them.

@@ -87,9 +87,9 @@ class Thermal:
             self._reference[number] = model.reference
             pads, degrees = model.coefficient.shape
             self._coefficient[:degrees, :pads, number] = model.coefficient.T
-            self._slope[number] = _typical_size(model.coefficient[:, :1])
+            self._slope[number] = _find_typical_size(model.coefficient[:, :1])
             if model.ramp is not None:
-                self._ramp[number] = _typical_size(model.ramp)
+                self._ramp[number] = _find_typical_size(model.ramp)
         self._coefficient /= stiffness
         self._filters = LowPass(times, n_signals=1)
 
@@ -196,7 +196,7 @@ class Thermal:
         ]
 
 
-def _typical_size(values: Array) -> float:
+def _find_typical_size(values: Array) -> float:
     """Return the root sum of squares of the K values of a pad, as rms over the pads (P, K)."""
     mean_square = (values**2).sum() / len(values)
     return float(np.sqrt(mean_square))

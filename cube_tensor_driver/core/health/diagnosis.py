@@ -199,7 +199,7 @@ class PadDiagnosis:
         """
         self._rest = rest_frequency
         self.noise = noise
-        self.bound = _squared_bound(noise)
+        self.bound = _square_bound(noise)
 
     def examine(self, window: Window, state: StatusBits) -> StatusBits:
         """Find the conditions of a window that has ended.
@@ -232,7 +232,7 @@ class PadDiagnosis:
         # Vibration raises the noise of all pads of a cube. They must not be reported as noisy then,
         # so the median noise of the pads is the usual noise if it is above that of the calibration.
         usual = np.fmax(self.noise, _lower_median(window.noise))
-        self.bound = _squared_bound(usual)
+        self.bound = _square_bound(usual)
         was_noisy = state & NOISY > 0
         ratio = np.where(was_noisy, NOISY_LEAVE, NOISY_ENTER)
         limit = ratio * usual
@@ -332,7 +332,7 @@ def has_high_residual(
     return np.where(rows > 0, is_high, was_high)
 
 
-def _squared_bound(noise: Array) -> Array:
+def _square_bound(noise: Array) -> Array:
     """Return the limit of squared second differences of the frequency, in Hz².
 
     Args:

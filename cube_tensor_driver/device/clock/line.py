@@ -269,7 +269,7 @@ class ClockLine:
 
         devices_ns, delays = np.array(self._points).T
         if len(devices_ns) >= MIN_BUCKETS_FOR_DRIFT:
-            slope = _slope_at_centre(devices_ns, delays)
+            slope = _find_slope_at_centre(devices_ns, delays)
             track.drift = min(max(slope, -MAX_DRIFT), MAX_DRIFT)
         # No point (device time, arrival) may lie below the line, because no delay is negative. If
         # the slope was limited to MAX_DRIFT, any point may be the lowest, so all are compared.
@@ -277,7 +277,7 @@ class ClockLine:
         track.offset = float(offsets.min())
         return was_set
 
-    def _drift_error(self) -> float:
+    def _estimate_drift_error(self) -> float:
         """Return the largest assumed error of the estimated relative drift between the clocks.
 
         It is the jitter of the delays divided by the time between the first and the last kept
@@ -302,7 +302,7 @@ class ClockLine:
         self.error_bound = None
         low = -math.inf
         high = math.inf
-        drift_error = self._drift_error()
+        drift_error = self._estimate_drift_error()
         for trip in reversed(self._round_trips):
             drifted = self._track.drift * trip.device_ns
             # The bounds of the offset from older round trips (questions for the hub's time) are
@@ -329,7 +329,7 @@ class ClockLine:
         self._track.bounded_offset = min(self._track.offset, self._trip_offset)
 
 
-def _slope_at_centre(x: Array, y: Array) -> float:
+def _find_slope_at_centre(x: Array, y: Array) -> float:
     """Return the slope of the lower convex hull of points at their mean x; 0 if all x are equal.
 
     Args:

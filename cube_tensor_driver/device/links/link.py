@@ -250,7 +250,7 @@ class Link:
         except BlockingIOError:
             return b""
         except OSError as error:
-            raise self._lost(error) from error
+            raise self._handle_loss(error) from error
         if not data:
             raise self.read_error(0)
         return data
@@ -261,7 +261,7 @@ class Link:
         Args:
             number: The errno of the read; 0 if it returned no byte because the stream ended.
         """
-        return self._lost(OSError(number, os.strerror(number)) if number else END_OF_STREAM)
+        return self._handle_loss(OSError(number, os.strerror(number)) if number else END_OF_STREAM)
 
     def write(self, data: bytes) -> None:
         """Send bytes without blocking. Those that the kernel does not accept now wait for `flush`.
@@ -302,7 +302,7 @@ class Link:
         except BlockingIOError:
             pass
         except OSError as error:
-            raise self._lost(error) from error
+            raise self._handle_loss(error) from error
 
     def is_draining(self) -> bool:
         """Return whether written bytes still wait in this process or in the kernel's serial driver.
@@ -329,7 +329,7 @@ class Link:
             if self.is_draining() and not isinstance(self._stream, socket.socket):
                 # The bytes that the hub has not read are discarded. Otherwise the kernel would
                 # block in close for up to 30 s to send them.
-                with contextlib.suppress(OSError, _terminal_error()):
+                with contextlib.suppress(OSError, _find_terminal_error()):
                     self._stream.reset_output_buffer()
             with contextlib.suppress(OSError):
                 self._stream.close()
@@ -408,7 +408,7 @@ class Link:
         if self._stream is not None:
             self._connecting = None
 
-    def _lost(self, error: OSError) -> LinkError:
+    def _handle_loss(self, error: OSError) -> LinkError:
         """Return the LinkError of the kind `lost` for a failed read or write of the port."""
         reason = error.strerror or str(error)
         return LinkError(
@@ -429,7 +429,7 @@ def explain_open_error(path: str, error: BaseException) -> LinkError:
     for source in (error, error.__context__):
         # An error of the terminal (termios.error) has no attribute `errno`. It comes from pyserial
         # unchanged or as the context of another error.
-        if code is None and isinstance(source, _terminal_error()):
+        if code is None and isinstance(source, _find_terminal_error()):
             code = source.args[0]
     if code in _OPEN_ERRORS:
         kind, fix = _OPEN_ERRORS[code]
@@ -437,7 +437,7 @@ def explain_open_error(path: str, error: BaseException) -> LinkError:
     return LinkError(f"{path}: cannot open it ({error}): correct the port", "bad_port")
 
 
-def _terminal_error() -> type[Exception]:
+def _find_terminal_error() -> type[Exception]:
     """Return the class of errors of the terminal, termios.error; OSError where Python has none."""
     try:
         import termios
@@ -456,7 +456,7 @@ def _open_port(path: str, baud: int) -> serial.Serial:
         port = serial.Serial(
             path, baud, timeout=0, write_timeout=0, inter_byte_timeout=0, exclusive=True
         )
-    except (OSError, _terminal_error()) as error:
+    except (OSError, _find_terminal_error()) as error:
         raise explain_open_error(path, error) from error
     except ValueError as error:
         kind = "bad_baud" if "baud" in str(error).lower() else "bad_port"

@@ -100,17 +100,17 @@ class LinkLogger:
     def info(self, message: str, /) -> None:
         """Log an event of the link that is no problem, for example that it was opened."""
         if self._is_allowed():
-            self._log.info(self._line(message))
+            self._log.info(self._format_line(message))
 
     def warning(self, message: str, /) -> None:
         """Log a problem that may pass without help, for example a lost connection."""
         if self._is_allowed():
-            self._log.warning(self._line(message))
+            self._log.warning(self._format_line(message))
 
     def error(self, message: str, /) -> None:
         """Log a problem that a person must solve, for example a cube missing in the skin file."""
         if self._is_allowed():
-            self._log.error(self._line(message))
+            self._log.error(self._format_line(message))
 
     def _is_allowed(self) -> bool:
         """Return whether a line may be logged now, and count it as logged or left out."""
@@ -124,7 +124,7 @@ class LinkLogger:
         self._allowed -= 1.0
         return True
 
-    def _line(self, message: str) -> str:
+    def _format_line(self, message: str) -> str:
         """Return the log line for a message: link, message, number of lines left out before."""
         omitted = self.left_out - self._reported_left_out
         self._reported_left_out = self.left_out

@@ -209,7 +209,7 @@ class Reader:
         """
         try:
             self._intake = Intake(self.links, wake_read, self._clock_ns)
-            self._loop()
+            self._run_loop()
         except Exception as error:  # noqa: BLE001  (a thread that ends unseen would look like silent hubs)
             self.failure = error
             _log.exception("the thread that reads the links has ended")
@@ -219,7 +219,7 @@ class Reader:
             finally:
                 self._on_end()
 
-    def _loop(self) -> None:
+    def _run_loop(self) -> None:
         """Wait for data of the links and handle them, until `close` is called."""
         tick_at = 0.0
         in_time_at = time.monotonic()

@@ -62,16 +62,16 @@ class RowCounts:
         Returns:
             Number of rows lost.
         """
-        lost = self._missing(n_waiting) - self.unaccounted
+        lost = self._count_missing(n_waiting) - self.unaccounted
         self.lost += lost
         self.lost_reason = repr(error)
         return lost
 
     def check(self, n_waiting: int) -> None:
         """Update `unaccounted`, where `n_waiting` rows wait for the rest of their scan."""
-        self.unaccounted = self._missing(n_waiting)
+        self.unaccounted = self._count_missing(n_waiting)
 
-    def _missing(self, n_waiting: int) -> int:
+    def _count_missing(self, n_waiting: int) -> int:
         """Return the number of received rows that were not delivered, left out or lost, and do not
         wait for the rest of their scan.
 

@@ -136,7 +136,7 @@ class ScanBuilder:
         # the next scan, the link would stay behind the others for good.
         scan = self._n_pending[link]
         if len(self._pending) > 1:
-            scan = max(scan, self._first_scan_at(stamp_ns))
+            scan = max(scan, self._find_first_scan_at(stamp_ns))
         if scan == len(self._pending):
             self._pending.append({})
             self._pending_ns.append(stamp_ns)
@@ -226,11 +226,11 @@ class ScanBuilder:
         Args:
             max_scans: Largest number of scans to remove; None for all that can be built.
         """
-        n_reached = self._n_reached()
+        n_reached = self._count_reached()
         if len(self._pending) - n_reached > 1:
             self._align_by_order()
             self._holds_back = True
-            n_reached = self._n_reached()
+            n_reached = self._count_reached()
         n_scans = len(self._pending)
         # Only scans to which no sample can be added any more are taken. If a link has no sample in
         # any pending scan, or another one is too far ahead, all scans are taken.
@@ -279,7 +279,7 @@ class ScanBuilder:
                 return True
         return False
 
-    def _n_reached(self) -> int:
+    def _count_reached(self) -> int:
         """Return the number of pending scans that every delivering link has reached.
 
         A link has reached a scan if it has a sample in this scan or in a later one.
@@ -304,7 +304,7 @@ class ScanBuilder:
         self._pending = scans[: max(self._n_pending)]
         self._pending_ns = [min(part.stamp_ns for part in scan.values()) for scan in self._pending]
 
-    def _first_scan_at(self, stamp_ns: int) -> int:
+    def _find_first_scan_at(self, stamp_ns: int) -> int:
         """Return the index of the first pending scan that is not too early for a sample.
 
         A scan is too early if it is earlier than the sample by more than `MAX_PERIODS_EARLIER`

@@ -104,7 +104,7 @@ class SequenceTracker:
         if not self._is_begun:
             return self._begin(sequence, device_us, Arrival.NEW)
 
-        ahead = self._ahead(sequence)
+        ahead = self._count_ahead(sequence)
         number = track.next + ahead
         if ahead >= 0:
             if ahead > MAX_GAP and device_us - track.newest_us < MIN_PERIOD_US * ahead:
@@ -120,7 +120,7 @@ class SequenceTracker:
         # after a restart of the hub.
         if self._restart_at == track.next and device_us < track.newest_us:
             return self._restart(sequence, device_us)
-        is_repeat = (number, device_us) in self._seen()
+        is_repeat = (number, device_us) in self._list_seen()
         if is_repeat or self._is_old_repeat(number, device_us):
             self.counters.duplicate += 1
             return Arrival.DUPLICATE
@@ -149,12 +149,12 @@ class SequenceTracker:
             taken: Number of samples that the hub reports to have taken since power-up, 32 bits,
                 which wraps to 0.
         """
-        ahead = self._ahead(taken)
+        ahead = self._count_ahead(taken)
         if self._is_begun and 0 < ahead <= MAX_GAP:
             self.counters.missing += ahead
             self._track.next += ahead
 
-    def _ahead(self, sequence: int) -> int:
+    def _count_ahead(self, sequence: int) -> int:
         """Return by how many samples a 32-bit number is ahead of the next expected number.
 
         The result is negative if the number is behind.
@@ -191,7 +191,7 @@ class SequenceTracker:
         """
         if number < self.first:
             return abs(self._track.newest_us - device_us) < RESTART_US
-        time_of = dict(self._seen())
+        time_of = dict(self._list_seen())
         if number in time_of:
             return False
         # The time is not limited on a side without a sample.
@@ -256,7 +256,7 @@ class SequenceTracker:
         self._track.seen[number % MAX_DISORDER] = number, device_us
         return arrival
 
-    def _seen(self) -> list[tuple[int, int]]:
+    def _list_seen(self) -> list[tuple[int, int]]:
         """Return number and device time, in µs, of the newest `MAX_DISORDER` samples that came."""
         oldest = self._track.next - MAX_DISORDER
         return [(number, us) for number, us in self._track.seen if number >= oldest]

@@ -308,11 +308,11 @@ def record(
         if not bag.messages:
             # An empty bag is removed, so that the next recording can use the same name.
             shutil.rmtree(bag.folder, ignore_errors=True)
-            raise BagError(f"nothing recorded, no bag made: {_why_nothing(recorder)}")
+            raise BagError(f"nothing recorded, no bag made: {_explain_nothing(recorder)}")
         return recorder
 
 
-def _why_nothing(recorder: Recorder) -> str:
+def _explain_nothing(recorder: Recorder) -> str:
     if recorder.refused:
         return "; ".join(recorder.refused.values())
     if recorder.counts:

@@ -40,14 +40,14 @@ class LinkDiagnostics:
                 rows.
         """
         counts = links.row_counts()
-        statuses = [_rows_status(self._skin_name, counts, self._counts_before)]
+        statuses = [_make_rows_status(self._skin_name, counts, self._counts_before)]
         self._counts_before = counts
         if with_links:
-            statuses += [_link_status(report) for report in links.report()]
+            statuses += [_make_link_status(report) for report in links.report()]
         return statuses
 
 
-def _rows_status(
+def _make_rows_status(
     skin_name: str,
     counts: RowCounts,
     before: RowCounts,
@@ -83,7 +83,7 @@ def _rows_status(
     return make_status("rows", skin_name, level, text, values)
 
 
-def _link_status(report: LinkReport) -> DiagnosticStatus:
+def _make_link_status(report: LinkReport) -> DiagnosticStatus:
     """Return the status of one link.
 
     Its level is that of the worst state that the link has had since the previous status.

@@ -244,11 +244,13 @@ class CubeHealth:
                 continue
             pads = self._skin.cubes[cube].calibration.layout.pads
             texts = [
-                f"pad {pads[pad]} {_condition_words(int(bits[cube, pad]))}"
+                f"pad {pads[pad]} {_describe_conditions(int(bits[cube, pad]))}"
                 for pad in np.flatnonzero(bits[cube]).tolist()
             ]
             if has_residual[cube]:
-                texts.append(f"residual above its level: {_residual_cause(suspects.get(cube))}")
+                texts.append(
+                    f"residual above its level: {_find_residual_cause(suspects.get(cube))}"
+                )
             words[cube] = "; ".join(texts)
         return words
 
@@ -359,7 +361,7 @@ def log_changes(logger: RcutilsLogger, changes: LogChanges) -> None:
             logger.info(line)
 
 
-def _condition_words(bits: int) -> str:
+def _describe_conditions(bits: int) -> str:
     """Return the faulty conditions of a pad as text, such as "open and noisy".
 
     Args:
@@ -369,7 +371,7 @@ def _condition_words(bits: int) -> str:
     return " and ".join(words)
 
 
-def _residual_cause(suspects: list[str] | None) -> str:
+def _find_residual_cause(suspects: list[str] | None) -> str:
     """Return a text with the possible cause of a high residual of a cube.
 
     Args:

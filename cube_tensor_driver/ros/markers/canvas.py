@@ -121,15 +121,15 @@ class Canvas:
         """
         colours = scene.colours(quantity, shown, ranges.colours)
         shapes = [shape._replace(colours=colours[members]) for members, shape in self._plates]
-        shapes += self._arrows(values, ranges)
-        shapes.append(self._faults(health))
+        shapes += self._draw_arrows(values, ranges)
+        shapes.append(self._draw_faults(health))
         if self._has_crosses:
-            shapes.append(self._crosses(values, ranges.traction))
-        shapes += self._contacts(contacts)
+            shapes.append(self._draw_crosses(values, ranges.traction))
+        shapes += self._draw_contacts(contacts)
         shapes += draw_legend(self._legend_place, quantity, ranges, health)
         return serialise(self._frame_id, shapes)
 
-    def _arrows(self, values: Array, ranges: scene.Ranges) -> list[Shape]:
+    def _draw_arrows(self, values: Array, ranges: scene.Ranges) -> list[Shape]:
         """Return the arrows of all cubes: traction (force per area on its upper face) and gradient.
 
         Args:
@@ -146,7 +146,7 @@ class Canvas:
             shapes.append(draw_arrows(scale, scale.name, arrows, normal, self._pitch))
         return shapes
 
-    def _faults(self, health: Index) -> Shape:
+    def _draw_faults(self, health: Index) -> Shape:
         """Return crosses over the cubes whose health (cubes,) is not fine."""
         # Health seldom changes, so the last shape is kept.
         if self._health is None or not np.array_equal(health, self._health):
@@ -157,7 +157,7 @@ class Canvas:
             self._fault_crosses = shape._replace(colours=np.repeat(scene.MARK[health], 4, axis=0))
         return self._fault_crosses
 
-    def _crosses(self, values: Array, longest_pa: float) -> Shape:
+    def _draw_crosses(self, values: Array, longest_pa: float) -> Shape:
         """Return the principal stresses of each cube as three lines.
 
         Args:
@@ -171,7 +171,7 @@ class Canvas:
         colours = np.where(is_pull.reshape(-1, 1), PULL_COLOUR, PUSH_COLOUR)
         return shape._replace(colours=np.repeat(colours, 2, axis=0))
 
-    def _contacts(self, contacts: SkinContacts | None) -> list[Shape]:
+    def _draw_contacts(self, contacts: SkinContacts | None) -> list[Shape]:
         """Return a ring for each contact, and a text that states its normal and shear force.
 
         The text is red while the contact slips. It is pale (`COARSE_OPACITY`) until the first fit

@@ -225,7 +225,7 @@ def draw_legend(
         centre = place.point(begin + 0.25 * len(text) * TEXT_HEIGHT, line)
         shapes.append(make_text(f"{scale.name} scale", text, height, centre))
 
-    title = _title(quantity, top, health)
+    title = _make_title(quantity, top, health)
     return [*shapes, make_text("legend", title, height, place.point(0.5, TITLE_LINE))]
 
 
@@ -241,7 +241,7 @@ def format_in_four_characters(value: float) -> str:
     return next(text for text in texts if len(text) <= 4).ljust(4, ".")
 
 
-def _title(quantity: scene.Quantity, top: float, health: Index) -> str:
+def _make_title(quantity: scene.Quantity, top: float, health: Index) -> str:
     """Return the title: quantity and range of the colours, and number of cubes in each health.
 
     It is a single line, because RViz draws a second line 1 cm lower, whatever the size of the text.

@@ -52,10 +52,10 @@ class Markers(SkinSubscriberNode):
         last = self._ranges.colours
         top = fixed or scene.choose_automatic_top(self._quantity, shown, last)
         ranges = self._ranges = self._ranges.follow(values, residual, top)
-        contacts = self._newest_contacts(skin)
+        contacts = self._find_newest_contacts(skin)
         return self._canvas.draw(self._quantity, shown, values, ranges, health, contacts)
 
-    def _newest_contacts(self, skin: FollowedSkin) -> SkinContacts | None:
+    def _find_newest_contacts(self, skin: FollowedSkin) -> SkinContacts | None:
         """Return the newest contacts; None if no message of `contacts` has arrived, or the newest
         is more than `MAX_CONTACTS_AGE_NS` older than the newest stress.
 

@@ -199,7 +199,7 @@ class CubeTopics:
             cube = int(rows.cube[row])
             left_out = int(rows.left_out[row])
             covariance = self._reconstructor.covariance(cube, left_out)
-            header = self._header(rows, row, cube)
+            header = self._make_header(rows, row, cube)
             message = make_tensor_message(header, rows, row, covariance)
             self._tensors.publish(cube, message)
 
@@ -222,11 +222,11 @@ class CubeTopics:
             strict=True,
         )
         for row, cube, force, torque in each:
-            header = self._header(rows, row, cube)
+            header = self._make_header(rows, row, cube)
             message = make_wrench_message(header, force, torque)
             self._wrenches.publish(cube, message)
 
-    def _header(self, rows: StressRows, row: int, cube: int) -> Header:
+    def _make_header(self, rows: StressRows, row: int, cube: int) -> Header:
         stamp = to_time(int(rows.stamp_ns[row]))
         frame_id = self._skin.frame(self._skin.cubes[cube])
         return Header(stamp=stamp, frame_id=frame_id)

@@ -90,7 +90,7 @@ def make_flat_contact(
         normal: Unit normal (3,) out of the skin.
         min_width: Smallest width of the polygon in m, for contacts along a line or at a point.
     """
-    basis = _plane_basis(*normal.tolist())
+    basis = _make_plane_basis(*normal.tolist())
     origin = points.mean(axis=0)
     flat = (points - origin) @ basis
     tangential = forces @ basis
@@ -102,16 +102,16 @@ def make_flat_contact(
     force_x, force_y = tangential.T
     moment = arm_x @ force_y - arm_y @ force_x
 
-    corners = _convex_hull(flat)
-    area, centroid, polar = _area_moments(corners)
+    corners = _find_convex_hull(flat)
+    area, centroid, polar = _compute_area_moments(corners)
     if area < min_width * np.abs(corners).max():
         # The points lie on a line. Each becomes a square, so that the polygon has an area.
         square = min_width / 2 * _UNIT_SQUARE
         around_points = flat[:, None] + square
-        corners = _convex_hull(around_points.reshape(-1, 2))
-        area, centroid, polar = _area_moments(corners)
+        corners = _find_convex_hull(around_points.reshape(-1, 2))
+        area, centroid, polar = _compute_area_moments(corners)
 
-    ratios = _edge_distances(corners, centre) / _edge_distances(corners, centroid)
+    ratios = _compute_edge_distances(corners, centre) / _compute_edge_distances(corners, centroid)
     shrink = max(
         float(ratios.min()),
         min(1.0, min_width / np.sqrt(area)),
@@ -126,7 +126,7 @@ def make_flat_contact(
     )
 
 
-def _edge_distances(corners: Array, place: Array) -> Array:
+def _compute_edge_distances(corners: Array, place: Array) -> Array:
     """Measure the distance of a position from all edges of a polygon.
 
     Args:
@@ -141,7 +141,7 @@ def _edge_distances(corners: Array, place: Array) -> Array:
     return np.asarray(edge_x * y - edge_y * x)
 
 
-def _area_moments(corners: Array) -> tuple[float, Array, float]:
+def _compute_area_moments(corners: Array) -> tuple[float, Array, float]:
     """Return the area in m², centroid (2,) in m and polar moment of area in m⁴ of a polygon.
 
     The moment is about the centroid.
@@ -179,7 +179,7 @@ def next_corners(corners: Array) -> Array:
     return np.concatenate([corners[1:], corners[:1]])
 
 
-def _convex_hull(flat: Array) -> Array:
+def _find_convex_hull(flat: Array) -> Array:
     """Return the corners of the convex hull of points (K, 2), counterclockwise.
 
     Source: A. M. Andrew, Information Processing Letters 9 (1979) 216. Qhull takes ten times as long
@@ -203,7 +203,7 @@ def _convex_hull(flat: Array) -> Array:
 
 
 @lru_cache(maxsize=64)
-def _plane_basis(
+def _make_plane_basis(
     x: float,
     y: float,
     z: float,

@@ -122,7 +122,7 @@ class MujocoLoad:
         self.poses = self.touch.poses
         self.depth = self.touch.depth
 
-        self._times, self._controls = _keyframe_controls(path, model)
+        self._times, self._controls = _read_keyframe_controls(path, model)
         self.repeats = None
         if len(self._times):
             self.repeats = float(self._times[-1])
@@ -133,13 +133,13 @@ class MujocoLoad:
 
     def at(self, seconds: float) -> StressField:
         """Compute stress and gradient at the cubes under the contacts at a time in s."""
-        return self.touch.field(self._touches_at(seconds))
+        return self.touch.field(self._find_touches_at(seconds))
 
     def total(self, seconds: float) -> Resultant:
         """Return total force, centre of pressure and mean normal of all contacts at a time in s."""
-        return total([touch.press for touch in self._touches_at(seconds)])
+        return total([touch.press for touch in self._find_touches_at(seconds)])
 
-    def _touches_at(self, seconds: float) -> list[BodyContact]:
+    def _find_touches_at(self, seconds: float) -> list[BodyContact]:
         """Return the contacts at a time in s; the scene is computed up to it if necessary."""
         # A scene can only be computed forwards. Contacts at an earlier time are still in memory, or
         # the scene is computed again from its start.
@@ -191,7 +191,7 @@ class MujocoLoad:
             self._touches.pop(oldest, None)
 
 
-def _keyframe_controls(
+def _read_keyframe_controls(
     path: Path,
     model: MjModel,
 ) -> tuple[Array, Array]:

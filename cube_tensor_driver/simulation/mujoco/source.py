@@ -167,9 +167,9 @@ class MujocoSkin:
         # The depth is rounded to µm, so that skins whose depths differ only by rounding errors
         # share their tables.
         layer = Layer(thickness, poisson)
-        self._discs, self._polygons = _tables(layer, round(self.depth, 6))
+        self._discs, self._polygons = _make_tables(layer, round(self.depth, 6))
         self._stiffness = young / (1 - poisson**2)
-        self._curvature = _curvatures(model, self._mujoco)
+        self._curvature = _compute_curvatures(model, self._mujoco)
         self._pads = SkinPads(skin, PadErrors(noise, drift, imperfections))
         self._reconstructor = Reconstructor(skin)
         self._scans = 0
@@ -229,9 +229,9 @@ class MujocoSkin:
             flat = [touch for touch in own if touch.polygon is not None]
             fields = []
             if discs:
-                fields.append(_field_of_discs(part, discs, self._discs))
+                fields.append(_compute_field_of_discs(part, discs, self._discs))
             if flat:
-                fields.append(_field_of_polygons(part, flat, self._polygons))
+                fields.append(_compute_field_of_polygons(part, flat, self._polygons))
             for part_stress, part_gradient in fields:
                 stress[part.cubes] += part_stress
                 gradient[part.cubes] += part_gradient
@@ -253,7 +253,7 @@ class MujocoSkin:
         """
         # MuJoCo's normal points from the first body to the second one.
         sign = 2 * side - 1
-        place, force, outward = self._contact_points(part, rows, sign)
+        place, force, outward = self._find_contact_points(part, rows, sign)
         normal = surface_normal(part.poses, part.pitch, place.mean(axis=0))
         is_felt = (outward @ normal > 0) & (force @ normal < 0)
         if not is_felt.any():
@@ -276,7 +276,7 @@ class MujocoSkin:
         radius = hertz_radius(pressing, curvature, self._stiffness)
         return BodyContact(part.body, ContactLoad("sphere", place[0], normal, total, radius))
 
-    def _contact_points(
+    def _find_contact_points(
         self,
         part: _BodyCubes,
         rows: Index,
@@ -322,7 +322,7 @@ class MujocoSkin:
         skin = self.skin
         reference = self._mujoco.MjData(model)
         self._mujoco.mj_kinematics(model, reference)
-        base = self._body_number(skin.parent_frame)
+        base = self._find_body_number(skin.parent_frame)
         if base < 0:
             numbers = range(model.nbody)
             names = [model.body(number).name for number in numbers]
@@ -331,7 +331,7 @@ class MujocoSkin:
                 f"skin {skin.name}; its bodies are {', '.join(filter(None, names))}"
             )
         # A cube whose link does not have the name of a body is on the body of the parent frame.
-        bodies = np.array([self._body_number(cube.link) for cube in skin.cubes])
+        bodies = np.array([self._find_body_number(cube.link) for cube in skin.cubes])
         bodies[bodies < 0] = base
 
         origin = reference.xpos[base]
@@ -340,7 +340,7 @@ class MujocoSkin:
         for number, cube in enumerate(skin.cubes):
             place = origin + axes @ self.poses.position[number]
             outward = axes @ self.poses.rotation[number, :, 2]
-            depth[number] = self._distance_to_surface(
+            depth[number] = self._measure_distance_to_surface(
                 reference,
                 int(bodies[number]),
                 place,
@@ -376,7 +376,7 @@ class MujocoSkin:
             parts.append(part)
         return parts, median
 
-    def _body_number(self, name: str | None) -> int:
+    def _find_body_number(self, name: str | None) -> int:
         """Return the number of a body, -1 if there is none of this name."""
         if name is None:
             return -1
@@ -384,7 +384,7 @@ class MujocoSkin:
         number: int = self._mujoco.mj_name2id(self.model, kind, name)
         return number
 
-    def _distance_to_surface(
+    def _measure_distance_to_surface(
         self,
         reference: MjData,
         body: int,
@@ -438,7 +438,7 @@ class MujocoSkin:
 
 
 @lru_cache(maxsize=8)
-def _tables(
+def _make_tables(
     layer: Layer,
     depth: float,
 ) -> tuple[DiscTables, PolygonTables]:
@@ -453,7 +453,7 @@ def _tables(
     return DiscTables(layer, depth), PolygonTables(layer, depth)
 
 
-def _field_of_discs(
+def _compute_field_of_discs(
     part: _BodyCubes,
     loads: list[ContactLoad],
     tables: DiscTables,
@@ -476,7 +476,7 @@ def _field_of_discs(
     return tables.field(place[..., :2], force, radii)
 
 
-def _field_of_polygons(
+def _compute_field_of_polygons(
     part: _BodyCubes,
     touches: list[BodyContact],
     tables: PolygonTables,
@@ -521,7 +521,7 @@ def _field_of_polygons(
     )
 
 
-def _curvatures(model: MjModel, mujoco: Any) -> Array:
+def _compute_curvatures(model: MjModel, mujoco: Any) -> Array:
     """Return the curvature (geoms + 1,) of each geom (shape of a body) in 1/m.
 
     It is 1 / radius for spheres, capsules and cylinders, and 0 for all others. The last entry, 0,

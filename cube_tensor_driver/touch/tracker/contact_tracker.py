@@ -284,7 +284,7 @@ class ContactTracker:
             region.begin_scan(points, peak)
             regions.append(region)
         self._regions = regions
-        distances = self._region_distances(found)
+        distances = self._measure_region_distances(found)
         for number, (region, row) in enumerate(zip(regions, distances, strict=True)):
             is_near = row < NEIGHBOUR_REACH_PITCHES * self._inverse.pitch
             within_reach = [regions[k] for k in np.flatnonzero(is_near)]
@@ -292,7 +292,7 @@ class ContactTracker:
             to_others = np.delete(row, number)
             region.gap = float(to_others.min(initial=np.inf))
 
-    def _region_distances(self, found: list[Index]) -> Array:
+    def _measure_region_distances(self, found: list[Index]) -> Array:
         """Return the distances (n, n), in m, of n regions: for each pair of regions, the smallest
         distance between a point of one and a point of the other.
 

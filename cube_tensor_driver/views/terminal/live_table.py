@@ -171,7 +171,7 @@ class LiveTable:
             shown = np.sort(by_size[:max_rows])
             notes.append(f"the {max_rows} cubes under the largest normal stress of {len(pressure)}")
 
-        columns = self._columns(shown.tolist(), pressure)
+        columns = self._make_columns(shown.tolist(), pressure)
         # The first and the last two columns (name, rate and state) are always shown.
         bar, *components, residual = list(columns)[1:-2]
         omissible = ["lines", bar, *reversed(components), residual]
@@ -189,14 +189,14 @@ class LiveTable:
                     left_out.append(name)
                 else:
                     shown_columns[heading] = column
-            table = self._table(shown_columns, has_lines=not omitted)
+            table = self._make_table(shown_columns, has_lines=not omitted)
             too_narrow = [f"too narrow for {', '.join(left_out)}"] if left_out else []
             table.caption = "; ".join([*notes, *too_narrow])
             if Measurement.get(self._console, options, table).maximum <= width:
                 break
         return table
 
-    def _columns(self, shown: Sequence[int], pressure: Array) -> dict[str, Cells]:
+    def _make_columns(self, shown: Sequence[int], pressure: Array) -> dict[str, Cells]:
         """Return all columns by their headings.
 
         Args:
@@ -214,13 +214,13 @@ class LiveTable:
                 size, unit = find_component_unit(name)
                 stress, _, axis = name.partition("_")
                 label = f"∂{stress}/∂{axis}" if axis else stress
-                columns[f"{label}\n{unit}"] = _numbers(values / size, shown, "+7.2f")
-        columns["residual"] = _numbers(self._latest.residual, shown, ".2f")
-        columns["Hz"] = _numbers(self._rate, shown, "4.0f")
+                columns[f"{label}\n{unit}"] = _format_numbers(values / size, shown, "+7.2f")
+        columns["residual"] = _format_numbers(self._latest.residual, shown, ".2f")
+        columns["Hz"] = _format_numbers(self._rate, shown, "4.0f")
         columns["state"] = [self._state(cube) for cube in shown]
         return columns
 
-    def _table(self, columns: Mapping[str, Cells], has_lines: bool) -> Table:
+    def _make_table(self, columns: Mapping[str, Cells], has_lines: bool) -> Table:
         """Make the table with these columns, which have lines between them or not."""
         count = counted(len(self._skin.cubes), "cube")
         title = f"skin {self._skin.name!r}: {count}. Tension is positive; "
@@ -257,7 +257,7 @@ class LiveTable:
         return Text("ok" if self._latest.count[number] else "waiting", "green")
 
 
-def _numbers(values: Array, shown: Sequence[int], form: str) -> Cells:
+def _format_numbers(values: Array, shown: Sequence[int], form: str) -> Cells:
     """Return the cells of some cubes: numbers in a format of Python, `UNOBSERVED` for NaN."""
     cells: Cells = []
     for value in values[list(shown)].tolist():
