@@ -316,7 +316,7 @@ def test_the_programs_of_the_page_run(mujoco, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     exec(sensor + hubs, {})
     said = capsys.readouterr().out
-    here, through_links = re.fullmatch(r"g\D+(\d+\.\d) kPa\ng\D+(\d+\.\d) kPa\n", said).groups()
+    here, through_links = re.fullmatch(r"l\D+(\d+\.\d) kPa\nl\D+(\d+\.\d) kPa\n", said).groups()
     assert float(here) > 1.0
     assert float(through_links) == pytest.approx(float(here), rel=0.3)
     assert not (tmp_path / "ports").exists()
