@@ -119,6 +119,16 @@ def test_imports_point_one_way():
             assert floor[other] > floor[room], f"{path} imports {module}"
 
 
+def test_each_class_has_a_name_of_its_own():
+    modules = {}
+    for package in PRODUCTS:
+        for path in (ROOT / package).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, ast.ClassDef):
+                    modules.setdefault(node.name, set()).add(path)
+    assert not {name: paths for name, paths in modules.items() if len(paths) > 1}
+
+
 def test_heavy_libraries_stay_at_home():
     for room, module, path in all_imports():
         homes = HOMES.get(module.split(".")[0], {room})
