@@ -81,6 +81,7 @@ _FIRST_FIELDS = (
     _Field("sequence", "<u4", 1),
     _Field("time_offset", "<i4", 1),
 )
+"""Fields with which both batch messages begin after the header."""
 _FREQUENCIES = (
     *_FIRST_FIELDS,
     _Field("n_pads", "<u1", PER_MESSAGE),
