@@ -42,7 +42,7 @@ class ZarrWriter(BufferedTable):
 
         Args:
             path: Folder of the group, which is created or replaced.
-            cubes: Names of the cubes by their indices, then a name for every index beyond them.
+            cubes: Names of the cubes by their indices, then one name for all higher indices.
                 They are stored as an attribute of the column `cube`.
 
         Raises:

@@ -51,8 +51,8 @@ MAX_RESIDUAL = 150.0
 that something touched the skin during the recording."""
 
 MAX_SLOPE_DEVIATION = 0.2
-"""Largest relative uncertainty (rms over the pads) of the effect of temperature, in Pa/K, with
-which a fit is accepted."""
+"""Largest relative uncertainty of the linear temperature coefficients of the pads' stress (in Pa/K,
+rms over the pads) with which a fit is accepted."""
 
 LAGS_S = np.geomspace(3.0, 1500.0, 26)
 """Time constants of low-pass filters, in s, with which the search for the best time constants of
@@ -315,7 +315,7 @@ def _search(
     The search begins with the grid `LAGS_S`, which is refined around the best solution.
 
     Args:
-        data: Averages of the blocks.
+        data: Averages over blocks of time.
         n_lags: Number of low-pass filters.
         degree: Highest power of the temperature.
         slope: Rms of the linear coefficients over the pads, in Pa/K; 0: not known yet.
@@ -343,12 +343,12 @@ def _search(
 
 
 def _filter(data: Warming, lags: tuple[float, ...]) -> Array:
-    """Return the temperature (N,) after low-pass filters in series.
+    """Return the temperatures (N,) of the N blocks of time after low-pass filters in series.
 
     At the begin of each bag, the output of the filters equals the measured temperature.
 
     Args:
-        data: Averages of the blocks.
+        data: Averages over blocks of time.
         lags: Time constants of the filters, in s.
     """
     total = np.zeros(len(data.seconds))
@@ -378,7 +378,7 @@ def _solve(
     """Compute the coefficients for given time constants by weighted least squares.
 
     Args:
-        data: Averages of the blocks.
+        data: Averages over blocks of time.
         lags: Time constants, in s, the longest first.
         degree: Highest power of the temperature.
         slope: Rms of the linear coefficients over the pads, in Pa/K; 0: not known yet.
@@ -415,7 +415,7 @@ def _describe(
     """Return the model of a solution, with the standard deviations of its values.
 
     Args:
-        data: Averages of the blocks.
+        data: Averages over blocks of time.
         best: The solution.
         slope: Rms of the linear coefficients over the pads, in Pa/K.
     """

@@ -363,7 +363,7 @@ def illustrative(
 
     Args:
         layout_name: Name of the layout: quad, planar or cube.
-        neglect: Names of modes whose amplitude is assumed to be zero.
+        neglect: Names of modes (linear stress fields) whose amplitude is assumed to be zero.
         uid: Unique id of the cube; None means any cube.
     """
     layout = find_layout(layout_name)

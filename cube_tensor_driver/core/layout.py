@@ -237,9 +237,9 @@ _NEXT_AXES = str.maketrans("xyz", "yzx")
 # The layout "cube" has the eight pads of "planar" in each of the planes z-x, x-y and y-z. The names
 # of the pads in the next plane follow by renaming the axes.
 _SECOND_SECTION = _PLANAR_PADS.translate(_NEXT_AXES)
-"""Names of the pads of the layout "cube" in the plane x-y."""
+"""Names of the pads of the layout "cube" whose centres lie in the plane x-y of the cube frame."""
 _THIRD_SECTION = _SECOND_SECTION.translate(_NEXT_AXES)
-"""Names of the pads of the layout "cube" in the plane y-z."""
+"""Names of the pads of the layout "cube" whose centres lie in the plane y-z of the cube frame."""
 
 LAYOUTS = {
     "quad": _make_layout("quad", _QUAD_PADS),

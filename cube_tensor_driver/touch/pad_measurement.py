@@ -64,9 +64,10 @@ _PADS = "pads"
 """Name of the matrix to the pads' stresses in the cached file, beside the attributes of
 `Spectra`."""
 
-_LENGTH_TOLERANCE = 1e-6
-"""Difference below which two lengths count as equal. It is relative for the sides of two cubes, and
-in units of half a side for the positions, normals and sizes of two pads (sensing elements)."""
+_MATCH_TOLERANCE = 1e-6
+"""Largest difference up to which the cube and pads of a calibration count as those of the influence
+functions. It applies to the relative difference of the cubes' sides, to the positions and sizes of
+pads (sensing elements) in units of half a side, and to their unit normals."""
 
 
 def model_pads(influence: Influence, calibrations: Sequence[Calibration]) -> MeasurementModel:
@@ -117,14 +118,14 @@ def _match_pads(influence: Influence, calibration: Calibration) -> list[int]:
     layout = calibration.layout
     given = influence.layout
     side = 2 * calibration.half_side
-    if abs(side / influence.side - 1) > _LENGTH_TOLERANCE:
+    if abs(side / influence.side - 1) > _MATCH_TOLERANCE:
         raise ElasticError(
             f"the influence functions are of a cube of {1e3 * influence.side:g} mm and calibration "
             f"{calibration.id} of one of {1e3 * side:g} mm; make them again with "
             f"./cube fem MODEL --surface, with side: {side:g} in the model"
         )
 
-    same_size = abs(given.pad_size - layout.pad_size) <= _LENGTH_TOLERANCE
+    same_size = abs(given.pad_size - layout.pad_size) <= _MATCH_TOLERANCE
     matches = []
     for name, position, normal in zip(
         layout.pads,
@@ -137,7 +138,7 @@ def _match_pads(influence: Influence, calibration: Calibration) -> list[int]:
         difference = shift.max(axis=1)
         difference += turn.max(axis=1)
         nearest = int(np.argmin(difference))
-        if difference[nearest] > _LENGTH_TOLERANCE or not same_size:
+        if difference[nearest] > _MATCH_TOLERANCE or not same_size:
             raise ElasticError(
                 f"the influence functions have no pad like {name} of layout {layout.name!r}; make "
                 "them again with ./cube fem MODEL --surface for this layout"

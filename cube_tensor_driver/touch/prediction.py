@@ -152,7 +152,9 @@ class MissingValuePrediction:
         return filled
 
     def noise(self, pad_variance: Single) -> Array:
-        """Compute the variances of the pressures that pad noise causes through the predictions.
+        """Compute the variances that pad noise adds to the pressures through the predicted values.
+
+        Missing values are predicted from other values, which contain the noise of the pads.
 
         Args:
             pad_variance: Variance (cubes, P) of the error of each pad, divided by the variance of

@@ -103,9 +103,9 @@ MIN_FORCE_N = 0.05
 state is `UNKNOWN` unless slip is detected."""
 
 FOLLOWED_DEVIATION = 0.02
-"""Standard deviation of the followed ratio of shear and normal force, divided by the ratio, after
-the contact has moved by up to some millimetres since the last update of the contact tracker. It
-was 1.6 % (rms) in simulations of 24-pad cubes."""
+"""Relative standard deviation of the ratio of shear and normal force that is computed from the
+changes of the cubes' values since the last update of the contact tracker, if the contact has moved
+by up to some millimetres since then. It was 1.6 % (rms) in simulations of 24-pad cubes."""
 
 MAX_SHIFT_DEPTHS = 0.2
 """Shift of a contact, divided by the depth of the cubes' centres below the surface, after which the

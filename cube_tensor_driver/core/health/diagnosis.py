@@ -65,15 +65,15 @@ In 1000 rows, noise alone spans 6 times its standard deviation.
 """
 
 RESIDUAL_ENTER = 0.5
-"""Fraction of the rows of a window (0.5 s) with a residual above its limit above which a cube is
-reported with a high residual.
+"""Largest fraction of rows with a residual above its limit, in a window of 0.5 s, at which a cube
+is not yet reported with a high residual.
 
 The limit of the residual (from the chi-square distribution) is exceeded by noise alone in one row
 of a thousand.
 """
 
 RESIDUAL_LEAVE = 0.1
-"""Fraction of the rows of a window (0.5 s) with a residual above its limit at or below which a cube
+"""Largest fraction of rows with a residual above its limit, in a window of 0.5 s, at which a cube
 is no longer reported with a high residual.
 
 The residual measures how far the signals of a cube's pads contradict each other.
@@ -333,7 +333,9 @@ def has_high_residual(
 
 
 def _square_bound(noise: Array) -> Array:
-    """Return the limit of squared second differences of the frequency, in Hz².
+    """Return the limit, in Hz², to which squared second differences of the frequency are cut.
+
+    Without the cut, one jump of the frequency would count as high noise.
 
     Args:
         noise: Usual noise (standard deviation of the frequency) of each pad, in Hz.

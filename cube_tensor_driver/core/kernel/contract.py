@@ -33,7 +33,8 @@ DONE = -1
 """Result of the kernel (the loop over rows of frequencies): all rows are processed."""
 
 NEEDS_WINDOW = -2
-"""Result of the kernel (the loop over rows of frequencies): it has stopped before a scan.
+"""Result of the kernel (the loop over rows of frequencies): it has stopped before a scan
+(at most one row of each cube).
 
 The newest time stamp of the scan lies outside the present window of 0.5 s, over which the health of
 pads is assessed. The caller ends this window, opens another, and calls the kernel again from that
@@ -59,7 +60,8 @@ kernel stops before the first row, and no row is processed.
 """
 
 NEEDS_STEP = -5
-"""Result of the kernel (the loop over rows of frequencies): it has stopped before a scan.
+"""Result of the kernel (the loop over rows of frequencies): it has stopped before a scan
+(at most one row of each cube).
 
 The newest time stamp of the scan lies outside the present step of the compensation,
 `Offsets.step_ns`. The caller advances creep and temperature, and calls the kernel again from that

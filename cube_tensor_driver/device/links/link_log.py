@@ -73,8 +73,10 @@ class LinkLogger:
         self._left_out_silence = False
 
     def change(self, state: LinkState, error: LinkError | None) -> None:
-        """Log a change of the state of the link, except a silence, and its end, less than
-        `SILENCE_PERIOD_S` after a logged one.
+        """Log a change of the state of the link.
+
+        A silence is logged at most once in `SILENCE_PERIOD_S`. Others are left out and counted, and
+        so is the return to the open state after them.
 
         Args:
             state: The new state.

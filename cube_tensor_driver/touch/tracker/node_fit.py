@@ -399,10 +399,11 @@ def _place_nodes(region: Array, around: Array, inverse: SurfaceInverse) -> tuple
     Args:
         region: Positions (n, 2) of the points of the region in m, on the skin laid flat.
         around: Positions (m, 2) of all points around the region.
-        inverse: Pitch and spacing of the points.
+        inverse: Gives the depth and pitch of the cubes, and the spacing of the points.
 
     Returns:
-        Positions (q, 2) of at most `MAX_NODES` nodes in m, and their distance in m.
+        Positions (q, 2) of at most `MAX_NODES` nodes in m, and the distance of neighbouring ones in
+        m.
     """
     farthest = MAX_BORDER_REACH_DEPTHS * inverse.depth
     reach = min(BORDER_REACH_PITCHES * inverse.pitch, farthest)
