@@ -103,9 +103,10 @@ distance of the nearest other region, and the change of force divided by the lar
 """
 
 START_ERROR = 0.15
-"""Relative standard deviation of the stress that a contact that is not fitted yet causes in the cubes
-around other contacts. Before the fit, the force of the contact is only an estimate: the integral of
-the traction that the linear inverse problem of elasticity yields from the values of all cubes."""
+"""Relative standard deviation of the stress that a contact which is not fitted yet causes in the
+cubes around other contacts. Before the fit, the force of the contact is only an estimate: the
+integral of the traction that the linear inverse problem of elasticity yields from the values of all
+cubes."""
 
 FIT_ERROR = 0.05
 """Relative standard deviation of the stress that a fitted contact causes in the cubes around other
