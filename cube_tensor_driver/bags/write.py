@@ -252,7 +252,7 @@ class BagWriter:
             self._connect(self._part, one)
 
     def _finish_part(self) -> None:
-        """Complete the current storage file and write metadata.yaml with it."""
+        """Complete the current storage file, and list it in metadata.yaml."""
         part = self._open_part()
         summary = part.summary(self._topics)
         part.file.finish(summary)

@@ -81,7 +81,7 @@ FAST_ERROR = 0.02
 This amplitude also stands for faster creep, which a recording does not show."""
 
 REST_S = 2.0
-"""Duration at the begin of a recording, in s, in which the cube must be unloaded. The mean stress
+"""Duration at the start of a recording, in s, in which the cube must be unloaded. The mean stress
 readings of the pads in it are subtracted from all readings."""
 
 SETTLE_S = 1.0
@@ -249,8 +249,8 @@ def fit_creep(
     memory = _find_memories(seconds, reading, time, blocks)
     forecast = relaxed_share(FORECAST * hold_s / time)
     first = _solve(means, memory, load, noise, forecast, 1.0, FIRST_BEND)
-    # The recording determines well only the amplitudes whose relaxation time lies between the first
-    # fitted reading and the end of the load.
+    # The recording determines well only the amplitudes whose relaxation time lies between the time
+    # of the first fitted reading and a third of the load's duration.
     is_known = (time > SETTLE_S) & (time < hold_s / 3)
     known = first.amplitude[:, is_known]
     shorter = known[:, :-1]

@@ -32,11 +32,11 @@ class SampleRows(Protocol):
 
     @property
     def cube(self) -> AnyArray:
-        """Index of the cube (N,)."""
+        """Index (N,) of the cube of each sample."""
 
     @property
     def sequence(self) -> AnyArray:
-        """Sequence number (N,)."""
+        """Sequence number (N,) that the hub gave each sample."""
 
     @property
     def stamp_ns(self) -> AnyArray:

@@ -1,6 +1,9 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""A node that observes a skin in other processes; `./cube demo`, torture and bench use it."""
+"""A ROS node that receives messages of nodes in child processes, and checks that these still run.
+
+`./cube demo`, torture and bench use it.
+"""
 
 from __future__ import annotations
 

@@ -35,9 +35,9 @@ from .wire.native import NOT_COMPILED, wire
 from .wire.protocol import VERSION, Ack, Command, Hello, Sample, Stats, Time
 
 MAX_SCANS = 4
-"""Default limit of the number of scans (one sample of every cube) per callback. If the caller
-requests n scans per callback, the limit is at least n + 1. After a pause of the process many scans
-wait; the limit keeps the memory that one callback needs small."""
+"""Maximum number of scans (one sample of every cube) in one call of `on_rows`, or `scans_per_call`
++ 1 if that is larger. After a pause of the process many scans wait; the limit keeps the memory that
+one call needs small."""
 MAX_EVENTS = 100
 """Number of changes of state (open, silent, closed …) of one link that are kept for the next
 `LiveLinks.report`. If there are more, the oldest are discarded."""

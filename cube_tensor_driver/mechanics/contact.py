@@ -258,10 +258,14 @@ def _compute_airy(
 ) -> tuple[Array, Array]:
     """Compute the field C_ij at the head of this file and its gradient, summed over the forces.
 
-    It is the part of the stress that depends on Poisson's ratio. In a plane Z = const, a function h
-    of the distance r has the second derivatives delta_ij h1 + d_i d_j h2 with h1 = h'/r, h2 =
-    h1'/r; h3 = h2'/r follows in the same way. These functions have the names chi1 to chi4 for h =
-    chi, log1 to log3 for h = chi_Z = ln(R + Z), and inv1 and inv2 for h = chi_ZZ = 1/R.
+    C is the part of the stress that depends on Poisson's ratio. It consists of derivatives of the
+    potentials chi, chi_Z = ln(R + Z) and chi_ZZ = 1/R. In a plane Z = const, each potential is a
+    function h of r = sqrt(d_x^2 + d_y^2), and its second derivatives are::
+
+        h_ij = delta_ij h1 + d_i d_j h2,   h1 = h'/r,   h2 = h1'/r
+
+    Higher derivatives contain h3 = h2'/r and h4 = h3'/r. In the code, the numbered functions are
+    called chi2 to chi4 for h = chi, log1 to log3 for h = chi_Z, and inv1 and inv2 for h = chi_ZZ.
 
     Args:
         d: Positions (..., N, L, 3) of N points from L forces, in m.

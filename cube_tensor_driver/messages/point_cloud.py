@@ -1,6 +1,9 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Headers and point clouds, made from a function that constructs messages."""
+"""PointCloud2 messages and message headers.
+
+The caller passes the function that constructs a message, because this folder does not import ROS.
+"""
 
 from __future__ import annotations
 

@@ -109,7 +109,7 @@ def _claim_domain() -> tuple[int, socket.socket]:
         # If the port is in use, another process of this package has reserved the domain.
         if claim is None:
             continue
-        # Any node that runs in the domain has bound the port of the first participant.
+        # If the port of the first participant is in use, a node runs in the domain.
         participant = _bind(domain, PARTICIPANT_OFFSET)
         if participant is not None:
             participant.close()

@@ -220,7 +220,10 @@ def _compute_hankel_transforms(
     bessel: BesselTable,
     weight: Array,
 ) -> tuple[Array, Array, Array]:
-    """Compute the spectra of n circular components of one order m.
+    """Compute the spectra P, M and N (file head) of n circular components of one order m.
+
+    A circular component is a combination of the pads' stresses that a rotation about the normal of
+    the skin only multiplies by a phase.
 
     Args:
         functions: Radial functions R, Z and T (n, 3, distances): response to a radial, normal and
@@ -230,7 +233,8 @@ def _compute_hankel_transforms(
         weight: Quadrature weights r dr (distances,) in m^2.
 
     Returns:
-        Hankel transforms P, M and N (waves, n) at the wave numbers of `bessel`.
+        Spectra P, M and N (waves, n), the Hankel transforms of R + T, R - T and Z, at the wave
+        numbers of `bessel`.
     """
     along, normal, across = np.moveaxis(functions, 1, 0)
 

@@ -50,8 +50,9 @@ and missing values of the centre cube are computed. With all 25 cubes of a windo
 matrices P (inverse covariances of the values) would take most of the memory."""
 
 MODEL_ERROR = 0.01
-"""Standard deviation of the error of the measurement model (calibration, depth) in one component,
-divided by the prior standard deviation of this component."""
+"""Standard deviation of the error that inexact calibrations and an inexact depth of the cubes cause
+in a measured component (stress or gradient), divided by this component's prior standard
+deviation."""
 
 ROWS_PER_POINT = 4
 """Number of results per surface point: the traction along x, y and z, and the pressure below the
@@ -328,16 +329,17 @@ def _solve_window(
     angle: Array,
     points: Array,
 ) -> _Window:
-    """Compute the matrices of one window from W cubes to the points around its centre cube.
+    """Compute the matrices of one window, for the traction around its centre cube.
 
-    Positions and rotations are in the frame of the centre cube, around which the skin is laid flat.
+    The traction follows from the values of the W cubes of the window. Positions and rotations are
+    in the frame of the centre cube, around which the skin is laid flat.
 
     Args:
         traction_prior: Prior covariances of traction and measured components.
         model: Components that the W cubes of the window observe, and their noise.
         place: Positions (W, 2) of the cubes in m.
         angle: Rotations (W,) of the cubes in rad.
-        points: Positions (points, 2) on the patch of the centre cube, in m.
+        points: Positions (points, 2) on the surface around the centre cube, in m.
     """
     columns = model.columns
     n = len(place)

@@ -126,8 +126,8 @@ MAX_LINEARISATIONS = 2
 cubes' values by force and position are computed. Each contact takes about 1 ms."""
 
 NEIGHBOUR_PITCHES = 3.0
-"""Distance of contacts, divided by the pitch (distance of neighbouring cubes), within which they
-are followed jointly."""
+"""Distance of two contacts, divided by the pitch (distance of neighbouring cubes), below which
+changes of the cubes' values are attributed to changes of both contacts."""
 
 
 class Slip(NamedTuple):

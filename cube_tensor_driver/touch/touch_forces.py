@@ -27,8 +27,8 @@ from ..mechanics.load_response import LoadResponse
 from .unrolled_skin import unroll
 
 LOAD_WIDTH = 5e-3
-"""Diameter, in m, of the Hertz contacts for which the estimate is computed. The estimate is linear,
-and wider contacts are sums of such contacts."""
+"""Diameter, in m, of the Hertz contact that is assumed as the load whose force is estimated. The
+estimate is linear, and wider contacts are sums of such contacts."""
 
 FORCE_DEVIATION = 0.1
 """Standard deviation s, in N, of the Gaussian prior of each component of the force of the load, a

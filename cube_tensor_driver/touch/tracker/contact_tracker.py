@@ -310,11 +310,13 @@ class ContactTracker:
         return np.asarray(to_regions)
 
     def _choose_updates(self, max_work: float) -> list[TrackedRegion]:
-        """Return the regions whose fits are computed for the newest values: all fits of Hertz
-        contacts, and those fits on nodes that have waited longest (`MAX_NODE_UPDATES`).
+        """Return the regions whose fits are computed again for the newest values.
+
+        These are all regions with Hertz contacts. Of those whose traction is fitted on nodes (small
+        contacts on a grid), they are the `MAX_NODE_UPDATES` that have waited longest.
 
         Args:
-            max_work: Largest work of the scan; infinite: all regions are chosen.
+            max_work: As `MAX_WORK_PER_SCAN`. Infinite: all fitted regions are chosen.
         """
         nodes = [region for region in self._fitted if isinstance(region.fit, NodeFit)]
         waiting = []

@@ -53,10 +53,12 @@ MAX_MISFIT_GROWTH = 1.3
 which the region is fitted again. The misfit grows when a contact moves or changes its shape."""
 
 MAX_HERTZ_MISFIT = 1.5
-"""Misfit (chi-squared per known value) of the cubes nearest to Hertz contacts, above which a fit of
-the traction on nodes (small contacts on a grid) is used instead. The misfit of the right model is
-1 with a standard deviation of 0.12 for 9 cubes with 15 values each, and of 0.2 for planar
-cubes."""
+"""Largest misfit (chi-squared per known value) of a fit of Hertz contacts at the cubes nearest to
+them. Above it, a fit of the traction on nodes (small contacts on a grid) is used instead.
+
+The misfit of the right model is 1 with a standard deviation of 0.12 for 9 cubes with 15 values
+each, and of 0.2 for planar cubes, whose pads lie in one plane and determine fewer values.
+"""
 
 MAX_NEAR_MISFIT = 200.0
 """Misfit (chi-squared per known value) up to which the first Hertz contact of a region is kept
