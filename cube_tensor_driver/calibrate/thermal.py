@@ -310,14 +310,15 @@ def _search(
     degree: int,
     slope: float,
 ) -> _Solution:
-    """Return the solution with the most likely lags.
+    """Find the most likely time constants (lags) of the low-pass filters, and the coefficients.
 
-    The search begins with the grid `LAGS_S`, which is refined around the best solution.
+    The filters model how the elastomer's temperature lags behind the thermometer. The search begins
+    with the grid `LAGS_S`, which is refined around the best solution.
 
     Args:
-        data: Averages over blocks of time.
+        data: Temperatures and pad stresses, averaged over blocks of 1 s.
         n_lags: Number of low-pass filters.
-        degree: Highest power of the temperature.
+        degree: Highest power of the filtered temperature in the fitted stress.
         slope: Rms of the linear coefficients over the pads, in Pa/K; 0: not known yet.
     """
 

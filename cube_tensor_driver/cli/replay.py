@@ -49,7 +49,11 @@ def add_arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Publish a bag; a reconstruction node makes the stress again."""
+    """Publish the recorded messages of a bag.
+
+    Stress is published only if an option asks for it, because a reconstruction node computes it
+    anew from the published frequencies.
+    """
     from ..bags.read import Bag
     from ..ros.commands.replay import replay
 

@@ -419,7 +419,8 @@ class Pipeline:
 
         Args:
             rows: N rows of frequencies.
-            known: Whether the health of a row is given (N,), or None.
+            known: Whether the health of the pads is given for each row (N,), so that the kernel
+                does not assess it; None: for no row.
 
         Raises:
             LayoutError: The frequencies have the wrong shape.

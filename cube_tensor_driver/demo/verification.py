@@ -28,8 +28,9 @@ class Arrivals:
     """Stores which rows (one cube at one sampling time) have arrived, and when.
 
     Attributes:
-        row_count: (cubes,) number of sent rows that one stored row of a cube represents; 0 for
-            cubes whose rows are not stored.
+        row_count: (cubes,) number of rows that each stored row of a cube counts as: 1, or, if only
+            the first cube of each hub is stored, the number of cubes of its hub. 0 for cubes whose
+            rows are not stored.
         rows: Number of rows that have arrived, stored or not.
     """
 

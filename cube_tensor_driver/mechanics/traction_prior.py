@@ -83,13 +83,18 @@ class TractionPrior:
         self.pressure_variance = float(tables["own"])
 
     def _tabulate(self) -> Arrays:
-        """Compute the covariances at the tabulated distances.
+        """Compute the covariances of the n circular components at the tabulated distances.
+
+        Circular components (circular.py) are complex combinations of the stresses and gradients at
+        a cube. Here they are in a frame whose x axis points to the cube from the other position (a
+        cube or a point of the surface). Their real parts are then independent of the imaginary
+        ones.
 
         Returns:
-            cross: Radial functions R, Z and T (distances, 3, n) (circular.py) of the covariance of
-                the circular components with the traction at a point of the surface.
-            real: Covariance (distances, n, n) of the real parts of two cubes' components.
-            imaginary: Covariance (distances, n, n) of their imaginary parts.
+            cross: Covariance of the components with the traction at a point of the surface, as
+                the radial functions R, Z and T of circular.py (distances, 3, n).
+            real: Covariance (distances, n, n) of the real parts of the components at two cubes.
+            imaginary: Covariance (distances, n, n) of the imaginary parts at two cubes.
             pressure: Covariance (distances, n) of the real parts with the pressure at the cubes'
                 depth below a point of the surface.
             own: Variance of the pressure at the cubes' depth.

@@ -194,7 +194,9 @@ class WindowPosteriors:
         place: Array,
         angle: Array,
     ) -> Index:
-        """Number the kinds of windows: same relative poses, noise and calibrations of the cubes.
+        """Find windows (cubes nearest to one cube) of the same kind, which share their matrices.
+
+        The cubes of such windows have the same relative poses, noise and calibrations.
 
         Args:
             model: Components that all cubes observe, and their noise.

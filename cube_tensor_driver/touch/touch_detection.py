@@ -70,8 +70,9 @@ of the farther cube divided by that of the nearer one. This ratio limits the pre
 can cause at other cubes. A touch at such a cube must exceed this limit."""
 
 MAX_DISTANT_RATIO = 1e-4
-"""Largest ratio of the pressure of a cube at least seven pitches away from a load to the largest
-pressure, at a pitch of 8 mm, a depth of 5 mm, and with a shear force of half the normal one."""
+"""Upper limit of the pressure that a load causes at a cube at least seven pitches away, divided by
+the largest pressure of all touched cubes. A touch at such a cube must exceed this limit. The value
+holds for a pitch of 8 mm, a depth of 5 mm, and a shear force of half the normal force."""
 
 MAX_DRIFT = 0.5
 """Largest drift of the pressure, in Pa/s, at which the rate of false alarms holds. All pads of a
@@ -98,7 +99,8 @@ standard deviations of the noise, at which the slow part starts again. So large 
 the slow part had adapted to a load, which has ended now."""
 
 STALE_NS = 1_000_000_000
-"""Time, in ns, without a sample of a cube after which nothing is known of it."""
+"""Maximum age, in ns, of the newest sample of a cube, relative to the newest sample of all cubes.
+If it is older, the cube counts as untouched, and its next sample starts the detection again."""
 
 PRESSURE = COMPONENTS.index("zz")
 """Index in `COMPONENTS` of the stress zz, whose negative is the pressure."""

@@ -65,8 +65,8 @@ class ForcesAtCubes:
         """Store the poses of the cubes in float32.
 
         Args:
-            poses: Poses in the parent frame of the skin. For the same bits as a recording, they
-                must be those of its SkinInfo message.
+            poses: Poses in the parent frame of the skin. Only those of the SkinInfo message of a
+                recording reproduce its forces bit for bit.
         """
         # The factor 1 is that of the specific force at the origin.
         position = np.insert(poses.position, 0, 1, axis=1)

@@ -192,19 +192,21 @@ class HealthState(NamedTuple):
 
 
 class Offsets(NamedTuple):
-    """Values that the kernel subtracts from v (pad stress / stiffness), because they are no load.
+    """Offsets that creep, temperature and weight cause in v (pad stress / stiffness).
 
-    For a row of cube c at the time t with the specific force s it is
+    The kernel subtracts them, so that only the effect of the load is left. In a row (sample) of
+    cube c at the time t with the specific force s (acceleration minus gravity), the offset is
 
         offset[c] + (slope[c] + gain[c] * v) * (t - since_ns[c]) + sum_i response[c, i] * s_i
 
-    The last term is weight; all others are creep and temperature. Values for pads that a cube does
-    not have are 0. The kernel changes the last four arrays.
+    The last term is the effect of weight, the others are those of creep and temperature. Values for
+    pads that a cube does not have are 0. The kernel changes the last four arrays.
 
     Attributes:
-        step_ns: Begin and end of the interval of time in which these values hold (2,), in ns.
+        step_ns: Begin and end of the time step in which `offset`, `slope` and `gain` hold (2,), in
+            ns.
         since_ns: Time for each cube from which t is counted in the equation (C,), in ns.
-        offset: Offsets of creep and temperature at this time (C, P).
+        offset: Offsets by creep and temperature at the time `since_ns` (C, P).
         slope: Change of the offset per second (C, P), for v = 0.
         gain: Additional change of the offset per second and per v (C, P).
         lasting: Status bits of creep and temperature (C,), for rows at most `MAX_GAP_NS` later than
@@ -213,8 +215,8 @@ class Offsets(NamedTuple):
         weighing: Status bits of weight (C,), for rows with a known specific force. Other rows get
             COMPENSATION instead.
         newest_ns: Time stamp of the newest row of each cube (C,), in ns; 0: none.
-        reading: v of this row before the subtraction (C, P); NaN where a pad was not used.
-        subtracted: What was subtracted from it (C, P).
+        reading: v of the newest row before the subtraction (C, P); NaN where a pad was not used.
+        subtracted: Offset that was subtracted from `reading` (C, P).
         newest_force: Specific force of the newest row that has this column (C, 3); NaN: unknown.
     """
 

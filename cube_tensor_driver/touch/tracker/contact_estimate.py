@@ -16,8 +16,8 @@ import numpy as np
 from ...core.arrays import Array
 
 _MIN_NORMAL_FORCE = 1e-12
-"""Smallest absolute value, in N, of the normal force in the position of a contact, which is the
-first moment of the pressure divided by the normal force. The limit avoids a division by 0."""
+"""Smallest normal force, in N, by which the first moment of the pressure is divided to find the
+position of a contact. It replaces any smaller force, which avoids a division by 0."""
 
 _HERTZ_MOMENT = 0.2
 """Second moment of the pressure of a Hertz contact about its centre along one axis, divided by the

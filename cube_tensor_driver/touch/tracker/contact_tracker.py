@@ -157,8 +157,9 @@ class ContactTracker:
             values: Components (cubes, 15) in Pa and Pa/m, NaN where unknown.
             uncertain: Whether the compensation of each cube is uncertain, so that a new contact
                 needs `UNCERTAIN_PRESSURE`; None: of no cube.
-            max_work: As `MAX_WORK_PER_SCAN`. 0: no fit is made or improved. Infinite: all fits are
-                improved as far as possible.
+            max_work: Computing work, in the unit of `MAX_WORK_PER_SCAN`, after which no further
+                step of a fit is made in this scan. 0: no fit is made or improved. Infinite: all
+                fits are improved as far as possible.
 
         Returns:
             Contacts, the one with the largest normal force first.

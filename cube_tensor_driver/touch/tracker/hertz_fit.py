@@ -484,11 +484,11 @@ def linearise(inverse: SurfaceInverse, fits: Sequence[HertzFit]) -> None:
 def _linearise_alike(
     inverse: SurfaceInverse, fits: list[HertzFit], contacts: int, cubes: int
 ) -> None:
-    """Linearise the response of the cubes at the contacts of K fits of the same shape.
+    """Linearise the response of the cubes for K fits with equal numbers of contacts and cubes.
 
     Args:
-        inverse: Responses of the cubes.
-        fits: The K fits.
+        inverse: Responses (stress in the skin under contacts of unit force).
+        fits: The K fits, whose attribute `linear` is set.
         contacts: Number J of contacts of each fit.
         cubes: Number n of cubes of each fit.
     """
