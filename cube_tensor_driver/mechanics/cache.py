@@ -28,8 +28,8 @@ MAX_CACHE_BYTES = 1 << 30
 removed."""
 
 _CONTENT = "content"
-"""Name of the array in each cached file that lists the file's other arrays with their types and
-shapes, by which a file that has lost an array is recognised."""
+"""Name of the array in each cached file that lists the other arrays of the file with their types
+and shapes. By this list, a file that has lost an array is recognised."""
 
 _CODE = ("mechanics", "touch")
 """Folders of the package with source files whose change makes all cached arrays invalid."""
@@ -100,7 +100,7 @@ def _load(path: Path) -> Arrays | None:
         Arrays by name; None if the file is missing or damaged, or cannot be marked.
     """
     try:
-        # The factor leaves room for the headers of the file.
+        # The limit is above that of `_store`, because a file contains headers besides the arrays.
         arrays = read_arrays(path, 2 * MAX_CACHE_BYTES)
         # The file's time becomes the time of its last use, by which `_make_room` sorts.
         os.utime(path)
@@ -117,7 +117,7 @@ def _describe(arrays: Arrays) -> AnyArray:
 
 
 def _store(path: Path, arrays: Arrays) -> None:
-    """Store arrays in a file, which appears complete, even if several processes store it at once.
+    """Store arrays in a file, of which other processes never see an incomplete version.
 
     Arrays of more than `MAX_CACHE_BYTES` are not stored.
 

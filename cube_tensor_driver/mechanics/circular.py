@@ -62,16 +62,16 @@ def _define_components() -> tuple[Complex, Orders]:
 
     components = combine_stresses("") + combine_stresses("_z")
 
-    # d/dx + i d/dy raises the angular order n of a component (its factor exp(i n phi)) by one,
-    # and d/dx - i d/dy lowers it by one.
+    # The derivative d/dx + i d/dy of a component of order m is a component of order m + 1, and
+    # d/dx - i d/dy one of order m - 1.
     by_x = combine_stresses("_x")
     by_y = combine_stresses("_y")
     pairs = zip(by_x, by_y, strict=True)
     for (order, along_x), (_, along_y) in pairs:
         raised = along_x + 1j * along_y
         components.append((order + 1, raised))
-        # If the order is 0, the component is real. Its two combinations are then complex conjugates
-        # of each other, and one of them is enough.
+        # A component of order 0 is real. Its derivatives `raised` and `lowered` would be complex
+        # conjugates of each other, so one of them is enough.
         if order > 0:
             lowered = along_x - 1j * along_y
             components.append((order - 1, lowered))
@@ -81,7 +81,7 @@ def _define_components() -> tuple[Complex, Orders]:
 
 
 _COMPONENTS = _define_components()
-"""Matrix and orders of the circular components, which are defined together."""
+"""Pair of arrays that define the circular components: `CIRCULAR_FROM_FIELD` and `ORDERS`."""
 
 CIRCULAR_FROM_FIELD = _COMPONENTS[0]
 """Matrix (14, 24) from the stresses and gradients `FIELD` to the circular components. A circular
@@ -89,7 +89,8 @@ component is a combination of stresses and gradients that a rotation of the fram
 angle multiplies by exp(-i m angle), where m is its order."""
 
 ORDERS = _COMPONENTS[1]
-"""Order m (14,) of each circular component."""
+"""Order m (14,) of each circular component: a rotation of the frame about z by an angle multiplies
+the component by exp(-i m angle)."""
 
 _PARTS_FROM_FIELD = np.concatenate([CIRCULAR_FROM_FIELD.real, CIRCULAR_FROM_FIELD.imag])
 """Matrix (28, 24) from the stresses and gradients `FIELD` to the real and then the imaginary parts
@@ -99,14 +100,15 @@ FIELD_FROM_CIRCULAR = np.linalg.pinv(_PARTS_FROM_FIELD).T
 """Matrix (28, 24) from the real and then the imaginary parts of the circular components back to the
 stresses and gradients `FIELD`.
 
-Row vectors are multiplied from the left: ``parts @ FIELD_FROM_CIRCULAR``.
+The parts are a row vector on the left of the matrix: ``field = parts @ FIELD_FROM_CIRCULAR``.
 """
 
 
 def rotation_phases(rotation: Complex, order: Orders) -> Complex:
     """Return the phases exp(i m angle) by which rotations multiply circular components of order m.
 
-    They are powers of exp(i angle), which takes a third of the time of exponential functions.
+    They are computed as powers of exp(i angle), because exponential functions take three times as
+    long.
 
     Args:
         rotation: Angles (...) of the rotations as the complex numbers exp(i angle).
@@ -134,12 +136,13 @@ def rotate_loads(
     Args:
         parts: Radial functions R, Z and T (N, 3, n) at the distances of N cubes from their load:
             factors of the radial, normal and tangential force (head of this file).
-        direction: Directions (N,) from the load to the cube, from the x axis on, in rad.
-        angle: The same directions (N,) in the frame of the cube, in rad.
+        direction: Directions (N,) from the load to the cube, as angles from the x axis, in rad.
+        angle: The same directions (N,), as angles from the x axis of the cube's frame, in rad.
         order: Orders m (n,) of the circular components.
 
     Returns:
-        Real parts and then imaginary parts (N, 3, 2 n), for loads along x, y and z.
+        Real parts and then imaginary parts (N, 3, 2 n) of the n components, for loads along x, y
+        and z.
     """
     radial = parts[:, 0]
     normal = parts[:, 1]
@@ -165,7 +168,8 @@ def sum_rotated(
 
     Args:
         circular: Circular components (N, L, 14) of L fields at N cubes, each in its own frame.
-        rotation: Angle (N, L) of each frame about z as the complex number exp(i angle).
+        rotation: Angle (N, L) about z of the frame of each field in the frame of its cube, as the
+            complex number exp(i angle).
 
     Returns:
         Stress (N, 6) and gradient (N, 6, 3) in the frame of each cube, summed over the L fields.

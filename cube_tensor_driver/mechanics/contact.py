@@ -282,7 +282,7 @@ def _compute_airy(
     force = (fx, fy)
     f_dot_d = fx * x + fy * y
 
-    # Derivatives of the potentials as polynomials in u = 1/R and v = 1/(R + Z)
+    # The derivatives of the potentials are polynomials in u = 1/R and v = 1/(R + Z).
     u = 1.0 / distance
     v = 1.0 / (distance - z)  # 1 / (R + Z), finite because Z >= 0
     chi2 = u * v**2
@@ -308,8 +308,8 @@ def _compute_airy(
         """Return the second derivative g_ij of the Airy function g, or the derivative of g_ij by Z.
 
         g contains one potential h for tangential forces and one for normal forces. The arguments
-        are h1 = h'/r, h2 = h1'/r and h3 = h2'/r of these, where ' is the derivative by the distance
-        r in a plane Z = const.
+        are the functions h1 = h'/r, h2 = h1'/r and h3 = h2'/r of these two potentials, where ' is
+        the derivative by the distance r in a plane Z = const.
 
         Args:
             i: First axis of the derivative, 0 (x) or 1 (y).

@@ -2,12 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Response of cubes at one depth to Hertz contacts on the surface.
 
-The response at the offset p = r (cos phi, sin phi) of cube and contact is an integral over the wave
-vector k of the spectra c(k) of the circular components (spectra.py)::
+The response at the offset p = r (cos phi, sin phi) from the contact to the cube is an integral over
+the wave vector k, with the weight d2k / (4 pi^2), of the spectra c(k) of the circular components
+(spectra.py)::
 
-    response(p) = int c exp(i k.p) B_a,     B_a = 3 (sin ka - ka cos ka) / (ka)^3     [d2k / 4 pi2]
+    response(p) = int c exp(i k.p) B_a,     B_a = 3 (sin ka - ka cos ka) / (ka)^3
 
-B_a is the spectrum of Hertz's pressure on a disc of radius a with a force of 1 N.
+B_a is the spectrum (Fourier transform) of Hertz's pressure on a disc of radius a with a force of
+1 N.
 
 Source: K. L. Johnson, Contact Mechanics (1985), 4.2 (Hertz).
 """
@@ -138,10 +140,10 @@ class ContactResponse:
             force: Force (N, 3) in N of the contact, along x, y and z.
 
         Returns:
-            Components (N, 8, 15). The first three are those under a force of 1 N along x, y and z.
-            The next four are derivatives of those under `force`: by x and y of the contact's
-            centre, and first and second derivative by the logarithm of the radius. The last are
-            those under a moment of 1 N m about z.
+            Eight sets (N, 8, 15) of components. Sets 0 to 2 are the components under a force of 1 N
+            along x, y and z. Sets 3 to 6 are derivatives of the components under `force`: by x and
+            y of the contact's centre, then the first and second derivative by the natural logarithm
+            of the radius. Set 7 is the components under a moment of 1 N m about z.
         """
         true_distance, direction = to_polar(place)
         distance = np.maximum(true_distance, _MIN_DISTANCE * self._depth)
@@ -204,8 +206,9 @@ class ContactResponse:
             size: Radius (N,) of the contact in m.
 
         Returns:
-            Functions (N, 4, 3, n) and their derivatives: value, slope over the distance, first and
-            second derivative by the logarithm of the radius.
+            Array (N, 4, 3, n) of the three functions for n circular components. Its second axis
+            holds the value, the derivative by the distance, and the first and second derivative by
+            the natural logarithm of the radius.
         """
         first, by_distance, distance_slope = self._table.weights(distance, 2)
         size_index = _find_size_index(size, self._depth)
@@ -275,7 +278,8 @@ class ContactResponse:
             force: Force (N, 3) in N of the contact, along x, y and z.
 
         Returns:
-            Changes (N, S, 15) in Pa for one standard deviation of each of the S quantities.
+            Changes (N, S, 15) in Pa for one standard deviation of each of S quantities: depth,
+            Poisson's ratio and, in a layer of finite thickness, the thickness.
         """
         circular = self._respond_fast(self._sensitivity_rows, ORDERS, place, angle, size, force)
         return np.asarray(_split(circular) @ self._point_matrix)
@@ -417,7 +421,10 @@ class ContactResponse:
 
 
 def _find_size_index(size: Array | float, depth: float) -> Array:
-    """Return the fractional indices (...) of radii in `DISC_SIZES`, within the table.
+    """Return the fractional indices (...) of radii in `DISC_SIZES`.
+
+    The indices are limited to the range in which cubic interpolation is possible, which needs one
+    tabulated radius below and two above.
 
     Args:
         size: Radii (...) in m.

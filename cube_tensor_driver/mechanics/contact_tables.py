@@ -3,9 +3,9 @@
 """Tables of the stress and gradient at cubes under contacts, fast enough for every simulation step.
 
 `DiscTables` are for round contacts, `PolygonTables` for polygons of uniform traction. Both hold
-circular components (circular.py) of unit loads, and both compute a field in three steps:
-interpolate the tables, weight the unit loads with the loads, rotate the sum into the frame of the
-cube.
+circular components (circular.py) under unit loads, and both compute a field in three steps: they
+interpolate the tables, multiply the components by the actual loads and sum them, and rotate the sum
+into the frame of the cube.
 
 For round contacts, the functions R, T and Z of circular.py are tabulated over the distance r and
 the radius of the contact.
@@ -19,8 +19,9 @@ that turns about O. The circular components of a right triangle then are::
 
     c = exp(i m beta) (A v + B conj(v) + Z v_z + W w),     v = (v_x + i v_y) exp(-i beta)
 
-A, B, Z and W over d and t are integrals of the R, T and Z of a point force. In polar coordinates
-about O, with alpha from the first leg on, the hypotenuse is at r = d / cos(alpha)::
+A, B, Z and W are functions of d and t: integrals of the R, T and Z of a point force. In polar
+coordinates r and alpha about O, with alpha = 0 along the first leg, the hypotenuse is at
+r = d / cos(alpha)::
 
     A = -(-1)^m int exp(i (m-1) alpha) int (R + T) / 2 r dr dalpha
     B = -(-1)^m int exp(i (m+1) alpha) int (R - T) / 2 r dr dalpha
@@ -50,16 +51,21 @@ surface. Other radii are rounded to the nearest one; within the range, this chan
 10 %."""
 
 GRID_STEP = 1 / 16
-"""Step of the grid of the polygon tables, in asinh(d) and in asinh(t / sqrt(1 + d**2)). d is the
-distance of the line through a polygon's edge from the point of the surface above the cube, t the
-length along this line from its nearest point, both divided by the depth of the cubes. The
-function asinh makes the grid fine near the cube and coarse far away."""
+"""Step of the grid of the polygon tables, in asinh(d) and in asinh(t / sqrt(1 + d**2)).
+
+d is the distance of the line through a polygon's edge from the point of the surface above the cube.
+t is the length along this line, from the point that is nearest to the cube. Both are divided by the
+depth of the cubes. The function asinh makes the grid fine near the cube and coarse far away.
+"""
 
 MAX_LEG_RATIO = 50.0
-"""Largest tabulated t / sqrt(1 + d**2). d is the distance of the line through a polygon's edge from
-the point of the surface above the cube, t the length along this line from its nearest point, both
-divided by the depth of the cubes' centres. Longer edges are cut off there, because traction farther
-away hardly causes any stress at the cube."""
+"""Largest tabulated ratio t / sqrt(1 + d**2) of the polygon tables.
+
+d is the distance of the line through a polygon's edge from the point of the surface above the cube.
+t is the length along this line, from the point that is nearest to the cube. Both are divided by the
+depth of the cubes' centres. Longer edges are cut off at this ratio, because traction farther away
+hardly causes any stress at the cube.
+"""
 
 _LAST_DISTANCE = REACH_DEPTHS * POINTS_PER_DEPTH
 """Index of the largest tabulated distance between a round contact and a cube."""
@@ -87,7 +93,7 @@ which the edge counts as a point and has no effect. The limit avoids a division 
 
 
 class _ContactTables:
-    """Base of the tables for round contacts and for polygons: look-up and summation of fields.
+    """Base class of the tables for round contacts and for polygons, which looks up and sums fields.
 
     Args:
         layer: Elastic layer that contains the cubes.
@@ -106,8 +112,8 @@ class _ContactTables:
         self.depth = depth
         inputs = [layer.thickness, layer.poisson, depth]
         table = load_or_compute(self._kind, inputs, self._compute)["table"]
-        # Complex numbers are stored as pairs of real ones, one row per grid point, so that a
-        # product of real matrices interpolates.
+        # Complex numbers are stored as pairs of real ones, with one row per grid point, so that the
+        # interpolation is a product of real matrices.
         n_loads = table.shape[-2]
         width = n_loads * len(ORDERS)
         self._rows = table.reshape(-1, width).view(np.float32)
@@ -128,13 +134,14 @@ class _ContactTables:
         loads: Complex,
         rotation: Complex,
     ) -> tuple[Array, Array]:
-        """Interpolate the tables and sum the fields of all loads.
+        """Interpolate the tables and sum the fields of L loads at each of N cubes.
 
         Args:
             weights: Interpolation weights (N, L, W) of W grid points.
             rows: Rows (N, L, W) of the tables that hold these grid points.
             loads: Amplitudes (N, L, unit loads) in the frame in which the tables are given.
-            rotation: exp(i angle) (N, L) of this frame in the frame of the cube.
+            rotation: Angle (N, L) about z of this frame in the frame of the cube, as the complex
+                number exp(i angle).
 
         Returns:
             Stress (N, 6) in Pa and gradient (N, 6, 3) in Pa/m.
@@ -394,8 +401,10 @@ def _find_triangle_neighbours(d: Array, t: Array) -> tuple[Single, Index]:
     """Return weights and rows with which a polygon's edge is looked up in the tables.
 
     Args:
-        d: Distance (...) of the edge's line, divided by the depth.
-        t: Start and end (..., 2) of the edge along this line, divided by the depth.
+        d: Distance (...) of the line through the edge from the point of the surface above the cube,
+            divided by the depth.
+        t: Positions (..., 2) of the start and the end of the edge along this line, from the point
+            that is nearest to the cube, divided by the depth.
 
     Returns:
         Weights (..., 8) of bilinear interpolation, and the rows (..., 8) of the table to which they

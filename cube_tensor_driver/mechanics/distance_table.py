@@ -20,9 +20,8 @@ value."""
 
 REACH_DEPTHS = 20
 """Largest tabulated distance along the surface from a load to a cube, divided by the depth of the
-cubes' centres below the surface. Responses and covariances at larger distances are those at this
-one times the inverse square of the distance, as the stress by a tangential force on a half space
-falls."""
+cubes' centres below the surface. Beyond it, responses and covariances fall with the inverse square
+of the distance, like the stress under a tangential force on a half space."""
 
 _POWERS = np.vander([-1, 0, 1, 2], increasing=True)
 """Powers 1, t, t^2, t^3 (4 table entries, 4 powers) at the entries t = -1, 0, 1, 2."""
@@ -35,15 +34,20 @@ _DERIVATIVE = np.diag([1.0, 2.0, 3.0], -1)
 """Matrix (4, 4) from the coefficients of a cubic polynomial to those of its derivative."""
 
 _SLOPE = _VALUE @ _DERIVATIVE
-"""Coefficients (4 table entries, 4 powers) of the first derivatives of these polynomials."""
+"""Coefficients (4 table entries, 4 powers) of the first derivatives of the polynomials whose
+coefficients are `_VALUE`."""
 
 _CURVATURE = _SLOPE @ _DERIVATIVE
-"""Coefficients (4 table entries, 4 powers) of their second derivatives."""
+"""Coefficients (4 table entries, 4 powers) of the second derivatives of the polynomials whose
+coefficients are `_VALUE`."""
 
 _CUBIC_LAGRANGE = np.stack([_VALUE, _SLOPE, _CURVATURE])
 """Coefficients (3, 4 table entries, 4 powers) of the weights of cubic Lagrange interpolation, and
-of their first and second derivative: with the fraction t of the index between the second and the
-third entry, the weight of an entry is the sum of its coefficients times 1, t, t^2, t^3."""
+of the first and second derivatives of these weights.
+
+The weight of an entry is the sum of its coefficients times 1, t, t^2, t^3. t is 0 at the second of
+the four entries and 1 at the third.
+"""
 
 
 class DistanceTable:
@@ -78,21 +82,24 @@ class DistanceTable:
 
         Args:
             distance: Distances (N,) in m.
-            count: Number of derivatives by the index of the row, the value included.
+            count: Number of sets of weights: 1 for those of the value, 2 for those of its first
+                derivative by the row number, too, 3 for those of the second derivative, too.
 
         Returns:
-            Index (N,) of the first of the four rows from which each value is interpolated, and for
-            each derivative the weights (4, N) of these rows.
+            Index (N,) of the first of the four rows from which each value is interpolated, and the
+            sets of weights (4, N) of these rows.
         """
         index, decay = self.locate(distance)
-        # The table begins one step before the distance 0. The row with the number `below` is
-        # therefore one step before the entry below the distance, and so is the first of the four.
+        # Row 0 is one step before the distance 0. So row `below` is one step before the largest
+        # tabulated distance that is not above the given one, and is the first of the four rows.
         below, *weights = cubic_weights(index, count)
         return below, *(one * decay for one in weights)
 
     def locate(self, distance: Array) -> tuple[Array, Array]:
-        """Return fractional indices (N,) of distances, at most `last`, and factors (N,) by which
-        the tabulated values are multiplied beyond `REACH_DEPTHS`.
+        """Return fractional indices (N,) of distances, and factors (N,) of the tabulated values.
+
+        Beyond `REACH_DEPTHS` depths, the index stays at `last`, and the factor falls from 1 with
+        the inverse square of the distance.
 
         Args:
             distance: Distances (N,) in m.
@@ -131,10 +138,11 @@ def cubic_weights(index: Array | float, count: int = 1) -> tuple[Array, ...]:
 
     Args:
         index: Fractional index (...), which lies between the second and the third entry.
-        count: Number of derivatives by the index, the value included.
+        count: Number of sets of weights: 1 for those of the value, 2 for those of its first
+            derivative by the index, too, 3 for those of the second derivative, too.
 
     Returns:
-        Index (...) of the second entry, and for each derivative the weights (4, ...) of all four.
+        Index (...) of the second entry, and the sets of weights (4, ...) of all four entries.
     """
     first = np.floor(index).astype(np.intp)
     t = index - first
@@ -149,7 +157,7 @@ def to_polar(place: Array) -> tuple[Array, Array]:
     """Convert positions (N, 2) in the x-y plane to polar coordinates about the origin.
 
     Returns:
-        Distances (N,) from the origin, and directions (N,) from the x axis on, in rad.
+        Distances (N,) from the origin, and directions (N,), as angles from the x axis, in rad.
     """
     x, y = place.T
     return np.hypot(x, y), np.arctan2(y, x)

@@ -93,7 +93,7 @@ class Layer:
         """Compute stress and gradient at one depth under a traction exp(i k.x) on the surface.
 
         In a half space, sigma_xx and sigma_yy have no limit for k -> 0 (uniform traction), because
-        their values depend on the direction of k. Their mean over all directions is returned there.
+        they depend on the direction of k. At k = 0, their mean over all directions is returned.
 
         Args:
             kx: Wavenumber along x (...) in 1/m.
@@ -222,7 +222,7 @@ class Layer:
     def _airy_half_space(zeta: Array) -> Array:
         """Return psi and its derivatives as `_solve_airy`, for a layer of infinite thickness.
 
-        Of the four solutions of which psi is a sum, the two that grow with the depth are 0 then.
+        psi is a sum of four solutions. Two of them grow with the depth; their factors are 0 here.
         """
         decay = np.exp(zeta)[..., None]
         a = np.array([1.0, 0.0])

@@ -4,11 +4,11 @@
 
 `ContactResponse` tabulates the same responses for loads of all sizes, but it needs scipy, which the
 reconstruction node does not load. Here the wave vectors k are a square grid of finite spacing, so
-that the load repeats `PERIOD_DEPTHS` away. The response at the distance r along x is the sum
+that the load repeats along x and y with a period of `PERIOD_DEPTHS` depths. The response at the
+distance r along x is the following sum, with the transfer functions c of the layer and the spectrum
+B of the load::
 
     response(r) = sum_k c(k) B(k) exp(i k_x r) (spacing / 2 pi)^2
-
-over the transfer functions c of the layer and the spectrum B of the load.
 """
 
 from __future__ import annotations
@@ -62,9 +62,9 @@ class LoadResponse:
         n_points = PERIOD_DEPTHS // 2 * POINTS_PER_DEPTH
         distance = self._step * np.arange(n_points)
 
-        # The term of the sum for -k_x is the complex conjugate of the term for k_x. So only those
-        # for k_x >= 0 are computed, and their real parts are counted twice. A loop over k_x takes
-        # much less memory than an array of all terms.
+        # The term of the sum for -k_x is the complex conjugate of the term for k_x. So only terms
+        # for k_x >= 0 are computed, and the real parts of those for k_x > 0 are counted twice. A
+        # loop over k_x takes much less memory than an array of all terms.
         field = np.zeros((len(distance), len(FIELD), 3))
         cell = (spacing / (2 * np.pi)) ** 2
         for kx in k[count:, None]:

@@ -35,8 +35,9 @@ class MeasurementModel(NamedTuple):
         components: Matrix (variants, 2 n, 15) from the real and imaginary parts of the circular
             components to the measured `COMPONENTS` in the frame of the cube, in Pa and Pa/m.
         variant: Index (cubes,) of the variant of each cube.
-        pads: Matrix (variants, 2 n, P) from the same parts to the stress of each pad, divided by
-            the standard deviation of the pad's noise; None if cubes are modelled as points.
+        pads: Matrix (variants, 2 n, P) from the real and imaginary parts of the circular components
+            to the stress of each pad, divided by the standard deviation of the pad's noise; None if
+            cubes are modelled as points.
     """
 
     spectra: Spectra
@@ -144,11 +145,11 @@ class CubeMeasurement:
     def matrices_towards(self, angle: Array, variant: Index) -> tuple[Array, Array]:
         """Return the matrices from circular components to measured components of N cubes.
 
-        The circular components are in a frame whose x axis points along the line between two cubes,
-        the measured components in the frame of the cube.
+        The measured components are in the frame of the cube. The circular components are in a frame
+        whose x axis points along the line between the cube and another cube or a point.
 
         Args:
-            angle: Direction (N,) of the line in the frame of the cube, in rad.
+            angle: Direction (N,) of this line in the frame of the cube, in rad.
             variant: Index (N,) of each cube's variant in the measurement model.
 
         Returns:

@@ -78,7 +78,8 @@ class Spectra:
         """Compute the response at given distances from forces distributed over the surface.
 
         Args:
-            bessel: Bessel functions at the distances from the load at which to compute them.
+            bessel: Bessel functions J_m(k r) at the distances r from the load at which the response
+                is computed.
             load_spectra: Spectra S (loads, waves) of the distributions of the forces.
 
         Returns:
@@ -125,12 +126,12 @@ class Spectra:
     ) -> tuple[Array, Array]:
         """Compute covariances of the components at two positions under a random traction.
 
-        The components n of these spectra are at the first position, which lies in the direction x
-        from the other one.
+        The n components of this object are at the first position, which lies in the direction x
+        from the other position.
 
         Args:
             other: Spectra of the n' components at the other position.
-            bessel: Bessel functions at the distances between both positions.
+            bessel: Bessel functions J_m(k r) at the distances r between the two positions.
             prior: Spectrum S (waves,) of the pressure.
             shear: Standard deviation s of the shear divided by that of the pressure.
 
@@ -147,8 +148,9 @@ class Spectra:
         crossed = plus_minus + minus_plus
         half = shear**2 / 2
 
-        # These are the covariances <c d*> and <c d> of two complex components c and d (formulas at
-        # the head of this file), for the direction phi = 0 from one position to the other.
+        # `conjugate` and `direct` are the covariances <c d*> and <c d> of two complex components c
+        # and d (formulas at the head of this file), for the direction phi = 0 from one position to
+        # the other.
         order = self.order[:, None]
         sign = (-1.0) ** other.order
         of_conjugate = normal + half * same

@@ -8,10 +8,12 @@ variance. Its spectrum S over the wave vector k is::
 
     S = sum_l (1/2) 2 pi l^2 exp(-(k l)^2 / 2)        (shear: SHEAR_RATIO^2 times that)
 
-With the spectra c(k) of the circular components (spectra.py), the covariance of the components at
-one cube with the traction at the offset p, and with the components d at another cube, are::
+Let c(k) be the spectra of the circular components (spectra.py) at a cube, and p the offset to this
+cube from a point of the surface or from another cube with the components d. The covariances of the
+components with the traction at the point, and with the components at the other cube, are integrals
+with the weight d2k / (4 pi^2)::
 
-    cross(p) = int c S exp(i k.p),       covariance(p) = int c S d* exp(i k.p)      [d2k / 4 pi2]
+    cross(p) = int c S exp(i k.p),       covariance(p) = int c S d* exp(i k.p)
 
 Source: C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learning (2006), 4.2.1
 (covariance and spectrum).
