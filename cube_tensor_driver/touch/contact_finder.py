@@ -28,7 +28,8 @@ from .surface import Contact, Surface
 from .tracker.contact_tracker import ContactTracker, TrackedContact
 
 AUTO = CONTACT_METHODS[0]
-"""Method that is `INVERSE` if the skin file describes the elastomer, otherwise `INTERPOLATION`."""
+"""Method that stands for `INVERSE` if the elastomer is known from the skin file or from influence
+functions, and otherwise for `INTERPOLATION`."""
 
 INTERPOLATION = CONTACT_METHODS[1]
 """Method that interpolates the pressure between the cubes."""
@@ -97,11 +98,11 @@ class ContactFinder(Protocol):
 
     @property
     def contacts(self) -> Sequence[Contact] | Sequence[TrackedContact]:
-        """Contacts in the last call of `update`, the one with the largest normal force first."""
+        """Contacts that the last call of `update` found, the largest normal force first."""
 
     @property
     def slip(self) -> Slip:
-        """Newest state and friction of these contacts; empty if the method is interpolation."""
+        """Newest slip state and friction of `contacts`; empty if the method is interpolation."""
 
     def update(self, time_s: float, values: Array, left_out: PadMasks, status: StatusBits) -> None:
         """Find the contacts in the newest values.
@@ -112,11 +113,11 @@ class ContactFinder(Protocol):
             left_out: Bit masks (cubes,), in which bit k is set if pad k (sensing element) of a cube
                 was not used for `values`.
             status: Status bits (cubes,) of `values`. Where COMPENSATION is set, the method inverse
-                finds a new contact only from `UNCERTAIN_PRESSURE` on.
+                finds a new contact only if its pressure is above `UNCERTAIN_PRESSURE`.
         """
 
     def follow(self, time_s: float, values: Array) -> bool:
-        """Update `slip` from values for which the contacts need not be found.
+        """Update `slip` from the newest values, without finding the contacts again.
 
         Args:
             time_s: Time of the values in s.

@@ -63,8 +63,8 @@ class Interpolation:
 
         Args:
             values: Values and derivatives (cubes, C), NaN where unknown.
-            columns: Column of the quantity in `values`. To use its derivatives along the cubes' x
-                and y axes, their two columns follow.
+            columns: Column of the quantity in `values`. If its derivatives along the cubes' x and y
+                axes are to be used, too, their two columns come after it.
 
         Returns:
             Values (M,) on all points; NaN on patches for which no neighbouring cube has a value.
@@ -100,8 +100,8 @@ class Interpolation:
     def _solve_weights(self, known: Mask, columns: list[int]) -> _Weights:
         """Return the interpolation weights for some columns of the values.
 
-        The weights depend only on which values are known. They are computed again only for patches
-        with a neighbouring cube of which other values are known than in the previous call.
+        The weights depend only on which values are known. For each patch, they are computed again
+        only if this has changed for one of its neighbouring cubes since the previous call.
 
         Args:
             known: Whether each value and derivative (cubes, C) is known.
@@ -186,6 +186,9 @@ class Interpolation:
 
 class _Weights:
     """Interpolation weights as a sparse matrix, whose entries can be replaced patch by patch.
+
+    In the shapes, M is the number of points of all patches, and `width` the number of values of a
+    cube: 1 without derivatives and 3 with both.
 
     Attributes:
         matrix: Matrix (M, cubes x width) from the value and derivatives of all cubes to all points.

@@ -34,8 +34,9 @@ from .unrolled_skin import unroll
 
 MAX_PITCH_OF_FOUR_POINTS = 3.25
 """Largest pitch (distance of neighbouring cubes), in depths of the cubes' centres, at which the
-patch of a cube has 2 x 2 points. Beyond it there are 3 x 3, one of them above the cube. A ball of
-0.3 N that pressed there, 4 depths between cubes, was not found between four points."""
+patch of a cube has 2 x 2 points. With a larger pitch it has 3 x 3 points, one of them above the
+cube. At a pitch of 4 depths, 2 x 2 points were not enough: a ball that pressed with 0.3 N above a
+cube, between the four points, was not found."""
 
 
 class TractionField(NamedTuple):
@@ -213,7 +214,8 @@ class SurfaceInverse:
         if not len(self.columns):
             raise ElasticError("no cube of the skin observes any component; check the calibrations")
         self.observed = observed[:, self.columns]
-        # Gradients times the half side are in Pa, too, so that all components are comparable.
+        # Gradients times half the side of a cube are in Pa, too, so that all components are
+        # comparable.
         is_stress = self.columns < len(STRESS)
         self._unit_factors = np.where(is_stress, 1.0, scale)
         self.by_pad = by_pad[:, self.columns] * self._unit_factors[:, None]
@@ -278,8 +280,8 @@ class SurfaceInverse:
         The contact tracker uses the components of a cube with pads left out like those of other
         cubes. `field` uses them only if cubes are modelled as points, because the response of
         points does not depend on the pads. With influence functions, the response depends on the
-        pads in use, but the matrices of `field` are computed for all pads. Therefore, the values of
-        such a cube then count as missing in `field`.
+        pads in use, but the matrices of `field` are computed for all pads. `field` then treats the
+        values of a cube with pads left out as missing.
 
         Args:
             cubes: Indices (n,) of the cubes.
@@ -340,13 +342,14 @@ class SurfaceInverse:
         """Compute the standard deviations of the field that is computed from a residual.
 
         Args:
-            residual: Values (cubes, C) in Pa minus the response to the contacts (contact tracker).
+            residual: Values (cubes, C) in Pa minus the response of the cubes to the contacts that
+                the contact tracker has fitted.
             scaled: Values (cubes, C) in Pa as from `scaled`. Errors of the pads' gains are
                 proportional to them.
         """
         y = self._fill(residual)
-        # Variance of each pad's error, divided by the variance of its noise: 1 for the noise itself
-        # plus the gain error.
+        # `variance_with_values` is the variance of each pad's error, divided by the variance of its
+        # noise: 1 for the noise itself, plus the part of the gain error.
         known = self._known
         known_values = np.where(known, scaled, 0.0)
         to_pads = stress_matrices(self.by_pad, known)

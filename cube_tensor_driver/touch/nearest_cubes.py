@@ -15,7 +15,8 @@ def find_nearest_cubes(poses: CubePoses, count: int, by_position: bool = False) 
 
     Args:
         poses: Poses of the cubes.
-        count: W, the number of cubes with the cube itself; a smaller skin has fewer.
+        count: Number W of nearest cubes, the cube itself included. If the skin has fewer cubes, W
+            is their number.
         by_position: Whether cubes at equal distances are sorted by their x and y in the frame of
             the cube, so that similar neighbourhoods list them in the same order. Otherwise they are
             sorted by index.
@@ -26,7 +27,7 @@ def find_nearest_cubes(poses: CubePoses, count: int, by_position: bool = False) 
     for position, rotation in zip(poses.position, poses.rotation, strict=True):
         offset = poses.position - position
         square = np.einsum("ni,ni->n", offset, offset)
-        # All cubes that are about as near as the last one are candidates.
+        # Candidates are all cubes that are at most about as far away as the last of the W cubes.
         limit = 1.01 * np.partition(square, count - 1)[count - 1]
         (candidates,) = np.nonzero(square <= limit)
         local = offset[candidates] @ rotation

@@ -90,13 +90,17 @@ def stress_matrices(by_pad: Array, known: Mask) -> Array:
 
 
 def regularise(covariance: Array, known: Mask) -> Array:
-    """Add to the diagonal of covariances (n, C, C) what makes them invertible, and return them.
+    """Increase the diagonals of covariances in place, so that they can be inverted.
 
-    Rows of unknown components are 0, and components may be almost linearly dependent.
+    Rows of unknown components are 0, so their diagonal becomes 1. Components may be almost linearly
+    dependent, so that the diagonals are also increased by a relative 1e-9.
 
     Args:
-        covariance: Covariances of C components of n cubes.
+        covariance: Covariances (n, C, C) of C components of n cubes, which are changed.
         known: Whether each component (n, C) is known.
+
+    Returns:
+        The array `covariance`.
     """
     diagonal = np.einsum("ncc->nc", covariance)
     diagonal *= 1 + 1e-9

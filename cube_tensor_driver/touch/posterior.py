@@ -108,8 +108,8 @@ class WindowPosteriors:
             values of the inner cubes.
         prior: Posterior variance (kinds, points x 2) in Pa^2 of the pressure on the surface and at
             the cubes' depth, at the scale s = 1 and without pad noise.
-        by_pad: Variance (kinds, points x 2, W P) in Pa^2 of these pressures that the noise of each
-            pad causes.
+        by_pad: Variance (kinds, points x 2, W P) in Pa^2 that the noise of each pad causes in the
+            pressure on the surface and in the pressure at the cubes' depth.
         trace: Contribution (kinds, inner P) of the noise of each pad to the trace of P M, where M
             is the covariance of the values that the errors of the pads cause.
         pads: Noise matrices (cubes, C, P) of all cubes in Pa, 0 where nothing is observed.
@@ -139,7 +139,7 @@ class WindowPosteriors:
         place, angle = unroll(poses, np.arange(n), self.near)
         self.kind = self._find_kinds(model, place, angle)
 
-        # One window stands for all windows of its kind.
+        # The matrices are computed for the first window of each kind, and serve for all of them.
         kinds, first = np.unique(self.kind, return_index=True)
         example = model.select(self.near[first])
         inputs: list[Any] = [

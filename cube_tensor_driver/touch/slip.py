@@ -3,10 +3,10 @@
 """Stick, slip and friction coefficient of the contacts of a skin.
 
 The contact tracker takes several milliseconds, too long for every scan (set of values of all cubes)
-at 1 kHz. Between its updates, force and position of each contact are followed in every scan: with
-the derivatives J of the values by force, position, radius and flatness of a Hertz contact, a change
-dy of the values is a change dp of these parameters (values divided by their noise, prior precision
-P)::
+at 1 kHz. Between its updates, force and position of each contact are followed in every scan. Let J
+be the derivatives of the cubes' values, divided by their noise, by the parameters of a Hertz
+contact (force, position, radius, flatness), and P the prior precision of these parameters. A change
+dy of the values, divided by their noise, then means a change dp of the parameters::
 
     dp = (J' J + P)^-1 J' dy
 
@@ -14,8 +14,9 @@ A body that sticks keeps its place on the skin, also while the skin deforms and 
 contact slips (Cattaneo, Mindlin). When all of the contact slips (gross slip), Coulomb's law fixes
 the ratio of shear and normal force, and the contact moves along the shear force that the body
 exerts on the skin. So a contact slips if it moves in this direction while the ratio stays nearly
-the same. The centre of pressure of a body that is pulled above the surface moves, too, but in
-proportion to the change of the ratio. A body that rolls moves without a shear force along its way.
+the same. If a sticking body is pulled at a point above the surface, its centre of pressure moves,
+too, but in proportion to the change of the ratio. A body that rolls moves without a shear force
+along its path.
 
 Source: K. L. Johnson, Contact Mechanics (1985), 7.1 (sliding) and 7.2 (partial slip).
 """
@@ -57,9 +58,9 @@ MIN_SPEED = 1e-3
 """Smallest speed of slip in m/s. Slower motion may be creep of the elastomer or drift."""
 
 SIGNIFICANCE = 5.0
-"""Smallest motion that counts as slip, divided by its standard deviation from the noise of the
-pads. With Gaussian noise, 6 lags and 1000 scans a second exceed it by chance once in 5 minutes; the
-direction and `MIN_DISTANCE_M` must agree, too."""
+"""Smallest motion that counts as slip, divided by the standard deviation that the noise of the pads
+causes. With Gaussian noise, 1000 scans a second and 6 lags (`LAGS`), noise alone exceeds it once in
+5 minutes. For slip, the direction must also agree, and `MIN_DISTANCE_M` must be exceeded."""
 
 LEVER_M = 0.1
 """Largest height in m above the surface at which an external shear force on a sticking body acts.
@@ -96,16 +97,17 @@ tilts.
 
 MIN_LATE_SHARE = 0.25
 """Smallest fraction of a contact's motion, during one of the durations `LAGS`, that must fall into
-the second half of this duration for slip. With less, the contact has stopped."""
+the second half of this duration for slip. If the fraction is smaller, the contact has stopped."""
 
 MIN_FORCE_N = 0.05
 """Normal force, in N, that a contact must exceed for the state `STICK`. With a smaller force, its
 state is `UNKNOWN` unless slip is detected."""
 
 FOLLOWED_DEVIATION = 0.02
-"""Relative standard deviation of the ratio of shear and normal force that is computed from the
-changes of the cubes' values since the last update of the contact tracker, if the contact has moved
-by up to some millimetres since then. It was 1.6 % (rms) in simulations of 24-pad cubes."""
+"""Relative standard deviation of the ratio of shear and normal force between updates of the contact
+tracker. The ratio then follows from changes of the cubes' values since the last update. Its error
+was 1.6 % (rms) in simulations of 24-pad cubes, for contacts that had moved by up to some
+millimetres since this update."""
 
 MAX_SHIFT_DEPTHS = 0.2
 """Shift of a contact, divided by the depth of the cubes' centres below the surface, after which the
@@ -161,7 +163,7 @@ NO_CONTACTS = Slip(
 
 
 class SlipEstimator:
-    """Estimates in every scan whether contacts slip that the contact tracker has found before.
+    """Estimates in every scan whether the contacts that the contact tracker has found slip.
 
     Attributes:
         slip: State and friction of the contacts in the newest scan, in the order of the contacts
@@ -184,7 +186,11 @@ class SlipEstimator:
         n_values = count * len(inverse.columns)
         n_scans = LAGS[-1] + 1
         # These are the fields of a contact. A load consists of force (3) in N and position (3) in
-        # m. `past` has the motion states (`_decide_motion_state`) of the last scans, newest first.
+        # m. `load` is the load at the cubes' values `values` (Pa), and `weights` is the matrix from
+        # changes of these values to changes of the load. `linearised` is the load for which this
+        # matrix was computed, and `noise` the standard deviation of the position, in m. `sums` are
+        # those of `_add_ratio`. `past` has the motion states (`_decide_motion_state`) of the last
+        # scans, newest first.
         fields: list[tuple[str, type, tuple[int, ...]]] = [
             ("id", int, ()),
             ("normal", float, (3,)),
@@ -262,8 +268,8 @@ class SlipEstimator:
         """Estimate `slip` from the values of a scan.
 
         Args:
-            time_s: Time of the scan in s. If it is that of the scan before, `values` are the same,
-                too.
+            time_s: Time of the scan in s. If it equals the time of the previous call, `values` must
+                be those of the previous call, too.
             values: Components (cubes, 15) in Pa and Pa/m, NaN where unknown.
 
         Returns:
@@ -396,6 +402,8 @@ class SlipEstimator:
     def _follow(self, scaled: Array) -> Array:
         """Return force in N and position in m (n, 6) of each contact in a scan.
 
+        They follow from the changes of the cubes' values, with the stored derivatives.
+
         Args:
             scaled: Components (cubes, C) in Pa of the scan, as from `SurfaceInverse.scaled`.
         """
@@ -408,7 +416,7 @@ class SlipEstimator:
         return loads
 
     def _linearise_changed(self, loads: Array, scaled: Array) -> None:
-        """Compute the derivatives for contacts that are new or have changed.
+        """Linearise the response of the cubes again for contacts that are new or have changed.
 
         Args:
             loads: Force in N and position in m (n, 6) of the contacts.

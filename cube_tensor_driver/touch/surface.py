@@ -70,8 +70,9 @@ class Contact(NamedTuple):
         position_uncertainty: Standard deviation of the position along each axis, in m.
         force_uncertainty: Standard deviation of the normal force, in N.
         slips: Whether the whole contact slides over the skin; False if it is not known.
-        is_coarse: Whether the force is that of the field of the method inverse, because no fit of
-            the contact is ready.
+        is_coarse: Whether force and position are less exact than usual, because the fit of the
+            contact to the newest values, or that of a contact beside it, is not ready yet. Only
+            contacts of the method inverse are fitted.
     """
 
     position: Array
@@ -93,7 +94,7 @@ def describe_contact(contact: Any) -> str:
     """Describe a contact by its forces, position and area.
 
     Args:
-        contact: A `Contact`, or another contact with its attributes.
+        contact: A `Contact`, or another object with these attributes (`TrackedContact`).
     """
     x, y, z = 1e3 * contact.position
     forces = f"{contact.normal_force:.3g} N normal, {contact.shear_force:.3g} N shear"
@@ -162,7 +163,7 @@ class Surface:
 
         Args:
             values: Components (cubes, 15) in the order of `COMPONENTS`, in Pa and Pa/m; NaN where
-                unknown. The values around a cube without any come from its neighbours.
+                unknown. Around a cube without values, those of its neighbours are interpolated.
         """
         return Field(self._interpolate_pressure(values), self._interpolate_shear(values))
 

@@ -2,14 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Detection of touch in every scan (one sample of every cube): whether, where and how hard.
 
-The pressure of a cube is -zz minus its slow part (high-pass). The sequential test is Page's CUSUM
-of the pressure p over its standard deviation sigma::
+The pressure p of a cube is -zz minus the slow part of -zz, an average that follows slow drift. The
+sequential test is Page's CUSUM: a sum S of the pressure over its standard deviation sigma, with a
+limit h::
 
     S <- max(0, S + p / sigma - REFERENCE),     touch begins when S > h and ends when S = 0
 
 Of all components that a cube measures, zz falls off fastest with the distance r from a load (r^-5
 below a point force; the others r^-3 or r^-4), so that a strong load does not look like touches of
-cubes far away. The test has one sign, because after a load the elastomer recovers in the other.
+cubes far away. The test only finds increases of the pressure, because the recovery of the elastomer
+after a load looks like a decrease.
 
 Source: D. C. Montgomery, Introduction to Statistical Quality Control (2013), 9.1 (CUSUM); D.
 Siegmund, Sequential Analysis (1985), 2.6 (mean time between false alarms). numpy alone is used,
@@ -76,7 +78,7 @@ holds for a pitch of 8 mm, a depth of 5 mm, and a shear force of half the normal
 
 MAX_DRIFT = 0.5
 """Largest drift of the pressure, in Pa/s, at which the rate of false alarms holds. All pads of a
-cube that drift together by 1.3e-6 of their frequency per second cause it."""
+cube must drift together, by 1.3e-6 of their frequency per second, to cause it."""
 
 REMAINDER = 0.02
 """Largest fraction of the pressure under a load that a cube still measures just after the load has
@@ -112,7 +114,8 @@ class Touches(NamedTuple):
     Attributes:
         stamp_ns: Time of the earliest sample of the scan, in ns of the source's clock.
         cube: Indices (m,) of the cubes with a larger pressure than their neighbours.
-        pressure: Pressure (m,) at the centre of this cube, without its slow part, in Pa.
+        pressure: Pressure (m,) in Pa at the centre of this cube, without its slow part (an average
+            that follows slow drift).
         pressure_uncertainty: Standard deviation (m,) of `pressure`, in Pa.
         force: Force (m, 3) on the skin within about a pitch around this cube, along x, y and z of
             this cube's frame, in N. NaN if the skin file states no elastomer, or if a component of
@@ -146,8 +149,8 @@ NO_TOUCHES = Touches(
 class Touch:
     """Finds touches in the stress of a skin, scan by scan (samples of every cube).
 
-    The work of a scan is bounded, whatever touches. Cubes that do not observe the stress zz find no
-    touch.
+    The computing time of a scan has an upper limit, whatever touches the skin. No touch is found at
+    cubes that do not observe the stress zz.
 
     Attributes:
         limit: Limit h of the CUSUM, in standard deviations of the noise.
@@ -190,7 +193,7 @@ class Touch:
         if skin.elastomer is not None:
             self._estimate = estimate_forces(poses, skin.elastomer, near, covariance)
 
-        # The largest value of the neighbours is found faster if they are the first axis.
+        # The largest value among the neighbours is found faster if they are the first axis.
         self._near = near.T.copy()
         # `_slow` is the slow part of each value (NaN where unknown), `_change` the difference of
         # the value from it.
@@ -212,10 +215,11 @@ class Touch:
         return f"Touch({len(self._sum)} cubes, {touched} of them touched)"
 
     def restart(self) -> None:
-        """Start the slow parts again after a tare, which changes all values.
+        """Start the slow parts of all cubes again after a tare, which changes all values.
 
-        Pressures without their slow parts do not change, so that touches continue. A new touch is
-        found after `SETTLING_ROWS` samples.
+        A slow part is the average that follows slow drift. Pressures without their slow parts do
+        not change, so that touches continue. New touches are only found after `SETTLING_ROWS`
+        samples.
         """
         self._restart(np.arange(len(self._sum)))
 
@@ -257,8 +261,8 @@ class Touch:
         slow = self._slow[cube]
         is_unknown = np.isnan(slow)
         if is_unknown.any():
-            # An unknown drift starts at the newest value minus the pressure of the detected load.
-            # Otherwise this load would be taken for drift.
+            # An unknown slow part starts at the newest value minus the last known difference of
+            # value and slow part. Otherwise a load that lasts would be taken for drift.
             load = np.nan_to_num(self._change[cube])
             slow = np.where(is_unknown, values - load, slow)
         change = values - slow
@@ -336,8 +340,8 @@ class Touch:
         """
         margin = self._margin[cube]
         if self._held.any() or margin.any():
-            # While the slow part is held, drift and what remains of the load must not count as
-            # touch.
+            # While the slow part of a cube is held, drift and the rest of an earlier load must not
+            # count as touch.
             remainder = REMAINDER * np.abs(pressure)
             growing = np.fmax(margin, remainder) + MAX_DRIFT * elapsed_s
             fading = (1 - elapsed_s / TIME_CONSTANT_S) * margin

@@ -2,15 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Linear estimate of the force of one small load from the cube below it and that cube's neighbours.
 
-The values y of these cubes are a sum: the response H(x) to the force F of the load at the position
-x, which is unknown, the responses to other loads farther away, and noise with the covariance N. The
-matrix W of the estimate y W has the smallest mean squared error over all positions x (mean <>)::
+The values y of these cubes are the sum of three parts: the response H(x) F to the force F of the
+load at the unknown position x, the responses to other loads farther away, and noise with the
+covariance N. The prior standard deviations of the forces are s for the load and t for other loads.
+<> is the mean over all positions x. The estimate y W of the force F has the smallest mean squared
+error with the matrix::
 
     W = (s^2 <H H'> + t^2 <H_other H_other'> + N)^-1 s^2 <H>
 
-s and t are the standard deviations of the forces. Source: S. M. Kay, Fundamentals of Statistical
-Signal Processing: Estimation Theory (1993), 12.3 (linear estimator of minimum mean square error).
-numpy alone is used, because the reconstruction node does not load scipy.
+Source: S. M. Kay, Fundamentals of Statistical Signal Processing: Estimation Theory (1993), 12.3
+(linear estimator of minimum mean square error). numpy alone is used, because the reconstruction
+node does not load scipy.
 """
 
 from __future__ import annotations
@@ -45,8 +47,8 @@ MAX_PITCHES = 1.0
 neighbouring cubes). Half a pitch would be enough for small loads; wide ones reach farther."""
 
 MIN_OTHER_PITCHES = 2.0
-"""Distance from the cube of the nearest other loads for which the estimate is computed, in pitches
-(distances of neighbouring cubes). It is the larger one of the distances along x and along y."""
+"""Smallest distance between the cube and the other loads that the estimate takes into account, in
+pitches (distances of neighbouring cubes). It is the larger one of the distances along x and y."""
 
 
 class ForceEstimate(NamedTuple):
@@ -80,7 +82,7 @@ def estimate_forces(
     Args:
         poses: Poses of the cubes.
         elastomer: Layer of elastomer around the cubes.
-        near: Indices (cubes, W) of the neighbours of each cube, itself first.
+        near: Indices (cubes, W) of each cube and its neighbours, the cube itself first.
         covariance: Covariances (cubes, 15, 15) of the noise of the components, in Pa and Pa/m, NaN
             where a component is not observed.
 

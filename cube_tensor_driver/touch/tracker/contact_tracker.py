@@ -96,8 +96,9 @@ class TrackedContact(NamedTuple):
         moment_uncertainty: Standard deviation of the moment, in N m.
         area_uncertainty: Standard deviation of the area, in m^2.
         refined: Whether force, position and moment come from a fit of the traction in the region of
-            contact to the newest values. If not, they are integrals of the linear field
-            (`COARSE_DEVIATION`), or those of an earlier fit, scaled with the pressure.
+            contact to the newest values, and all regions near it are fitted, too. If not, they are
+            less exact: integrals of the linear field (`COARSE_DEVIATION`), results of an earlier
+            fit, scaled with the pressure, or results of a fit near a region that has no fit yet.
     """
 
     id: int
@@ -210,7 +211,7 @@ class ContactTracker:
 
     @property
     def _fitted_cubes(self) -> Index:
-        """Indices (n,) of the cubes of all fits."""
+        """Indices (n,) of the cubes from whose values regions are fitted."""
         is_fitted = np.zeros(len(self._scaled), bool)
         for fit in self._fits:
             is_fitted[fit.values.cubes] = True
@@ -270,8 +271,9 @@ class ContactTracker:
         owner = np.full(len(pressure), len(self._regions))
         for number, region in enumerate(self._regions):
             owner[region.points] = number
-        # A region matches the previous one with which it has most points in common, if no region
-        # with a larger pressure has matched it. The last entry stands for points outside of all.
+        # A region matches the previous region with which it has most points in common, if no region
+        # with a larger pressure has matched it before. The last entry of `unmatched` stands for
+        # points that belonged to no region.
         unmatched: list[TrackedRegion | None] = [*self._regions, None]
         regions = []
         for points in found:
@@ -294,8 +296,9 @@ class ContactTracker:
             region.gap = float(to_others.min(initial=np.inf))
 
     def _measure_region_distances(self, found: list[Index]) -> Array:
-        """Return the distances (n, n), in m, of n regions: for each pair of regions, the smallest
-        distance between a point of one and a point of the other.
+        """Return the distances (n, n), in m, between n regions.
+
+        The distance of two regions is that of their two nearest points.
 
         Args:
             found: Indices of the points of the surface in each region.
@@ -313,8 +316,9 @@ class ContactTracker:
     def _choose_updates(self, max_work: float) -> list[TrackedRegion]:
         """Return the regions whose fits are computed again for the newest values.
 
-        These are all regions with Hertz contacts. Of those whose traction is fitted on nodes (small
-        contacts on a grid), they are the `MAX_NODE_UPDATES` that have waited longest.
+        These are all regions with Hertz contacts. Among the other regions, whose traction is fitted
+        on nodes (small contacts on a grid), the `MAX_NODE_UPDATES` are chosen that have waited
+        longest.
 
         Args:
             max_work: As `MAX_WORK_PER_SCAN`. Infinite: all fitted regions are chosen.
@@ -363,7 +367,7 @@ class ContactTracker:
         return total, deviation
 
     def _respond(self, cubes: Index) -> tuple[Array, Array]:
-        """Return `_sum_responses`, up to date for some cubes.
+        """Compute stale responses of some cubes again, and return `_sum_responses`.
 
         Args:
             cubes: Indices (n,) of the cubes.
@@ -462,7 +466,8 @@ class ContactTracker:
         """
         inverse, regions = self._inverse, self._regions
         # The traction field of a narrow contact is blurred beyond its region. So the integral takes
-        # in all points of the surface within a pitch of the region, unless another one is nearer.
+        # in all points of the surface within a pitch of the region to which no other region is
+        # nearer.
         region_points = np.concatenate([one.points for one in regions])
         sizes = [len(one.points) for one in regions]
         numbers = np.repeat(np.arange(len(regions)), sizes)

@@ -1,6 +1,9 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Traction on the whole skin: that of the fitted regions, and of the residual field around them."""
+"""Traction on the whole skin: the sum of the fits of all regions of contact and a residual field.
+
+The residual field is the traction that explains what the fits leave of the cubes' values.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +41,7 @@ def add_fits(
     over all points times the area of a square is the force.
 
     Args:
-        inverse: Points and kernels of the skin.
+        inverse: Points and responses of the skin.
         residual: Traction and pressure that explain the residual: the values minus the response of
             the cubes to all fits.
         fits: Fits of all regions of contact.
@@ -111,7 +114,8 @@ def _distribute(
     tree = cKDTree(place)
     distance, nearest = tree.query(samples, distance_upper_bound=inverse.spacing)
 
-    # Point forces beyond the border of the skin (at an infinite distance) act on no point.
+    # Point forces beyond the border of the skin act on no point; cKDTree.query returns an infinite
+    # distance for them.
     is_on_skin = np.isfinite(distance)
     contact = np.repeat(np.arange(count), len(offsets))
     normal_weight = weights[:, 2]

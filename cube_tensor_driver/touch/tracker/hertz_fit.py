@@ -5,10 +5,10 @@
 A ball presses as a Hertz contact: force, centre and radius describe it with a few numbers, which
 the values of the cubes determine better than the forces of many nodes (node_fit.py), above all
 where the cubes are far apart. Gauss-Newton steps find the parameters x with the largest posterior.
-With the derivatives J of the whitened values by the parameters, the whitened residual r, and the
-prior precision P about x0::
+With the derivatives J of the whitened values by the parameters, the whitened residual r, the prior
+mean x0 and precision P of the parameters, and the misfit t (chi-squared per value, at least 1)::
 
-    (J' J + P) change = J' r - P (x - x0),    covariance t (J' J + P)^-1
+    (J' J + P) change = J' r - P (x - x0),    covariance of x = t (J' J + P)^-1
 
 Source: K. L. Johnson, Contact Mechanics (1985), 4.2 (Hertz); D. J. C. MacKay, Bayesian
 interpolation, Neural Computation 4 (1992) 415 (evidence).
@@ -152,7 +152,7 @@ class HertzFit:
 
         Args:
             inverse: Depth and responses of the skin.
-            values: Values of the cubes around the region.
+            values: Positions and noise of the cubes around the region.
             starts: Contacts at which the fit begins.
         """
         self.values = values
@@ -166,7 +166,8 @@ class HertzFit:
         self.misfit = 1.0
         self.shape_misfit = 1.0
         self.last_step = np.inf
-        # In its first scan a fit comes from a start that is no earlier place of the contacts.
+        # `_previous` are the contacts of the scan before, from which `predict` extrapolates. In the
+        # first scan of a fit there are none.
         self._previous: Discs | None = None
         n_contacts = len(starts.forces)
         self._flatness = np.zeros(n_contacts)
@@ -182,7 +183,7 @@ class HertzFit:
         ]
         precision = np.array(deviations) ** -2
         self._contact_precision = np.tile(precision, n_contacts)
-        self._elastomer_errors = np.zeros(1)  # the depth comes first
+        self._elastomer_errors = np.zeros(1)  # the first error is that of the depth
 
     def prior_precision(self, quantities: int) -> Array:
         """Return the prior precisions (p,) of the parameters for the next linearisation.
@@ -197,13 +198,16 @@ class HertzFit:
 
     @property
     def depth_error(self) -> float:
-        """Error of the depth of the cubes' centres that the last step has found, divided by it."""
+        """Error of the depth of the cubes' centres that the last step has found, divided by the
+        depth."""
         return DEPTH_DEVIATION * float(self._elastomer_errors[0])
 
     @property
     def displacement(self) -> float:
-        """Distance of the contacts from those at which the response was linearised, measured as the
-        step in `SETTLED_STEP`."""
+        """Difference between the contacts found and those at which the response was linearised.
+
+        It is measured like the size of a step in `SETTLED_STEP`.
+        """
         found, base = self.found, self.linear.contacts
         shift = found.centres - base.centres
         growth = found.log_sizes - base.log_sizes
@@ -236,10 +240,10 @@ class HertzFit:
 
     @property
     def inflation(self) -> float:
-        """Factor on all variances, as the residuals are larger than noise alone makes them.
+        """Factor by which all variances are multiplied if residuals are larger than noise explains.
 
-        It is the larger one of `misfit` and `shape_misfit`: the edge of a flat punch, where the
-        pressure is infinite, only changes the values of the nearest cubes.
+        It is the larger one of `misfit` and `shape_misfit`. The latter is needed, for example, for
+        a flat punch, whose infinite pressure at the edge only changes the nearest cubes' values.
         """
         return max(self.misfit, self.shape_misfit)
 
@@ -301,8 +305,8 @@ class HertzFit:
         and forces are in its frame.
 
         Args:
-            values: Source of the measured stress and gradient of the cubes around the new home
-                cube. The new home cube is one of the cubes of the present fit.
+            values: Positions and noise of the cubes around the new home cube. This cube is one of
+                the cubes of the present fit.
         """
         is_home = self.values.cubes == values.home
         (number,) = np.flatnonzero(is_home)
@@ -513,10 +517,10 @@ def _linearise_alike(
     all_forces = np.repeat(all_forces, cubes, axis=0)
     slopes = response.response_slopes(positions, angles, variants, all_sizes, all_forces)
     slopes = slopes[:, :, inverse.columns]
-    # The response changes with the depth faster than linearly: by its derivative halfway between
-    # the stated depth and the one found. In a half space, that is the derivative at the stated
-    # depth under a load whose lengths are divided by `halfway`, up to a factor of all values,
-    # which only scales the error that the next step finds.
+    # The response is not linear in the depth. Its change from the stated depth to the one found
+    # follows from the derivative halfway between these two depths. In a half space, this derivative
+    # is that at the stated depth for a load whose lengths are divided by `halfway`, times a factor.
+    # The factor is the same for all values, so it only scales the error that the next step finds.
     depth_errors = np.array([fit.depth_error for fit in fits])
     halfway = np.repeat(1 + depth_errors / 2, contacts * cubes)
     near_positions = positions / halfway[:, None]
@@ -528,8 +532,9 @@ def _linearise_alike(
     by_contact = by_contact.astype(float)
     by_force = by_contact[:, :, :, :3]
     values = np.einsum("kjnac,kja->knc", by_force, forces)
-    # With h = FLATNESS_STEP and the derivatives by the logarithm of the radius, the response to the
-    # difference of contact and mixture is h^2 (first - second / 2), to order h^2.
+    # `first` and `second` are derivatives by the logarithm of the radius. With h = FLATNESS_STEP,
+    # the response to the difference of contact and mixture that defines the flatness is
+    # h^2 (first - second / 2), to order h^2.
     first = by_contact[:, :, :, 5]
     second = by_contact[:, :, :, 6]
     by_contact[:, :, :, 6] = FLATNESS_STEP**2 * (first - second / 2)

@@ -57,10 +57,11 @@ class CubeNoise:
         self._revision = -1
 
     def update(self, scaled: Array, cubes: Index) -> None:
-        """Compute the noise variances of the stress again, for cubes that need it.
+        """Compute the noise of cubes again if it has changed.
 
-        Those are cubes of which other pads are in use, or other components are known (not NaN),
-        than in the scan before, or whose stress has changed much.
+        It is computed for cubes whose pads in use or known components (not NaN) have changed since
+        the last update, or whose stress has changed so much that the variance of a pad's error has
+        changed by more than the factor `MAX_NOISE_CHANGE`.
 
         Args:
             scaled: Components of stress and gradient (times d0, half the side of a cube), in Pa
@@ -110,7 +111,7 @@ class CubeNoise:
             self._whiten(changed, variance[is_changed])
 
     def _replace_pads(self, cubes: Index, known: Mask) -> None:
-        """Store the noise matrices of n cubes for other known components or pads in use.
+        """Store the noise matrices of n cubes whose known components or pads in use have changed.
 
         Args:
             cubes: Indices (n,) of the cubes.
@@ -160,8 +161,8 @@ class LocalValues:
         whitening: Matrices (n, C, C) as in `CubeNoise`, of the last `refresh`.
         known: Whether each of the C components of the cubes is known (n, C).
         count: Number of known values.
-        disturbance: Standard deviation (n, C), in Pa, of the values' part that other contacts
-            cause.
+        disturbance: Standard deviation (n, C), in Pa, of the part of the values that contacts
+            outside of the region cause.
     """
 
     whitening: Array

@@ -5,16 +5,16 @@
 The traction is different from zero only in the region, which the field of the inverse problem shows
 (pressure_regions.py). This knowledge makes integrals over the region far more exact than those of
 the field, whose prior is the same everywhere. The traction is the sum of small Hertz contacts on a
-grid of nodes. With the forces f of the nodes (N), the whitened response B of the cubes to them, and
-the whitened values w, which have noise of variance 1, the posterior is that of a Gaussian process::
+grid of nodes. Let f be the forces of the nodes in N, B the whitened response of the cubes to them,
+w the whitened values and e their noise. The posterior is that of a Gaussian process::
 
     w = B f + e,    f ~ N(0, s^2 K),    e ~ N(0, t)
     mean f = s^2 K B' W w,    covariance t (s^2 K - s^4 K B' W B K),    W = (1 + s^2 B K B')^-1
 
 K is the prior covariance of the forces for a pressure of variance 1 Pa^2. The scale s is that with
 the largest evidence; the misfit t is chi-squared divided by the number of values, but at least 1,
-so that an imperfect model increases the stated deviations. An eigenvalue
-decomposition of K^1/2' B' B K^1/2 gives all of this for every s at once.
+so that an imperfect model increases the stated deviations. One eigenvalue decomposition of
+K^1/2' B' B K^1/2 gives mean, covariance and evidence for every s.
 
 Depth, thickness and Poisson's ratio of the elastomer have errors, too. To first order, they change
 w by further columns, whose factors have the prior N(0, 1).
@@ -54,8 +54,9 @@ neighbouring cubes), up to which nodes (small contacts) are placed beyond the bo
 itself ends there, because it consists of points of the skin, but the contact may not."""
 
 MAX_BORDER_REACH_DEPTHS = 4.0
-"""Largest such distance, divided by the depth of the cubes' centres. Cubes do not feel the force of
-nodes much farther away, which would make the force of the contact arbitrary."""
+"""Largest distance from a region of contact at which nodes (small contacts) are placed beyond the
+border of the skin, divided by the depth of the cubes' centres. Cubes do not feel the force of nodes
+much farther away, which would make the force of the contact arbitrary."""
 
 ENVELOPE_FLOOR = 0.03
 """Smallest prior standard deviation of the force of a node (one of the small contacts whose sum is
@@ -74,8 +75,8 @@ prior."""
 
 _NODE_RADIUS = 0.36
 """Radius of the Hertz contact of a node, divided by the depth of the cubes' centres: 0.9 times
-`NODE_STEP`. Wider nodes, where they lie farther apart, would blur narrow edges. The cubes hardly
-feel the gaps between nodes up to a depth apart."""
+`NODE_STEP`. It is the same where nodes lie farther apart, because wider nodes would blur narrow
+edges, and because the cubes hardly feel the gaps between nodes that are up to a depth apart."""
 
 _PEAK_WIDTH = 0.5
 """Standard deviation of the Gaussian that smooths the fitted pressure before its peaks are counted,
@@ -144,7 +145,7 @@ class NodeFit:
         Args:
             inverse: Poses, points, noise and responses of the skin.
             points: Indices of the points of the surface that form the region.
-            values: Values of the cubes around the region.
+            values: Positions and noise of the cubes around the region.
         """
         self.values = values
         is_around = np.isin(inverse.cube, values.cubes)
@@ -167,7 +168,8 @@ class NodeFit:
         self._white_response = white.reshape(n_values, 3, -1)
         self._peak_width = _PEAK_WIDTH * inverse.depth
         self.is_sharp = False
-        # Contacts of the present posterior and labels, computed when they are needed.
+        # `_estimates` are the contacts of the present posterior and labels. They are computed when
+        # they are needed; None: not yet.
         self._estimates: list[ContactEstimate] | None = None
         # The sensitivity (n, C, S) holds the changes of the values, in Pa, by one standard
         # deviation of each of S quantities of the elastomer, the depth first. It is known after the
@@ -193,8 +195,9 @@ class NodeFit:
         projected = vectors.T @ projected
         prior_variances = _SCALES[:, None] ** 2
 
-        # By the Woodbury identity, columns' W columns is columns' columns minus the part that the
-        # prior of the forces explains, for every scale s and W = (1 + s^2 B K B')^-1.
+        # `products` are the products columns' W columns for every scale s, with the matrix
+        # W = (1 + s^2 B K B')^-1. By the Woodbury identity, they are columns' columns minus the
+        # part that the prior of the forces explains.
         signal_to_noise = prior_variances * eigenvalues
         weights = prior_variances / (1 + signal_to_noise)
         explained_by_forces = np.einsum("se,ea,eb->sab", weights, projected, projected)
@@ -324,7 +327,8 @@ class NodeFit:
         """Return force, centre, moment and area of each contact of the region, by integration."""
         if self._estimates is not None:
             return self._estimates
-        # Second moments count the force of a node as spread over the distance of nodes.
+        # For second moments, the force of a node counts as spread over an area as wide as the
+        # distance of neighbouring nodes.
         radius = _NODE_RADIUS / NODE_STEP * self.spacing
         estimates = []
         n_contacts = self.labels.max() + 1
@@ -342,8 +346,9 @@ class NodeFit:
     def shape_misfit(self) -> float:
         """Misfit that shows whether the model of the traction is wrong.
 
-        It is `misfit`, that of all cubes around the region, because nodes assume no shape of the
-        contact. A `HertzFit`, which does, computes it from the cubes nearest to its contacts.
+        It is `misfit`, to which all cubes around the region contribute, because nodes assume no
+        shape of the contact. A `HertzFit` assumes a shape, and therefore computes `shape_misfit`
+        from the cubes nearest to its contacts.
         """
         return self.misfit
 

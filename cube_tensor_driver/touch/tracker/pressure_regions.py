@@ -15,7 +15,7 @@ from ..inverse import SurfaceInverse
 
 DETECTION_FRACTION = 0.2
 """Pressure (at the depth of the cubes' centres) above which a point of the surface belongs to a
-contact, divided by the largest one on the skin. The pressure must also exceed an absolute
+contact, divided by the largest pressure on the skin. The pressure must also exceed an absolute
 threshold."""
 
 RELEASE_FRACTION = 0.75
@@ -27,9 +27,10 @@ UNCERTAIN_PRESSURE = 1200.0
 """Smallest pressure, in Pa at the depth of the cubes' centres, of a new contact above a cube whose
 compensation is uncertain (status bit COMPENSATION).
 
-When the ground of nine unloaded cubes 24 mm apart warmed by 15 K within a minute, the compensated
-values gave up to 402 Pa, and up to 860 Pa if they had been tared before, because a tare removes the
-error of the fit at rest, which cancels a part. With smaller distances they gave less.
+The compensated values of nine unloaded cubes 24 mm apart gave a pressure of up to 402 Pa when the
+ground warmed by 15 K within a minute. With a tare before, it was up to 860 Pa: the tare removes the
+error of the fit at rest, which cancels a part of the error while the ground warms. With smaller
+distances, the pressures were lower.
 """
 
 JOIN_PITCHES = 1.25
@@ -189,8 +190,8 @@ def split_peaks(pressure: Array, root: Array, is_neighbour: Mask) -> Index:
             significant_fall = MIN_FALL * uncertainty
             if fall < max(relative_limit, significant_fall):
                 owner[owner == other] = first
-    # Nodes that are left have too little pressure for a peak and no neighbour that belongs to one.
-    # They are assigned to the highest peak.
+    # Nodes without an owner have too little pressure for a peak of their own, and had no neighbour
+    # that belongs to a peak. They are assigned to the highest peak.
     owner[owner < 0] = 0
     _, consecutive = np.unique(owner, return_inverse=True)
     return np.asarray(consecutive.reshape(-1))

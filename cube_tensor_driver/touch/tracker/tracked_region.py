@@ -44,8 +44,9 @@ MAX_OTHERS_CHANGE = 0.3
 """Change of the stress that other regions cause in the cubes of a fit on nodes, above which the
 region is fitted again: mean square of the whitened change since the fit.
 
-The first fits of regions that begin together subtract the inexact stress by each other. A narrow
-prior that was found with it (`NodeFit.sharpen`) would keep the traction at wrong nodes.
+The first fits of regions that begin together each subtract an inexact estimate of the stress that
+the other regions cause. A narrow prior that was found with this estimate (`NodeFit.sharpen`) would
+keep the traction at wrong nodes.
 """
 
 MAX_MISFIT_GROWTH = 1.3
@@ -96,8 +97,8 @@ which the skin is laid flat for the fit, in pitches (distances of neighbouring c
 distance, the cube nearest to the contacts becomes the home cube."""
 
 MAX_STALE_CHANGE = 0.06
-"""Largest relative change of a region's contacts up to which the stress that they cause in distant
-cubes is not computed again, divided by the relative deviation of this stress (`FIT_ERROR`,
+"""Relative change of a region's contacts from which on the stress that they cause in distant cubes
+is computed again, divided by the relative standard deviation of this stress (`FIT_ERROR`,
 `START_ERROR`).
 
 The relative change is the larger one of two ratios: the shift of the contacts divided by the
@@ -112,9 +113,9 @@ cubes."""
 
 FIT_ERROR = 0.05
 """Relative standard deviation of the stress that a fitted contact causes in the cubes around other
-contacts. It is computed for the stated depth, thickness and Poisson's ratio, whose errors change it
-by 3 % each (sensitivity.py). With 1 %, and Poisson's ratio off by 0.02, forces of fourteen contacts
-were off by 2.2 stated deviations."""
+contacts. The stress is computed for the stated depth, thickness and Poisson's ratio, whose errors
+change it by 3 % each (sensitivity.py). With the value 1 % and an error of Poisson's ratio of 0.02,
+forces of fourteen contacts were off by 2.2 stated deviations."""
 
 MAX_STEPS = 10
 """Largest number of Gauss-Newton steps in the first fit of a Hertz contact."""
@@ -308,8 +309,9 @@ class TrackedRegion:
     def stale_cubes(self, cubes: Index) -> Index:
         """Return those of some cubes for which the stored response to this region is out of date.
 
-        Those are cubes for which it was not computed, or all if the contacts of the region have
-        changed by more than `MAX_STALE_CHANGE` since.
+        If the contacts of the region have changed by more than `MAX_STALE_CHANGE` since responses
+        were computed, these are all of the cubes. If not, they are the cubes whose response has not
+        been computed for these contacts.
 
         Args:
             cubes: Indices (n,) of the cubes.
@@ -418,9 +420,10 @@ class TrackedRegion:
         return self.age == 0
 
     def estimate_contacts(self) -> list[ContactEstimate]:
-        """Return the contacts of the fit, scaled with the pressure if it is that of older values.
+        """Return the contacts of the fit.
 
-        The stated deviation of a force then includes its whole change.
+        If the fit was computed for older values, forces and moments are scaled with the change of
+        the largest pressure since, and the stated deviation of a force includes its whole change.
         """
         if self.fit is None:
             return []
@@ -461,7 +464,7 @@ class TrackedRegion:
 
     @property
     def needs_hertz_fit(self) -> bool:
-        """Whether the first fit of this region is due, and is that of a Hertz contact."""
+        """Whether this region has no fit yet, and a Hertz contact is to be fitted first."""
         return self.fit is None and self._is_hertz_due
 
     def begin_hertz_fit(self, total: Array, deviation: Array) -> HertzFit:
@@ -482,8 +485,9 @@ class TrackedRegion:
     def accept_if_good(self, fit: HertzFit) -> None:
         """Keep a first fit if its steps have converged and its misfit is small.
 
-        It is always kept if other regions are near: their contacts may cause the misfit, which then
-        falls when these regions are fitted, too.
+        If other regions are near, their contacts may cause the misfit, which then falls when these
+        regions are fitted, too. So the fit is then kept up to a misfit of `MAX_NEAR_MISFIT`, even
+        if its steps have not converged.
         """
         limit = MAX_NEAR_MISFIT if self.near else MAX_HERTZ_MISFIT
         is_settled = not fit.is_unsettled or self.near
@@ -505,8 +509,13 @@ class TrackedRegion:
         values.disturbance = deviation[cubes] - self.relative_error * np.abs(own)
 
     def _fit_nodes(self, scaled: Array, respond: Respond) -> int:
-        """Fit the traction on nodes (small contacts on a grid) in place of the present fit, and
-        return the work of it."""
+        """Fit the traction on nodes (small contacts on a grid) in place of the present fit.
+
+        If there are too many cubes or no known values, the present fit stays.
+
+        Returns:
+            Work of the fit, in the unit of `MAX_WORK_PER_SCAN`.
+        """
         self._is_tried = True
         inverse = self._inverse
         points = inverse.points[self.points]
@@ -538,8 +547,12 @@ class TrackedRegion:
         return len(fit.places)
 
     def _replace_by_hertz(self, nodes: NodeFit, scaled: Array) -> int:
-        """Replace the fit on nodes by one Hertz contact for each contact, if that increases the
-        evidence of the values. Return the work of it."""
+        """Replace the fit on nodes by one Hertz contact for each of its contacts, if that increases
+        the evidence (probability of the values).
+
+        Returns:
+            Work of the fit of Hertz contacts, in the unit of `MAX_WORK_PER_SCAN`.
+        """
         self._is_hertz_due = False
         starts = nodes.estimate_contacts()
         largest_aspect = max(one.aspect for one in starts)
@@ -551,18 +564,18 @@ class TrackedRegion:
         discs = discs._replace(log_sizes=log_sizes)
         fit = HertzFit(self._inverse, nodes.values, discs)
         work = self._iterate(fit, scaled, MAX_STEPS)
-        # The evidence of all cubes hides a misfit of the nearest ones, which other contacts may
-        # cause, too.
+        # The evidence of all cubes can hide a misfit of the nearest cubes, so it is tested apart.
+        # If there are other regions, their contacts may cause this misfit, and it is ignored.
         is_round = fit.shape_misfit < MAX_HERTZ_MISFIT or np.isfinite(self.gap)
         if is_round and not fit.is_unsettled and fit.score < nodes.posterior.score:
             self._accept(fit)
         return work
 
     def _accept(self, fit: HertzFit | NodeFit) -> None:
-        """Make `fit` the fit of this region, and store the state of the region at this fit: its
-        points of the surface, its largest pressure and the misfit.
+        """Make `fit` the fit of this region, and store the state of the region at this fit.
 
-        If later scans differ from it too much, the region is fitted again.
+        The state consists of the points of the surface, the largest pressure, the response to other
+        regions and the misfit. If later scans differ from it too much, the region is fitted again.
         """
         self.fit = fit
         self.age = 0
@@ -579,9 +592,9 @@ def update_responses(
 ) -> None:
     """Compute the response of cubes (change of their components, in Pa) to regions of contact.
 
-    The response is only computed again for regions whose contacts have changed. It is that to round
-    Hertz contacts, because the stress of distant cubes hardly depends on the shape. For the cubes
-    of a region's own fit, it is the response that this fit predicts.
+    The response is only computed again for regions whose contacts have changed. It is computed for
+    round Hertz contacts, because the stress in distant cubes hardly depends on the shape of a
+    contact. For the cubes of a region's own fit, it is the response that this fit predicts.
 
     Args:
         inverse: Poses and responses of the skin.
