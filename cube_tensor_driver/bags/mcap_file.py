@@ -57,7 +57,8 @@ and the times are in ns since the Unix epoch.
 """
 
 _N_CHANNELS = 1 << 16
-"""Number of different channels (numbers of topics) that an MCAP file can have."""
+"""Number of different channels that an MCAP file can have. A channel is the number, of 16 bits, by
+which a message refers to its topic."""
 
 CHUNK_BYTES = 1 << 18
 """Size, in bytes, at which the writer completes a chunk (block of messages) of an MCAP file.
@@ -119,8 +120,8 @@ class McapReader:
                 validate_crcs=True,
                 record_size_limit=MAX_CHUNK_BYTES,
             ).get_summary()
-            # Only the statistics state how many messages the file should have. Without them, lost
-            # messages would not be noticed.
+            # Only the statistics record of the summary states how many messages the file should
+            # have. Without this record, lost messages would not be noticed.
             if index is None or index.statistics is None:
                 raise McapError("the file has no summary")
             sizes = [chunk.uncompressed_size for chunk in index.chunk_indexes]
@@ -217,8 +218,9 @@ class McapReader:
         # stops at the end of the record instead of allocating any amount of memory.
         record = BytesIO(self._stream.read(length - RECORD_HEAD.size))
         data = unpack_chunk(Chunk.read(ReadDataStream(record)))
-        # The records are found here, because the library mcap takes many times as long. What is
-        # shorter than the head of a message is none.
+        # This loop finds where the records of the chunk begin, because the library mcap takes many
+        # times as long. A rest of the chunk that is shorter than the head of a message record
+        # contains no message, so the search stops before it.
         begins = []
         begin = 0
         n_heads = max(0, len(data) - _MESSAGE_HEAD.itemsize + 1)
@@ -226,7 +228,8 @@ class McapReader:
         while begin < n_heads:
             begins.append(begin)
             begin += RECORD_HEAD.size + read_head(data, begin)[1]
-        # This array has a head at every byte of the data, without copying it.
+        # The elements of this array are views of the data: element i is the head of the message
+        # record that would begin at byte i. Those at `begins` are the real heads.
         heads: AnyArray = np.ndarray(n_heads, f"V{_MESSAGE_HEAD.itemsize}", data, strides=(1,))
         record_begin = np.array(begins, np.intp)
         head = heads[record_begin].view(_MESSAGE_HEAD)

@@ -38,8 +38,9 @@ SUFFIXES = {"mcap": ".mcap", "sqlite3": ".db3"}
 """File name suffix of each storage format; the keys are rosbag2's names of the formats."""
 
 _TOPICS = re.compile(rb"^  topics_with_message_count:\n((    |  -).*\n)*", re.MULTILINE)
-"""Pattern of the list of topics in metadata.yaml. It is most of the text, and parsing it takes
-longer than reading the messages of a bag of a few seconds."""
+"""Pattern of the list of topics in metadata.yaml, which is removed before the text is parsed. This
+list is most of the text, and parsing it takes longer than reading the messages of a bag of a few
+seconds."""
 
 _UNLIMITED_DURATION = {"sec": 9223372036, "nsec": 854775807}
 """Duration that states "no limit" in a quality of service profile of DDS (the middleware of ROS 2):
@@ -187,8 +188,8 @@ def read_metadata(folder: Path) -> tuple[list[Path], str]:
     """Read the names of the storage files from metadata.yaml in a bag's folder.
 
     Returns:
-        The files in the order of recording; "file" or "message" where rosbag2 compressed whole
-        files or single messages (zstd), else another text.
+        The files in the order of recording, and the mode of compression (zstd): "file" if rosbag2
+        compressed whole files, "message" if it compressed single messages, else another text.
 
     Raises:
         BagError: There is no metadata.yaml in the folder, it is damaged, or it has a newer version

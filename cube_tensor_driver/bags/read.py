@@ -38,7 +38,8 @@ from .stored_messages import StoredMessages, join_in_blocks
 MAX_DISORDER_NS = SECOND
 """Largest difference of stamps, in ns, by which messages and samples in a bag may be out of order.
 
-To find what belongs to a sample, the bag is read until stamps are this much later.
+A message that belongs to a sample is searched until the bag has been read up to stamps that are
+later than that of the sample by this difference.
 """
 
 VERSION = 4

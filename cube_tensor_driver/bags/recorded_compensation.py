@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a bag states about compensation: motion of the skin, states of creep and temperature.
 
-The messages of `compensation` have the stamps of the messages of stress, and so those of the
-frequencies, to which they belong.
+A message on the topic `compensation` has the same stamp as the message of frequencies, and the
+message of stress computed from it, to which it belongs.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class RecordedCompensation(NamedTuple):
     The default values apply if the bag has no messages on the topic `compensation`.
 
     Attributes:
-        motion: Motion of the skin, which the effect of its weight depends on; None: weight is not
+        motion: Motion of the skin, which determines the effect of its weight; None: weight is not
             compensated.
         states: Name of an effect (creep, thermal) -> its state before the first sample of the
             message.
@@ -82,16 +82,16 @@ class CompensationReader:
 
         Returns:
             Content of the message on the topic `compensation` with the same stamp. If there is no
-            such message: unknown motion if a message read before states a motion, otherwise no
-            compensation.
+            such message, the motion is `UNKNOWN_MOTION` if an earlier message contains a motion;
+            otherwise nothing is compensated.
         """
         if not self.is_recorded:
             return self._default
         if wanted_ns < self._wanted_ns - MAX_DISORDER_NS:
             self._restart()
         self._wanted_ns = wanted_ns
-        # Messages can be out of order, so the wanted one counts as missing only when a message with
-        # a much later stamp has been read.
+        # Messages can be out of order, so the wanted message counts as missing only after a message
+        # has been read whose stamp is later by `MAX_DISORDER_NS`.
         last_ns = wanted_ns + MAX_DISORDER_NS
         while wanted_ns not in self._known and self._newest_ns < last_ns:
             item = next(self._unread, None)

@@ -130,10 +130,10 @@ class RecordedHealthReader:
                 yield batch
 
     def _read_until(self, limit_ns: int) -> Iterator[_StressBatch]:
-        """Read further batches of stress into the memory until a stamp of `limit_ns` is reached.
+        """Read, keep and yield further batches of stress until a stamp of `limit_ns` is reached.
 
         Args:
-            limit_ns: Stamp, in ns since the Unix epoch.
+            limit_ns: Stamp, in ns since the Unix epoch, at which reading stops.
         """
         while self._newest_ns < limit_ns:
             batch = next(self._unread, None)

@@ -152,7 +152,8 @@ def find_skin_infos(bag: Bag, topic: str) -> list[Any]:
 
     The messages of the reconstruction node are preferred, because they contain the rest frequencies
     that the last tare (measurement without load) found. The driver's messages on `driver/info`
-    contain those of the calibration, and are used only if no reconstruction was recorded.
+    contain the rest frequencies of the calibrations, and are used only if the bag has no message of
+    the reconstruction node.
 
     Args:
         bag: Open bag.

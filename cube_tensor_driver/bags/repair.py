@@ -4,8 +4,8 @@
 
 An MCAP file is a sequence of records. Messages lie in chunk records (blocks of messages), each of
 which is followed by the index of each of its channels (topics). Everything after the last chunk
-with all of its indexes is cut off, and the summary, which readers need, is written again. SQLite
-undoes by itself what was not committed.
+with all of its indexes is cut off, and the summary, which readers need, is written again. An SQLite
+file needs no such repair: SQLite itself rolls back a transaction that was not committed.
 
 The StreamReader of the library mcap is not used to find the records: it relies on the lengths
 inside a record, so it finds nothing after the first damaged record. Here the start of the next

@@ -155,8 +155,9 @@ class BagSource:
         begins = np.flatnonzero(_begins_segment(cube, info_index, recorded)) + 1
         bounds = [0, *begins.tolist(), len(messages)]
         for begin, end in pairwise(bounds):
-            # Rows with rising cube indices count as one scan. Messages are joined only if the index
-            # does not rise between them: their scans, on which the health depends, stay separate.
+            # Rows with rising cube indices count as one scan, and the health depends on the scans.
+            # So messages are joined only if the index does not rise from the last row of a message
+            # to the first row of the next one: otherwise two scans would become one.
             order = cube[begin]
             can_join = len(order) and order[0] <= order[-1]
             step = end - begin if can_join else 1

@@ -46,8 +46,8 @@ INSERT INTO schema(schema_version, ros_distro) VALUES (4, 'rosbags');
 """SQL that creates the tables of a .db3 file as rosbag2 of ROS 2 Jazzy does (schema version 4)."""
 
 _IS_SOUND = "typeof(timestamp) = 'integer' AND typeof(data) = 'blob'"
-"""SQL condition that a row of the table ``messages`` fulfils if it can be read. SQLite stores a
-type with every value, not per column, so damage can change the type of a single value."""
+"""SQL condition that is true for a row of the table ``messages`` if the row can be read. SQLite
+stores a type with every value, not per column, so damage can change the type of a single value."""
 
 _log = logging.getLogger(__name__)
 

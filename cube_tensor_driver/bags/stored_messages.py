@@ -14,7 +14,8 @@ import numpy as np
 from ..core.arrays import AnyArray, Index, Times
 
 BLOCK_BYTES = 1 << 18
-"""Total size, in bytes, of messages that are put together where the file itself has no blocks."""
+"""Minimum total size, in bytes, of the messages that are joined to one block if the storage file is
+not divided into blocks itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +46,7 @@ class StoredMessages:
             yield channel, time_ns, self.data[begin:end]
 
     def select(self, chosen: Any) -> StoredMessages:
-        """Return the messages that a slice, a mask or numbers of messages choose."""
+        """Return the messages that are chosen by a slice, a mask or their indices."""
         return StoredMessages(
             self.data,
             self.begin[chosen],
@@ -65,7 +66,8 @@ class StoredMessages:
         for first, last in pairwise(bounds):
             if first < last:
                 size = int(sizes[first])
-                # All windows of this length within the data, which overlap; none is copied.
+                # Row i of `windows` is a view of the `size` bytes that begin at byte i of the data,
+                # so the rows overlap. Only the rows at which messages begin are copied.
                 shape = (len(self.data) - size + 1, size)
                 windows: AnyArray = np.ndarray(shape, np.uint8, self.data, strides=(1, 1))
                 yield self.time_ns[first:last], windows[self.begin[first:last]]

@@ -50,7 +50,7 @@ def summarise_cubes(bag: Bag, topic: str, n_cubes: int) -> Iterator[CubeSummary]
         topic: Topic of the skin's frequencies.
         n_cubes: Number of cubes of the skin.
     """
-    # The empty first part stands for a topic without messages.
+    # The empty first part makes the concatenation below possible for a topic without messages.
     parts = [[np.empty(0, np.int64)] * 3]
     parts += bag.columns(topic, frequency_codec, ("cube", "sequence"))
     stamp_ns, cube, sequence = (np.concatenate(column) for column in zip(*parts, strict=True))
@@ -61,8 +61,8 @@ def summarise_cubes(bag: Bag, topic: str, n_cubes: int) -> Iterator[CubeSummary]
             yield CubeSummary(n_samples)
             continue
         steps = np.mod(np.diff(sequence[rows]), COUNTER_RANGE)
-        # A forward step of at least half the range is in fact a step back: the hub restarted and
-        # counts from 0 again, so no samples were lost.
+        # A step of at least half the range of the sequence numbers is in fact a step back: the hub
+        # was restarted and counts from 0 again, so no samples were lost.
         is_forward = (steps > 0) & (steps < COUNTER_RANGE // 2)
         periods_ns = np.diff(stamp_ns[rows])
         # The median is used because a pause of the recording would lengthen the mean period.

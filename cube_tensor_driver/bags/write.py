@@ -39,8 +39,8 @@ class _Part:
     Attributes:
         path: Path of the file.
         file: Writer of the file's format.
-        channels: Number by which the file identifies each topic, by the topic's name.
-        counts: Number of messages written on each topic.
+        channels: Name of each topic -> number by which the file identifies the topic.
+        counts: Name of each topic -> number of messages written on it.
         first_ns: Time of the message that was written first.
         start_ns: Time of the earliest message.
         end_ns: Time of the latest message.

@@ -93,8 +93,8 @@ def write_recipe(folder: Path, job: ReprocessJob) -> None:
         settings = asdict(contacts.settings)
         recipe["contacts"] = {**settings, "rate": contacts.rate}
     path = folder / RECIPE_NAME
-    # A recipe without results comes from a run that failed before its first result. It may be
-    # replaced.
+    # A folder with this file but without results comes from a run that failed before its first
+    # result. Then the file may be replaced.
     if path.exists() and has_results(folder):
         if read_yaml(path) != recipe:
             raise BagError(

@@ -53,7 +53,8 @@ class Overrides:
 
     Attributes:
         calibration: Calibration that is used for every cube.
-        skin: Skin whose calibrations are used; its cubes are found by their names.
+        skin: Skin whose calibrations are used. A recorded cube gets the calibration of the cube
+            that has the same name in this skin.
         tare: Begin and end of a time without load, in s after the start of the bag. The mean
             frequencies in it become the rest frequencies.
     """

@@ -79,7 +79,8 @@ def frequency_table(source: BagSource) -> pyarrow.Table:
         if segment.number != number:
             number = segment.number
             changes["rest_frequency"] = recording.settings[number].rest_frequency
-        # Changes that come with messages without rows are kept until there is a row.
+        # `changes` are written into the first row of a segment. If a segment has no rows, they are
+        # kept for the next one.
         health = segment.health
         if not len(rows) or health is None:
             continue
