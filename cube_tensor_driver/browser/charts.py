@@ -30,14 +30,15 @@ TIME_SCALE = uplot.Scale(
     auto=False,
     range=(-HISTORY_S, 0.0),
 )
-"""Time axis of the plots: seconds relative to the newest value, without automatic range."""
+"""Time axis of the plots, in seconds relative to the newest value; its range is always the last
+`HISTORY_S` seconds."""
 
 RELAYOUT_PERIOD = 4
-"""Number of updates of the page between two changes of the range of a chart's value axis that are
-too small to be seen.
+"""Number of updates of the page after which the range of each chart's value axis is changed by an
+amount that is too small to be seen.
 
-A chart that was made before the browser knew its width has no time axis. Each change of a range
-makes the browser lay the chart out again, with the time axis.
+The browser lays a chart out again at each change of a range. This is needed because a chart that
+was made before the browser knew its width has no time axis until it is laid out again.
 """
 
 MAX_LINES = 12
@@ -101,7 +102,8 @@ class Chart(NamedTuple):
     lines: dict[str, tuple[int, int]]
 
     def values(self, history: History) -> dict[str, Array]:
-        """Return label -> values (M,) of each line at the M instants of a history, in `unit`."""
+        """Return the label of each line -> its values (M,) at the M instants of a history, in units
+        of `unit`."""
         return {label: history.of(*place) / self.unit for label, place in self.lines.items()}
 
 
@@ -275,7 +277,7 @@ def make_chart(history: History, names: Sequence[str], cubes: Sequence[int], gro
 
 
 def make_chart_properties(history: History, chart: Chart) -> dict[str, Any]:
-    """Return the data and the ranges of a plot, by their names in viser; {} if it has no lines.
+    """Return the data and the axis ranges of a plot as properties of viser; {} without lines.
 
     Args:
         history: Values of all cubes in the last seconds.

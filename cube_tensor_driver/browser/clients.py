@@ -163,7 +163,7 @@ class ReplayClient:
     def jump_to(self, position: float) -> None:
         """Store a position, in s after the start of the bag, to which a later `update` jumps.
 
-        A position that is stored before that replaces this one.
+        If another position is stored before that update, it replaces this one.
         """
         self._wanted_position = position
         self._wanted_s = time.monotonic()
@@ -171,9 +171,9 @@ class ReplayClient:
     def update(self) -> bool:
         """Process the answers of services, then send the jump that `jump_to` stored, if any.
 
-        The jump waits while an earlier jump is not answered, and while no replay is known: on a
-        busy machine the messages of a replay arrive late. If no replay appears within
-        `MAX_ANSWER_S`, the jump is dropped, and a note tells the user so.
+        The jump waits until an earlier jump has been answered, and until the state of a replay has
+        arrived, which takes long on a busy machine. If no replay appears within `MAX_ANSWER_S`, the
+        jump is dropped, and a note tells the user so.
 
         Returns:
             Whether a jump was sent in this call.

@@ -141,8 +141,9 @@ class ReplayControls:
         self._button.label = "go on with the replay" if replay.paused else "stop the replay"
 
     def _move_slider(self, position: float) -> None:
-        # If the slider is not where this object has put it, the user has moved it, and the position
-        # is not yet taken. Until then it must stay: viser would take the same value for no event.
+        # If the slider does not have the value `_drawn` that this object gave it last, the user has
+        # moved it, and `_take_position` has not read the new value yet. Until then the slider must
+        # not be moved, because the position that the user has chosen would be lost.
         if self._slider.value == self._drawn and position != self._drawn:
             self._drawn = position
             self._slider.value = position  # type: ignore[misc]

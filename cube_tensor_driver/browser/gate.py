@@ -7,10 +7,10 @@ Without a check, any page of the internet that is open in a browser here could t
 address, or by a name that leads to this machine (DNS rebinding). A server on other addresses
 answers browsers that were given its token.
 
-viser (1.1) has no setting for either, no hook before the handshake, and its server is made inside
-a private method by `websockets.asyncio.server.serve`. That name is therefore replaced while the
-server is being made, and only then: `guarded_server`. Everything else would be larger: a proxy
-leaves viser's own port open to other pages, and a subclass repeats 300 lines of private code.
+viser (1.1) has no setting for these checks and calls no function of its user before the handshake.
+A private method of viser makes the server with `websockets.asyncio.server.serve`. `guarded_server`
+therefore replaces this function, only while the server is being made. Other solutions are worse: a
+proxy leaves viser's own port open to other pages, and a subclass repeats 300 lines of private code.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ from ..core.errors import ConfigError
 LOCAL_HOSTS = ("127.0.0.1", "localhost", "::1")
 """Names of this machine that may stand in the Host header of an HTTP request.
 
-The port in the header is not compared, because it is another one through a tunnel (ssh -L).
+The port in the header is not compared, because a browser that connects through a tunnel (ssh -L)
+sends the port of the tunnel.
 """
 
 MISSING_TOKEN = (

@@ -23,7 +23,7 @@ becomes the first one of a new pair.
 """
 
 MAX_NUMBER_DIFFERENCE = 2**24
-"""Maximum difference of the numbers of the two samples from which a rate is computed.
+"""Maximum difference of the sequence numbers of the two samples from which a rate is computed.
 
 A larger difference (modulo 2**32) means that the hub has restarted and counts from 0 again.
 """

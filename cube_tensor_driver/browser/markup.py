@@ -88,8 +88,8 @@ class PageStatus:
 
     Attributes:
         action: Text about the result of the user's last action, such as a tare.
-        title: Title of the note with this text.
-        colour: Colour of this note.
+        title: Title of the note that shows the text `action`.
+        colour: Colour of that note.
         recording: Whether a bag is being recorded.
     """
 

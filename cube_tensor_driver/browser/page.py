@@ -60,8 +60,8 @@ CAMERA_DIRECTIONS = {
     # Exactly from above, it would not be known which side of the skin is up in the picture.
     "from above": np.array([0.0, -0.01, 1.4]) * SPAN,
 }
-"""Name of a direction of view -> vector to the camera from its target, the point at which it looks,
-in the coordinates of the scene."""
+"""Name of a direction of view -> vector (3,), in the coordinates of the scene. It leads from the
+camera's target (the point at which the camera looks) to the camera."""
 
 PHONE_TARGET = np.array([0.0, -0.45, -0.3]) * SPAN
 """Point of the scene at which the camera looks on a phone.
@@ -101,9 +101,9 @@ JUMP = "jump"
 Act = Callable[..., None]
 """Function that a page calls, in threads of viser, when its user wants something.
 
-Its arguments are the action, `TARE`, `CLEAR_TARE`, `RECORD`, `STOP`, `HOLD` or `JUMP`, and for the
-latter a function that returns a time in the replay, in s after the start of the bag. It returns at
-once; the action is done later, in the thread that shows the page.
+Its first argument is the action: `TARE`, `CLEAR_TARE`, `RECORD`, `STOP`, `HOLD` or `JUMP`. For
+`JUMP` the second argument is a function that returns a time in the replay, in s after the start of
+the bag. The call returns at once; the action is done later, in the thread that shows the page.
 """
 
 NOTE_S = 8.0
@@ -176,7 +176,8 @@ class Page:
         is_frozen = self._history is not None
         if not self._paused or not is_frozen:
             shown = self._scan
-            # Without new values, as in a replay that is held, the automatic ranges stay.
+            # While no new values arrive, as in a replay that is held, the automatic ranges of
+            # colours and arrows do not change.
             if shown is None or not np.array_equal(shown.values, scan.values, equal_nan=True):
                 self._ranges_before = self._ranges
             self._scan = scan

@@ -18,10 +18,11 @@ from .history import SampleRate
 from .surface_field import SurfaceField
 
 MAX_RESULT_DELAY_NS = 1_000_000_000
-"""Maximum difference, in ns, of the stamps of the newest `stress` message and of the newest message
-of the node `contacts`, which copies the stamp of the `stress` message that it has processed.
+"""Maximum difference, in ns, between the stamp of the newest `stress` message and the stamp of the
+newest message of the node `contacts`.
 
-A larger difference means that the node has ended.
+The node gives its messages the stamp of the `stress` message from which it has computed them. A
+larger difference means that the node has ended.
 """
 
 MAX_WAITING_MESSAGES = 300
@@ -118,10 +119,12 @@ class ScanSynchronizer:
         _add_result(self._clouds, stamp_ns, cloud)
 
     def advance(self) -> bool:
-        """Go on to the newest waiting rows that the node `contacts` has processed, if it runs.
+        """Make the newest waiting rows the present ones, with the results for them.
+
+        While the node `contacts` runs, only rows that it has processed are taken.
 
         Returns:
-            Whether there were such rows.
+            Whether rows were taken.
         """
         if not self._waiting:
             return False

@@ -64,8 +64,9 @@ MAX_NAMED_CUBES = 256
 MIN_ARROW_UNIT = SPAN / 16
 """Minimum of the unit length to which the sizes of arrows are relative, in units of the scene.
 
-The unit length is the pitch (distance of neighbouring cubes) if that is larger. On a skin of a
-thousand cubes the pitch is so small that the directions of such arrows could not be seen.
+The unit length is the pitch (distance of neighbouring cubes) if the pitch is larger than this
+minimum. On a skin of a thousand cubes the pitch is so small that the directions of arrows of that
+size could not be seen.
 """
 
 MIN_THICKNESS = SPAN / 500
@@ -362,7 +363,7 @@ class Scene:
         """
         poses = self._placement.poses
         arrows = lines(poses, values, length)
-        # A shorter arrow would be hardly more than a dot.
+        # Arrows shorter than `MIN_ARROW` are left out, because they would look like dots.
         size = np.linalg.norm(arrows[:, 1] - arrows[:, 0], axis=1)
         arrows = arrows[size > MIN_ARROW * self._placement.arrow]
         return scene.heads(arrows, np.broadcast_to(VIEW_DIRECTION, (len(arrows), 3)))
@@ -381,7 +382,8 @@ class Scene:
         placement, pitch = self._placement, self._placement.pitch
         poses = placement.poses
         lines, is_tension = scene.make_principal_crosses(poses, values, pitch / longest)
-        # The crosses are centred on the upper faces; this lifts them.
+        # The lines are centred on the upper faces of the cubes, which would hide a part of them, so
+        # they are lifted to `CROSS_HEIGHT`.
         height = CROSS_HEIGHT * pitch - poses.half_side
         lift = height[:, None] * poses.rotation[:, :, 2]
         lines = lines + lift[:, None, None]
@@ -390,7 +392,8 @@ class Scene:
     def _draw_chosen_cube(self, cube: int) -> Array:
         """Return the lines of the marks at the corners of the chosen cube."""
         placement = self._placement
-        # The marks stand a little outside of the face; on a large skin they have a minimum size.
+        # The square of the marks is larger than the face (2 half sides); on a large skin it has a
+        # minimum size.
         side = max(2.6 * float(placement.poses.half_side[cube]), 0.2 * placement.arrow)
         lines = make_corner_lines(placement.poses.rotation[cube], side)
         return np.asarray(lines + scene.above(placement.poses, 1.1)[cube])
@@ -472,7 +475,8 @@ class Scene:
 
     def _add_names(self, api: viser.SceneApi) -> Any:
         """Add the names of the cubes, each in front of its cube; none above `MAX_NAMED_CUBES`."""
-        # All names are children of one frame; hiding the frame hides them with a single message.
+        # All names are children of one frame in viser, so that a single message to the browser,
+        # which hides the frame, hides all names.
         frame = api.add_frame("/names", show_axes=False, visible=False)
         if len(self._names) > MAX_NAMED_CUBES:
             return frame

@@ -25,7 +25,8 @@ MAX_SURFACE_POINTS = 5000
 and shear between the cubes) is drawn."""
 
 MAX_POINTS_PER_SIDE = 12
-"""Maximum number of points of the surface along one side of the square patch around a cube."""
+"""Maximum number of grid points along one side of the square part of the skin's surface around a
+cube."""
 
 
 class ShownSkin:

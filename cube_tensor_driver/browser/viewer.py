@@ -72,15 +72,16 @@ PICTURE_PERIOD_S = 0.1
 MIN_PAUSE_SHARE = 2.0
 """Minimum pause after an update of the pages, divided by the processor time that the update took.
 
-So the updates of a very large skin take at most a third of a core, and come less often.
+With a ratio of 2, the updates take at most a third of a core; those of a very large skin come less
+often than once per `PICTURE_PERIOD_S`.
 """
 
 WAITING_NOTE_S = 2.0
 """Time, in seconds after the start, at which the terminal prints that no skin is published yet."""
 
 MAX_STEP_S = 0.02
-"""Maximum time, in seconds, from one check whether a picture is due to the next. The check also
-follows each message."""
+"""Maximum time, in seconds, between two checks whether the pages are to be updated. A check also
+follows each message from ROS."""
 
 NEVER_STALE_S = 1e9
 """Maximum age, in seconds, of a cube's latest row (sample) while a replay of a bag is paused.
@@ -182,7 +183,7 @@ class Viewer:
             start_s = time.thread_time()
             self._callback_errors.catch(self._update)(self._shown)
             pause_s = MIN_PAUSE_SHARE * (time.thread_time() - start_s)
-            # Pictures that are overdue, for example after the computer slept, are skipped.
+            # Pictures whose times have passed, for example while the computer slept, are skipped.
             self._next_picture_s = max(
                 self._next_picture_s + PICTURE_PERIOD_S,
                 time.monotonic() + pause_s,
