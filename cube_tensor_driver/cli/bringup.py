@@ -41,10 +41,11 @@ PPM = 1e6
 """Number of ppm (parts per million) in 1."""
 
 UNKNOWN_MISFIT = 0.5
-"""Limit of the misfit that selects the message if presses do not determine a cube's rotation.
+"""Misfit that selects the text for the user if the presses do not determine how a cube is rotated.
 
-The misfit is 0 if the best rotation explains the measurement completely and 1 if it explains
-nothing. Below the limit the message is that several rotations fit, above it that none fits.
+Below this misfit the text is that several explanations fit; from it up, the text states which part
+of the measurement is not explained. The misfit is 0 if the best rotation explains the measurement
+completely and 1 if it explains nothing.
 """
 
 
@@ -207,7 +208,8 @@ def watch_rest(source: LinkSource) -> PadsAtRest:
             live.update(table, refresh=True)
             if is_over:
                 break
-    # The live table is erased; this one stays on the screen, also if stdout is no terminal.
+    # The live table is erased at its end. The printed table stays on the screen, and is also
+    # written if stdout is no terminal.
     console.print(table)
     return rest
 

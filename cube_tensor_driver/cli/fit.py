@@ -23,7 +23,7 @@ FIGURES = (
     *("coefficients", "deviations", "gain", "gain_deviation", "scale", "chi2", "dof"),
     *("held_out", "undetermined", "advice"),
 )
-"""Names of the attributes of a fit that the JSON file contains."""
+"""Names of the attributes of a `Fit` that are written to the file of the option --json."""
 
 
 def add_arguments(parser: Parser) -> None:
@@ -259,7 +259,8 @@ def read_inputs(
         # Unloaded rows cannot be found in a bag, because a reference sensor never measures exactly
         # 0. Therefore the rest frequencies are those of the last tare during the recording.
         rest, rest_source = base.rest_frequency, "of the bag, after tare"
-    # A bag contains no loads; --reference names the topic with the loads.
+    # A bag contains frequencies but no table of loads; only with --reference, which names the topic
+    # of a reference sensor, the loads can be taken from it.
     elif is_bag(options.loads):
         raise ConfigError(
             f"{options.loads} is a bag: name the topic to fit to with --reference; "

@@ -1,6 +1,6 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""./cube tare: take the present load of a running skin as zero load, or clear that."""
+"""./cube tare: take the present load of a running skin as zero load, or clear all tares."""
 
 from __future__ import annotations
 

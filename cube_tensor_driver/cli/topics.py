@@ -35,7 +35,8 @@ def describe_cubes(cubes: list[str]) -> str:
     """Return the number and names of the cubes that have a topic of the same kind, as a text.
 
     Args:
-        cubes: Names of the cubes. They are empty for a topic of the whole skin, and so is the text.
+        cubes: Names of the cubes. For a topic of the whole skin the list is empty, and the function
+            returns an empty text.
     """
     from ..views.terminal.output import counted
 
