@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files of influence functions, found by the name that a parameter or an option gives.
 
-Influence functions state what each pad measures of a unit force at points of the skin's surface;
-they are tables computed with finite elements.
+An influence function states what a pad measures under a unit force, for many positions of the force
+on the skin's surface. The files are tables computed with finite elements.
 """
 
 from __future__ import annotations

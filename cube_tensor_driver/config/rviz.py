@@ -17,8 +17,8 @@ CAMERA_DISTANCE = 1.5
 its legend."""
 
 MIN_CAMERA_DISTANCE_M = 0.05
-"""Minimum distance of RViz's camera from the skin, in m. It serves skins of a single cube: the
-diagonal between the centres of their cubes is 0."""
+"""Minimum distance of RViz's camera from the skin, in m. It is needed for a skin of a single cube:
+the box around the centres of its cubes has the diagonal 0."""
 
 LEGEND_HEIGHT = 0.8
 """Height (along y) of the legend that the node `markers` draws beside the skin, divided by the

@@ -74,7 +74,7 @@ _CUBE = mapping(
         "calibration": TEXT,
     },
 )
-"""Schema of a cube. It is found by its link and index, or by its uid."""
+"""Schema of a cube, which the file identifies either by its link and index or by its uid."""
 _ELASTOMER = mapping(
     ("depth", "thickness"),
     {
