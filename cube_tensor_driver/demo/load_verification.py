@@ -26,10 +26,11 @@ from ..touch.surface import Surface
 from .verification import Arrivals, Comparison, compare, percentile
 
 MIN_TIMES_COMPARED = 500
-"""Minimum number of sampling times that are compared with the load, if there are as many.
+"""Minimum number of sampling times that are compared with the load; a measurement with fewer times
+is compared completely.
 
-Of a longer measurement, every n-th sampling time is compared, because the load at each of them is
-the solution of a contact problem, which takes time.
+If a measurement has many more, only every n-th sampling time is compared, because computing the
+load at each time takes long: it is the solution of a contact problem.
 """
 
 RANGE_TIMES = 100
@@ -222,10 +223,10 @@ class LoadVerification:
         return compare(self._log.table, arrivals, *self._span_ns)
 
     def _find_received(self, comparison: Comparison) -> tuple[Index, Array, Mask]:
-        """Return the tensors that arrived, at every n-th sampling time of a long measurement.
+        """Return the tensors that arrived; of a long measurement only those of every n-th time.
 
         Args:
-            comparison: The samples that the hubs took, and which rows of stress of them arrived.
+            comparison: The samples that the hubs took, and which rows of stress arrived for them.
 
         Returns:
             T sampling times, in ns since the Unix epoch; components (T, cubes, 15) in Pa and Pa/m,
@@ -252,7 +253,7 @@ class LoadVerification:
         """Compute the errors of the tensors that arrived.
 
         Args:
-            comparison: The samples that the hubs took, and which rows of stress of them arrived.
+            comparison: The samples that the hubs took, and which rows of stress arrived for them.
 
         Returns:
             Rms and largest error relative to the range of each component under the load, and rms

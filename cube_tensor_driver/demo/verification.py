@@ -28,9 +28,9 @@ class Arrivals:
     """Stores which rows (one cube at one sampling time) have arrived, and when.
 
     Attributes:
-        row_count: (cubes,) number of rows that each stored row of a cube counts as: 1, or, if only
-            the first cube of each hub is stored, the number of cubes of its hub. 0 for cubes whose
-            rows are not stored.
+        row_count: (cubes,) number of rows that each stored row of a cube stands for: 1, or, if only
+            rows of the first cube of each hub are stored, the number of cubes of this hub. It is 0
+            for cubes whose rows are not stored.
         rows: Number of rows that have arrived, stored or not.
     """
 
@@ -82,8 +82,8 @@ class Arrivals:
             Index of the cube; sequence number; stamp and time of arrival, in ns since the Unix
             epoch.
         """
-        # The parts of all messages are replaced by the joined one, so that the next call does not
-        # have to join them again.
+        # The joined array replaces the parts of all messages, so that the next call does not have
+        # to join them again.
         joined = np.hstack(self._parts)
         self._parts = [joined]
         return joined
@@ -91,9 +91,9 @@ class Arrivals:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The samples that the hubs took in a period, and the rows of them that arrived.
+    """The samples that the hubs took in a period, and the rows that arrived for these samples.
 
-    A row is one cube at one sampling time.
+    A row is one cube at one sampling time; a sample of a hub has one row for each of its cubes.
 
     Attributes:
         sent: Number of rows of the samples that the hubs took.
