@@ -221,8 +221,8 @@ class EpisodeWriter:
             columns[key] = numbers[:, np.newaxis]
         data_set.write(windows | columns)
 
-        # A window has room for more samples than most frames have. What is left free is NaN, which
-        # the statistics leave out.
+        # The arrays `windows` have room for more samples than most frames have. The free entries
+        # are NaN, which the statistics leave out.
         components = windows[TACTILE].reshape(-1, len(COMPONENTS))
         residual = windows[RESIDUAL].reshape(-1, 1)
         self._statistics[TACTILE].add(components)

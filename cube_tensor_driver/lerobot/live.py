@@ -55,8 +55,11 @@ MIN_HEIGHT = 4 * MIN_SQUARE
 (`NUMBER_GRID`), covers at most half of it."""
 
 MAX_AGE_NS = 5_000_000
-"""Age, in ns, from which on a sample must be in the frame that is read; but at least one sampling
-period, within which there need not be a new sample."""
+"""Maximum age, in ns, of a sample that may still be missing in the frame that is read.
+
+If the sampling period is longer, the period is the maximum age: within it a cube need not have a
+new sample.
+"""
 
 CATCH_UP_S = 0.02
 """Longest time, in s, for which `next_picture` waits until no unread sample is older than
@@ -73,12 +76,12 @@ UNKNOWN_GREY = 90
 
 
 class LiveWindows:
-    """Writes the stress of a live skin to a file, for each frame the samples since the last one.
+    """Writes the stress of a live skin to a file, one window for each frame.
 
-    The samples of one frame are a window. A thread collects them as they arrive, whatever the
-    recorder does meanwhile. Windows may differ in length, so a pause of the recorder makes only one
-    window longer. The file is FOLDER/NUMBER.arrow, with the number of the first frame. It is an
-    Arrow stream, which stays readable if the program is killed.
+    The window of a frame consists of all samples since the frame before. A thread collects samples
+    as they arrive, whatever the recorder does meanwhile. Windows may differ in length, so a pause
+    of the recorder makes only one window longer. The file is FOLDER/NUMBER.arrow, with the number
+    of the first frame. It is an Arrow stream, which stays readable if the program is killed.
     """
 
     def __init__(

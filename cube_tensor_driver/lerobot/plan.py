@@ -54,12 +54,12 @@ many samples into one frame, the size of the whole data set would be multiplied.
 """
 
 ALWAYS_ALLOWED_COUNT = 100
-"""Number that is added to the largest allowed number of frames (time steps) of an episode, and to
-that of samples of a cube in one frame.
+"""Number that is added to two limits: to the largest allowed number of frames (time steps) of an
+episode, and to the largest allowed number of samples of a cube in one frame.
 
-The ratios `MAX_STAMP_RATIO` and `MAX_DEPTH_RATIO` bound these numbers relative to what the sample
-rate lets expect. In a recording of a few frames, a few samples that were stamped late would already
-exceed the ratios, although nothing is wrong.
+The limits are multiples (`MAX_STAMP_RATIO`, `MAX_DEPTH_RATIO`) of the numbers that are expected
+from the duration of the recording and the sample rate. Without this addition, a few samples that
+were stamped late would exceed the limits in a recording of a few frames, although nothing is wrong.
 """
 
 Report = Callable[[float, float, str], None]
@@ -180,7 +180,7 @@ class Episode:
         if not len(cube):
             return
         # The first samples determine the begin of frame 0 (the first time step). Samples that are
-        # read later but have earlier stamps are put into it, too.
+        # read later but have earlier stamps are put into frame 0, too.
         if not self.rows:
             self.begin_ns = int(stamp_ns.min())
         frame = self.sample_frame_of(stamp_ns)

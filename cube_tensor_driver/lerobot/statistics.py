@@ -86,7 +86,8 @@ class Statistics:
         is_empty = total == 0
         weight = count / np.maximum(total, 1)
         mean = (weight * means).sum(axis=0)
-        # Law of total variance: the variances within the parts, plus that of the means of the parts
+        # Law of total variance: the total variance is the mean of the variances within the parts
+        # plus the variance of the means of the parts.
         within = (weight * variances).sum(axis=0)
         differences = (means - mean) ** 2
         between = (weight * differences).sum(axis=0)

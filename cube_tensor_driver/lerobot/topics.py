@@ -277,7 +277,8 @@ def _list_nested_paths(
 
     Args:
         fields: Name and kind of each field, as `message_fields` returns them.
-        prefix: Path of the fields within the outermost message, ending in "."; "" for its own.
+        prefix: Path from the outermost message to these fields, ending in "."; "" if they are the
+            fields of the outermost message itself.
 
     Yields:
         Paths such as ``wrench.force.x``, of a number or of a list of numbers of fixed length; None
@@ -287,8 +288,7 @@ def _list_nested_paths(
         if node == Nodetype.NAME:
             yield from _list_nested_paths(message_fields(kind), f"{prefix}{name}.")
             continue
-        # For a list of fixed length, `kind` consists of the node and kind of its elements, and the
-        # length.
+        # For a list of fixed length, `kind` is a pair: (node and kind of an element, length).
         if node == Nodetype.ARRAY:
             node, kind = kind[0]
         if node != Nodetype.BASE:

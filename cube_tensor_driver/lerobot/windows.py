@@ -122,8 +122,8 @@ def arrange_windows(
         Arrays (n, depth, cubes, …) by the names of the features.
     """
     n_frames, n_cubes = counts.shape
-    # A cell is one cube in one frame. Stable sorting keeps its samples in the order of
-    # recording.
+    # A cell is a pair of a frame and a cube. Stable sorting keeps the samples of each cell in the
+    # order of recording.
     cell = frame * n_cubes + rows.cube
     order = np.argsort(cell, kind="stable")
     cell = cell[order]
