@@ -81,7 +81,7 @@ _FIRST_FIELDS = (
     _Field("sequence", "<u4", 1),
     _Field("time_offset", "<i4", 1),
 )
-"""Fields with which both batch messages begin after the header."""
+"""Fields that follow the header in SkinFrequencies as well as in SkinStress."""
 _FREQUENCIES = (
     *_FIRST_FIELDS,
     _Field("n_pads", "<u1", PER_MESSAGE),
@@ -118,10 +118,10 @@ class _Shape(NamedTuple):
 
 
 class _Layout(NamedTuple):
-    """Layout of all messages with the same numbers of rows and pads and length of the frame id.
+    """Byte offsets of the fields of all messages that have the same `_Shape`.
 
     Attributes:
-        shape: The numbers of rows and pads and the length of the frame id.
+        shape: Length of the frame id, number of rows and number of pads of these messages.
         record: Structured dtype of numpy that describes a whole message.
         sequences: Names of the fields that are sequences, `frame_id` first.
         counts: Numbers of values that these sequences must have.
@@ -427,8 +427,8 @@ class MessageCodec(Generic[AnyRows]):
         # number of values is the number of rows.
         (rows,) = struct.unpack_from("<I", data, rows_at)
         shape = _Shape(frame, rows, 0)
-        # A damaged message may state any number of rows. A layout allocates no memory for rows, and
-        # numpy refuses one that is longer than any message.
+        # A damaged message may state any number of rows. Computing a layout allocates no memory for
+        # the rows, and numpy raises a ValueError if the layout would be longer than any message.
         with contextlib.suppress(ValueError):
             layout: _Layout = self._find_layout(shape)
             if self._has_pads:

@@ -49,7 +49,10 @@ def read_motion(message: Any, stamp_ns: int) -> Motion | None:
 
 
 def read_states(message: Any) -> dict[str, Array]:
-    """Return the states in a SkinCompensation message, by the `STATES`; empty ones are left out."""
+    """Return the states of effects in a SkinCompensation message, by their names in `STATES`.
+
+    States that are empty in the message are left out.
+    """
     states = {}
     for name in STATES:
         state = np.asarray(getattr(message, name), float)

@@ -34,16 +34,19 @@ _NUMBERS = (
     "position_uncertainty",
     "force_uncertainty",
 )
-"""Numbers of a contact that every method gives, with one name in message and `Contact`."""
+"""Numbers of a contact that every method of contact estimation gives. Each has the same name in the
+message SkinContacts and in `Contact`."""
 _TRACKED_NUMBERS = (
     "moment",
     "shear_uncertainty",
     "area_uncertainty",
     "moment_uncertainty",
 )
-"""Numbers of a contact that only the method inverse gives; otherwise they are NaN."""
+"""Numbers of a contact that only the method `inverse` of contact estimation gives. With another
+method, the arrays of these numbers in the message are empty."""
 _FRICTION = ("friction", "friction_uncertainty", "friction_use")
-"""Numbers of a contact that are taken from `Slip`."""
+"""Numbers of a contact that are taken from `Slip`: friction coefficient, standard deviation of the
+coefficient, and ratio of shear to normal force divided by the coefficient."""
 _VECTORS = {
     "position": "Point",
     "normal": "Vector3",

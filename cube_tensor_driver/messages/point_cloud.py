@@ -24,7 +24,7 @@ FLOAT32 = 7
 """Value of the constant FLOAT32 of sensor_msgs/msg/PointField."""
 
 FLOAT32_SIZE = 4
-"""Size of a number of this type, in bytes."""
+"""Size, in bytes, of a number of the type FLOAT32 of a PointField."""
 
 
 def make_cloud_message(

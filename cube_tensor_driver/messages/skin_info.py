@@ -87,7 +87,9 @@ def read_cube_calibrations(info: Any) -> tuple[Calibration, ...]:
 
 @lru_cache
 def _parse_calibration(name: str, text: str) -> Calibration:
-    """Return a calibration, which is cached because many recordings of one skin have the same.
+    """Return the calibration that a text describes.
+
+    The result is cached, because many recordings of one skin contain the same text.
 
     Args:
         name: Id of the calibration, for error messages.
