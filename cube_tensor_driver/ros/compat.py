@@ -51,7 +51,7 @@ def make_executor(warn: Callable[[str], object] = lambda text: None) -> Executor
 
 
 def with_number(callback: Callable[[Any, int | None], None]) -> Callable[..., None]:
-    """Wrap a function of a message and its sequence number so that a subscription can call it.
+    """Wrap a function that takes a message and its sequence number, as callback of a subscription.
 
     Args:
         callback: Called with each message and its sequence number. DDS numbers the messages of each

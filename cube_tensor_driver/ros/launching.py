@@ -268,7 +268,8 @@ def _check_names(context: LaunchContext, declared: Iterable[str]) -> None:
     """Raise ConfigError if the command line of `ros2 launch` has an argument that is not declared.
 
     Launch itself ignores such arguments. They are checked only if the command line names a launch
-    file of this package, because another one that includes it has arguments of its own.
+    file of this package. Another launch file, which includes one of this package, may declare
+    further arguments.
     """
     file_names = {Path(word).name for word in sys.argv}
     own_launch_files = {SKIN_LAUNCH.name, "cube.launch.py"}

@@ -30,8 +30,11 @@ from .node import CubeNode
 from .qos import NEWEST
 
 MAX_SAMPLES = 4096
-"""Maximum number of samples of an IMU that are kept; then the older half is dropped. A message of
-frequencies covers up to 1 s, in which an IMU with 1 kHz sends half as many as are left."""
+"""Maximum number of samples of an IMU that are kept. When it is reached, the older half is dropped.
+
+A message of frequencies covers up to 1 s, in which an IMU with 1 kHz sends 1000 samples. So the
+2048 samples that are left suffice.
+"""
 
 MAX_TRANSFORM_AGE_NS = SECOND
 """Maximum difference, in ns, between the time of a transform and the time of the newest row (sample
@@ -39,8 +42,8 @@ of a cube). With an older transform the direction of gravity counts as unknown. 
 apply to static transforms."""
 
 CROSS_OF_AXES = np.cross(np.eye(3)[:, None], np.eye(3)).swapaxes(1, 2).reshape(3, 9)
-"""For each axis x, y, z, the 9 numbers of the matrix whose product with any vector r is the cross
-product of the unit vector along the axis and r (3, 9)."""
+"""Matrices of the cross products with the unit vectors e along x, y and z, (3, 9). Each row holds
+the 9 numbers, row by row, of the matrix whose product with any vector r is e x r."""
 
 
 class MissingMotion(CubeError):
@@ -86,6 +89,10 @@ class Transforms:
 
     def newest(self, target: str, source: str) -> tuple[Array, Array, int]:
         """Return the newest transform from one frame to another.
+
+        Args:
+            target: Frame into which vectors are transformed.
+            source: Frame in which the vectors are given.
 
         Returns:
             Rotation (3, 3), position (3,) of the source's origin in the target frame, in m, and the
@@ -134,7 +141,10 @@ class GravityMotion:
         self._transforms = Transforms(node)
 
     def motion(self, first_ns: int, last_ns: int) -> Motion:
-        """Return the motion that follows from the newest transform; see `ImuMotion.motion`."""
+        """Return the motion that follows from the newest transform, at the end of a span of time.
+
+        Arguments and errors are those of `ImuMotion.motion`.
+        """
         rotation, _, time_ns = self._transforms.newest(self._parent_frame, self._frame)
         age_ns = last_ns - time_ns
         if time_ns and abs(age_ns) > MAX_TRANSFORM_AGE_NS:
@@ -148,12 +158,13 @@ class GravityMotion:
 
 
 IMU_HEADER = struct.Struct("<4xiII")
-"""Begin of a serialised message sensor_msgs/Imu in little-endian CDR: seconds, nanoseconds, and the
-length of the frame id, which follows."""
+"""Layout of the begin of a serialised message sensor_msgs/Imu (little-endian CDR): seconds and
+nanoseconds of the stamp, and length of the frame id. The frame id follows."""
 
 IMU_NUMBERS = struct.Struct("<104x3d72x4d")
-"""Numbers behind the frame id: angular velocity, linear acceleration, and the first element of its
-covariance. Orientation and other covariances are skipped."""
+"""Layout of the numbers behind the frame id in a serialised message sensor_msgs/Imu: angular
+velocity, linear acceleration, and the first element of the covariance of the linear acceleration.
+Orientation and other covariances are skipped."""
 
 Vector = tuple[float, ...]
 """Components x, y and z of a vector. Computing with three floats is faster than with an array."""
@@ -224,8 +235,9 @@ class ImuMotion:
         elif interval_ns <= MAX_INTERVAL_NS:
             changes = zip(velocity, before.angular_velocity, strict=True)
             mean = tuple((now - then) * SECOND / interval_ns for now, then in changes)
-            # The mean acceleration is that in the middle of the interval. It is extrapolated
-            # linearly by half an interval to the time of the sample.
+            # The mean angular acceleration is taken as that in the middle of the interval between
+            # the samples. It is extrapolated linearly to the end of the interval, the time of the
+            # new sample.
             means = zip(mean, before.mean_acceleration, strict=True)
             acceleration = tuple(1.5 * now - 0.5 * then for now, then in means)
             sample = sample._replace(angular_acceleration=acceleration, mean_acceleration=mean)
@@ -234,7 +246,9 @@ class ImuMotion:
         self._samples.append(sample)
 
     def motion(self, first_ns: int, last_ns: int) -> Motion:
-        """Return the motion at the samples around a span of time, to be interpolated in it.
+        """Return the motion at the times of the IMU's samples before, in and after a span of time.
+
+        The caller interpolates between these times.
 
         Args:
             first_ns: Begin of the span, in ns since the Unix epoch.

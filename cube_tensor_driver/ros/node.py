@@ -307,8 +307,8 @@ class CubeNode(LifecycleNode):
 
     def _check_parameters(self, parameters: list[RclpyParameter]) -> SetParametersResult:
         for parameter in parameters:
-            # rclpy also asks about its own parameters, such as use_sim_time, which have no entry.
-            # They are not checked here.
+            # rclpy also calls this method for its own parameters, such as use_sim_time. They have
+            # no entry in `_parameters_by_name` and are not checked here.
             known = self._parameters_by_name.get(parameter.name)
             if known is None:
                 continue

@@ -87,7 +87,7 @@ class SkinSubscriber:
         self._node.destroy_subscription(self._stress)
 
     def now(self) -> float:
-        """Return the time of the node's clock, in s. It is the arrival time of stress in `skin`."""
+        """Return the time of the node's clock, in s, with which arrivals of stress are stored."""
         return 1e-9 * float(self._node.get_clock().now().nanoseconds)
 
     def _receive_info(self, info: SkinInfo) -> None:

@@ -43,8 +43,8 @@ interpreter lock more often.
 FLUSH_PERIOD_S = 0.25
 """Time, in seconds, after which written data are passed to the operating system (flushed).
 
-If the process is killed (SIGKILL), the messages that were not yet flushed are lost. Together with
-the time for writing, these are at most the messages of twice this period.
+If the process is killed (SIGKILL), the messages that were not yet flushed are lost. Because writing
+takes time, too, these may be the messages of up to twice this period.
 """
 
 MAX_WAITING_BYTES = 256 << 20
@@ -70,8 +70,8 @@ class Recorder:
     """Records topics into a bag, until `close`.
 
     The caller calls `find_topics` regularly, which subscribes to topics that are published by now.
-    Messages are kept from the time on at which all topics are connected (see `MAX_CONNECT_S`),
-    those of latched topics from their connection on.
+    Recording begins when all topics are connected (see `MAX_CONNECT_S`), and messages that came
+    before are dropped. Only messages of latched topics are kept from their connection on.
 
     Attributes:
         has_begun: Whether recording has begun, so that messages are kept.

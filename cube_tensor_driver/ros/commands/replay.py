@@ -37,11 +37,11 @@ CLOCK_PERIOD_S = 0.01
 before every replayed message."""
 
 SETTLE_S = 1.0
-"""Time, in seconds, without a new subscriber after which the replay begins if `frequencies` has a
-subscriber.
+"""Time, in seconds, for which no further subscriber must have come before the replay begins.
 
-A node discovers each topic separately, so a node that has subscribed to `info` may not have found
-`frequencies` yet and would miss the first messages.
+It applies if the topic `frequencies` has a subscriber; otherwise `MAX_WAIT_S` does. A node
+discovers each topic separately, so a node that has subscribed to `info` may not have found
+`frequencies` yet and would miss its first messages.
 """
 
 MAX_WAIT_S = 3.0
@@ -53,9 +53,10 @@ LOOK_PERIOD_S = 0.1
 waits for them."""
 
 SHOWN_NS = 100_000_000
-"""Duration of the recording, in ns, that is published after a jump while the player is paused.
+"""Length, in ns, of the part of the recording that is published after a jump while the player is
+paused.
 
-In this time every cube was sampled at least once, so that viewers show the stress of all cubes at
+In this part every cube was sampled at least once, so that viewers show the stress of all cubes at
 the new position.
 """
 

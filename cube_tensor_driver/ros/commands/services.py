@@ -31,7 +31,7 @@ ANNOUNCE_S = 3.5
 DDS repeats its announcements every 3 s, and the first ones can be lost."""
 
 SETTLE_S = 0.3
-"""Time, in seconds, without a newly found topic or service, after which the search ends.
+"""Time, in seconds, after which a search for topics or services ends if it has found nothing new.
 
 It is also the time between finding a service and calling it: rmw_fastrtps drops the response to a
 client that the server has discovered less than 0.1 s before.

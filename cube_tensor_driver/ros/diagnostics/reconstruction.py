@@ -41,9 +41,9 @@ MIN_UPDATES_TO_LOG = 5
 logged, because hubs may start later than the node."""
 
 MAX_KNOWN_PUBLISHERS = 8
-"""Maximum number of publishers of one topic whose last sequence number is remembered. If several
-publishers send on the topic, their different sequence numbers must not be taken for lost
-messages."""
+"""Maximum number of publishers of one topic whose last sequence numbers are remembered. By these
+numbers a message from another publisher is recognised, so that its number is not taken for a gap,
+which would be counted as lost messages."""
 
 LogChanges = list[tuple[str, bool]]
 """Lines for the log, each with a flag: True if it reports a problem, False if it reports the end of
@@ -209,7 +209,7 @@ class CubeHealth:
         self._health.collect()
 
     def summary(self) -> dict[str, int]:
-        """Return the present numbers of pads in each faulty condition and of cubes with a residual.
+        """Return the numbers of pads in each faulty condition, and of cubes with a high residual.
 
         Conditions are open, short, noisy and so on. The keys of the dict are the keys of the
         diagnostic status, such as "pads open". Numbers that are 0 are left out.
@@ -300,8 +300,8 @@ class LostMessages:
         self._lost_by_dds = 0
         self._newest: int | None = None
         # Number of messages that are missing just before the newest one. They are counted as lost
-        # only when the next message has the next number: only then is the newest message not from
-        # another publisher with other numbers.
+        # only when the next message has a higher number. Otherwise the newest message may come from
+        # another publisher, whose numbers differ.
         self._gap = 0
         self._other_publishers: deque[int] = deque(maxlen=MAX_KNOWN_PUBLISHERS)
         self._has_several_publishers = False

@@ -20,10 +20,12 @@ LINE_WIDTH = 0.05
 """
 
 UPSIDE_DOWN = np.array([-1.0, 1.0, -1.0])
-"""Rotation by 180 degrees about the y axis, as factors of the x, y and z coordinates.
+"""Rotation by 180 degrees about the y axis: the factors by which it multiplies the coordinates x, y
+and z.
 
 Boxes are drawn upside down, because RViz 2 shades them: the face towards -z has 0.9 of the
-brightness of the colour, the face towards +z only 0.5. The shape of a box does not change.
+brightness of the colour, the face towards +z only 0.5. The rotation does not change the shape of a
+box.
 """
 
 TRACTION_LENGTH = 1.2

@@ -90,8 +90,8 @@ class Reconstruction(CubeNode):
         skin = self._skin = recorded.skin if recorded else self.read_skin()
         self._reconstructor = Reconstructor(skin)
         self._reconstructor.drift_time = float(self.value("drift_time"))
-        # The driver may put one scan more into a message than the number that belongs to
-        # publish_period. The factor 2 allows hubs to send faster than the rate in the skin file.
+        # A message of the driver may contain one scan more than follows from publish_period and the
+        # rate. The factor 2 allows hubs to send faster than the rate in the skin file.
         scans = scans_per_message(self.value("publish_period"), skin.rate)
         self._max_scans = max(MAX_SCANS, 2 * (scans + 1))
 
@@ -219,7 +219,7 @@ class Reconstruction(CubeNode):
         self._diagnostics.count(stress)
 
     def _note_compensation(self, rows: FrequencyRows, stamp_ns: int) -> FrequencyRows:
-        """Publish the data of the compensation, and add the specific force at its cube to each row.
+        """Publish the data of the compensation, and add to each row the specific force at its cube.
 
         The message `compensation` contains what a recording needs to repeat the compensation of
         these rows: the motion of the skin, and at intervals the states of creep and temperature.

@@ -4,9 +4,10 @@
 
 The hardware component ``cm_topic_hardware_component/CMTopicSystem`` of ros2_control turns two
 topics, ``<component>/names`` and ``<component>/values``, into state interfaces (numbers that
-controllers read). Its source decides what is sent here: it finds the names that belong to values by
-their common version, takes version 0 for "no data yet", warns in every cycle while it does not know
-the version, and returns the last values for ever if no more come.
+controllers read). The source code of this component decides what is sent here. The component finds
+the names that belong to values by their common version, and takes version 0 for "no data yet". It
+warns in every cycle while it does not know the version, and returns the last values for ever if no
+more come.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ discards what a subscriber has not yet taken when the publisher ends, so that a 
 that is late by a few milliseconds would miss a single message."""
 
 LAST_VALUES_PERIOD_S = 0.02
-"""Time, in s, between two of these messages."""
+"""Time, in s, between two of the messages of NaN that are repeated for `LAST_VALUES_S`."""
 
 
 class SkinWrenches:
@@ -195,8 +196,9 @@ class StateInterfaces:
             for kind, what in zip(kinds, ("names", "values"), strict=True)
         )
         names = [f"state_interface.{one}/{part}" for one in wrenches.names for part in COMPONENTS]
-        # The component finds the names that belong to values by their version, so other names need
-        # another version, also after a restart of the node. 0 would mean that there are no data.
+        # The component finds the names that belong to values by their version. So other names need
+        # another version, also after a restart of the node, and the version is computed from the
+        # names. It is not 0, which would mean that there are no data.
         version = zlib.crc32("\n".join(names).encode()) or 1
         self._names = kinds[0](names=names, names_version=version)
         self._values = kinds[1](names_version=version)

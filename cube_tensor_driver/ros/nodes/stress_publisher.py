@@ -116,8 +116,8 @@ class StressPublisher:
 class ForceCloud:
     """Publishes `forces`, a point cloud with one force per cube in the order of the skin file.
 
-    It is published only while it has subscribers. The form is one that software for other tactile
-    sensors can read.
+    It is published only while it has subscribers. Software for other tactile sensors can read this
+    form.
     """
 
     def __init__(
