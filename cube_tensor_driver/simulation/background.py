@@ -31,8 +31,9 @@ from .simulator import Simulator, StopRequest
 class BackgroundHubs:
     """Simulates all hubs of a skin on pseudo-terminals, in real time in a thread, until `close`.
 
-    The load of each sample is read in advance, just after the previous sample. So a new load acts
-    from the second sample after `set_load` on. Before the first `set_load`, there is no load.
+    The load of each sample is read in advance, just after the previous sample was taken. So a new
+    load acts from the second sample after the call of `set_load` on. Before the first call, there
+    is no load.
     """
 
     def __init__(

@@ -69,7 +69,7 @@ class SimulatedHub:
         version: Protocol version of the hub's frames.
         false_uid: Unique number that HELLO contains instead of `uid`; None: `uid`.
         extra_pads: Number of pads that HELLO contains in addition to `n_pads`.
-        celsius: Temperature in 0.01 °C in the SAMPLE frames.
+        celsius: Temperature that the SAMPLE frames contain, in units of 0.01 °C.
         pad_fault: Bit masks (cubes,) of the pads that the hub reports as failed; None for no pads.
         runs: All samples taken so far, as runs (samples at equal intervals) in the order of time.
     """

@@ -6,20 +6,21 @@ and the effects of temperature (`temperature.py`) and of weight (`motion.py`).
 The foam of the pads creeps: under a constant stress, its strain keeps growing, and so does the
 stress that a pad reports. In linear viscoelasticity, the compliance J (strain per stress) is a
 Prony series (chain of Kelvin-Voigt elements), J(t) = J(0) (1 + sum_i c_i (1 - exp(-t / tau_i))).
-So a pad under the stress v(t) reports the stress::
+So a pad under the stress v(t) reports the following stress, in which q_i is v after a first-order
+low-pass filter with the time constant tau_i::
 
     v + sum_i c_i q_i,     tau_i dq_i/dt = v - q_i
 
 Loading and unloading then differ, which is the hysteresis of this model. Measured elastomers follow
-a power law over many decades of time instead, J(t) = J(0) (1 + a t^alpha) (fractional element). It
-is an integral over Kelvin-Voigt elements of all times::
+a power law over many decades of time instead, J(t) = J(0) (1 + a t^alpha) (fractional element). The
+power law is an integral over Kelvin-Voigt elements of all time constants tau::
 
     t^alpha = alpha / Gamma(1 - alpha) * integral of (1 - exp(-t / tau)) tau^(alpha - 1) dtau
 
-so it is simulated by as many terms as make the error of the integral invisible. The silicone around
-the cubes needs no such term: if its Poisson's ratio does not change, the stress in a viscoelastic
-body under given tractions is that of the elastic body (correspondence principle). The growth of
-contacts as silicone creeps is not modelled.
+so it is simulated as a sum over so many time constants that the error of the sum is negligible. The
+silicone around the cubes needs no creep terms: if its Poisson's ratio does not change, the stress
+in a viscoelastic body under given tractions is that of the elastic body (correspondence principle).
+The growth of contacts as silicone creeps is not modelled.
 
 Source: J. D. Ferry, Viscoelastic Properties of Polymers (1980), 1.E and 3.F; R. M. Christensen,
 Theory of Viscoelasticity (1982), 2.2; F. Mainardi, Fractional Calculus and Waves in Linear
@@ -47,8 +48,8 @@ GROWTH_S = 600.0
 """Duration of a steady load, in s, over which `Imperfections.creep_growth` states the creep."""
 
 MAX_DEVIATIONS = 6
-"""Largest deviation of the creep of a pad from the mean, in standard deviations. Larger random
-deviations, which occur once in 10^9 pads, are limited to it."""
+"""Largest deviation of the creep of a pad from the mean, in standard deviations. Random deviations
+that are larger, which occur about twice in 10^9 pads, are limited to this value."""
 
 POWER_LAW_TIMES = np.geomspace(1e-4, 1e10, 51)
 """Time constants (51,), in s, of the exponential terms whose sum replaces a power law of creep.
@@ -130,22 +131,22 @@ class Imperfections:
         creep_exponent: Exponent alpha of the power law, 0 to 1.
         creep_spread: Standard deviation of a pad's `creep_growth` divided by the mean.
         temperature: Times in s and temperatures in °C of the ground below the skin, which the
-            thermometers of the hubs measure; in between they are linear. Empty: the temperature is
-            unknown and has no effect.
-        air: The same for the air above the skin; empty: it keeps the first temperature of the
-            ground.
+            thermometers of the hubs measure; between these times it changes linearly. Empty: the
+            temperature is unknown and has no effect.
+        air: Times in s and temperatures in °C of the air above the skin, which also changes
+            linearly between them. Empty: the air keeps the first temperature of the ground.
         heat_exchange: Heat exchange of the surface with the air, in W/(m² K).
-        thermal_stress: File of `./cube fem --temperature -o` with the layer and the stress of its
-            pads, or the name of a shipped one.
+        thermal_stress: File, written by `./cube fem --temperature -o`, with the layer and the
+            stress of the pads in it, or the name of such a file in the package.
         pad_drift: Mean relative change of the rest frequency (frequency without load) of a pad per
             K, because of its electronics.
         pad_drift_spread: Standard deviation of a pad's `pad_drift` divided by the mean.
         layer_spread: Standard deviation of the layer's height at a cube divided by the mean.
         poses: Times in s, positions in m, and roll, pitch, yaw in rad of the parent frame of the
-            skin in the world, whose z axis points up; half cosines in between. Empty: cubes and
-            elastomer weigh nothing.
-        weight: File of `./cube fem --weight -o` with the stress of the pads by specific force, or
-            the name of a shipped one.
+            skin in the world, whose z axis points up. Between two poses each number follows half a
+            period of a cosine. Empty: cubes and elastomer weigh nothing.
+        weight: File, written by `./cube fem --weight -o`, with the stress of the pads per specific
+            force, or the name of such a file in the package.
         seed: Seed of the random numbers that determine the deviation of each pad.
 
     Raises:
@@ -180,8 +181,8 @@ class Imperfections:
             times = [time for time, *_ in getattr(self, name)]
             if times != sorted(set(times)):
                 raise ConfigError(f"{name}: found the times {times} s, allowed: rising times")
-        # With more growth, a pad would report a negative stress at the begin of a load, because the
-        # reported stress is the true one at 1 s.
+        # The reported stress is the true one 1 s after the begin of a load, and smaller before.
+        # With a growth above the limit, it would be negative at the begin.
         max_growth = GROWTH_S**self.creep_exponent - 1
         max_spread = 1 + MAX_DEVIATIONS * self.creep_spread
         limit = max_growth / max_spread
@@ -226,8 +227,8 @@ class PadBehaviour:
             shape: Number of cubes and of pads per cube.
             seed: Seed that differs between the hubs of a skin.
         """
-        # All numbers are drawn in the same order for all parameters, so that a seed always gives
-        # the same dead pads (pads that do not work).
+        # The random numbers are drawn in the same order whatever the imperfections are, so that a
+        # seed gives the same dead pads (pads that do not work) whatever the other deviations are.
         random = np.random.default_rng([imperfections.seed, seed])
         self._gain = 1 + imperfections.gain_spread * random.standard_normal(shape)
         self._dead = random.random(shape) < imperfections.dead
@@ -254,12 +255,13 @@ class PadBehaviour:
             growth: Growth of the reported stress from 1 s to `GROWTH_S` (cubes, pads).
             exponent: Exponent alpha of the power law.
         """
-        # Reported stress per true stress after the time t: 1 + a (t^alpha - 1), with the factor a.
+        # The reported stress divided by the true one, at the time t in s after the begin of a
+        # steady load, is 1 + factor (t^alpha - 1).
         factor = growth / (GROWTH_S**exponent - 1)
         step = math.log(POWER_LAW_TIMES[1] / POWER_LAW_TIMES[0])
         weight = exponent / math.gamma(1 - exponent) * POWER_LAW_TIMES**exponent
-        # t^alpha is an integral of terms 1 - exp(-t / tau) over tau. Its part below the first time
-        # constant is reported without delay.
+        # t^alpha is an integral of the terms 1 - exp(-t / tau) over tau. The part of the integral
+        # with shorter time constants than the first of `POWER_LAW_TIMES` is reported without delay.
         fastest = weight[0] / exponent * math.exp(-exponent * step / 2)
         self._at_once = 1 - factor * (1 - fastest)
         self._creep_time = np.append(self._creep_time, POWER_LAW_TIMES)

@@ -70,8 +70,8 @@ class SimulatedLink:
         held_back: Frame that is sent after the next one (fault `reorder`).
         broken_pads: Pads under a fault.
         warming: Simulated time in µs at which the temperature began to change, and the fault.
-        hold: Simulated time in µs whose load acts for the duration of a fault `hold`, and the
-            fault; None: the load changes with time.
+        hold: Simulated time in µs at which a fault `hold` has frozen the load, and this fault;
+            None: the load changes with time.
     """
 
     name: str

@@ -144,9 +144,10 @@ class Load:
     perpendicular to its z axis. The position of a contact is projected onto this surface. If the
     cube is tilted by an angle against the normal of the contact, the force is multiplied by the
     cosine of the angle; beyond a right angle, it is 0. A sphere of radius R under the normal force
-    F has a Hertz contact of the radius a, a³ = 3 F R (1 − ν²) / (4 E). The tangential force of a
-    slide is friction × normal force along its velocity v, multiplied by v / √(v² +
-    FRICTION_SPEED²).
+    F has a Hertz contact of the radius a, a³ = 3 F R (1 − ν²) / (4 E), with Young's modulus E and
+    Poisson's ratio ν of the elastomer. The tangential force of a slide acts along its velocity. It
+    is the coefficient of friction times the normal force, multiplied by v / √(v² +
+    FRICTION_SPEED²) with the speed v.
 
     Source: K. L. Johnson, Contact Mechanics (1985), 4.2 (Hertz), 7.1 (sliding), 8.1 (rolling with
     traction).
@@ -156,7 +157,7 @@ class Load:
         poses: Poses of the cubes.
         depth: Distance from the centres of the cubes to the surface, in m.
         repeats: Time in s after which the script repeats; None: it plays once.
-        period: The same time, or the length of a script that plays once, in s.
+        period: Time in s after which the script repeats, or the length of a script that plays once.
     """
 
     def __init__(self, skin: Skin, script: Script) -> None:
@@ -299,8 +300,8 @@ class Load:
             shear /= math.hypot(speed, FRICTION_SPEED)
         else:
             if len(action.shear) == 1:
-                # A single shear value is that at the largest normal force; in between, shear is
-                # proportional to the normal force.
+                # A single value of the shear force applies at the largest normal force; at other
+                # times the shear force is proportional to the normal force.
                 shear = action.shear[0] * size / action.force.max()
             else:
                 shear = interpolate_knots(action.shear, progress)
@@ -342,8 +343,9 @@ class Load:
     def _plan_path(self, action: Action) -> CubicSpline | None:
         """Return the path of an indenter through all positions of an action, at equal intervals.
 
-        It starts and ends at rest, unless the last position is equal to the first one. It is None
-        for an action with a single position.
+        The indenter starts and ends at rest. Only if the path has at least three positions and the
+        last one equals the first one, the indenter passes this position with the same velocity at
+        both times. The result is None for an action with a single position.
         """
         if len(action.path) == 1:
             return None
@@ -420,8 +422,8 @@ class LoadMemory:
         field = self._fields.get(time_us)
         if field is None:
             field = self._load.at(time_us * 1e-6)
-            # If the memory is full, all fields are removed: kept ones would not be used before the
-            # memory is full again.
+            # If the memory is full, all fields are removed. The load comes back to a stored time
+            # only after one period, and by then the memory would be full again.
             field_bytes = sum(part.nbytes for part in field)
             if (len(self._fields) + 1) * field_bytes > MAX_CACHED_BYTES:
                 self._fields.clear()
@@ -437,7 +439,7 @@ def _choose_orders(
 ) -> Index:
     """Return the number of rings of point forces (cubes,) that represent a contact for each cube.
 
-    It is lower for cubes far from the contact. The errors of stress and gradient are at most 1e-3
+    Cubes far from the contact need fewer rings. The errors of stress and gradient are at most 1e-3
     of their largest values. With any number of rings, the stress is in equilibrium with the force.
 
     Args:

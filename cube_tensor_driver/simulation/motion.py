@@ -8,8 +8,9 @@ measures the specific force, acceleration minus gravity::
 
     s = (R C)^T (d²(p + R r)/dt² + g z)
 
-The stress of the pads is linear in s. Finite elements (`./cube fem --weight`) have computed it from
-the densities of cube and elastomer.
+with the gravitational acceleration g and the unit vector z of the world. The stress of the pads is
+linear in s. Finite elements (`./cube fem --weight`) have computed it from the densities of cube and
+elastomer.
 """
 
 from __future__ import annotations
@@ -28,15 +29,15 @@ from ..core.poses import CubePoses
 from ..core.tensor import rotation_from_rpy
 
 STEP_S = 1e-3
-"""Step, in s, of the second differences that yield accelerations. At 5 Hz, their error is below
-1e-4 of the acceleration."""
+"""Time step, in s, of the second differences from which accelerations are computed. For a motion of
+5 Hz, the error of an acceleration is below 1e-4 of it."""
 
 
 def read_weight(name: str, n_pads: int) -> Array:
     """Return the stress of the pads per specific force (P, 3), in Pa per m/s².
 
     Args:
-        name: File of `./cube fem --weight -o`, or the name of a shipped one.
+        name: File that `./cube fem --weight -o` has written, or the name of one in the package.
         n_pads: Number of pads P that the cubes have.
 
     Raises:

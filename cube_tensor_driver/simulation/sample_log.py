@@ -23,10 +23,10 @@ from ..core.rows import COUNTER_RANGE
 from .faults import Fault
 
 ABSENT = -1
-"""Value in place of the index in the skin, for a cube of a hub that is not in the skin."""
+"""Value in place of the index of a cube in the skin, if a cube of a hub is not in the skin."""
 
 NO_LINK = -1
-"""Value in place of the index of a link, for a cube that is on no link of the log."""
+"""Value in place of the index of a cube's link, if the cube is on no link of the log."""
 
 CUBE_RANGE = 1 << 16
 """Number of possible indices of a cube in a skin, which have 16 bits in messages."""

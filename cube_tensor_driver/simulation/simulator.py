@@ -73,8 +73,9 @@ class PlayedLink(SimulatedLink):
 
     Attributes:
         carried: Cubes on the hub.
-        prepared: Frequencies (hub cubes, pads) in mHz that were computed in advance and that
-            successive samples use again and again; empty if the load is computed for each sample.
+        prepared: Frequencies (hub cubes, pads) in mHz that were computed in advance, one array for
+            each of successive sampling times; after the last one the first is used again. Empty:
+            the load is computed for each sample.
     """
 
     carried: HubCubes
@@ -276,7 +277,8 @@ class Simulator:
     def _take_samples(self, now_us: int, stop: StopRequest) -> None:
         """Take all samples that are due at simulated time `now_us`, unless a stop is requested.
 
-        The hubs take one sample in turn. So if the simulator is late, all hubs are equally late.
+        Every hub takes one sample before any hub takes its next one. So if the simulator is late,
+        all hubs are equally late.
         """
         is_behind = True
         while is_behind and not stop.is_due(self._is_needed()):

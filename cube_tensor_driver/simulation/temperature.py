@@ -3,7 +3,8 @@
 """Temperature of a simulated skin: heat conduction through its layer, thermal stress and drift.
 
 The ground below the elastomer has a given temperature, and the surface exchanges heat with the air.
-With the height z above the ground, the height h of the layer and its temperature T(z, t)::
+The layer has the height h, the thermal diffusivity D and the thermal conductivity k; its
+temperature at the height z above the ground is T(z, t)::
 
     dT/dt = D d²T/dz²,   T(0) = T_ground,   -k dT/dz(h) = exchange (T(h) - T_air)
 
@@ -41,7 +42,7 @@ CONDUCTIVITY = 0.2
 
 CELLS = 44
 """Number of finite volumes across a layer. 10 s after a step of the temperature of ground or air,
-their error is below 2e-3 of the step."""
+the error of the temperature in the layer is below 2e-3 of the step."""
 
 
 class ThermalLayer(NamedTuple):
@@ -155,7 +156,8 @@ class WarmLayer:
         steady = self._find_steady(ground, air)
         steps = self._rate * seconds
         decay = np.exp(-steps)
-        # The amplitudes follow a steady state that changes linearly, and lag behind it.
+        # The steady state changes linearly with ground and air. The amplitudes lag behind it by
+        # `lag`, and their departure from it at the begin decays exponentially.
         lag = (steady - self._steady) * -np.expm1(-steps) / steps
         departure = self._amplitude - self._steady
         self._amplitude = steady + departure * decay - lag

@@ -4,12 +4,14 @@
 
 An engine with rigid bodies gives forces at points. A single point is a round contact, whose radius
 is that of Hertz. Several points between the same two bodies are a flat contact: uniform traction on
-the convex hull of the points, shrunk towards the centre of pressure c until its own centroid g lies
-there (the effective area of a footing that is loaded off its centre)::
+a polygon. The polygon is the convex hull of the points, moved so that its centroid g becomes the
+centre of pressure c, and shrunk by the factor s so that it stays inside the hull (the effective
+area of a footing that is loaded off its centre). A corner q of the hull becomes::
 
-    q -> c + s (q - g),     s = min over the hull's edges of  distance(c) / distance(g)
+    c + s (q - g),     s = min over the hull's edges of  distance(c) / distance(g)
 
-The force and the moments of this traction are those of the points, and the traction nowhere pulls.
+where distance is that of a point from the edge. The force and the moments of this traction are
+those of the forces at the points, and the traction nowhere pulls.
 The moment about the normal (torsion) becomes a tangential traction that is proportional to the
 distance from c.
 
@@ -44,8 +46,8 @@ class Polygon(NamedTuple):
         corners: Corners (K, 3) in m, counterclockwise about the normal.
         centre: Centroid (3,) in m.
         traction: Traction (3,) in Pa on the skin at the centroid.
-        twist: Gradient in Pa/m of the circulating traction, which is twist normal x (q - centre) at
-            the position q.
+        twist: Strength in Pa/m of the circulating traction, which at the position q is twist times
+            the cross product of the normal and q - centre.
     """
 
     corners: Array
@@ -81,8 +83,8 @@ def make_flat_contact(
 ) -> Polygon:
     """Return the traction on a polygon that represents the contact of a flat body.
 
-    It has the force and the moments of the forces at the contact points. The polygon is their
-    convex hull, shrunk until its centroid is the centre of pressure.
+    The traction has the force and the moments of the forces at the contact points. The polygon is
+    the convex hull of the points, shrunk so that its centroid is the centre of pressure.
 
     Args:
         points: Positions (K, 3) of the contact points in m.

@@ -5,9 +5,9 @@
 The scene is one XML file, whose motion is given by its keyframes:
 
 - The text `skin` in `<custom>` names its skin file, relative to the scene's folder.
-- It starts in the first keyframe, if that is at time 0.
+- The scene starts in the first keyframe, if that keyframe is at time 0.
 - The controls `ctrl` of the keyframes are reached at their times, and change linearly in between.
-- After the last keyframe it starts again. Without keyframes it goes on without an end.
+- After the last keyframe the scene starts again. Without keyframes it goes on without an end.
 """
 
 from __future__ import annotations
@@ -31,10 +31,9 @@ KEPT_S = 2.0
 of a skin need the contacts at slightly different times, and a scene is only computed forwards."""
 
 UNBOUNDED_PERIOD_S = 10.0
-"""Value, in s, of the attribute `period` of a scene that never repeats.
-
-If the load is computed in advance (option `--instants`), it is computed for this time and repeated.
-"""
+"""Length, in s, of the part of a scene without repetition that is computed in advance and then
+repeated, if the user asks for that (option `--instants`). It is the attribute `period` of such a
+scene."""
 
 
 def read_scene(path: Path) -> MjModel:
@@ -85,7 +84,7 @@ class MujocoLoad:
         poses: Poses of the cubes.
         depth: Distance from the centres of the cubes to the surface, in m.
         repeats: Time in s after which the scene repeats; None: never.
-        period: The same time, or `UNBOUNDED_PERIOD_S`.
+        period: Time in s after which the scene repeats; `UNBOUNDED_PERIOD_S` if it never does.
     """
 
     def __init__(

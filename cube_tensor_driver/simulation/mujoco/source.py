@@ -104,7 +104,7 @@ class BodyContact(NamedTuple):
 
     Attributes:
         body: Number of the body that is touched.
-        press: Round contact with the same force, centre and area.
+        press: Round contact with the force, centre and area of this contact.
         polygon: Traction on a polygon if the contact is flat; None if it is round.
     """
 
@@ -263,8 +263,8 @@ class MujocoSkin:
         total = force.sum(axis=0)
         pressing = -float(total @ normal)
         if len(place) > 1:
-            # A round contact of the same area also describes the flat one, for uses that need only
-            # its centre and force.
+            # A round contact of the same area also describes this flat contact, for callers that
+            # need only its centre and force.
             polygon = make_flat_contact(place, force, normal, MIN_WIDTH_DEPTHS * self.depth)
             pressure = -float(polygon.traction @ normal)
             radius = math.sqrt(pressing / pressure / math.pi)
