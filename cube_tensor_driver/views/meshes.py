@@ -51,8 +51,9 @@ def join_squares(corners: AnyArray) -> Mesh:
 
 def make_cube() -> Mesh:
     """Return the mesh of a cube with its centre at the origin and half a side of 1."""
-    # The corners of each face follow each other counterclockwise, seen from outside: exchanging the
-    # axes cyclically keeps this direction, and a reflection in the centre reverses it.
+    # The corners of each face follow each other counterclockwise, seen from outside. Exchanging the
+    # axes cyclically keeps this direction. A reflection in the centre reverses it, so the lower
+    # face lists the reflected corners in reverse order.
     upper = np.column_stack([2 * _SQUARE, np.ones(4)])
     lower = -upper[::-1]
     faces = [np.roll(face, axis, axis=1) for face in (upper, lower) for axis in range(3)]
@@ -85,9 +86,9 @@ def find_hit_cube(
 ) -> int | None:
     """Return the index of the cube that a ray hits, or None if it hits none.
 
-    A ray hits a cube if it passes the centre at less than a pitch. Of several cubes, the one with
-    the centre closest to the ray is taken; cubes more than two pitches behind the first one are
-    ignored, because they lie on the far side of a curved skin.
+    A ray hits a cube if its distance from the cube's centre is below one pitch. Of several cubes,
+    the one with the centre closest to the ray is taken. Cubes more than two pitches behind the
+    first one are ignored, because they lie on the far side of a curved skin.
 
     Args:
         position: (N, 3) centres of the cubes.

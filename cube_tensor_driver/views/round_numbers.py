@@ -16,7 +16,8 @@ If the values on one side of zero are all noise, the axis ends at zero on that s
 def round_down(length: float) -> float:
     """Return the largest number of the form 1, 2 or 5 times a power of ten that is at most
     `length`, which must be positive."""
-    # Without the tolerance, rounding could reduce a length of exactly 1, 2 or 5.
+    # The tolerance keeps a rounding error from turning a length of exactly 1, 2 or 5 into the next
+    # smaller number.
     limit = length * (1 + 1e-9)
     return max(number for number in _round_numbers(length) if number <= limit)
 
@@ -35,7 +36,8 @@ def round_range(low: float, high: float) -> tuple[float, float]:
         low = 0.0
     if abs(high) <= noise:
         high = 0.0
-    # Without the tolerance, rounding could give a size of exactly 1, 2 or 5 the next larger step.
+    # The tolerance keeps a rounding error from giving a size of exactly 1, 2 or 5 the next larger
+    # step.
     min_step = size * (1 - 1e-9)
     step = min(number for number in _round_numbers(size) if number >= min_step) / 2
     n_below = np.floor(min(low, 0) / step)

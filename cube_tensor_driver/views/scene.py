@@ -407,8 +407,8 @@ def heads(arrows: Array, normal: Array) -> Array:
     """
     tail, tip = arrows[:, 0], arrows[:, 1]
     back = BARB_LENGTH * (tail - tip)
-    # For an arrow along the normal the cross product would be 0. A small vector in another
-    # direction, added to the normal, prevents that.
+    # The barbs are perpendicular to the normal. The cross product of an arrow and the normal would
+    # be 0 for an arrow along the normal, so a small vector in another direction is added to it.
     tilted = normal + 1e-3 * np.roll(normal, 1, axis=1)
     across = np.cross(back, tilted)
     size = np.linalg.norm(across, axis=1, keepdims=True)

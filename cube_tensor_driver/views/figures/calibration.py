@@ -35,8 +35,8 @@ def draw_layout(layout: Layout) -> Figure:
         layout: Names, centres and normals of the pads, which lie on the faces of the cube.
     """
     figure = Figure(figsize=(5, 4.6))
-    # Each part is given its drawing order (zorder), because matplotlib would sort the parts by the
-    # distance of their centres, which hides the wrong ones.
+    # The code gives each part its drawing order (zorder). matplotlib would sort the parts by the
+    # distance of their centres from the viewer, so that some visible parts would be hidden.
     axes: Any = figure.add_subplot(projection="3d", computed_zorder=False)
     _draw_edges(axes)
     for name, centre, normal in zip(
@@ -215,10 +215,10 @@ def draw_thermal_fit(fit: ThermalFit) -> Figure:
 
 @print_style()
 def draw_correction(title: str, seconds: Array, before: Array, after: Array) -> Figure:
-    """Draw stresses of pads that are no load, before and after a fit of creep or weight.
+    """Draw stresses of pads before and after the effect of creep or weight is removed by a fit.
 
     Args:
-        title: What the stresses are.
+        title: Title of the picture, which names the stresses.
         seconds: Times (N,), in s.
         before, after: Stresses of P pads (N, P), in Pa.
     """

@@ -17,10 +17,8 @@ Panel = tuple[str, Mapping[str, AnyArray]]
 """
 
 MIN_GAP_STEPS = 3.0
-"""Minimum time between two samples, relative to the median of this time, that counts as a gap.
-
-No line connects the two samples at a gap.
-"""
+"""Minimum time between two successive samples that counts as a gap, divided by the median of the
+times between all successive samples. No line connects the two samples at a gap."""
 
 MARKERS_PER_LINE = 12
 """Approximate number of markers on a line; they show which line it is, not single samples."""

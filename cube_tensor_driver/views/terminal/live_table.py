@@ -46,8 +46,8 @@ BAR_WIDTH = 12
 """Width, in characters, of the longest bar in the column for the pressure."""
 
 PEAK_DECAY = 0.99
-"""Factor by which the pressure that a full bar stands for shrinks from one drawing of the table to
-the next, while all pressures on the skin are smaller."""
+"""Factor by which the pressure of a full bar is multiplied from one drawing of the table to the
+next, while all pressures on the skin are smaller."""
 
 MIN_PEAK = 1.0
 """Minimum pressure, in Pa, of a full bar; it avoids a division by zero without load."""
