@@ -62,8 +62,8 @@ def read_numbers(
     Args:
         value: Number, or nested list of numbers.
         name: Name of the value, for the error message.
-        error: Class of the error that is raised if the value is not of finite numbers, or has
-            another shape.
+        error: Class of the error that is raised if the value does not consist of finite numbers, or
+            has another shape.
         shape: Shape that the array must have; None allows any shape.
     """
     if not isinstance(value, np.ndarray):

@@ -56,10 +56,15 @@ def pad_table(
 
 
 def index_cubes(cube: AnyArray, n_cubes: int) -> Index | slice:
-    """Return an index of the cubes of rows (N,) into tables of all cubes of a skin.
+    """Return an index that selects the cubes of N rows from tables of all cubes of a skin.
 
-    A scan of all cubes, the usual case, gets a slice, with which numpy copies nothing. Numbers that
-    the skin does not have are replaced by the nearest that it has.
+    In the usual case, one row of each cube in order, the index is a slice, with which numpy copies
+    nothing.
+
+    Args:
+        cube: Numbers of the cubes (N,). Numbers that the skin does not have are replaced by the
+            nearest number that it has.
+        n_cubes: Number of cubes of the skin.
     """
     all_cubes = np.arange(n_cubes)
     if np.array_equal(cube, all_cubes):

@@ -3,13 +3,20 @@
 """Inversion of a response by weighted least squares, and the residual that shows broken pads.
 
 The pads measure the stresses v = A s, where A is the response (pads x modes) and the state s holds
-the amplitudes of the modes. With W = diag(1 / noise), and the columns of Q an orthonormal basis of
-those of W A, without remainders below `RANK_TOLERANCE` of the longest column:
+the amplitudes of the modes. The estimated quantities are:
 
-    components    H W v,   H = T (W A)^+      T takes a state to components, see Modes.components
+    components    H W v,   H = T (W A)^+
     covariance    H H'
-    chi-square    |N' W v|^2                  N completes Q to a basis of the pads; its number of
-                                              columns is the number of degrees of freedom
+    chi-square    |N' W v|^2
+
+    W             diag(1 / noise)
+    T             matrix from a state to components, see Modes.components
+    (W A)^+       pseudo-inverse of W A
+    N             its columns are an orthonormal basis of the vectors that are orthogonal to all
+                  columns of W A; their number is the number of degrees of freedom
+
+A column of W A counts as a combination of the other columns if what remains after subtracting such
+a combination is shorter than `RANK_TOLERANCE` times the longest column.
 
 Source: Kiyota & Shinoda, eqs. 2 to 5, are the closed forms for one layout; docs/physics.md corrects
 their eqs. 4 and 5.
@@ -30,11 +37,12 @@ from .modes import Modes
 from .symmetry import Structure
 
 RANK_TOLERANCE = 1e-4
-"""Smallest part of a mode's response that is used to invert the response of a cube: the part that
-modes with a stronger response do not explain, relative to the strongest response.
+"""Smallest independent part of a mode's response that is used to invert the response of a cube,
+relative to the strongest response of a mode.
 
-The response (pads x modes) is first divided by the noise of the pads. The pads respond so little to
-a combination of modes with a smaller part that its amplitude would be mostly noise.
+The independent part is the one that modes with a stronger response do not explain. The response
+(pads x modes) is first divided by the noise of the pads. An amplitude that was computed from a
+smaller part would be mostly noise.
 """
 
 LEAK_TOLERANCE = 1e-3
@@ -204,8 +212,8 @@ def make_estimator(
     covariance: Array = multiply(half, half.T)
     covariance[~observed] = np.nan
     covariance[:, ~observed] = np.nan
-    # Only noise and faults have a part along combinations of pads that are orthogonal to the
-    # response of every mode (linear stress field): the residual.
+    # The residual is the part of the pad stresses that is orthogonal to the response of every mode
+    # (linear stress field). Only noise and faults cause it.
     n_present = len(present)
     explained = multiply(seen, seen.T)
     unexplained = np.eye(n_present) - explained

@@ -229,9 +229,9 @@ class Pipeline:
     ) -> Array:
         """Return the ratio of the frequencies without load to the rest frequencies (N, P).
 
-        The ratio is the product of two factors. One is that of temperature. The other is the ratio
-        f / f0 at which the stress of a pad, divided by its stiffness, is the offset o that is
-        subtracted as no load. It follows from the pad law
+        The ratio is the product of two factors. One states how temperature changes the frequency of
+        a pad without load. The other is the ratio f / f0 at which the stress of a pad, divided by
+        its stiffness, is the offset o that the compensation subtracts. It follows from the pad law
         o = (f - f0) / (f0 (1 + beta) / beta - f), where beta is the ratio of the parasitic to the
         active capacitance of a pad without load.
 
@@ -284,11 +284,11 @@ class Pipeline:
                 other.
             left_out: Bit masks of the pads that are not used (N,). None stands for the pads that
                 the device reports as broken.
-            watch: Health, which is updated with each row before its stress is computed. It then
-                states the pads that are not used, and adds the conditions of the cube's pads to the
-                status.
+            watch: Health, which is updated with each row before its stress is computed. The pads
+                that it finds broken are not used, and the conditions of the cube's pads are added
+                to the status.
             known: Whether the health of a row (pads that are not used, conditions) is given by
-                `left_out` and the `status` of `out`, and not by `watch` (N,). None: of no row.
+                `left_out` and the `status` of `out`, and not by `watch` (N,). None: for no row.
             out: Rows to write into; None makes new ones.
             effects: Effects that are subtracted; None: none are, whatever columns the rows have.
             offset: Array for what is subtracted (N, P), stress / stiffness; None: not wanted.
@@ -556,7 +556,7 @@ class Pipeline:
         matrix = np.zeros(self._tables.matrix.shape[1:])
         matrix[:n_pads, :N_COMPONENTS] = estimator.matrix.T
         # If pads are missing and the rank falls by more than their number, the residual has more
-        # degrees of freedom than the table has columns for it. Then only the first are used.
+        # degrees of freedom than the table has columns for it. Then the excess ones are not used.
         null = estimator.null[: self._n_residuals]
         dof = len(null)
         # The residual is NaN (unknown) if there are no more pads than determined modes.

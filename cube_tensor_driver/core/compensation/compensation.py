@@ -5,10 +5,14 @@
     v = (f - f0) / (f_highest - f)        pad law: stress on a pad / its stiffness
     v - offset,  offset = sum of effects  what the load contributes
 
-The kernel subtracts the offsets from each row (`kernel.contract.Offsets`). What creep and
-temperature contribute to them is computed here in steps that are longer than the interval between
-rows. Creep comes after temperature, whose effect was measured in place and contains the creep of
-the foam under thermal stress, and before weight, which strains the foam.
+f is the frequency of a pad, f0 its frequency without load, and f_highest the upper limit of its
+frequency (`oscillator.py`). The kernel subtracts the offsets from each row
+(`kernel.contract.Offsets`). What creep and temperature contribute to them is computed here in steps
+that are longer than the interval between rows.
+
+Creep is computed from readings v minus the effect of temperature, because this effect was measured
+in place and already contains the creep of the foam under thermal stress. The effect of weight is
+not subtracted from these readings, because the foam creeps under weight as under a load.
 
 A row is one sample of one cube, C the number of cubes of the skin, P the largest number of pads of
 a cube. Without effects, nothing is computed here.

@@ -7,18 +7,20 @@ reading u (strain times modulus) and K memories r_k, which are low-passed readin
 
     s = u - sum_k a_k r_k,      tau_k dr_k/dt = u - r_k
 
-The memories are advanced in steps (`low_pass.py`) to the newest row of each cube, with their lags
-d_k = u - r_k. What is subtracted from a row at the time t after it follows likewise, for a reading
-that has changed along a straight line to the reading u_1 of this row::
+In each step (`low_pass.py`), the memories r_k are advanced to the newest row of each cube, whose
+reading is u; d_k = u - r_k is how far they lag behind. From a row at the time t after it, with the
+reading u_1, is subtracted::
 
     sum_k a_k r_k + (sum_k a_k m_k(t) d_k + (u_1 - u) sum_k a_k (1 - m_k(t) tau_k / t))
 
-The values of the brackets at the end of the step, divided by its length, count as constant, so that
-the kernel only needs a slope and a gain.
+with m_k(t) = 1 - exp(-t / tau_k), if the reading has changed along a straight line. Both sums in
+the large brackets are computed for the end of the step and divided by its length. The quotients
+count as constant during the step, so that the kernel only needs a slope and a gain.
 
-Where nothing is known about earlier loads (before the start, within a long gap), the memories are
-computed as if there had been none besides the readings at its ends. The share of a memory that is
-not known decays with its relaxation time, and is part of the deviation.
+Loads before the first row and within a long gap are unknown. The memories are computed as if there
+had been no load before the first row, and as if the reading had changed along a straight line
+within the gap. The share of a memory that comes from unknown loads decays with its relaxation time,
+and is part of the deviation.
 
 A row is one sample of one cube, C the number of cubes of the skin, P the largest number of pads of
 a cube. Stresses are divided by the stiffness of the pads.
@@ -98,7 +100,7 @@ class Creep:
         self._reading = np.zeros(shape)
         # Fraction of each low-passed reading that depends on loads that were not measured.
         self._unknown = np.ones(time.shape)
-        # Largest reading of each pad that such a load is assumed to have caused.
+        # Largest reading of each pad that loads that were not measured are assumed to have caused.
         self._largest_unknown = np.zeros(shape)
         self._is_certain = np.ones(n_cubes, bool)
         self.offset = np.zeros(shape)
@@ -126,7 +128,7 @@ class Creep:
         change = now - self._reading
         share = self._memories.advance(elapsed_ns * 1e-9, change)
         # Over the interval, each filter replaces this share of its output by the readings of the
-        # interval. They are known (0) or, in a gap, unknown (1).
+        # interval. The unknown fraction of these readings is 0 or, in a gap, 1.
         self._unknown += share * (is_gap - self._unknown)
         self._unknown[:, is_lost] = 1.0
         if is_gap.any():
@@ -163,7 +165,7 @@ class Creep:
         The function is exact at the end of the duration, if readings change linearly until then.
 
         Args:
-            duration_s: Duration for each cube (C,), in s.
+            duration_s: Time from the newest row of each cube to the end of the step (C,), in s.
         """
         # The durations of successive steps are usually equal.
         if not np.array_equal(duration_s, self._duration_s):
@@ -181,7 +183,11 @@ class Creep:
         self.slope -= self.gain * self._reading
 
     def _set_duration(self, duration_s: Array) -> None:
-        """Compute what depends only on the duration of `_set_line` for each cube (C,), in s."""
+        """Compute the factors in `slope` and `gain` that depend only on the duration of the step.
+
+        Args:
+            duration_s: Time from the newest row of each cube to the end of the step (C,), in s.
+        """
         self._duration_s = duration_s
         share, mean = self._memories.find_shares(duration_s)
         # The low-passed reading changes, per second, by one fraction of its lag behind the reading
@@ -193,9 +199,10 @@ class Creep:
             self._full_gain += amplitude * of_change[k]
 
     def deviation(self, cube: int) -> Array:
-        """Return the errors (P, k) of a cube's creep that its k independent causes make, in Pa.
+        """Return the errors (P, k) of a cube's computed creep by k independent causes, in Pa.
 
-        Each column has the size of one standard deviation.
+        The causes are unknown earlier loads and errors of the law of creep. Each column has the
+        size of one standard deviation.
         """
         model = self._models[cube]
         reading = self._reading[:, cube]
@@ -206,8 +213,8 @@ class Creep:
         errors = [unknown[0]]
         _, _, is_gap = self._find_gaps()
         if is_gap[cube]:
-            # The filters have not been advanced over this gap in the rows yet. Until they are, the
-            # whole of the creep counts as unknown.
+            # Before its newest row, the cube had a gap without rows, over which the filters have
+            # not been advanced yet. Until they are, the whole of the creep counts as unknown.
             newest = np.nan_to_num(self._newest.reading[cube])
             before = np.abs(reading)
             larger = np.maximum(before, np.abs(newest))

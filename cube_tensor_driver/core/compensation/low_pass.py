@@ -5,7 +5,7 @@
     time dx/dt = u - x
 
 The input u is a straight line from u_0 to u_1 over an interval of length t. How far the output
-lags behind, d = u - x, then follows from
+lags behind is d = u - x. It changes from d_0 to d_1 over the interval:
 
     d_1 = (1 - m) d_0 + (m time / t) (u_1 - u_0),      m = 1 - exp(-t / time)
 
@@ -34,8 +34,8 @@ MAX_STEP_NS = MAX_GAP_NS + STEP_NS
 """Longest interval between a cube's newest rows at two successive steps, in ns, in which load and
 temperature count as known.
 
-It is the longest interval between two successive rows that allows this, plus one step, because more
-rows may follow a gap before the next step.
+It is `MAX_GAP_NS`, the same limit for two successive rows, plus one step, because more rows may
+follow a gap before the next step.
 """
 
 HALVINGS = 10
@@ -85,7 +85,7 @@ class LowPass:
             n_signals: Number P of signals.
         """
         self._time = time
-        # Whether a cube has other time constants than the one before.
+        # Whether a cube has other time constants than the cube with the number before.
         is_different = time[:, 1:] != time[:, :-1]
         self._is_other = is_different.any(axis=0)
         n_times, n_cubes = time.shape
@@ -95,7 +95,7 @@ class LowPass:
         """Advance the filters by one interval for each cube.
 
         Args:
-            elapsed_s: Lengths of the intervals (C,), in s; the outputs stay where it is 0.
+            elapsed_s: Lengths of the intervals (C,), in s; 0 leaves the outputs unchanged.
             change: Changes of the inputs (P, C), along straight lines.
 
         Returns:

@@ -1,10 +1,10 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Values of effects on the pads that are no load, as blocks of a calibration.
+"""Models of the effects on the pads that are no load, as blocks of a calibration.
 
-P is the number of pads of the cube. Stresses on pads are without the pads' gains (relative
-sensitivities), like the response matrix, so that a model computed for the layout holds for each
-cube; tension is positive.
+P is the number of pads of the cube; tension is positive. The stresses that `WeightModel` states do
+not include the pads' gains (relative sensitivities), so that a model computed for the layout holds
+for each cube. Those that `ThermalModel` states include the gains.
 """
 
 from __future__ import annotations

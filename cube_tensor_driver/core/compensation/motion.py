@@ -22,13 +22,14 @@ from ..rows import FrequencyRows
 
 MAX_EXTRAPOLATION_NS = 20_000_000
 """Longest time, in ns, by which the motion is extrapolated beyond the instants at which it is
-known, unless two intervals between instants are longer.
+known. If the nearest two instants are more than 10 ms apart, twice their interval is the limit.
 
-An arm that is shaken with 2 g at 5 Hz is then wrong by less than 4 m/s².
+The specific force of an arm that is shaken with 2 g at 5 Hz is then wrong by less than 4 m/s².
 """
 
 MAX_INTERVAL_NS = 200_000_000
-"""Longest interval between two instants, in ns, over which the motion is interpolated."""
+"""Longest interval between two instants, in ns, over which the motion is interpolated. Within a
+longer one, the motion counts as unknown."""
 
 
 class Motion(NamedTuple):
@@ -58,7 +59,7 @@ class ForcesAtCubes:
     """Computes the specific forces at the cubes of one skin, with the same bits on every processor.
 
     The specific force is what an accelerometer at the cube measures: acceleration minus gravity.
-    The methods `_interpolate` and `_find_forces` are the specification of the function in C.
+    The function `_interpolate` and the method `_find_forces` specify what the function in C does.
     """
 
     def __init__(self, poses: CubePoses) -> None:
@@ -68,7 +69,7 @@ class ForcesAtCubes:
             poses: Poses in the parent frame of the skin. Only those of the SkinInfo message of a
                 recording reproduce its forces bit for bit.
         """
-        # The factor 1 is that of the specific force at the origin.
+        # The specific force at the origin is multiplied by 1, its derivatives by the coordinates.
         position = np.insert(poses.position, 0, 1, axis=1)
         self._position = np.ascontiguousarray(position, np.float32)
         self._rotation = np.ascontiguousarray(poses.rotation, np.float32)

@@ -2,13 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compensation of temperature: thermal stress and drift of the pads, with the lag of the elastomer.
 
-The thermometer of a hub is not the elastomer, whose temperature u follows the measured one T. It is
-a sum of first-order low-pass filters (`low_pass.py`) with the time constants lag_i::
+The temperature u of the elastomer lags behind the temperature T that the thermometer of the hub
+measures. u is T after first-order low-pass filters in series with the time constants lag_i. It is
+computed as a weighted sum of the outputs x_i of the same filters in parallel (`low_pass.py`)::
 
     lag_i dx_i/dt = T - x_i,      u = sum_i w_i x_i,      w_i = prod_j lag_i / (lag_i - lag_j)
 
-so that u is T after one filter after the other. A row is one sample of one cube, C the number of
-cubes of the skin, P the largest number of pads of a cube.
+The product is over all j other than i. A row is one sample of one cube, C the number of cubes of
+the skin, P the largest number of pads of a cube.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ from .low_pass import MAX_STEP_NS, LowPass
 START_KELVIN = 1.0
 """Standard deviation, in K, of the difference between elastomer and thermometer at the first row.
 
-The history before is unknown. Indoors, arm and air change by about 1 K in a quarter of an hour; the
-deviation decays with the lag.
+Temperatures before the first row are unknown. Indoors, arm and air change by about 1 K in a quarter
+of an hour. The deviation decays with the lag of the elastomer.
 """
 
 LOST_KELVIN = 5.0
@@ -47,7 +48,7 @@ class Thermal:
 
     Attributes:
         has_model: Whether the calibration of a cube has a model of this effect (C,).
-        is_known: Whether the effect is known up to `MAX_DEVIATION` (C,).
+        is_known: Whether the standard deviation of the effect is at most `MAX_DEVIATION` (C,).
         offset: The effect on each pad now (P, C), stress / stiffness.
     """
 
@@ -74,8 +75,8 @@ class Thermal:
         # Effect of the elastomer's temperature on the stress of a pad, in Pa/K, as the root mean
         # square over the pads of a cube.
         self._slope = np.zeros(n)
-        # Standard deviation of this stress, in Pa per K by which the elastomer lags behind the
-        # thermometer, likewise.
+        # Standard deviation of the stress of a pad, in Pa per K by which the elastomer lags behind
+        # the thermometer, as the root mean square over the pads of a cube.
         self._ramp = np.zeros(n)
         for number, model in enumerate(self._models):
             if model is None:
@@ -122,8 +123,8 @@ class Thermal:
         given[cube] = scan.temperature
         is_missing = np.isnan(given)
         is_first = np.isnan(self._measured) & ~is_missing
-        # If a time stamp precedes the last one, no time counts as elapsed. With its first measured
-        # temperature, the elastomer of a cube counts as equally warm.
+        # If a time stamp precedes the last one, no time counts as elapsed. The first temperature
+        # measured at a cube is taken as the temperature of its elastomer, too.
         elapsed_ns = np.maximum(time_ns - self._time_ns, 0)
         elapsed_ns[is_first] = 0
         change = given - self._measured
@@ -156,7 +157,7 @@ class Thermal:
 
         lag_deviation = self._ramp * abs(self._lag)
         start_deviation = self._slope * self._unknown
-        # The comparison is false for NaN, with which no temperature has been measured so far.
+        # The comparison is false for NaN, which means that no temperature has been measured so far.
         is_accurate = lag_deviation + start_deviation <= MAX_DEVIATION
         self.is_known = self.has_model & is_accurate
 
@@ -197,7 +198,7 @@ class Thermal:
 
 
 def _find_typical_size(values: Array) -> float:
-    """Return the root sum of squares of the K values of a pad, as rms over the pads (P, K)."""
+    """Return the root sum of squares of the K values (P, K) of a pad, as the rms over P pads."""
     mean_square = (values**2).sum() / len(values)
     return float(np.sqrt(mean_square))
 

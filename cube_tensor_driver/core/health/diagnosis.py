@@ -1,6 +1,6 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Diagnosis of pads from the statistics of a window, and how long a condition lasts.
+"""Diagnosis of pads from statistics over windows of 0.5 s, and the present conditions of pads.
 
 All arrays are (cubes, pads); nothing loops over cubes.
 """
@@ -50,11 +50,10 @@ noise of 20 rows to less than 10 times the usual noise, above which a pad is rep
 """
 
 STUCK_MIN_SPAN = 5.0
-"""Span (highest minus lowest frequency in a window) of the pads of a cube, as a multiple of their
-noise, that shows that the cube is loaded.
+"""Median span (highest minus lowest frequency in a window of 0.5 s) of the pads of a cube, as a
+multiple of their noise, above which the cube counts as loaded.
 
-If the median span of the cube's pads is larger, and one pad keeps a single value, this pad is
-reported as stuck.
+A pad of a loaded cube that keeps a single value is reported as stuck.
 """
 
 STILL_MAX_SPAN = 8.0
@@ -81,7 +80,7 @@ The residual measures how far the signals of a cube's pads contradict each other
 
 DRIFT_LIMIT = 2e-4
 """Shift of a pad's frequency, divided by its rest frequency (frequency without load), minus the
-median of such shifts of the cube's pads, above which the pad is reported as drifting.
+median of the shifts of all pads of the cube, above which the pad is reported as drifting.
 
 The shift is measured from the mean frequency at the time at which the cube came to rest.
 """
@@ -102,7 +101,8 @@ class Conditions:
         """Start without conditions.
 
         Args:
-            sums: State of the kernel, whose masks and conditions of cubes are kept up to date.
+            sums: State that the kernel reads. Its bit masks of pads and its conditions of cubes are
+                kept up to date here.
             exists: Whether each cube has each pad (cubes, P).
         """
         self._sums = sums
@@ -169,7 +169,8 @@ class PadDiagnosis:
     """Finds stuck, noisy and drifting pads, and still cubes, from the statistics of windows.
 
     Attributes:
-        still: Whether the frequency of no usable pad of a cube moved in the last window (cubes,).
+        still: Whether each cube is still (cubes,): in the last window of 0.5 s, the frequency of no
+            usable pad moved.
         noise: Standard deviation of the frequency of each pad (cubes, P), in Hz, by the
             calibration.
         bound: Limit to which squared second differences of the frequency are cut in the next window
@@ -195,7 +196,8 @@ class PadDiagnosis:
         Args:
             rest_frequency: Frequencies without load (cubes, P), in Hz; NaN where a cube has no such
                 pad.
-            noise: Standard deviations of the frequencies (cubes, P), in Hz, likewise.
+            noise: Standard deviations of the frequencies (cubes, P), in Hz; NaN where a cube has no
+                such pad.
         """
         self._rest = rest_frequency
         self.noise = noise
@@ -285,8 +287,9 @@ class PadDiagnosis:
     def _find_drifting(self, window: Window) -> Mask:
         """Return a mask (cubes, P) of the pads that drift.
 
-        The frequency of such a pad moves away from its value at rest, while those of the other
-        pads of the cube do not. Only cubes that are still (constant frequencies) are examined.
+        The frequency of a drifting pad moves away from its value at rest, while the frequencies of
+        the other pads of the cube do not. Only cubes that are still (constant frequencies) are
+        examined.
 
         Args:
             window: Statistics of the window that has ended.

@@ -1,14 +1,15 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Tracking of slow drift in the rest frequencies of unloaded cubes.
+"""Tracking of slow drift in the rest frequencies of cubes.
 
 The frequency of a pad without load changes over minutes and hours (temperature, ageing). While
 nothing touches a cube, its rest frequencies follow the measured ones with a first-order low-pass
-filter. While something touches it, its own frequencies cannot tell drift from load: what a load
-cannot do lies outside the span of the modes, where it changes no stress either. What the unloaded
-cubes of the skin have in common tells it, because a contact touches only some cubes, so a loaded
-cube follows their median. If too few are unloaded, it stays as it is, and the drift that it may
-have is a deviation.
+filter. While something touches the cube, its own frequencies do not show its drift: the part of the
+drift that could not come from a load is orthogonal to the response of all modes, so that it changes
+no stress, and the other part looks like a load. The unloaded cubes of the skin show the drift that
+all cubes have in common. So the rest frequencies of a loaded cube follow the median drift of the
+unloaded ones. If fewer than `MIN_UNLOADED_CUBES` are unloaded, the rest frequencies of a loaded
+cube are kept. The drift that may remain is stated as a standard deviation.
 """
 
 from __future__ import annotations
@@ -45,9 +46,10 @@ fill the recording.
 
 
 MIN_UNLOADED_CUBES = 3
-"""Smallest number of unloaded cubes of a layout whose median drift a loaded cube follows.
+"""Smallest number of unloaded cubes of a layout whose median drift a loaded cube follows. With
+fewer, the rest frequencies of the loaded cube are kept.
 
-A load on one of three, too small to be noticed, does not move their median.
+An unnoticed small load on one of three cubes does not move their median.
 """
 
 
@@ -59,6 +61,7 @@ class DriftTracker:
 
         f0 += (mean(f) / unloaded_factor - f0) * WINDOW_S / time_constant
 
+    `Pipeline.unloaded_factor` corrects for temperature and the effects that are compensated.
     A cube is unloaded when all of its usable pads have been still and within `CONTACT_THRESHOLD`
     of their rest frequency for `RELEASE_S`. A load that stays below the threshold cannot be
     distinguished from drift and becomes part of the rest frequency. A loaded cube follows the
@@ -133,7 +136,8 @@ class DriftTracker:
             change: Changes of the tracked rest frequencies in this window (cubes, P), in Hz. Those
                 of loaded cubes are 0 and are replaced.
             follows: Whether the rest frequency of a pad follows its own frequency (cubes, P).
-            follows_others: Whether it follows the pads of other cubes instead (cubes, P).
+            follows_others: Whether the rest frequency follows the pads of other cubes instead
+                (cubes, P).
         """
         is_unloaded: Mask = np.asarray(follows.any(axis=1))
         self._followed_windows += is_unloaded
@@ -169,7 +173,7 @@ class DriftTracker:
             usable: Whether a cube has this pad and the pad works (cubes, P).
 
         Returns:
-            The answer for each cube (cubes,); False for a cube without usable pads.
+            Whether each cube is at rest (cubes,); False for a cube without usable pads.
         """
         with np.errstate(invalid="ignore"):  # NaN where a cube has no such pad
             shift = np.abs(measured / self._tracked_rest - 1)

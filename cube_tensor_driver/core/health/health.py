@@ -92,7 +92,7 @@ class Health:
         # Number of rows of each cube from the last call of `collect` to the begin of the present
         # window; negative if the call was within this window.
         self._uncollected_rows = np.zeros(n_cubes, int)
-        # Whether the residual of a cube was high at any time since that call.
+        # Whether the residual of a cube was high at any time since the last call of `collect`.
         self._had_high_residual = np.zeros(n_cubes, bool)
         self.refresh()
         self._set_bound()

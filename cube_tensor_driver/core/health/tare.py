@@ -4,11 +4,11 @@
 
     f0 = mean(f) / factor(T, o)
 
-The mean frequency of each pad over the last windows (of 0.5 s) that `Health` keeps becomes the
-frequency without load, f0. factor(T, o) is f0(T) / f0 by the temperature model of the calibration
-and by the offset o that compensation (of weight, for example) subtracts. The
-mean is of data that have already arrived, so nothing has to wait. A tare is refused if a frequency
-moved during these windows, or if the data have a gap.
+From the mean frequency of each pad over the last windows (of 0.5 s) that `Health` keeps, its
+frequency f0 without load is computed. factor(T, o) is the ratio to f0 of the frequency of an
+unloaded pad at the temperature T, with the offset o that the compensation (of weight, for example)
+subtracts. The mean is of data that have already arrived, so nothing has to wait. A tare is refused
+if a frequency moved during these windows, or if the data have a gap.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ MAX_REST_CHANGE = 0.2
 """Largest relative change, against the calibration, of a rest frequency (frequency without load)
 with which a tare is accepted.
 
-A larger difference shows that a load is on the cube, or that the calibration is of another cube.
+A larger change shows that a load is on the cube, or that the calibration is of another cube.
 """
 
 JUMP_SPAN_RATIO = 10.0

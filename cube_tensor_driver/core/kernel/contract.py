@@ -97,12 +97,17 @@ CUBE_STATE = np.dtype(
 )
 """Layout in memory of the state of one cube from which the health of its pads is assessed.
 
-Fields: newest time stamp and interval between the newest two rows, in ns; longest interval of at
-least `GAP_NS` before the first row of the present window of 0.5 s and within the window, in ns;
-number of rows in the window, and of those with a residual above its limit; bit masks of the pads
-that are not used, and of those for which a row of the window showed a condition; temperature in °C;
-conditions of all pads together; and whether the newest time stamp is doubtful. The struct
-cube_state in C has the same layout.
+The struct cube_state in C has the same layout. The window is the present window of 0.5 s. Fields:
+
+- time_ns, interval_ns: newest time stamp, and interval between the newest two rows;
+- gap_before, gap_within: interval before the first row of the window, and longest interval between
+  two rows of the window, in ns; 0 if shorter than `GAP_NS`;
+- rows, over_limit: number of rows in the window, and of those with a residual above its limit;
+- mask, found: bit masks of the pads that are not used, and of the pads for which a row of the
+  window showed a condition;
+- temperature: newest temperature, in °C;
+- status: conditions of all pads together;
+- is_doubtful: whether the newest time stamp is doubtful.
 """
 
 PAD_QUANTITIES = (
@@ -121,11 +126,16 @@ PAD_QUANTITIES = (
 )
 """Names of the quantities that the kernel keeps of each pad, in their order in memory.
 
-They are the newest frequency f and its difference to the one before, in Hz; the sums over the
-present window of 0.5 s of squared first differences, of squared second differences, of these cut to
-the limit "bound", and of f minus "base"; the lowest and highest f in the window, in Hz; "base", the
-frequency without load at the start of the program, in Hz; "bound", in Hz²; and the limits of the
-frequencies that are possible, in Hz.
+The window is the present window of 0.5 s. Frequencies are in Hz, squares in Hz²:
+
+- last, difference: newest frequency f, and its difference to the frequency before;
+- first_squares, second_squares, bounded_squares: sums over the window of squared first differences,
+  of squared second differences, and of squared second differences cut to the limit "bound";
+- sum: sum over the window of f minus "base";
+- lowest, highest: lowest and highest f in the window;
+- base: frequency without load at the start of the program;
+- bound: limit of squared second differences;
+- low, high: limits of the frequencies that are possible.
 """
 
 
@@ -141,7 +151,8 @@ class Tables(NamedTuple):
         calibration: Number of the calibration of each cube (C,).
         pads: Number of pads of each calibration (G,).
         rest: Frequencies without load (C, P), in Hz; NaN where a cube has no such pad.
-        highest: Upper limits of the frequencies by the pad law (C, P), in Hz; NaN likewise.
+        highest: Upper limits of the frequencies by the pad law (C, P), in Hz; NaN where a cube has
+            no such pad.
         reference: Reference temperature of each calibration (G,), in °C; NaN without a model.
         coefficients: Coefficients of the temperature models (G, D, P), in 1/K^d, the linear first.
         matrix: Maps (T, P, K) from v (pad stress / stiffness) to outputs: 15 components, then
@@ -210,7 +221,7 @@ class Offsets(NamedTuple):
         slope: Change of the offset per second (C, P), for v = 0.
         gain: Additional change of the offset per second and per v (C, P).
         lasting: Status bits of creep and temperature (C,), for rows at most `MAX_GAP_NS` later than
-            `since_ns`. If there are any, later rows get COMPENSATION instead.
+            `since_ns`. If any bit is set, rows that are later get COMPENSATION instead.
         response: Response of the pads to specific force (C, 3, P), per m/s².
         weighing: Status bits of weight (C,), for rows with a known specific force. Other rows get
             COMPENSATION instead.
@@ -261,7 +272,8 @@ class Columns(NamedTuple):
     def find_scan(self, row: int) -> slice:
         """Return the rows from a given one to the end of its scan.
 
-        The cube numbers rise within a scan, so it ends before a row whose number does not.
+        The cube numbers rise within a scan. So the scan ends before a row whose cube number is not
+        larger than that of the row before it.
         """
         is_end = self.cube[row + 1 :] <= self.cube[row:-1]
         count = int(np.argmax(is_end)) if is_end.any() else len(is_end)
@@ -280,7 +292,7 @@ class Task(NamedTuple):
         n_residuals: Number of outputs of a matrix (see `Tables.matrix`) that are residuals.
         tables: Tables of the skin.
         health: State of the health, which is changed; None: health is not assessed.
-        offsets: What is subtracted and its state, which is changed; None: nothing is.
+        offsets: What is subtracted, and its state, which is changed; None: nothing is subtracted.
         columns: Rows to process.
         out: Rows to write; its arrays are contiguous. Before the call, `left_out` and `status` hold
             the pads that are not used and the conditions of the pads, for all rows whose health is

@@ -1,6 +1,6 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""The kernel in numpy: the specification to read, and the kernel where no C compiler was.
+"""The kernel in numpy: it specifies the kernel in C, and runs where that was not compiled.
 
 The rows of one scan (at most one row of each cube) are processed together; the kernel in C takes up
 to 32 rows of a scan. Both give the same bits on every processor, because each operation is one
@@ -158,7 +158,7 @@ def pack_bits(bits: Mask) -> PadMasks:
 
 
 def _find_due(scan: slice, task: Task) -> int:
-    """Return what is due before a scan, because of its newest time stamp.
+    """Return what the caller has to do before a scan, by the newest time stamp of the scan.
 
     The time stamp is also stored in the state of the health.
 
@@ -359,8 +359,8 @@ def _add_to_window(
 
     Args:
         health: State of the health, which is changed.
-        rows: Rows of one scan; those after the last cube are left out.
-        cube: Numbers of the cubes, to index with.
+        rows: Rows of one scan, of which only the first n are added.
+        cube: Numbers of the cubes of these rows (n,), to index with.
         is_over_limit: Whether the residual of a row is above its limit.
     """
     ratio, weight = _measure_pace(health, rows, cube)
@@ -395,13 +395,14 @@ def _measure_pace(
 ) -> tuple[Single, Single]:
     """Compute ratios and weights for second differences from the intervals between rows.
 
-    The ratio r of two successive intervals makes the second difference of a linear drift vanish,
-    and the weight w gives it the variance of the noise; `statistics.py` has the formulas.
+    The ratio r of two successive intervals makes the second difference of a linear drift vanish.
+    The weight w gives the square of a second difference of noise the same mean for each r.
+    `statistics.py` has the formulas.
 
     Args:
         health: State of the health, whose times are changed.
-        rows: Rows of one scan; those after the last cube are left out.
-        cube: Numbers of the cubes, to index with.
+        rows: Rows of one scan, of which only the first n are used.
+        cube: Numbers of the cubes of these rows (n,), to index with.
 
     Returns:
         Ratios r and weights w (n, 1), to apply to all pads of a row.
