@@ -24,8 +24,8 @@ def split_into_scans(rows: FrequencyRows, n_cubes: int) -> tuple[Array, Array]:
         Frequencies (S, n_cubes, P) in Hz of S scans and P pads per cube, NaN where a cube has no
         row; and the time stamps (S,) of the first rows of the scans, in s since the Unix epoch.
     """
-    # Within a scan the index of the cube increases, so a row whose index does not is the first
-    # row of the next scan.
+    # Within a scan the index of the cube increases. So a row whose index is not larger than that of
+    # the row before is the first row of the next scan.
     cube = rows.cube.astype(int)
     is_first = np.diff(cube, prepend=n_cubes) <= 0
     scan = np.cumsum(is_first) - 1

@@ -2,18 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Identification of creep: the viscoelastic law of each pad from one press that is held.
 
-The stress of a pad is s = u - sum_k a_k r_k with its reading u and memories r_k, which are readings
-low-passed with relaxation times tau_k (`core/compensation/creep.py`). While a load is held, s is
-constant but unknown, and after it s = 0. So s and the amplitudes a_k follow from linear least
-squares. How the load came on does not matter, because memories are computed from measured readings.
+The stress of a pad is s = u - sum_k a_k r_k. u is the reading of the pad, and the memories r_k are
+readings that were low-passed with the relaxation times tau_k (`core/compensation/creep.py`). While
+a load is held, s is constant but unknown, and after it s = 0. So s and the amplitudes a_k follow
+from linear least squares. How fast the load was applied does not matter, because the memories are
+computed from the measured readings.
 
-The relaxation times reach far beyond the hold. What the readings do not determine continues as
-they suggest. If creep grows as a power of time, the amplitudes grow by a constant factor q from one
-relaxation time to the next, so (a_k+1 - 2 q a_k + q² a_k-1)² is a part of the sum of squares. A
-first fit with q = 1 yields q.
+The longest relaxation times exceed the duration of the hold, so the readings do not determine their
+amplitudes. If creep grows as a power of time, the amplitudes grow by a constant factor q from one
+relaxation time to the next. To extrapolate this growth, weighted squares of the second differences
+a_k+1 - 2 q a_k + q² a_k-1 are added to the sum of squares. A first fit with q = 1 yields q.
 
-The deviation of the law is that which least squares state for a load that lasts `FORECAST` times as
-long as the hold.
+The uncertainty of the amplitudes is computed for the creep under a load that lasts `FORECAST` times
+as long as the hold.
 
 Source: J. D. Ferry, Viscoelastic Properties of Polymers (1980), 4.A and 11.F.
 """
@@ -58,22 +59,23 @@ the rms error with which a sum of exponentials describes real creep."""
 
 MAX_MISFIT = 5e-3
 """Largest error of the creep law (rms difference between the measured and the computed stress
-readings of the pads), divided by the load. With a larger error, the load was not held constant."""
+readings of the pads), divided by the load. With a larger one the fit raises an error, because the
+load was probably not held constant."""
 
 FIRST_BEND = 0.15
 """Standard deviation that the first fit assumes for second differences of the creep law's
 amplitudes at successive relaxation times, divided by the mean amplitude.
 
-It keeps the amplitudes smooth. If creep grows as a power of time, with an exponent of 0.1 to 0.4,
-these differences are 0.03 to 0.7 of the mean amplitude.
+The assumption makes the amplitudes a smooth sequence. If creep grows as a power of time, with an
+exponent of 0.1 to 0.4, the second differences are 0.03 to 0.7 of the mean amplitude.
 """
 
 BEND = 0.05
 """Standard deviation that the second fit assumes for second differences of the creep law's
 amplitudes at successive relaxation times, divided by the mean amplitude.
 
-It is smaller than `FIRST_BEND`, because the growth of the amplitudes that the first fit found
-(creep by a power of time) is divided out of these differences.
+It is smaller than `FIRST_BEND`, because the second fit knows the growth of the amplitudes (creep by
+a power of time) from the first fit. Its second differences are 0 for amplitudes with this growth.
 """
 
 FAST_ERROR = 0.02
@@ -85,14 +87,17 @@ REST_S = 2.0
 readings of the pads in it are subtracted from all readings."""
 
 SETTLE_S = 1.0
-"""Time, in s, from the moment at which half of the load is reached to the first stress reading that
-is fitted, in which the load must become constant. As much is left out at the end of the load."""
+"""Time, in s, after half of the load is reached, in which the load must become constant. Stress
+readings within this time are not fitted, nor those within the same time before and after the end
+of the load."""
 
 MIN_HOLD_S = 60.0
-"""Shortest duration, in s, for which the load must be held constant to determine creep."""
+"""Shortest duration, in s, for which the load must be held constant to determine creep. If it was
+held for a shorter time, the fit raises an error."""
 
 MIN_LOAD_RATIO = 100.0
-"""Smallest load of a pad, divided by the noise of its readings, with which creep is determined."""
+"""Smallest load of a pad, divided by the noise of its readings, with which creep is determined. If
+the load of any pad is smaller, the fit raises an error."""
 
 BLOCKS_PER_E_FOLD = 12
 """Number of averaged stress readings that are fitted for each growth of the time since the press by
@@ -169,7 +174,8 @@ def fit_recorded_creep(path: Path, name: str | None) -> tuple[CreepFit, Calibrat
         name: Name of the cube; None: the only one.
 
     Returns:
-        The fit, and the recorded calibration with the law and with gains that fit it.
+        The fit; and the recorded calibration with the law, and with gains from which the creep that
+        they contain is removed.
 
     Raises:
         BagError: There is no such bag or cube.
@@ -269,8 +275,8 @@ def fit_creep(
             f"{SETTLE_S:g} s, and hold a constant load, such as a dead weight"
         )
 
-    # The reading after the shortest low-pass filter nearly equals the reading, so an error of its
-    # amplitude changes all computed stresses by the same fraction.
+    # The low-pass filter with the shortest relaxation time hardly changes the readings. So an error
+    # of its amplitude changes all computed stresses by the same fraction.
     fast = np.zeros_like(amplitude)
     fast[:, 0] = np.hypot(misfit, FAST_ERROR * amplitude[:, 0])
     deviation = np.array([fast, solution.deviation])
@@ -287,11 +293,11 @@ def fit_creep(
 
 
 def compute_step_reading(model: CreepModel, seconds: float) -> Array:
-    """Return the readings of the pads after a step of the stress by 1 (P,).
+    """Return the readings of the pads (P,) some time after the stress has risen from 0 to 1.
 
     Args:
-        model: The law.
-        seconds: Time after the step, in s.
+        model: The law of creep.
+        seconds: Time after the rise, in s.
     """
     times = np.geomspace(1e-4, seconds, 300)
     amplitude = model.amplitude.T
@@ -301,8 +307,8 @@ def compute_step_reading(model: CreepModel, seconds: float) -> Array:
         ratio = step / model.time[:, None]
         share = relaxed_share(ratio)
         slope_share = 1 - share / ratio
-        # The stress is 1, so the new reading u_1 is 1 + sum_k a_k r_k. As the low-passed readings
-        # r_k contain (slope share) * u_1, the equation is solved for u_1.
+        # The stress is 1, so the new reading u_1 is 1 + sum_k a_k r_k. The low-passed readings r_k
+        # contain `slope_share` * u_1, so the equation is solved for u_1.
         memory += share * (reading - memory) - slope_share * reading
         known = 1 + (amplitude * memory).sum(axis=0)
         weight = 1 - (amplitude * slope_share).sum(axis=0)
@@ -363,6 +369,8 @@ def _find_blocks(
     release: float,
 ) -> list[Index]:
     """Divide readings into blocks, whose length grows with the time since the load changed.
+
+    Readings within `SETTLE_S` of a change of the load are in no block.
 
     Args:
         seconds: Times of the readings (S,), in s.
@@ -442,8 +450,8 @@ def _solve(
     """
     n_times = memory.shape[1]
     held = means.reading[means.is_loaded > 0]
-    # About half of the relaxation times are shorter than the load, and only these contribute to the
-    # creep under it. The scale of the regularisation follows from that.
+    # About half of the relaxation times are shorter than the duration of the load, and only their
+    # amplitudes contribute to the creep under it. The mean amplitude follows from that.
     creep = np.abs(held[-1] / held[0] - 1).mean()
     mean_amplitude = 2 * creep / n_times
     identity = np.eye(n_times)
@@ -473,9 +481,10 @@ def _solve(
         solution, *_ = np.linalg.lstsq(system, right, rcond=None)
         found.amplitude[pad] = solution[1:]
         found.error[:, pad] = reading - columns @ solution
-        # With the covariance C of the amplitudes and the gradient g of the prediction, C g divided
-        # by sqrt(g' C g) changes the prediction by one standard deviation. The stress counts as
-        # known, because the calibration of gains determines it.
+        # The creep at the end of a long load is predicted. Its gradient g with respect to the
+        # amplitudes is `forecast`, and C is the covariance of the amplitudes. A change of them by
+        # C g / sqrt(g' C g) changes the prediction by one standard deviation. The stress under the
+        # load counts as known, because the calibration of gains determines it.
         amplitudes = system[:, 1:]
         normal = amplitudes.T @ amplitudes
         spread = np.linalg.solve(normal, forecast)

@@ -245,7 +245,7 @@ def fit(
     residuals = whitened.ravel() / scale
     covariance = compute_robust_covariance(jacobian, residuals, scale)
     # Coefficients that the loads do not determine have an unknown variance (NaN). The covariance is
-    # computed with a pseudo-inverse, which gives them a small one.
+    # computed with a pseudo-inverse, which gives them a small variance.
     covariance[:n_free][is_open] = np.nan
     covariance[:, :n_free][:, is_open] = np.nan
     # Coefficients that the caller fixed have the variance 0.
@@ -325,7 +325,7 @@ class _Model:
         self.gains = rows.reshape(-1, n_pads).T
 
     def unpack(self, theta: Array) -> tuple[Array, Array]:
-        """Return all coefficients (K,) and gains (P,) that some values of the parameters stand for.
+        """Return the coefficients (K,), also the fixed ones, and the gains (P,) for parameters.
 
         Args:
             theta: Parameters: the coefficients of the response that are not fixed, then the
@@ -553,7 +553,8 @@ def _advise(
         model: The model.
         theta: Fitted parameters (coefficients, then coordinates of the gains).
         x: States (amplitudes of the modes) of the given loads (N, M), in Pa.
-        null: Basis (parameters, H) of the changes of the parameters that change no reading.
+        null: H independent changes of the parameters (parameters, H) that change no reading (stress
+            on a pad under a load).
         is_open: For each coefficient that is not fixed, whether the loads leave it undetermined.
 
     Returns:
@@ -580,8 +581,9 @@ def _advise(
             jacobian = model.jacobian(theta, model.design(candidate))
             new_null = find_null_space(jacobian)
             new_open = find_undetermined(new_null, len(names))
-            # The best load leaves the fewest coefficients undetermined. Among equal ones, it leaves
-            # the fewest independent changes of the parameters that change no reading.
+            # The best load leaves the fewest coefficients undetermined. Among loads that are equal
+            # in this, it leaves the fewest independent changes of parameters without effect on any
+            # reading.
             left = (new_open.sum(), new_null.shape[1], mode)
             results.append((left, candidate, new_null, new_open))
         best = min(results, key=itemgetter(0))
@@ -592,8 +594,8 @@ def _advise(
                 "give them as fixed, or choose a larger symmetry"
             )
             break
-        # Sometimes this load determines a coefficient only together with the next advised one. The
-        # sentence then names all undetermined coefficients.
+        # Sometimes the best load determines a coefficient only together with the load that is
+        # advised next. Then the sentence names all undetermined coefficients.
         settled = names[is_open & ~new_open]
         subject = settled if len(settled) else names[is_open]
         name = model.structure.modes.names[mode]

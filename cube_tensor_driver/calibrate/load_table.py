@@ -180,7 +180,7 @@ def _read_cells(path: Path) -> tuple[list[str], Array]:
         # Spreadsheet programs begin a file with a byte order mark, which this encoding removes.
         text = read_bounded(path, "table of loads").decode("utf-8-sig")
         # The csv module must get the ends of lines unchanged, because a cell in quotation marks may
-        # contain some.
+        # contain ends of lines.
         file = io.StringIO(text, newline="")
         stripped = [[cell.strip() for cell in line] for line in csv.reader(file)]
     except ConfigError as error:

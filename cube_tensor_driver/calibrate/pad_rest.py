@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Behaviour of the pads while nothing touches them: frequency, noise, drift and faults.
 
+f[n]     frequency of a pad in sample n
 noise    sqrt(mean(e²) / 6),   e[n] = f[n] - 2 f[n-1] + f[n-2]    (`core/health/statistics.py`)
-drift    slope of the straight line fitted to all samples f[n] of a pad over time
+drift    slope of the straight line fitted to f[n] over time
 """
 
 from __future__ import annotations
@@ -91,7 +92,8 @@ def measure_pads_at_rest(frequency: Array, seconds: Array) -> PadsAtRest:
     has_frequency = ~silent & (mean > 0)
     scale = np.where(has_frequency, mean, np.nan)
     relative_noise = noise / scale
-    # Infinity where no pad of the cube varies, because such a cube has no noisy pad.
+    # Pads that keep a single value are left out of the median noise of their cube (NaN). If all
+    # pads do, the median is infinite, so that no pad of the cube counts as noisy.
     left_out = np.where(others_vary, np.nan, np.inf)
     of_varying = np.where(varies, relative_noise, left_out)
     usual = np.nanmedian(of_varying, axis=1, keepdims=True)

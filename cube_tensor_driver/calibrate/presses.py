@@ -10,7 +10,9 @@ finger. For each rotation, an order of the pads has the misfit
     misfit² = sum_k min_g |m_k - a e_g|² / sum_k |m_k|²,   a = max(0, m_k·e_g / e_g·e_g)
 
     m_k   stresses (P,) that the pads measured in press k
-    e_g   stresses (P,) expected for this rotation, press k and distance g, in this order of pads
+    e_g   stresses (P,) expected under 1 N for this rotation, press k and distance g, in this order
+          of pads
+    a     force of press k in N, not negative because a finger cannot pull
 
 Pads are swapped two at a time as long as a swap reduces misfit² to at most `MAX_SWAP_RATIO` of its
 value. Of all explanations (rotation and order) that fit about as well as the best one, the one with
@@ -199,7 +201,8 @@ def compute_expected_presses(
             the depth.
 
     Returns:
-        Stresses (rotations, SIDES, distances, pads), in Pa, tension positive.
+        Stresses (rotations, sides, distances, pads), in Pa, tension positive, with the sides in the
+        order of `SIDES`.
     """
     cube_position = np.array([[0.0, 0.0, -depth]])
     downwards = (0.0, 0.0, -1.0)
@@ -210,7 +213,8 @@ def compute_expected_presses(
     loaded = finger + centres[:, :, None, :]
     stress, slope = field(cube_position, loaded, force, POISSONS_RATIO)
 
-    # The inverse of each rotation takes the field of the skin into the frame of the cube.
+    # The inverse of each rotation transforms the stress field from the frame of the skin to that of
+    # the cube.
     inverse = np.swapaxes(rotations, -1, -2)
     to_cube = inverse[:, None, None, None]
     rotated_stress = rotate_stress(stress, to_cube)
@@ -338,7 +342,7 @@ def _compute_misfit(
     expected: Array,
     places: Index,
 ) -> Array:
-    """Compute the misfit of several orders of the pads, in which the wires may lead to them.
+    """Compute the misfit of several orders of the pads, each of which assigns the wires to pads.
 
     The misfit is the root of the fraction of the squared measured stresses that the expected ones
     do not explain, with the best distance and force for each press.

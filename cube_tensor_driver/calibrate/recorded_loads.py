@@ -28,9 +28,9 @@ from .fit import loads_from_forces
 from .load_table import Loads
 
 WRENCH_TYPE = "geometry_msgs/msg/WrenchStamped"
-"""Message type of a force sensor as the reference."""
+"""ROS message type of a reference sensor that measures the force on the cube."""
 TENSOR_TYPE = "cube_tensor_driver/msg/StressTensorStamped"
-"""Message type of another calibrated cube as the reference."""
+"""ROS message type of a reference sensor that is another calibrated cube."""
 
 MAX_STEP_RATIO = 5.0
 """Longest time between two messages of the reference sensor over which its load is interpolated, as
@@ -93,8 +93,9 @@ def read_recorded_loads(
             area,
             calibration.half_side,
         )
-    # For each sample of the cube, the number of the next message of the reference sensor. Limiting
-    # it to 1 … last gives every sample a message before it and one after it.
+    # `following` is the number of the first message of the reference sensor after each sample of
+    # the cube. It is limited to 1 … last, so that every sample has a message before it and one
+    # after it.
     following = np.searchsorted(reference_ns, stamp_ns)
     following = following.clip(1, len(reference_ns) - 1)
     steps = np.diff(reference_ns)
@@ -132,7 +133,7 @@ def find_cube(
     path: Path,
     name: str | None,
 ) -> int:
-    """Return the number of the cube with a name, or of the only cube if the name is None.
+    """Return the number of the cube with a given name, or of the only cube if the name is None.
 
     Raises:
         BagError: No cube has the name, or the name is None and there are several cubes.
@@ -149,7 +150,7 @@ def find_cubes(
     path: Path,
     name: str | None,
 ) -> list[int]:
-    """Return the numbers of the cube with a name, or of all cubes if the name is None.
+    """Return the number of the cube with a given name, or of all cubes if the name is None.
 
     Raises:
         BagError: No cube has the name.
@@ -181,7 +182,7 @@ class BlockMeans:
         Args:
             source: The opened bag.
             block_ns: Duration of a block, in ns.
-            n_values: Number of values of a row.
+            n_values: Number of values of a row that are averaged.
         """
         bag = source.bag
         self._start_ns = bag.start_ns
@@ -214,7 +215,7 @@ def read_samples(
     number: int,
     n_pads: int,
 ) -> tuple[Times, AnyArray, AnyArray]:
-    """Return the samples of a cube, without those with a pad that the device reports as broken.
+    """Return the samples of a cube. Those in which the device reports a broken pad are left out.
 
     Args:
         source: The opened bag.
@@ -298,8 +299,8 @@ def _read_reference(
             )
         return stamp_ns, loads_from_forces(modes, values, area)
 
-    # Columns after the stresses are gradients, in Pa/m. The amplitude of such a mode (linear stress
-    # field) is the gradient times half the side of the cube.
+    # Columns after the stresses are gradients, in Pa/m. The amplitude of the mode (linear stress
+    # field) that belongs to a gradient is the gradient times half the side of the cube.
     values[:, len(STRESS) :] *= half_side
     shape = (len(values), modes.n_modes)
     state = np.zeros(shape)

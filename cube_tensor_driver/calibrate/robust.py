@@ -36,12 +36,12 @@ STAGES = {
     "huber": 1e-3,
     "tukey": 1e-9,
 }
-"""Stages of the fit in their order: least squares with equal weights ("plain"), with Huber's
-weights, and with Tukey's weights. A stage ends when a step changes the parameters by at most this
-fraction of their size.
+"""Stages of the fit in their order, each with a tolerance: least squares with equal weights
+("plain"), with Huber's weights, and with Tukey's weights. A stage ends when a step changes the
+parameters by at most the tolerance times their norm.
 
-With Huber's weights the fit has a single minimum, with Tukey's it has several. So Huber's stage
-only has to lead near the right one, and its fraction is larger.
+With Huber's weights the fit has a single minimum, with Tukey's it has several. Huber's stage only
+has to lead near the right minimum for Tukey's stage, so its tolerance is larger.
 """
 
 DIRECTION_TOLERANCE = 1e-6
@@ -126,7 +126,7 @@ def find_undetermined(null: Array, count: int) -> Mask:
         count: Number of parameters to examine, from the first on.
 
     Returns:
-        For each examined parameter, whether one of these changes alters it (count,).
+        For each examined parameter, whether one of the changes in `null` alters it (count,).
     """
     examined = null[:count]
     part = np.linalg.norm(examined, axis=1)

@@ -1,19 +1,25 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Fit of what temperature does to unloaded pads in place, from bags in which the skin warms.
+"""Fit of the effect of temperature on the unloaded pads of a skin, from bags in which it warms.
 
     v_p(t) = c_p0 + sum_d c_pd u(t)^d + s_p exp(-t / lag_1) + error,    d = 1 ... degree
-    u      measured temperature minus the reference, after low-pass filters with the lags
 
-The term with s_p is what the elastomer still remembers from before the bag; it is small a priori.
-Heat is no low-pass filter, so the error is mostly that of the filters and grows with the lag
-T - u. Blocks of a second therefore count with the weight 1 / (noise² + (share × slope × lag)²),
-which makes the quiet times decide on the coefficients. The lags minimise the negative logarithm of
-the likelihood. A second filter, or a second degree, must earn its place.
+    v_p    stress on pad p by the pad law at the time t since the beginning of the bag
+    T      measured temperature minus the reference temperature
+    u      temperature of the elastomer: T after low-pass filters with the time constants lag_1, ...
+    c_pd   coefficients of pad p
+    s_p    effect of the unknown difference between u and T at the beginning; it is small a priori
 
-Deviations follow from the residuals themselves, summed over blocks as long as the memory of the
-elastomer, because neighbouring residuals are alike (W. K. Newey, K. D. West, Econometrica 55
-(1987)); the lags count as unknown for each pad.
+Low-pass filters only approximate conduction of heat. This error is mostly larger than the noise,
+and grows with T - u. So each block of 1 s has the weight
+1 / (noise² + (`LAG_ERROR` × slope × (T - u))²), where slope is the rms of c_p1 over the pads. Times
+at which the temperature is nearly constant then determine the coefficients. The time constants
+minimise the negative logarithm of the likelihood. A second filter, or a second degree, is used only
+if it reduces the residual considerably.
+
+Neighbouring residuals are correlated. So the standard deviations of the coefficients are computed
+from sums of residuals over intervals of the length lag_1 (W. K. Newey, K. D. West, Econometrica 55
+(1987)). The time constants count as further unknowns of each pad.
 """
 
 from __future__ import annotations
@@ -62,9 +68,9 @@ MAX_LAG_STEP = 1.01
 """Ratio of successive estimates of a lag (time constant) below which the search for it ends."""
 
 LAG_ERROR = 0.05
-"""Standard deviation of the elastomer's temperature after low-pass filters, divided by the
-difference to the measured temperature. It stands for conduction of heat, which filters only
-approximate."""
+"""Standard deviation of the error of the elastomer's temperature as low-pass filters compute it,
+divided by the difference between this temperature and the measured one. The error arises because
+filters only approximate conduction of heat."""
 
 MAX_FILTER_RATIO = 0.8
 """Ratio of the rms residual with two low-pass filters to the one with a single filter, below which
@@ -80,8 +86,8 @@ filters only approximate, looks like a quadratic effect while the skin warms onc
 
 MAX_LAG_PATTERNS = 3
 """Maximum number of principal components of the residual stresses of the pads that become part of
-the model. They state its error in proportion to the difference between the measured temperature and
-that of the elastomer."""
+the model (`ThermalModel.ramp`). They state the error of the model per K of difference between the
+measured temperature and that of the elastomer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +134,8 @@ class ThermalFit:
 
         Returns:
             Rms stress of the unloaded pads before and after the effect of temperature is
-            subtracted, in Pa, and rms deviation of the linear coefficient over the pads, in Pa/K.
+            subtracted, in Pa, and rms over the pads of the standard deviation of the linear
+            coefficient, in Pa/K.
         """
         deviation = np.array(self.model.deviation)
         change = self.data.stress - self.offset
@@ -139,7 +146,7 @@ class ThermalFit:
         )
 
     def calibration(self, base: Calibration, source: str) -> Calibration:
-        """Return a calibration with the model and with the rest frequencies at its reference.
+        """Return a calibration with the model, and rest frequencies at its reference temperature.
 
         Args:
             base: Calibration with which the stresses were computed.
@@ -181,10 +188,11 @@ def read_warming(paths: Sequence[Path], name: str | None) -> dict[str, tuple[Cal
         name: Name of the cube; None: all.
 
     Returns:
-        Calibration with the rest frequencies in use, and averages, by the name of the cube.
+        For each cube by its name: the calibration with the rest frequencies that were in use, and
+        the averages over blocks of time.
 
     Raises:
-        BagError: A bag has no such cube or states no temperature, or the bags differ.
+        BagError: A bag has no such cube or states no temperature, or the bags have different cubes.
     """
     parts: list[BlockMeans] = []
     names: list[str] = []
@@ -473,7 +481,7 @@ def _check(
         fit: The result.
         slope: Rms of the linear coefficients over the pads, in Pa/K, with equal weights of all
             blocks.
-        change: Relative difference of this value to that with the weights of the fit.
+        change: Relative difference between `slope` and the rms with the weights of the fit.
     """
     data, model = fit.data, fit.model
     worst = max(root_mean_square(pad) for pad in fit.residual.T)

@@ -25,16 +25,22 @@ from ..core.pipeline import Pipeline
 from .recorded_loads import BlockMeans, find_cubes
 
 BLOCK_NS = 500_000_000
-"""Length of the blocks over which frequencies and specific forces are averaged, in ns."""
+"""Length, in ns, of the blocks of time over which the stresses on the pads and the specific forces
+are averaged."""
 
 MIN_SPREAD = 3.0
 """Smallest standard deviation of the specific force, in m/s², along the direction in which it
-varies least. Six poses, in which each axis points upwards and downwards, have 5.7; the smallest
-sufficient number is four (x, y, z upwards, z downwards: 3.5). With three poses it is 0."""
+varies least. If it is smaller, the fit raises an error.
+
+Six poses, in which each axis of the cube points upwards and downwards once, yield 5.7. Four poses
+are the fewest that suffice (x, y, z upwards, z downwards: 3.5); three poses yield 0.
+"""
 
 MIN_BLOCKS = 20
-"""Smallest number of blocks (of 0.5 s) with data: four times the number of unknowns of a pad, which
-are three responses, a constant and a drift."""
+"""Smallest number of blocks (of 0.5 s) with data. With fewer, the fit raises an error.
+
+It is four times the number of unknowns of a pad, which are three responses, a constant and a drift.
+"""
 
 
 class WeightFit(NamedTuple):
@@ -43,9 +49,9 @@ class WeightFit(NamedTuple):
     Attributes:
         calibration: The recorded calibration with the response.
         seconds: Times of the N blocks of the first cube (N,), in s.
-        before: Stresses on its pads, averaged over the blocks (N, P), in Pa, minus a fitted
-            constant and linear drift.
-        after: These stresses minus the fitted effect of weight (N, P), in Pa.
+        before: Stresses on the pads of the first cube, averaged over the blocks (N, P), in Pa,
+            minus a fitted constant and linear drift.
+        after: `before` minus the fitted effect of weight (N, P), in Pa.
     """
 
     calibration: Calibration
@@ -55,7 +61,7 @@ class WeightFit(NamedTuple):
 
 
 def fit_weight(path: Path, name: str | None = None) -> WeightFit:
-    """Fit the response to specific force to a bag.
+    """Fit the pads' response to specific force (acceleration minus gravity) to a bag (recording).
 
     Args:
         path: Path of a bag in which nothing touches the skin.
@@ -63,7 +69,8 @@ def fit_weight(path: Path, name: str | None = None) -> WeightFit:
             mean of their responses.
 
     Raises:
-        BagError: The bag has no such cube, states no motion, or does not turn it enough.
+        BagError: The bag has no such cube, states no motion of the skin, or is too short; its cubes
+            have different calibrations; or the skin was not turned enough.
     """
     with open_bag(path) as source:
         calibrations = source.recording.settings[0].calibrations
