@@ -48,7 +48,7 @@ with many cubes sends in this time, so a shorter delay loses nothing."""
 OVERLOAD_S = 0.5
 """Delay, in s, of this process in reading received bytes, above which it drops whole scans (one
 sample of every cube) if samples are lost at the same time: the host is too slow. After a shorter
-delay it catches up without loss. Dropping goes on until none was needed for this time."""
+delay it catches up without loss. Dropping ends when no further sample was lost for as long."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class _LinkRecord:
         log: Logger for events of the link.
 
     Attributes:
-        track: Sample numbers and clock values of the link, on which `account` and `clock` work.
+        track: Sample numbers and clock values of the link, which `account` and `clock` change.
         account: Counters of the samples of the link: delivered, missing, duplicate.
         clock: Conversion of the device times of the hub to host time.
         logger: Logger of the link, which counts the lines that it left out.
@@ -175,8 +175,8 @@ class LiveLinks:
 
         It may be called again after `close`.
         """
-        # A port may hang in the kernel and keep the thread of the reader before, so each start has
-        # a reader of its own.
+        # A port that hangs in the kernel may keep the thread of the previous reader from ending, so
+        # each start makes a new reader.
         self._reader = self._make_reader()
         self._reader.start()
 
@@ -272,11 +272,11 @@ class LiveLinks:
     def _is_overloaded(self) -> bool:
         """Return whether scans (one sample of every cube) must be dropped, as the host is too slow.
 
-        They must be if this process reads received bytes too late by `OVERLOAD_S` and samples are
-        lost. If it reads late but nothing is lost, everything is delivered. The oldest scans are
-        dropped as a whole, so that the others are complete and late by a few sample periods at
-        most. Otherwise the kernel and the hubs would drop samples at random, and scans with gaps
-        cost more time than complete ones.
+        Scans must be dropped if this process reads received bytes too late by `OVERLOAD_S` and
+        samples are lost. If it reads late but nothing is lost, everything is delivered. The oldest
+        scans are dropped as a whole, so that the others are complete and late by a few sample
+        periods at most. Otherwise the kernel and the hubs would drop samples at random, and scans
+        with gaps cost more time than complete ones.
         """
         now = time.monotonic()
         if self._reader.behind_s > OVERLOAD_S:
@@ -512,7 +512,7 @@ def _describe_losses(
     now: dict[str, int],
     lag_s: float,
 ) -> list[str]:
-    """Return a text about the samples lost since the last report; none if none were lost.
+    """Return a list with a text about the samples lost since the last report; empty if none were.
 
     The text states how many were lost and where: in this host, in the hub, or on the line.
 

@@ -53,22 +53,22 @@ class LinkTrack(Structure):
         newest_us: Device time of the newest sample, in µs.
         reference: Number (32 bits) of the sample from which device times are predicted; -1 if there
             is none.
-        reference_us: Device time of this sample, in µs.
+        reference_us: Device time of the sample `reference`, in µs.
         first_us: Device time that is the origin of device times in ns.
         first_ns: Host time that is the origin of host times in ns.
         newest_ns: Newest device time, in ns; `NEVER` before the first sample.
         last_arrival_ns: Host time of the last arrival, in ns since the Unix epoch.
         last_stamp_ns: Last stamp (host time of sampling) that was given, in ns since the epoch.
-        is_earliest_late: Whether the host has read the earliest point of this second late.
+        is_earliest_late: Whether the host read the point with the height `bucket_height` late.
         period_us: Estimated sample period, in µs; 0 if it is not known.
         offset: Arrival minus device time on the clock line at device time 0, in ns.
-        bounded_offset: The offset without the smallest delay, as far as it is known, in ns.
+        bounded_offset: `offset` without the smallest delay, as far as this delay is known, in ns.
         drift: Slope of arrival minus device time over device time.
         jitter_ns: Mean height of the newest points above the clock line, in ns.
         bucket_end: Arrival time, in ns, at which the present second (bucket) ends.
         bucket_height: Smallest height above the line in this bucket, in ns; infinite if none.
-        earliest_ns: Device time of the point with this height, in ns.
-        earliest_delay: Arrival minus device time of this point, in ns.
+        earliest_ns: Device time of the point with the height `bucket_height`, in ns.
+        earliest_delay: Arrival minus device time of the same point, in ns.
         seen: Number and device time, in µs, of the newest samples; the place of number n is n % 64.
     """
 

@@ -37,10 +37,10 @@ MAX_STEPS = 3
 Then the arrival times at the host are the stamps of the samples."""
 STEPS_NS = 10_000_000_000
 """Length, in ns, of the time window in which the steps of a hub's clock are counted. Older steps do
-not count, so that the clock is used again."""
+not count, so that the clock is used again after some time without steps."""
 MAX_BAD_ANSWERS = 3
-"""Number of successive answers to the request TIME (for the hub's time) that contradict the device
-times of its samples before this is reported as a problem."""
+"""Number of successive answers to the request TIME (for the hub's time) that must contradict the
+device times of the hub's samples before the contradiction is reported as a problem."""
 CLOCK_SET = "the hub's clock was set: stamps follow its new time"
 """Problem that is reported after a step of the hub's clock."""
 CLOCK_STANDS_STILL = "the hub's clock stands still: rows are stamped by their arrival"
@@ -85,8 +85,8 @@ class HubClock:
         self._n_bad_answers = 0
         self.track.last_arrival_ns = NEVER
         self.track.last_stamp_ns = NEVER
-        # Last stamp given while a step of the hub's clock was suspected that was confirmed later.
-        # It was computed without the step and may be later than the true time.
+        # Last stamp that was given while a step of the hub's clock was only suspected, if the step
+        # was confirmed later. The stamp was computed without the step and may be too late.
         self._doubtful_stamp = NEVER
         self._restart()
 
@@ -376,7 +376,8 @@ class HubClock:
             was_set = decision.was_set(device_ns, delay, arrival, self.track.jitter_ns)
         else:
             # The delays of samples that this host reads too late do not show whether the hub's
-            # clock was set. After the time limit, this is left to the check of later delays.
+            # clock was set. After the time limit the clock counts as not set; if it was set, the
+            # check of later delays finds the step.
             is_in_time = arrival - decision.since_ns <= MAX_DECISION_NS
             was_set = None if is_in_time else False
         if was_set is None:

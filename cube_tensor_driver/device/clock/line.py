@@ -47,8 +47,9 @@ MAX_DRIFT = 1e-3
 limited. A larger value arises when the host pauses and reads many samples late."""
 MAX_RISE_NS = 20e6
 """Largest credible change of the smallest delay of samples (arrival minus sampling), in ns; USB
-adapters delay samples by up to 16 ms. If all delays of `MIN_BUCKETS_HIGH` successive seconds exceed
-the smallest earlier one by more, or one delay falls below it by more, a clock was set."""
+adapters delay samples by up to 16 ms. The hub's or the host's clock counts as set if all delays of
+`MIN_BUCKETS_HIGH` successive seconds exceed the smallest earlier delay by more, or if one delay is
+smaller than it by more."""
 MAX_FALL_NS = 4e6
 """Largest credible decrease of the smallest delay of samples (arrival minus sampling) within 1 s,
 in ns. A larger one, after the first second, shows that the hub's or the host's clock was set.
@@ -147,8 +148,8 @@ class ClockLine:
     def add(self, device_ns: float, arrival_ns: int, is_late: bool = False) -> bool:
         """Add the point (device time, arrival time) of a sample to the clock line.
 
-        The line states host time over device time for the smallest delay. A point below the line
-        lowers it. After each bucket of 1 s the line is fitted anew.
+        The line states host time over device time for the smallest delay. If the point lies below
+        the line, the line is lowered to it. After each bucket of 1 s the line is fitted anew.
 
         Args:
             device_ns: Device time of the sample, in ns since the first point.

@@ -33,13 +33,14 @@ DECISION_NS = 200_000_000
 """Time, in ns, for which delays of samples are collected after a suspected step of a hub's clock.
 
 A delay is the time from the sampling to the arrival of a sample. If the hub only sampled late, the
-smallest delay is the same as before; if its clock was set, it differs by the step. The decision
-comes earlier if one of the two would make a delay negative or improbably long.
+smallest delay is the same as before; if its clock was set, the delay differs by the step. The
+decision comes earlier if one of the two cases would make a delay negative or improbably long.
 """
 MAX_DECISION_NS = 1_000_000_000
 """Time limit, in ns after a suspected step of the hub's clock, for deciding whether the clock was
 set or the hub only sampled late. Until then the decision waits while the smallest delay of samples
-(arrival minus sampling) is about as far from the value expected in the one case as in the other."""
+(arrival minus sampling) is about as far from the value expected in the one case as in the other.
+After it, the nearer value decides."""
 MIN_DECISION_READS = 8
 """Number of reads after a suspected step of the hub's clock before the smallest delay decides. The
 samples of a few reads may all be delayed."""
@@ -203,7 +204,8 @@ class StepDecision:
         # early, 1 if its clock was set.
         reference_ns = self.usual_delay_ns
         if step_ns > 0:
-            # The next sample may have a smaller delay than the samples before the step.
+            # Even if the clock was not set, the delay may become smaller than before the step, down
+            # to that of the clock line, which is 0 here.
             reference_ns = 0.0
         shift = (reference_ns - delay_ns) / step_ns
         max_shift = (reference_ns - self.min_delay_ns) / step_ns

@@ -46,7 +46,9 @@ NO_SAMPLES = NativeSamples([], [], [])
 
 
 class LinkRead(NamedTuple):
-    """Frames or error from reading one link once, unless the module in C has handled all frames.
+    """Result of reading one link once: frames, or an error that shows that the link is lost.
+
+    There is no such result if the module in C has handled all frames of the read.
 
     Attributes:
         link: Index of the link.
@@ -100,7 +102,8 @@ class Intake:
         Args:
             timeout_s: Longest wait for the first bytes, in s.
             gather_s: Longest wait, in s, for frames of the other links after the first frame.
-            expected: Number of links whose frames end this second wait.
+            expected: Number of links that deliver samples. The wait for frames of the other links
+                ends early when this many have delivered some.
 
         Returns:
             Whether bytes had been waiting before the call, so that this host is behind; the samples

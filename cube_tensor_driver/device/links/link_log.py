@@ -75,8 +75,8 @@ class LinkLogger:
     def change(self, state: LinkState, error: LinkError | None) -> None:
         """Log a change of the state of the link.
 
-        A silence is logged at most once in `SILENCE_PERIOD_S`. Others are left out and counted, and
-        so is the return to the open state after them.
+        A silence is logged at most once in `SILENCE_PERIOD_S`. Further silences are left out and
+        counted, and so is the return to the open state after each of them.
 
         Args:
             state: The new state.

@@ -83,7 +83,7 @@ class Session:
         self._has_hello = False  # whether HELLO has come since the port was opened
         self._opened_at = self._last_sample = 0.0
         self._retry_at = self._check_port_at = self._hello_at = self._ask_time_at = 0.0
-        # Whether the hub supports the request TIME. One that does not answers it by an ACK.
+        # Whether the hub supports the request TIME. A hub without it answers the request by an ACK.
         self._knows_time = True
         # Numbers of received bytes, and of samples that the module in C has handled, at the last
         # check of the timers.
@@ -304,8 +304,8 @@ class Session:
     def _check_silence(self, now: float) -> None:
         """Set the state SILENT if no sample has come for the time limit.
 
-        The limit is `SILENT_S` or three sample periods, whichever is longer. One period of this
-        check is subtracted, so that the state never comes later.
+        The limit is `SILENT_S` or three sample periods, whichever is longer. The period of this
+        check (`TICK_S`) is subtracted from it, so that the state is never set later.
 
         Args:
             now: Monotonic time, in s.

@@ -25,7 +25,8 @@ with their number ("and 3 more")."""
 ABSENT = -1
 """Value that stands for the index in the skin if a hub's cube is not in the skin file."""
 _OTHER_LINK_HAS_IT = "left out here: another link has a cube of the same uid"
-"""Reason in the log why a cube with a uid that came before is left out."""
+"""Text in the log for a cube that is left out because the hub of another link has a cube of the
+same uid."""
 
 
 HubIndex = NDArray[np.int32]
@@ -220,7 +221,7 @@ class CubeTable:
 
         cubes = np.full(hello.n_cubes, ABSENT, np.int32)
         # Cubes with the same problem share one line of the log. This dictionary holds their names
-        # by the noun of the cubes and the text of the problem.
+        # by the beginning of the line ("cube" or "the hub's cube") and the text of the problem.
         names: dict[tuple[str, str], list[str]] = {}
         for number, address in enumerate(self._addresses):
             is_claimed = number in claimed

@@ -261,7 +261,7 @@ class ScanBuilder:
     def _holds_late_sample(self, missing: set[int]) -> bool:
         """Return whether the pending scan holds a late sample, whose scan was delivered without it.
 
-        Such a sample is delivered alone. If it waited for the next samples of the other links, its
+        A late sample is delivered alone. If it waited for the next samples of the other links, its
         link would stay one sample behind from then on. A sample counts as late if its time is
         nearer to the last delivered sample of every missing link than to that of its own link.
 

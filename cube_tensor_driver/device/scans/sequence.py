@@ -182,8 +182,9 @@ class SequenceTracker:
         """Return whether a late sample was taken since the last restart of the hub.
 
         This is so if its device time lies between those of the samples with the next smaller and
-        the next larger number. If the hub's clock was set back between these two, it is enough
-        that it is later than the first or earlier than the second of them.
+        the next larger number. If the hub's clock was set back between these two samples, it is
+        enough that the device time is later than that of the first, or earlier than that of the
+        second.
 
         Args:
             number: Unwrapped number of the sample.

@@ -375,8 +375,8 @@ fit the length."""
 def to_hertz(millihertz: NDArray[np.uint32]) -> Single:
     """Convert frequencies in mHz, as `Sample` has them, to Hz; NaN where a pad was not measured.
 
-    They are converted in double precision and rounded once, because float32 cannot represent 1 mHz
-    of 100 kHz.
+    They are converted in double precision and rounded to float32 once, at the end, because float32
+    cannot resolve 1 mHz at 100 kHz.
     """
     hertz = (millihertz * 1e-3).astype(np.float32)
     hertz[millihertz == NOT_MEASURED] = np.nan
