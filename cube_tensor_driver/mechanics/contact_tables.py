@@ -47,8 +47,8 @@ from .spectra import layer_spectra, tabulate_bessel
 
 CONTACT_SIZES = np.geomspace(0.1, 5.0, 23)
 """Radii of the tabulated round contacts, divided by the depth of the cubes' centres below the
-surface. Other radii are rounded to the nearest one; within the range, this changes them by at most
-10 %."""
+surface. Other radii are replaced by the nearest one. Within the range, this changes them by at most
+10 %; radii outside of the range become the smallest or the largest one."""
 
 GRID_STEP = 1 / 16
 """Step of the grid of the polygon tables, in asinh(d) and in asinh(t / sqrt(1 + d**2)).

@@ -82,8 +82,8 @@ class DistanceTable:
 
         Args:
             distance: Distances (N,) in m.
-            count: Number of sets of weights: 1 for those of the value, 2 for those of its first
-                derivative by the row number, too, 3 for those of the second derivative, too.
+            count: Number of sets of weights. The first set is for the value, the second and third
+                are for its first and second derivative by the row number.
 
         Returns:
             Index (N,) of the first of the four rows from which each value is interpolated, and the
@@ -138,8 +138,8 @@ def cubic_weights(index: Array | float, count: int = 1) -> tuple[Array, ...]:
 
     Args:
         index: Fractional index (...), which lies between the second and the third entry.
-        count: Number of sets of weights: 1 for those of the value, 2 for those of its first
-            derivative by the index, too, 3 for those of the second derivative, too.
+        count: Number of sets of weights. The first set is for the value, the second and third are
+            for its first and second derivative by the index.
 
     Returns:
         Index (...) of the second entry, and the sets of weights (4, ...) of all four entries.

@@ -93,6 +93,7 @@ class TractionPrior:
         ones.
 
         Returns:
+            Dictionary with the following arrays.
             cross: Covariance of the components with the traction at a point of the surface, as
                 the radial functions R, Z and T of circular.py (distances, 3, n).
             real: Covariance (distances, n, n) of the real parts of the components at two cubes.
