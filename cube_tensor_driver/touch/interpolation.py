@@ -224,7 +224,8 @@ class _Weights:
         self.uncertainty = np.zeros((n, points))
         self.data = np.zeros((n, points, per_row))
         indices = np.repeat(columns, points, axis=0).ravel()
-        # Row starts of the CSR format (compressed sparse rows); all rows have equally many entries.
+        # `starts` are the row starts of the CSR format (compressed sparse rows). All rows have
+        # equally many entries.
         starts = np.arange(rows + 1) * per_row
         self.matrix = csr_matrix(
             (

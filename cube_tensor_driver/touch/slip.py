@@ -76,8 +76,8 @@ LEAK_M = 0.01
 force, by 1. Where the skin deviates from the model, changes of the force look like motion."""
 
 MIN_RATIO = 0.1
-"""Smallest ratio of shear and normal force of a contact that slips. With less shear, its direction
-is not known well enough, and rolling looks like slip."""
+"""Smallest ratio of shear and normal force of a contact that slips. With less shear, the direction
+of the shear force is not known well enough, and rolling looks like slip."""
 
 MIN_SHARE_OF_LARGEST = 0.5
 """Smallest ratio of shear to normal force at which a contact can slip, divided by the largest ratio

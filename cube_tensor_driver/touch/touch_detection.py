@@ -44,8 +44,9 @@ DEFAULT_RATE_HZ = 1000.0
 """Sampling rate of each cube, in Hz, that is assumed if the skin file states none."""
 
 TIME_CONSTANT_S = 1.0
-"""Time constant, in s, of the high-pass that removes slow drift from the pressure of a cube. It
-also removes loads that grow slowly, by less than about 2.3 Pa/s on a cube with 24 pads."""
+"""Time constant, in s, of the high-pass that removes slow drift from the pressure of a cube. The
+high-pass also removes loads that grow slowly, by less than about 2.3 Pa/s on a cube with 24 pads.
+"""
 
 REFERENCE = 2.0
 """Reference value of the CUSUM, in standard deviations of the noise. It is half of the smallest
@@ -307,7 +308,7 @@ class Touch:
         pressure: Array,
         elapsed_s: Array,
     ) -> Array:
-        """Return the gain (k,) of the low-pass with which the slow parts of k cubes follow.
+        """Return the gain (k,) of the low-pass filter that gives the slow parts of k cubes.
 
         `_test` has to be called before, with the same arguments.
 

@@ -110,8 +110,8 @@ def estimate_contact(nodes: Array, forces: Array, root: Array, size: float) -> C
     arm_x, arm_y = arm.T
     moment = arm_x @ forces[1] - arm_y @ forces[0]
 
-    # Derivatives (4, 3, q) of the position (x, y), the moment and the area by the 3 components of
-    # the force of each of q nodes.
+    # `slopes` are the derivatives (4, 3, q) of the position (x, y), the moment and the area by the
+    # 3 components of the force of each of q nodes.
     slopes = np.zeros((4, 3, len(nodes)))
     slopes[:2, 2] = arm.T / normal_force
     slopes[2, 0] = -arm_y

@@ -22,14 +22,16 @@ from .local_values import rotations_about_normal, unroll_points
 from .node_fit import NodeFit
 
 _MIN_RINGS = 4
-"""Smallest number of concentric rings of point forces by which a Hertz contact is represented when
-its force is distributed over the points of the surface."""
+"""Smallest number of concentric rings of point forces that represent a Hertz contact when its force
+is distributed over the points of the surface."""
 
 _RINGS_PER_SPACING = 16
-"""Number of concentric rings of point forces, by which a Hertz contact is represented, within the
-distance of neighbouring points of the surface. Each point force is moved to the nearest of these
-points. With rings this narrow, the error of the pressure due to the moves is below the standard
-deviation of the pressure."""
+"""Number of rings of point forces per distance of neighbouring points of the surface.
+
+A Hertz contact is represented by point forces on concentric rings, and each point force is moved to
+the nearest point of the surface. With this number, the error of the pressure due to the moves is
+below the standard deviation of the pressure.
+"""
 
 
 def add_fits(

@@ -397,12 +397,12 @@ class HertzFit:
         radii = np.exp(self.found.log_sizes)
         sizes = radii[:, None] * growth
 
-        # Derivatives (3 axes, J, 7, J, 8) of the forces of all Hertz contacts of the sum by the 8
-        # parameters of each of the J fitted contacts.
+        # `slopes` are the derivatives (3 axes, J, 7, J, 8) of the forces of all Hertz contacts of
+        # the sum by the 8 parameters of each of the J fitted contacts.
         slopes = np.zeros((3, count, 7, count, _N_PARAMETERS))
         wider_share = 1 / (1 + np.exp(2 * FLATNESS_STEP))
         narrower_share = 1 - wider_share
-        # Numbers of these Hertz contacts among the seven of a fitted contact.
+        # These are indices of the shifted and the resized ones of the seven Hertz contacts.
         x_shifted = [1, 2]
         y_shifted = [3, 4]
         resized = [5, 6]

@@ -3,7 +3,7 @@
 """Values of the cubes around a region, divided by their noise.
 
 The noise of a cube grows with the stress of its pads, because the relative error of their gains is
-`GAIN_ERROR`. Computing it takes long, and is only done for cubes whose stress has changed.
+`GAIN_ERROR`. Computing the noise takes long, so it is only done for cubes whose stress has changed.
 """
 
 from __future__ import annotations
@@ -158,7 +158,8 @@ class LocalValues:
         angle: Rotations (n,) of the cubes about z in rad, in the frame of the home cube.
         variant: Number (n,) of the matrix of the measurement model that applies to each cube, which
             depends on its calibration and its pads in use.
-        whitening: Matrices (n, C, C) as in `CubeNoise`, of the last `refresh`.
+        whitening: Matrices (n, C, C) as in `CubeNoise`, at the last `refresh`, multiplied by the
+            weights of the cubes.
         known: Whether each of the C components of the cubes is known (n, C).
         count: Number of known values.
         disturbance: Standard deviation (n, C), in Pa, of the part of the values that contacts

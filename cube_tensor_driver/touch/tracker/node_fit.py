@@ -51,7 +51,8 @@ with its third power. The nodes of larger regions lie farther apart."""
 BORDER_REACH_PITCHES = 1.5
 """Distance from a region of contact at the border of the skin, divided by the pitch (distance of
 neighbouring cubes), up to which nodes (small contacts) are placed beyond the border. The region
-itself ends there, because it consists of points of the skin, but the contact may not."""
+ends at the border, because it consists of points of the skin, but the contact may extend farther.
+"""
 
 MAX_BORDER_REACH_DEPTHS = 4.0
 """Largest distance from a region of contact at which nodes (small contacts) are placed beyond the
@@ -85,8 +86,9 @@ contact."""
 
 _POINT_MARGIN = 0.75
 """Largest distance of a node (one of the small contacts whose sum is the traction) from the nearest
-point of its region of contact, divided by the distance of neighbouring points of the surface. Half
-of the diagonal of the square that a point represents is 0.71."""
+point of its region of contact, divided by the distance of neighbouring points of the surface. Every
+point represents a square with half a diagonal of 0.71, so nodes may lie anywhere in these squares.
+"""
 
 _CORRELATION_LENGTHS = np.array([0.2, 0.8, 3.0])
 """Correlation lengths of the pressure in a contact, divided by the depth of the cubes' centres: for
@@ -155,7 +157,8 @@ class NodeFit:
         self.places, self.spacing = _place_nodes(region_points, points_around, inverse)
         self.size = _NODE_RADIUS * inverse.depth
 
-        # The force of a node is its pressure times the square of the spacing.
+        # The force of a node is its pressure times the square of the spacing, so covariances of
+        # forces contain the fourth power of the spacing.
         self._squared_distances = cdist(self.places, self.places, "sqeuclidean")
         lengths = _CORRELATION_LENGTHS[:, None, None] * inverse.depth
         exponents = self._squared_distances / (2 * lengths**2)
@@ -169,7 +172,7 @@ class NodeFit:
         self._peak_width = _PEAK_WIDTH * inverse.depth
         self.is_sharp = False
         # `_estimates` are the contacts of the present posterior and labels. They are computed when
-        # they are needed; None: not yet.
+        # they are needed; before that, `_estimates` is None.
         self._estimates: list[ContactEstimate] | None = None
         # The sensitivity (n, C, S) holds the changes of the values, in Pa, by one standard
         # deviation of each of S quantities of the elastomer, the depth first. It is known after the
@@ -235,8 +238,9 @@ class NodeFit:
         explained_means = by_errors @ best_errors
         corrected = means[:, :2] - explained_means
         forces, by_depth = corrected.T
-        # The covariance is the sum of three parts: for an exactly known elastomer, by its estimated
-        # errors, and by the error of the depth. Its square root has the columns of all three.
+        # The covariance is the sum of three parts: that for an exactly known elastomer, and those
+        # due to its estimated errors and to the error of the depth. Its square root consists of the
+        # columns of the square roots of these parts.
         cholesky_factor = np.linalg.cholesky(information[best])
         errors_root = np.linalg.inv(cholesky_factor).T
         exact_root = basis * np.sqrt(variances)
@@ -431,6 +435,7 @@ def _place_nodes(region: Array, around: Array, inverse: SurfaceInverse) -> tuple
         nodes = nodes[is_in_region | is_beyond_border]
         if len(nodes) <= MAX_NODES:
             return nodes, step
-        # The number of nodes is proportional to 1 / step^2. The 2 % spare a further round.
+        # The number of nodes is proportional to 1 / step^2. The additional 2 % usually save a
+        # further iteration.
         squared_growth = 1.02 * len(nodes) / MAX_NODES
         step *= np.sqrt(squared_growth)

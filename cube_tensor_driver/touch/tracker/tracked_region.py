@@ -240,7 +240,8 @@ class TrackedRegion:
         return self.fit is not None and self.fit.shape_misfit > limit
 
     def _have_others_changed(self, fit: NodeFit) -> bool:
-        """Whether the stress by other regions has changed by more than `MAX_OTHERS_CHANGE`."""
+        """Whether the stress that other regions cause in the cubes of a fit has changed by more
+        than `MAX_OTHERS_CHANGE` since the fit was made."""
         values = fit.values
         change = np.broadcast_to(self.others - self._fitted_others, values.known.shape)
         white = values.whitening @ change[:, :, None]
@@ -289,7 +290,7 @@ class TrackedRegion:
 
     @property
     def has_fitted_neighbours(self) -> bool:
-        """Whether all near regions have a fit, whose response this fit can subtract."""
+        """Whether all regions in `near` have a fit, so that the response to them is well known."""
         return all(other.fit is not None for other in self.near)
 
     @property
@@ -499,7 +500,7 @@ class TrackedRegion:
         """Set `others`, the response to the other regions that a fit subtracts from its values.
 
         Args:
-            values: Values of the fit, whose `disturbance` is set.
+            values: Positions and noise of the cubes of the fit; the attribute `disturbance` is set.
             total: Response (cubes, C), in Pa, of all cubes to all regions.
             deviation: Standard deviation (cubes, C) of this response, in Pa.
         """
