@@ -116,7 +116,7 @@ class ContactWriter:
             self._write(stamp_ns, int(recorded_ns[number]))
 
     def _is_due(self, stamp_ns: int) -> bool:
-        """Return whether one period has passed since contacts were due, or time has jumped back.
+        """Return whether contacts are due: a period after the last due time, or after a jump back.
 
         Args:
             stamp_ns: Stamp of the message of frequencies, in ns since the Unix epoch. If the result

@@ -38,8 +38,8 @@ if TYPE_CHECKING:
     from .contacts import ContactOptions
 
 PARTIAL_PREFIX = ".partial-"
-"""Begin of the name of the folder, beside the results, in which one job writes its result. After an
-interruption, an incomplete result is computed again from the start."""
+"""Prefix of the name of the folder, beside the results, in which a job writes its result until the
+result is complete. After an interruption, an incomplete result is computed again from the start."""
 
 MAX_NAMED_CUBES = 5
 """Largest number of cubes that one error message names."""
@@ -386,7 +386,8 @@ def _measure_rest(
     begin_ns = bag.start_ns + round(begin_s * 1e9)
     end_ns = bag.start_ns + round(end_s * 1e9)
     # Weight is compensated, so that the rest frequencies are valid in every pose of the skin.
-    # Creep is not, because it only follows a load, and a tare requires that there is none.
+    # Creep is not compensated, because only a load causes it, and a tare requires that there is no
+    # load.
     compensation = Compensation(pipeline)
     for rows in BagSource(bag, source.topic):
         rows = rows.select(rows.cube < len(exists))
