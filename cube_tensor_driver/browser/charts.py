@@ -259,7 +259,8 @@ class Charts:
 def make_chart(history: History, names: Sequence[str], cubes: Sequence[int], group: str) -> Chart:
     """Return a chart with one line for each cube and each value of a group that is observed.
 
-    At most `MAX_LINES` lines are drawn. A value is observed if any cube has had it in the history.
+    At most `MAX_LINES` lines are drawn. A value counts as observed if it was known for any cube at
+    any instant of the history.
 
     Args:
         history: Values of all cubes in the last seconds.
