@@ -103,8 +103,9 @@ class Signal:
         messages.sort(key=itemgetter(0))
         stamps = [stamp for stamp, _ in messages]
         self._stamp_ns: Times = np.array(stamps, np.int64)
-        # Row k + 1 has the numbers after message k. A JointState may contain only some of the
-        # joints; the others keep their latest values, which are NaN before the first message.
+        # Row k + 1 of `_values` has the numbers that hold after message k; row 0 is NaN. A
+        # JointState may contain only some of the joints. The others keep their latest values, which
+        # are NaN until a message contains them.
         latest = dict.fromkeys(topic.names, np.nan)
         shape = (len(messages) + 1, len(latest))
         self._values: Single = np.full(shape, np.nan, np.float32)
@@ -130,7 +131,7 @@ class Signal:
             (frames, numbers) values; NaN before the first message, and for numbers that the bag
             does not have.
         """
-        # A message belongs to the frame (time step) in which its stamp lies.
+        # The row for a frame (time step) is the number of messages with stamps up to its end.
         frame_of_message = episode.frame_of(self._stamp_ns)
         frames = np.arange(first, last)
         row = np.searchsorted(frame_of_message, frames, side="right")
