@@ -88,7 +88,7 @@ class SkinWrenches:
         self._stale_s = stale_s
 
     def update(self, rows: StressRows, now: float) -> None:
-        """Compute the wrenches of cubes from new rows. If a cube has several, the last one counts.
+        """Compute the wrenches of cubes from new rows. Of several rows of a cube, the last counts.
 
         Args:
             rows: Rows of stress, one sample of one cube each. Rows of cubes that the skin does not
