@@ -155,7 +155,7 @@ class HubCubes:
 
     Attributes:
         link: Link of the skin that the hub is on.
-        members: Index in the skin of each cube (hub cubes,) of the hub, in the order of the hub;
+        members: (hub cubes,) indices in the skin of the hub's cubes, in the order of the hub;
             `ABSENT` for cubes that are not in the skin.
         cubes: Computes the frequencies of those cubes of the hub that are in the skin.
     """
@@ -253,18 +253,19 @@ def make_hub_cubes(
 
 
 def find_hub_members(skin: Skin, link: str) -> Index:
-    """Return the indices in the skin of the cubes (hub cubes,) of the hub on a link.
+    """Return the indices in the skin of the cubes that the hub on a link has.
 
     A cube whose index on the hub is given in the skin file has this index. Cubes for which the skin
-    file gives a uid (unique number) instead take the free indices, in the order of the skin. Of
-    these, cubes without a link are on the first link of the skin.
+    file gives a uid (unique number) instead take the free indices, in the order of the skin. If the
+    skin file gives no link for such a cube, it is on the first link of the skin.
 
     Args:
         skin: The skin.
         link: Name of the link.
 
     Returns:
-        Index in the skin for each index on the hub; `ABSENT` where no cube of the skin has it.
+        (hub cubes,) index in the skin for each index on the hub; `ABSENT` for an index on the hub
+        that no cube of the skin has.
     """
     by_index: dict[int, int] = {}
     by_uid: list[int] = []

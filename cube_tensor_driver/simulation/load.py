@@ -36,8 +36,8 @@ MAX_CACHED_BYTES = 64 << 20
 """Maximum memory, in bytes, of the stress fields that `LoadMemory` keeps for a repeated load."""
 
 _ORDERS = np.array([2, 3, 4, 6, 8, 11, 16, 23, 32, 45, 64])
-"""Quadrature orders (number of rings of point forces that represent a contact) in use. They are
-few, so that many cubes have the same order and are computed together."""
+"""Numbers of concentric rings of point forces by which a contact can be represented (quadrature
+orders). They are few, so that many cubes have the same number and are computed together."""
 
 _FAR_RATIO = 0.15
 """Ratio of a contact's radius to the distance from a cube to the rim of the contact, below which

@@ -11,8 +11,9 @@ temperature at the height z above the ground is T(z, t)::
 Finite volumes turn this into a linear system, whose eigenvectors are advanced exactly under
 temperatures of ground and air that are linear in time. The thermal stress of a pad is linear in
 T(z); finite elements (`./cube fem --temperature`) have computed it for Legendre polynomials. The
-oscillators of a cube have the mean temperature of its height. Heat along the layer, and into the
-cubes, which conduct better than the elastomer, is left out.
+oscillators of a cube have the mean temperature of the layer between the lower and the upper face of
+the cube. The conduction of heat along the layer, and into the cubes, which conduct better than the
+elastomer, is left out.
 
 Source: H. S. Carslaw, J. C. Jaeger, Conduction of Heat in Solids (1959), 3.11.
 """
@@ -150,7 +151,13 @@ class WarmLayer:
         ground: float,
         air: float,
     ) -> None:
-        """Advance by a time in s, in which ground and air change linearly to these values in °C."""
+        """Compute the temperatures of the layer after a further span of time.
+
+        Args:
+            seconds: Length of the span, in s, in which ground and air change linearly.
+            ground: Temperature of the ground at its end, in °C.
+            air: Temperature of the air at its end, in °C.
+        """
         if seconds <= 0:
             return
         steady = self._find_steady(ground, air)
@@ -180,10 +187,11 @@ class ThermalPads:
 
         Args:
             layer: Layer with the cubes, and the thermal stress of their pads.
-            height: Height of the layer at each cube (cubes,), divided by that of `layer`.
+            height: Height of the layer at each cube (cubes,), divided by `layer.height`.
             exchange: Heat exchange of the surface with the air, in W/(m² K).
             drift: Relative change of the rest frequency of each pad (cubes, P), per K.
-            ground, air: Pairs of a time in s and a temperature in °C; it is linear in between.
+            ground, air: Pairs of a time in s and a temperature in °C, which changes linearly
+                between these times.
         """
         self._knots = [np.array(knots).T for knots in (ground, air)]
         self._drift = drift
@@ -213,10 +221,14 @@ class ThermalPads:
         return round(self._outside(seconds)[0], 2)
 
     def at(self, seconds: float) -> tuple[Array, Array]:
-        """Return the stress (cubes, P) in Pa and the factors (cubes, P) of the rest frequencies.
+        """Return the effect of temperature on the pads.
 
         Args:
             seconds: Simulated time in s; it should not decrease from call to call.
+
+        Returns:
+            Thermal stress of the pads (cubes, P), in Pa, and the factors (cubes, P) by which
+            temperature multiplies their rest frequencies.
         """
         knots = [times for times, _ in self._knots]
         all_times = np.concatenate([*knots, [seconds]])
