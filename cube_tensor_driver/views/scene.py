@@ -291,8 +291,8 @@ def make_traction_arrows(
 ) -> Array:
     """Return one arrow per cube for the traction σ·n on its upper face (+z).
 
-    An arrow points in the direction in which the load pushes or pulls. If it presses, it ends on
-    the face; otherwise it begins there. Components that are not observed count as 0.
+    An arrow points in the direction in which the load pushes or pulls. If the load presses, the
+    arrow ends on the face; otherwise it begins there. Components that are not observed count as 0.
 
     Args:
         poses: Poses of the N cubes (position of the centre, rotation, half the side) in the parent

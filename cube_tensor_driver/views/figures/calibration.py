@@ -191,8 +191,8 @@ def draw_thermal_fit(fit: ThermalFit) -> Figure:
     data = fit.data
     figure = Figure(figsize=(7, 6))
     warm, before, after = figure.subplots(3, 1)
-    # The times of the blocks begin at 0 in each bag. Their numbers, which are seconds because a
-    # block is 1 s long, put the bags one after the other.
+    # The times of the blocks begin at 0 in each bag. So the index of a block is drawn instead,
+    # which puts the bags one after the other. It is a time in s, because a block lasts 1 s.
     time = np.arange(len(data.seconds)) / 60
     warm.plot(time, data.temperature, "k-", label="thermometer of the hub")
     elastomer = fit.level + float(fit.model.reference)

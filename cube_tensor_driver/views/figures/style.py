@@ -56,7 +56,7 @@ markers, so that they can be distinguished in grey."""
 _CURVE_MARKERS = "os^Dv<>p"
 """Markers of successive curves, one for each colour."""
 _CURVE_DASHES = ("-", "--", "-.", ":")
-"""Line styles of curves with the same colour."""
+"""Line styles of successive curves, chosen so that curves with the same colour differ."""
 
 
 @contextmanager
