@@ -419,7 +419,7 @@ def test_control_c_ends_work_in_c():
     """A lock that C code waits for without end, as a factorisation that no signal interrupts."""
     code = """
 import ctypes, signal
-from cube_tensor_design.cli.interrupt import ends_at_once
+from cube_tensor_design.interrupt import ends_at_once
 
 signal.signal(signal.SIGINT, lambda *_: None)  # also where the signal comes before the wait
 libc, lock = ctypes.CDLL(None), ctypes.create_string_buffer(64)
