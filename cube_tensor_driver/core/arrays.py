@@ -74,8 +74,8 @@ def index_cubes(cube: AnyArray, n_cubes: int) -> Index | slice:
 
 
 def multiply(left: AnyArray, right: AnyArray) -> AnyArray:
-    """Multiply row vectors or matrices (..., n) by matrices (..., n, m), with the same bits
-    everywhere.
+    """Multiply row vectors or matrices (..., n) by matrices (..., n, m), with the same bits on
+    every processor.
 
     The terms are added in their order. The `@` of numpy (BLAS) adds them in an order that depends
     on the processor.

@@ -436,7 +436,7 @@ def _read_number(value: object, name: str) -> float:
 
 
 def _read_coefficients(value: object) -> dict[str, float]:
-    """Return coefficients by name, as a file holds them, as numbers.
+    """Return the coefficients of a file as floats, by name.
 
     Raises:
         CalibrationError: The value is no table, or an entry is no number.

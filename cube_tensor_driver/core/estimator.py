@@ -247,7 +247,7 @@ def _orthonormalise(
         length: Number of leading rows of the matrix in which the resulting columns are orthonormal.
             The same linear combinations are applied to the other rows.
         tolerance: Smallest length that a column may have after its projection on earlier results
-            is subtracted, relative to the longest column.
+            is subtracted, relative to the longest column. Shorter columns are not used.
         count: Maximum number of columns to return; by default the rank.
 
     Returns:

@@ -37,7 +37,7 @@ class Forces:
 
     Attributes:
         position: Positions of the cubes in the parent frame (cubes, 3), in m.
-        side: Side w of the area of each cube (cubes,), in m.
+        side: Side w of the square on which the traction of each cube acts (cubes,), in m.
     """
 
     def __init__(self, skin: PlacedSkin, side: float | None = None) -> None:

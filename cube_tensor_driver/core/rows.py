@@ -77,7 +77,7 @@ class FrequencyRows(_Rows):
 
     Attributes:
         cube: Number of the cube in the skin (N,).
-        sequence: Number that the hub gave the sample (N,); it wraps around.
+        sequence: Number that the hub gave the sample (N,); it wraps to 0 at 2**32.
         stamp_ns: Time at which the pads were read (N,), in ns of the source's clock.
         frequency: Frequency of each pad (N, P), in Hz. NaN where nothing was measured, and where
             the cube has no such pad.

@@ -233,7 +233,10 @@ class Creep:
         return np.stack(errors, axis=1)
 
     def _update_certainty(self) -> None:
-        """Mark a cube as certain once the error by unknown loads is below `MAX_UNKNOWN` again."""
+        """Mark the creep of a cube as certain again if the error by unknown loads is small enough.
+
+        The limit of the error is `MAX_UNKNOWN`.
+        """
         doubtful = np.flatnonzero(~self._is_certain)
         if len(doubtful):
             is_small = self._find_unknown(doubtful) < MAX_UNKNOWN

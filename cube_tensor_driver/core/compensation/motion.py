@@ -39,7 +39,8 @@ class Motion(NamedTuple):
         time_ns: The instants (K,), in ns on the clock of the rows, in rising order. If there are
             none (K = 0), the motion is unknown; a single one holds at all times.
         specific_force: Specific force at the origin of the frame (K, 3), in m/s².
-        gradient: Derivatives of its components with respect to position (K, 3, 3), in 1/s².
+        gradient: Derivatives of the components of the specific force with respect to position
+            (K, 3, 3), in 1/s².
     """
 
     time_ns: Times
@@ -66,8 +67,8 @@ class ForcesAtCubes:
         """Store the poses of the cubes in float32.
 
         Args:
-            poses: Poses in the parent frame of the skin. Only those of the SkinInfo message of a
-                recording reproduce its forces bit for bit.
+            poses: Poses in the parent frame of the skin. The forces of a recording are reproduced
+                bit for bit only with the poses of its SkinInfo message.
         """
         # The specific force at the origin is multiplied by 1, its derivatives by the coordinates.
         position = np.insert(poses.position, 0, 1, axis=1)

@@ -159,7 +159,7 @@ class Conditions:
         cubes["status"] = np.bitwise_or.reduce(state, axis=1)
 
     def collect(self) -> StatusBits:
-        """Return all conditions (cubes, P) that a pad had at any time since the last call."""
+        """Return all conditions (cubes, P) that each pad had since the last call of this method."""
         found: StatusBits = self._since_collected | self.state
         self._since_collected = np.zeros_like(found)
         return found

@@ -61,11 +61,12 @@ class DriftTracker:
 
         f0 += (mean(f) / unloaded_factor - f0) * WINDOW_S / time_constant
 
-    `Pipeline.unloaded_factor` corrects for temperature and the effects that are compensated.
+    `Pipeline.unloaded_factor` corrects for temperature and for the effects that are compensated.
+
     A cube is unloaded when all of its usable pads have been still and within `CONTACT_THRESHOLD`
     of their rest frequency for `RELEASE_S`. A load that stays below the threshold cannot be
-    distinguished from drift and becomes part of the rest frequency. A loaded cube follows the
-    median of the unloaded cubes with its layout.
+    distinguished from drift and becomes part of the rest frequency. The rest frequencies of a
+    loaded cube follow the median drift of the unloaded cubes with the same layout.
 
     Attributes:
         deviation: Standard deviation of the drift of a loaded cube minus the drift that is
@@ -158,7 +159,10 @@ class DriftTracker:
             self.deviation[cubes] = spread * self._loaded_windows[cubes]
 
     def _adopt_tare(self) -> None:
-        """Track drift from the rest frequencies of the pipeline if a tare has replaced them."""
+        """Track drift from the new rest frequencies if a tare has replaced those of the pipeline.
+
+        The counts of windows since the tare begin again at 0.
+        """
         current = self._pipeline.rest_frequency
         if not np.array_equal(current, self._rest_in_use, equal_nan=True):
             self._rest_in_use = self._tracked_rest = self._tared_rest = current

@@ -278,8 +278,7 @@ def _check_pads(
             "take the load off, or calibrate the cube again",
         ),
     ):
-        # A comparison with NaN is False. So "not <=" is used instead of ">", with which NaN counts
-        # as above the limit.
+        # A comparison with NaN is False. So "not <=" counts NaN as above the limit, unlike ">".
         exceeds = used & ~(values <= limit)
         if not exceeds.any():
             continue

@@ -128,13 +128,13 @@ def temperature_factor(
 
 
 def find_existing(tables: Tables, calibration: Numbers) -> Mask:
-    """Return whether cubes with these calibrations (N,) have each pad (N, P)."""
+    """Return a mask (N, P) of the pads that cubes with N calibrations have."""
     pads = np.arange(tables.rest.shape[1])
     return pads < tables.pads[calibration][:, None]
 
 
 def mask_bits(tables: Tables, calibration: Numbers, mask: PadMasks) -> Mask:
-    """Return whether a cube has a pad and the bit of the pad is set in a mask (N, P).
+    """Return a mask (N, P) of the pads that the cubes have and whose bits are set in bit masks.
 
     Args:
         tables: Tables of the skin.
