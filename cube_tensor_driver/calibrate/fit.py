@@ -325,7 +325,7 @@ class _Model:
         self.gains = rows.reshape(-1, n_pads).T
 
     def unpack(self, theta: Array) -> tuple[Array, Array]:
-        """Return the coefficients (K,), also the fixed ones, and the gains (P,) for parameters.
+        """Return the coefficients (K,), fixed ones included, and the gains (P,) of parameters.
 
         Args:
             theta: Parameters: the coefficients of the response that are not fixed, then the
@@ -413,7 +413,7 @@ class _Model:
                 r = (difference / self.noise).ravel()
                 if stage == "huber":
                     # Tukey's stage keeps the last scatter (standard deviation of the residuals) of
-                    # Huber's, because with a new one in each step it might not converge.
+                    # Huber's, because with a new scatter in each step it might not converge.
                     scale = estimate_scatter(r)
                 if stage != "plain":
                     weights = compute_weights(stage, r / scale)

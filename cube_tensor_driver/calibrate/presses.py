@@ -106,7 +106,8 @@ class SteadyPress(NamedTuple):
     """A press on a cube during which the frequencies have stopped changing.
 
     Attributes:
-        cube: Number of the cube whose pads changed most.
+        cube: Number of the cube that is pressed: the one with the largest frequency change of a
+            pad.
         change: Frequency changes of its pads relative to their frequencies without load (P,); NaN
             for pads that do not work.
     """

@@ -253,7 +253,7 @@ def _read_reference(
         half_side: Half side of the cube, in m.
 
     Returns:
-        Times (N,), rising, in ns, and states (amplitudes of the modes) (N, M), in Pa.
+        Times (N,) in ns, in rising order, and states (amplitudes of the modes) (N, M), in Pa.
 
     Raises:
         BagError: The topic is missing or has another type, has fewer than two messages with

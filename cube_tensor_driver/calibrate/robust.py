@@ -92,8 +92,8 @@ def solve_least_squares(a: Array, b: Array) -> Array:
         b: Vector (R,).
 
     Returns:
-        The solution; of all solutions, the one with the smallest parameters, after each is scaled
-        by the length of its column of a.
+        The solution x. If there are several, it is the one with the smallest norm, where each
+        parameter is multiplied by the length of its column of a.
     """
     scaled, size = _scale_columns(a)
     x, *_ = np.linalg.lstsq(scaled, b, rcond=DIRECTION_TOLERANCE)

@@ -53,8 +53,8 @@ MIN_RANGE = 3.0
 one, noise and creep would look like an effect of temperature."""
 
 MAX_RESIDUAL = 150.0
-"""Largest rms difference between measured and fitted stress of a pad, in Pa. A larger one shows
-that something touched the skin during the recording."""
+"""Largest rms difference between measured and fitted stress of a pad, in Pa. With a larger one the
+fit raises an error, because something touched the skin during the recording."""
 
 MAX_SLOPE_DEVIATION = 0.2
 """Largest relative uncertainty of the linear temperature coefficients of the pads' stress (in Pa/K,
@@ -74,7 +74,7 @@ filters only approximate conduction of heat."""
 
 MAX_FILTER_RATIO = 0.8
 """Ratio of the rms residual with two low-pass filters to the one with a single filter, below which
-two are used."""
+two are used to model how the elastomer's temperature lags behind the thermometer."""
 
 MAX_DEGREE_RATIO = 0.3
 """Ratio of the rms residual with a quadratic effect of temperature to that with a linear one, below
