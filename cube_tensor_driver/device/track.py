@@ -22,8 +22,8 @@ MAX_DEVICE_US = 1 << 51
 ones, which only a faulty hub sends, are replaced by this one, so that differences of device times
 in ns fit 64 bits."""
 RESTART_US = 1_000_000
-"""Smallest difference, in µs of the hub's clock, between an older sample and the newest one that is
-taken for a restart of the hub. A sample that is older by less has only come out of order."""
+"""Smallest time, in µs of the hub's clock, by which a sample must be older than the newest one to
+show that the hub has restarted. A sample that is older by less has only come out of order."""
 NEVER = -(1 << 62)
 """Time, in ns, that is earlier than every device time (hub's clock) and every host time. It stands
 for the time of a sample before the first one came."""

@@ -22,10 +22,10 @@ MAX_DELAY_NS = 60_000_000_000
 """Longest credible delay, in ns, between the sampling of a sample and its arrival. If the estimated
 time of sampling is further before the arrival, the arrival time is the stamp of the sample."""
 MAX_PAUSE_NS = 60_000_000_000
-"""Longest pause, in ns by both clocks, between two reads of a hub's samples after which the clock
-line (host time over device time) is still used. After a longer pause the error of the drift, up to
-6 ms per minute, would look like a step of the hub's clock. The line is then begun anew, and only
-its drift is kept."""
+"""Longest pause, in ns, between two reads of a hub's samples after which the clock line (host time
+over device time) is still used. A pause is longer only if it is so by both the hub's and the host's
+clock. Then the error of the drift, up to 6 ms per minute, would look like a step of the hub's
+clock. So the line is begun anew, and only its drift is kept."""
 MIN_STILL_NS = 200_000_000
 """Time, in ns, for which the device times (hub's clock) of samples must stay the same before the
 hub's clock counts as standing still. `MIN_STILL_READS` must be reached, too."""

@@ -243,7 +243,8 @@ class Link:
             elif isinstance(self._stream, socket.socket):
                 data = self._stream.recv(READ_CHUNK)
             elif self._stream is not None:
-                # Here no byte means that none has arrived; an unplugged port raises an OSError.
+                # pyserial returns no byte if none has arrived; for an unplugged port it raises an
+                # OSError.
                 return self._stream.read(self._stream.in_waiting)
             else:
                 return b""

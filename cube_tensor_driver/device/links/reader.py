@@ -312,7 +312,7 @@ class Reader:
 
     @contextlib.contextmanager
     def _closing_on_error(self, i: int) -> Iterator[Session]:
-        """Yield the session of a link; close the link if a LinkError is raised in the block."""
+        """Yield the session of a link; close the link if the `with` block raises a LinkError."""
         try:
             yield self._sessions[i]
         except LinkError as error:

@@ -65,7 +65,7 @@ class TcpConnection:
         return self._socket
 
     def close(self) -> None:
-        """Give up the attempt; a second call does nothing."""
+        """Give up the attempt to connect; a second call does nothing."""
         self._is_closed = True
         if self._socket is not None:
             self._socket.close()

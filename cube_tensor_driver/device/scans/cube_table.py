@@ -88,8 +88,8 @@ class CubeTable:
     Args:
         n_links: Number of links.
         addresses: For each cube of the skin, the uid, or the link and index, to find it by.
-        counts: Numbers of rows, of which those of unknown cubes and of cubes with another number of
-            pads are counted here.
+        counts: Counters of rows. Rows of unknown cubes, and of cubes with another number of pads,
+            are added to them here.
 
     Attributes:
         n_pads: Largest number of pads of a cube of the skin.

@@ -23,7 +23,7 @@ MAX_REPEAT_US = 60_000_000
 than the newest one. No line holds samples for longer, so an older sample shows that the hub has
 restarted and its device time has begun again near zero."""
 _MAX_CUBES = 1 << 16
-"""Number of indices of a cube on a hub, which have 16 bits."""
+"""Largest number of cubes of a hub, because the index of a cube on its hub has 16 bits."""
 
 
 class Arrival(str, Enum):
