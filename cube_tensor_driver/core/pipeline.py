@@ -550,7 +550,7 @@ class Pipeline:
         Args:
             number: Number of the table.
             group: Number of the calibration.
-            estimator: Map from the stresses on these pads to components and residuals.
+            estimator: Map from the stresses on the good pads to components and residuals.
         """
         n_pads = self._groups[group].layout.n_pads
         matrix = np.zeros(self._tables.matrix.shape[1:])

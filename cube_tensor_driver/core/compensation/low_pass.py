@@ -110,7 +110,13 @@ class LowPass:
         return share
 
     def find_shares(self, elapsed_s: Real) -> tuple[Array, Array]:
-        """Return m = 1 - exp(-t / time) and m time / t, both (K, C), for intervals t (C,), in s."""
+        """Return m = 1 - exp(-ratio) and m / ratio, both (K, C).
+
+        The ratio is the length of an interval divided by the time constant of a filter.
+
+        Args:
+            elapsed_s: Lengths of the intervals (C,), in s.
+        """
         # The cubes of one hub follow each other and have equal intervals, so one computation serves
         # them all.
         is_other = self._is_other | (elapsed_s[1:] != elapsed_s[:-1])

@@ -70,7 +70,7 @@ scan on.
 
 MAX_GAP_NS = 5_000_000_000
 """Longest interval between two rows of a cube, in ns, in which load and temperature of the cube
-count as known."""
+count as known. In a longer one they count as unknown."""
 
 MAX_SPECIFIC_FORCE = 1000.0
 """Upper limit of a credible specific force along one axis, in m/s² (about 100 g). A force that is
