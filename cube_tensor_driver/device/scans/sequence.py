@@ -47,9 +47,10 @@ class Arrival(str, Enum):
 class SequenceCounters:
     """Numbers of samples of one hub, by what happened to them.
 
-    The hub has taken delivered + missing samples since the first received one, and delivered +
-    duplicate samples were received. If the hub restarts, its samples since power-up that did not
-    come count as missing. Samples that were lost just before the restart cannot be counted.
+    Since the first received sample, the hub has taken `delivered` + `missing` samples, and
+    `delivered` + `duplicate` samples were received. If the hub restarts, its samples since power-up
+    that did not come count as missing. Samples that were lost just before the restart cannot be
+    counted.
 
     Attributes:
         delivered: Samples to deliver, including those out of order.
@@ -344,8 +345,9 @@ class SampleAccount:
     def _begin_part(self, frame: Sample) -> SequenceTracker:
         """Return the tracker for a frame whose first cube or number of cubes is new.
 
-        A hub with many cubes divides each sample into several frames (parts). Parts whose cubes are
-        in this frame now are ended, so that they do not count as missing.
+        A hub with many cubes divides each sample into several frames (parts). The counts of other
+        parts, whose cubes are in this frame now, are ended, so that these parts do not count as
+        missing.
 
         Args:
             frame: The SAMPLE frame.
