@@ -77,8 +77,8 @@ def run(options: argparse.Namespace) -> int:
     from ..fem.fem import compute_response
     from ..fem.model import read_model
     from ..fem.volume_loads import compute_thermal_stress, compute_weight
-    from ..studies.surface_study import study_surface
     from ..interrupt import ends_at_once
+    from ..studies.surface_study import study_surface
 
     model = read_model(options.model)
     _check_options(options, model)
