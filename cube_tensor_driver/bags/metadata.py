@@ -32,7 +32,7 @@ FILE_NAME = "metadata.yaml"
 """Name of the file in a bag's folder that describes the bag."""
 
 METADATA_VERSION = 9
-"""Version of metadata.yaml's format that is written; it is that of rosbag2 in ROS 2 Jazzy."""
+"""Version of the format in which metadata.yaml is written, as by rosbag2 of ROS 2 Jazzy."""
 
 SUFFIXES = {"mcap": ".mcap", "sqlite3": ".db3"}
 """File name suffix of each storage format; the keys are rosbag2's names of the formats."""

@@ -38,8 +38,8 @@ from .stored_messages import StoredMessages, join_in_blocks
 MAX_DISORDER_NS = SECOND
 """Largest difference of stamps, in ns, by which messages and samples in a bag may be out of order.
 
-A message that belongs to a sample is searched until the bag has been read up to stamps that are
-later than that of the sample by this difference.
+The search for a message that belongs to a sample ends when a stamp has been read that is later
+than the stamp of the sample by this difference.
 """
 
 VERSION = 4

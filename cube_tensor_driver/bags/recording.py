@@ -94,10 +94,9 @@ class Recording:
     def info_index_at(self, newest_ns: Times) -> Index:
         """Return the index in `infos` of the SkinInfo that applies to each message of frequencies.
 
-        A SkinInfo message contains the cubes' poses, calibrations and rest frequencies.
-
-        A SkinInfo applies to rows with its stamp or later ones: the reconstruction node stamps it
-        just after the last row that it reconstructed with the previous SkinInfo.
+        A SkinInfo message contains the cubes' poses, calibrations and rest frequencies. It applies
+        to rows with its stamp or later stamps: the reconstruction node gives it a stamp just after
+        the last row that was reconstructed with the previous SkinInfo.
 
         Args:
             newest_ns: Stamps (M,) of the newest row of each message, in ns since the Unix epoch.

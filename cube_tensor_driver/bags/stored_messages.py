@@ -74,7 +74,7 @@ class StoredMessages:
 
 
 def join(messages: Sequence[tuple[int, int, bytes]]) -> StoredMessages:
-    """Put single messages together.
+    """Join single messages to one object with arrays.
 
     Args:
         messages: Channel, time of recording in ns, and serialised bytes of each message; at least
@@ -87,7 +87,7 @@ def join(messages: Sequence[tuple[int, int, bytes]]) -> StoredMessages:
 
 
 def join_in_blocks(messages: Iterable[tuple[int, int, bytes]]) -> Iterator[StoredMessages]:
-    """Put single messages together in blocks of at least `BLOCK_BYTES`; the last may be smaller.
+    """Join single messages to blocks of at least `BLOCK_BYTES`; the last one may be smaller.
 
     Args:
         messages: Channel, time of recording in ns, and serialised bytes of each message.

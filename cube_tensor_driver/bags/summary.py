@@ -18,7 +18,7 @@ DIAGNOSTICS_TYPE = "diagnostic_msgs/msg/DiagnosticArray"
 """Message type of the diagnostics, which state the condition of each node and cube."""
 
 MIN_GAP_PERIODS = 1.5
-"""Time between two successive samples of a cube above which it counts as a gap, as a multiple of
+"""Largest time between two successive samples of a cube that does not count as a gap, divided by
 the cube's median sampling period."""
 
 
@@ -29,8 +29,8 @@ class CubeSummary:
     Attributes:
         samples: Number of recorded samples.
         lost: Number of samples whose sequence numbers are missing.
-        gaps: Number of gaps: times between two samples that exceed the median sampling period by
-            more than the factor `MIN_GAP_PERIODS`.
+        gaps: Number of gaps: times between two successive samples above `MIN_GAP_PERIODS` times the
+            median sampling period.
         rate: Samples per second, from the median period; None with fewer than two samples.
         longest_gap: Longest time between two samples, in s; None with fewer than two samples.
     """
