@@ -117,9 +117,9 @@ MIN_ARROW = 0.15
 which is the distance of neighbouring cubes)."""
 
 VIEW_DIRECTION = np.array([0.1, -0.7, 0.7])
-"""(3,) unit vector from the skin to the camera as it stands at first (`CAMERA_POSITION` in
-page.py), in the scene. The heads of the arrows are perpendicular to it, so that they are visible.
-"""
+"""Direction (3,) from the skin to the camera at its first position (`CAMERA_POSITION` in page.py),
+in the coordinates of the scene. The plane in which the head of an arrow lies is perpendicular to
+this direction, so that the head is visible."""
 
 RING_CORNERS = 48
 """Number of corners of the polygon that is drawn as the ring around a contact."""
