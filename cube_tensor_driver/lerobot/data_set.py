@@ -67,8 +67,9 @@ class DataSet:
         depth: Number of samples of each cube that a frame has room for.
         frames: Number of frames written so far.
         episodes: Description of each complete episode: a row of the table in meta/episodes/.
-        calibrations: Ids of the cubes' calibrations: the first ones, and each change, with the bag
-            and the stamp (ns since the Unix epoch) from which on they were used.
+        calibrations: One entry for the first calibrations, and one for each change: the ids of the
+            cubes' calibrations, and bag and stamp (ns since the Unix epoch) from which on they were
+            used.
     """
 
     def __init__(

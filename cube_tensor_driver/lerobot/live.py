@@ -269,7 +269,7 @@ class RecordedWindows:
         return self.at(frame_number(picture))
 
     def at(self, number: int) -> dict[str, AnyArray]:
-        """Return the window with a frame number (see `of`)."""
+        """Return the window that was stored under a frame number; result and errors as in `of`."""
         if number not in self._frames:
             raise BagError(f"no window has the number {number}; name the folder of this data set")
         batch = self._frames[number]
