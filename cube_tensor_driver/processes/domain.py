@@ -16,7 +16,8 @@ VARIABLE = "ROS_DOMAIN_ID"
 their own domain."""
 
 RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
-"""Environment variable that states where ROS nodes search for each other, such as LOCALHOST."""
+"""Name of the environment variable whose value, such as LOCALHOST, states where ROS nodes search
+for each other."""
 
 MAX_DOMAIN = 232
 """Largest number of a DDS domain. The UDP ports of larger ones would exceed 65535."""
