@@ -21,8 +21,8 @@ Callback = Callable[..., Any]
 which of these it is."""
 
 MAX_CHARACTERS = 1000
-"""Maximum number of characters of a text that a service returns and logs. A longer text is cut: it
-quotes the request of a client, which may have megabytes."""
+"""Maximum number of characters of a text that a service returns and logs. A longer text is cut,
+because it may quote the request of a client, which can have megabytes."""
 
 LOG_PERIOD_S = 5.0
 """Minimum time, in seconds, between two log messages about errors that occur repeatedly."""

@@ -35,7 +35,7 @@ from ..device.live import make_link_configs
 from ..processes.skin_processes import Value
 
 _CONFIG = package_data() / "config"
-"""Folder of the files that the package brings."""
+"""Folder of the configuration files that are installed with the package."""
 
 SINGLE_CUBE = _CONFIG / "cube.yaml"
 """Path of the skin file of a single cube, the default of cube.launch.py."""

@@ -73,7 +73,7 @@ def make_motion_source(node: CubeNode, parent_frame: str) -> ImuMotion | Gravity
 
 
 class Transforms:
-    """Transforms between frames, from the topics /tf and /tf_static."""
+    """Receives the transforms between frames on the topics /tf and /tf_static."""
 
     def __init__(self, node: CubeNode) -> None:
         # The import is here and not at the top, so that robots without TF need not install tf2_ros.

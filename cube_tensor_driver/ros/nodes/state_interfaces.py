@@ -57,9 +57,9 @@ LAST_VALUES_PERIOD_S = 0.02
 class SkinWrenches:
     """The latest wrench of each cube of a skin and of the whole skin; NaN where it is not known.
 
-    The wrench of a cube acts on its face +z, in the frame of the cube. The wrench of the skin is
-    the sum of all cubes about the origin of the parent frame, in that frame; it is known only if
-    the wrenches of all cubes are known.
+    The wrench of a cube acts on its face +z and is given in the frame of the cube. The wrench of
+    the skin is the sum of the wrenches of all cubes about the origin of the parent frame, in that
+    frame; it is known only if the wrenches of all cubes are known.
 
     Attributes:
         names: Names of the cubes, then that of the skin.
