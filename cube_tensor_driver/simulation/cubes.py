@@ -28,7 +28,8 @@ from .motion import HeavyPads, read_weight
 from .sample_log import ABSENT
 
 Millihertz = NDArray[np.uint32]
-"""Array of frequencies in mHz, as a hub sends them; `NOT_MEASURED` is a pad without a frequency."""
+"""Array of frequencies in mHz, as a hub sends them. The value `NOT_MEASURED` stands for a pad
+without a frequency."""
 
 
 class PadErrors(NamedTuple):

@@ -53,8 +53,9 @@ FRAME_FAULTS = ("drop", "flip", "insert", "duplicate", "reorder", "truncate")
 """Kinds of faults that alter or lose single frames (messages of a hub) with a sample."""
 
 PAD_FAULTS = ("open", "short", "stuck", "noisy", "report")
-"""Kinds of faults of one pad (sensing element) of a cube: open or shorted, a frequency that does
-not change or is noisy, and a good pad that the hub reports as failed."""
+"""Kinds of faults of one pad (sensing element) of a cube: its lead is broken, its oscillator stops,
+its frequency does not change or is noisy, or the hub reports the pad as failed although it is good.
+"""
 
 MOMENTARY_FAULTS = (*FRAME_FAULTS, "reset", "wrap", "drift", "step")
 """Kinds of faults without a duration: they end as soon as they have begun. All other kinds last for

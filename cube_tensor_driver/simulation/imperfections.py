@@ -45,7 +45,8 @@ MAX_SEED = (1 << 63) - 1
 """Largest seed of the random deviations of the pads: the largest signed 64-bit integer."""
 
 GROWTH_S = 600.0
-"""Duration of a steady load, in s, over which `Imperfections.creep_growth` states the creep."""
+"""Time, in s, after the begin of a steady load, at which the stress that pads report has grown by
+creep as `Imperfections.creep_growth` states."""
 
 MAX_DEVIATIONS = 6
 """Largest deviation of the creep of a pad from the mean, in standard deviations. Random deviations
@@ -54,8 +55,8 @@ that are larger, which occur about twice in 10^9 pads, are limited to this value
 POWER_LAW_TIMES = np.geomspace(1e-4, 1e10, 51)
 """Time constants (51,), in s, of the exponential terms whose sum replaces a power law of creep.
 
-With their ratio of 1.9, the sum differs from the power law by less than 1e-5 of the load. Loads of
-0.01 s to some hours lie far within their range.
+With their ratio of 1.9, the sum differs from the power law by less than 1e-5 of the load. Loads
+that last 0.01 s to some hours lie far within their range.
 """
 
 _CREEP_TERM: JsonSchema = {
@@ -252,7 +253,7 @@ class PadBehaviour:
         """Add the terms of creep with a power law.
 
         Args:
-            growth: Growth of the reported stress from 1 s to `GROWTH_S` (cubes, pads).
+            growth: Relative growth (cubes, pads) of the reported stress from 1 s to `GROWTH_S`.
             exponent: Exponent alpha of the power law.
         """
         # The reported stress divided by the true one, at the time t in s after the begin of a

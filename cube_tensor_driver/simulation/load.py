@@ -30,7 +30,7 @@ change smoothly where a slide reverses its direction."""
 
 MAX_RADIUS_DEPTHS = 12
 """Largest allowed radius of a contact, divided by the depth of the cubes' centres. Larger contacts
-would need a number of point forces whose stress takes minutes to compute."""
+would need so many point forces that computing their stress takes minutes."""
 
 MAX_CACHED_BYTES = 64 << 20
 """Maximum memory, in bytes, of the stress fields that `LoadMemory` keeps for a repeated load."""
@@ -40,8 +40,8 @@ _ORDERS = np.array([2, 3, 4, 6, 8, 11, 16, 23, 32, 45, 64])
 orders). They are few, so that many cubes have the same number and are computed together."""
 
 _FAR_RATIO = 0.15
-"""Ratio of a contact's radius to the distance from a cube to the rim of the contact, below which
-one ring of point forces represents the contact accurately enough."""
+"""Ratio of the radius of a contact to the distance between a cube and the rim of the contact. Below
+this ratio, one ring of point forces represents the contact accurately enough for this cube."""
 
 
 def default_script() -> Script:

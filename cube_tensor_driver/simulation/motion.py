@@ -54,7 +54,7 @@ def read_weight(name: str, n_pads: int) -> Array:
 
 
 class HeavyPads:
-    """Specific force at some cubes of a moving skin, and the stress of their pads by it."""
+    """Computes the specific force at some cubes of a moving skin, and the stress of pads by it."""
 
     def __init__(
         self,

@@ -187,14 +187,15 @@ class SampleLog:
 
 @dataclass(frozen=True)
 class SampleTable:
-    """Columns of all samples (S,) that the hubs of a skin took.
+    """Table of all S samples that the hubs of a skin took.
 
     Attributes:
-        link: Index of the link whose hub took each sample (S,).
-        number: Number of each sample (S,), which does not wrap at 2^32.
-        time_ns: Wall clock at which each sample was taken (S,), in ns since the Unix epoch.
-        rows_per_sample: Number of the skin's cubes on each link (links,).
-        link_of_cube: Link of each possible index of a cube (`CUBE_RANGE`,), or `NO_LINK`.
+        link: (S,) index of the link whose hub took the sample.
+        number: (S,) number of the sample, which does not wrap at 2^32.
+        time_ns: (S,) wall clock at which the sample was taken, in ns since the Unix epoch.
+        rows_per_sample: (links,) number of the skin's cubes on each link.
+        link_of_cube: (`CUBE_RANGE`,) index of the link of the cube with each possible index, or
+            `NO_LINK`.
     """
 
     link: Index

@@ -64,7 +64,7 @@ HUBS_FILE = ".hubs"
 each link's hub (`HubSize`). It is written before the pipe for faults is created."""
 
 _PIPE_BYTES = 65536
-"""Number of bytes that are read from the pipe for faults at once."""
+"""Maximum number of bytes that one read from the pipe for faults returns."""
 
 
 @dataclass
@@ -379,7 +379,7 @@ class StopRequest:
         return not is_needed or time.monotonic() >= self._until_s
 
     def close(self) -> None:
-        """Close both ends of the pipe."""
+        """Close both ends of the pipe to which `fd` belongs."""
         os.close(self.fd)
         os.close(self._write)
 

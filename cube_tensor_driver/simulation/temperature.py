@@ -93,7 +93,7 @@ def read_thermal_stress(name: str, n_pads: int) -> ThermalLayer:
 
 
 class WarmLayer:
-    """Temperature of the layer at some cubes over time."""
+    """Computes how the temperature of the layer at some cubes changes with ground and air."""
 
     def __init__(
         self,
@@ -172,7 +172,7 @@ class WarmLayer:
 
 
 class ThermalPads:
-    """Thermal stress and drift of the pads of some cubes over time."""
+    """Computes the effect of temperature on the pads of some cubes: thermal stress and drift."""
 
     def __init__(
         self,
