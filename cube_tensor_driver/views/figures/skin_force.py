@@ -12,8 +12,8 @@ from ...core.arrays import Array
 from .style import print_style
 
 _AXIS_STYLES = (("x", "o", "C0", "--"), ("y", "s", "C1", ":"), ("z", "D", "black", "-"))
-"""Name, marker, colour and line style of each coordinate axis; they can be distinguished in grey,
-too."""
+"""Name, marker, colour and line style of each coordinate axis. The curves of the axes can be
+distinguished in grey, too."""
 
 MM_PER_M = 1e3
 """Number of millimetres in a metre."""

@@ -60,10 +60,8 @@ MIN_ROWS = 4
 """Minimum number of rows (cubes) in the table, even if the terminal has fewer lines."""
 
 UNLIMITED_WIDTH = 1000
-"""Width, in characters, that rich is given while it computes how wide the table would like to be.
-
-It is larger than any table, so that it does not limit the result.
-"""
+"""Width of the terminal, in characters, that is assumed while the library rich computes the width
+that a table needs. It is larger than any table, so that it does not limit the result."""
 
 
 Cells = list[str | Text]
@@ -149,9 +147,9 @@ class LiveTable:
     def draw(self, max_rows: int, width: int) -> Table:
         """Make the table for a terminal.
 
-        In a skin of more than `max_rows` cubes, those with the largest absolute σzz are shown. A
-        table that is too wide loses, one after the other until it fits: the lines between columns,
-        the bars, the components (the last one first), and the residual.
+        In a skin of more than `max_rows` cubes, those with the largest absolute σzz are shown. If
+        the table is too wide, parts of it are left out one after the other until it fits: the lines
+        between columns, the bars, the components (the last one first), and the residual.
 
         Args:
             max_rows: Maximum number of cubes in the table.
