@@ -348,7 +348,12 @@ class Bag:
     def _unpack(
         self, file: McapReader | SqliteReader, messages: StoredMessages
     ) -> Iterator[tuple[int, int, bytes]]:
-        """Decompress messages that rosbag2 compressed one by one; damaged ones are left out."""
+        """Decompress messages that rosbag2 compressed one by one; damaged ones are left out.
+
+        Args:
+            file: The storage file of the messages, which knows their topics.
+            messages: The compressed messages.
+        """
         for channel, time_ns, data in messages:
             try:
                 yield channel, time_ns, _decompress(data)

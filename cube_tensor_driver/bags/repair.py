@@ -112,7 +112,7 @@ def repair(path: Path, keep_rest: bool = True) -> Repaired:
 
 
 def _repair_folder(folder: Path, keep_rest: bool) -> Repaired:
-    """Repair all files of a bag and describe them in metadata.yaml."""
+    """Repair all files of a bag and describe them in metadata.yaml; `keep_rest` as in `repair`."""
     # Files that metadata.yaml describes as complete are checked, too, because the disk may have
     # lost their ends after the recording.
     cut = damaged = 0
@@ -176,6 +176,10 @@ def _summary(path: Path) -> FileSummary:
 
 def _repair_file(path: Path, keep_rest: bool) -> tuple[int, int]:
     """Make one storage file readable; an MCAP file without a complete chunk is removed.
+
+    Args:
+        path: The storage file.
+        keep_rest: Whether the bytes that are cut off are saved in another file, see `repair`.
 
     Returns:
         Number of bytes that were cut off, and number of damaged chunks that were left out.
