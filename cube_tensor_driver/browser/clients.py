@@ -219,7 +219,12 @@ class BagRecorder:
     """
 
     def __init__(self, folder: Path, say: Say) -> None:
-        """Set the parent folder of all bags, which is made if it does not exist."""
+        """Prepare to record.
+
+        Args:
+            folder: Parent folder of all bags, which is made if it does not exist.
+            say: Function that shows notes to the user.
+        """
         self._folder = folder
         self._say = say
         self.path = folder

@@ -350,7 +350,13 @@ def show_waiting(
     layout: PageLayout,
     text: str,
 ) -> None:
-    """Show a text in a browser while no skin is published."""
+    """Show a text in a browser while no skin is published.
+
+    Args:
+        client: The browser.
+        layout: Arrangement of the page in this browser.
+        text: The text, as HTML.
+    """
     set_up(client, layout, "cube_tensor_driver")
     client.gui.add_html(markup.STYLE + markup.box(text))
     client.scene.add_label(
@@ -395,7 +401,13 @@ def set_up(
 
 
 def place_camera(client: viser.ClientHandle, layout: PageLayout, direction: str) -> None:
-    """Look at the skin from one of `CAMERA_DIRECTIONS`; unknown texts do nothing."""
+    """Place the camera of a browser in one of the `CAMERA_DIRECTIONS` from the skin.
+
+    Args:
+        client: The browser.
+        layout: Arrangement of the page, with the target and the distance of the camera.
+        direction: Name of the direction. With an unknown name nothing is done.
+    """
     if direction not in CAMERA_DIRECTIONS:  # a browser may send any text
         return
     camera = client.camera

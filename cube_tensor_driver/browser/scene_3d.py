@@ -328,7 +328,12 @@ class Scene:
         return TRACTION_LENGTH * unit / ranges.traction, GRADIENT_LENGTH * unit / ranges.gradient
 
     def _choose_colours(self, colouring: Colouring, with_field: bool) -> Update:
-        """Return the properties of the cubes and of the field."""
+        """Return the properties of the objects that show values as colours: cubes and field.
+
+        Args:
+            colouring: The values that are drawn as colours.
+            with_field: Whether the field (pressure and shear between the cubes) is visible.
+        """
         quantity, top = colouring.quantity, colouring.top
         values, visible = colouring.field, np.full(len(colouring.field), with_field)
         update: Update = {}
