@@ -72,7 +72,7 @@ class Parameter(NamedTuple):
             return math.nan
 
     def refusal(self, value: Any) -> str:
-        """Return an error message if the parameter cannot have a value; "" if it can.
+        """Return an error message if the parameter does not allow a value; "" if it does.
 
         Args:
             value: The value, which has the type of the parameter.

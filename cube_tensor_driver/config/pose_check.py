@@ -31,8 +31,8 @@ MAX_SPACED_CUBES = 500
 compared, so time and memory grow with the square of the number."""
 
 POSITION_RESOLUTION_M = 1e-6
-"""Grid, in m, to which positions are rounded. Cubes with the same rounded position are reported as
-being at one place."""
+"""Resolution, in m, to which positions are rounded. Cubes with equal rounded positions are reported
+as being at one position."""
 
 MAX_NAMES = 4
 """Maximum number of cubes with the same position that a warning names; the others are counted."""
