@@ -48,11 +48,11 @@ one value for the whole message."""
 _SECONDS_AT = len(LITTLE_ENDIAN)
 """Byte offset of the seconds of the stamp, an int32, in a serialised message."""
 _NANOSECONDS_AT = _SECONDS_AT + 4
-"""Byte offset of the nanoseconds of the stamp, a uint32."""
+"""Byte offset of the nanoseconds of the stamp, a uint32, in a serialised message."""
 _FRAME_LENGTH_AT = _NANOSECONDS_AT + 4
-"""Byte offset of the length of the frame id, a uint32."""
+"""Byte offset of the length of the frame id, a uint32, in a serialised message."""
 _FRAME_AT = _FRAME_LENGTH_AT + 4
-"""Byte offset of the text of the frame id."""
+"""Byte offset of the text of the frame id in a serialised message."""
 
 SHAPE_AT = _FRAME_LENGTH_AT
 """Byte offset, from the start of a serialised message, of the bytes that `MessageCodec.shape_bytes`

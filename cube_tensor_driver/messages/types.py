@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 PACKAGE = "cube_tensor_driver"
-"""Name of the ROS package that defines the message types below."""
+"""Name of the ROS package that defines the message types of skins, such as SkinStress."""
 FREQUENCIES = f"{PACKAGE}/msg/SkinFrequencies"
 """Type of the messages with the frequencies of the pads, which the driver publishes."""
 STRESS = f"{PACKAGE}/msg/SkinStress"
