@@ -56,8 +56,8 @@ With best effort, a slow subscriber does not make the publisher wait.
 SERVICES = QoSProfile(depth=1000)
 """Profile (quality of service) of services.
 
-Its queue is longer than the default of ROS, 10 requests, beyond which DDS silently drops the oldest
-one. The parameter services of rclpy have a depth of 1000, too.
+With the default depth of ROS, 10, DDS silently drops the oldest request when more than 10 wait. The
+parameter services of rclpy have a depth of 1000, too.
 """
 
 
