@@ -525,7 +525,7 @@ def _compute_curvatures(model: MjModel, mujoco: Any) -> Array:
     """Return the curvature (geoms + 1,) of each geom (shape of a body) in 1/m.
 
     It is 1 / radius for spheres, capsules and cylinders, and 0 for all others. The last entry, 0,
-    is for flexible bodies, which have no geom.
+    is for flexible bodies, which have no geom. `mujoco` is the module of this name.
     """
     kinds = mujoco.mjtGeom
     round_kinds = (kinds.mjGEOM_SPHERE, kinds.mjGEOM_CAPSULE, kinds.mjGEOM_CYLINDER)
