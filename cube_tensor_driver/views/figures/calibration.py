@@ -230,7 +230,14 @@ def draw_correction(title: str, seconds: Array, before: Array, after: Array) -> 
 
 
 def _draw_pads(upper: Any, lower: Any, minutes: Array, before: Array, after: Array) -> None:
-    """Draw stresses (N, P) of pads before and after a compensation, in Pa, in two axes."""
+    """Draw stresses of pads before and after a compensation.
+
+    Args:
+        upper: Axes of matplotlib for the stresses before the compensation.
+        lower: Axes for those after it.
+        minutes: Times (N,), in minutes.
+        before, after: Stresses of P pads (N, P), in Pa.
+    """
     for axes, stress, label in ((upper, before, "before / Pa"), (lower, after, "after / Pa")):
         for pad, values in enumerate(stress.T):
             shade = str(0.7 * pad / max(1, len(stress.T) - 1))

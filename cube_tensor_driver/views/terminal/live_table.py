@@ -256,7 +256,13 @@ class LiveTable:
 
 
 def _format_numbers(values: Array, shown: Sequence[int], form: str) -> Cells:
-    """Return the cells of some cubes: numbers in a format of Python, `UNOBSERVED` for NaN."""
+    """Return the cells of some cubes in a column of numbers; NaN becomes `UNOBSERVED`.
+
+    Args:
+        values: (N,) numbers of all cubes.
+        shown: Indices of the cubes that have a row.
+        form: Format of the numbers in Python's notation, such as ".1f".
+    """
     cells: Cells = []
     for value in values[list(shown)].tolist():
         cell = UNOBSERVED if np.isnan(value) else f"{value:{form}}"
