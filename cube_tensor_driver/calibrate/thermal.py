@@ -302,7 +302,7 @@ def fit_thermal(data: Warming) -> ThermalFit:
     if curved.misfit < best.misfit + np.log(MAX_DEGREE_RATIO):
         best = curved
 
-    result = _describe(data, best, slope)
+    result = _describe(data, best)
     _check(result, slope, change)
     return result
 
@@ -416,17 +416,12 @@ def _solve(
     return _Solution(lags, degree, columns, weight, values, float(misfit))
 
 
-def _describe(
-    data: Warming,
-    best: _Solution,
-    slope: float,
-) -> ThermalFit:
+def _describe(data: Warming, best: _Solution) -> ThermalFit:
     """Return the model of a solution, with the standard deviations of its values.
 
     Args:
         data: Averages over blocks of time.
         best: The solution.
-        slope: Rms of the linear coefficients over the pads, in Pa/K.
     """
     degrees = slice(1, 1 + best.degree)
     residual = data.stress - best.columns @ best.values
