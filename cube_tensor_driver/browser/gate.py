@@ -93,7 +93,9 @@ def check_host(host: str) -> None:
 
 @contextmanager
 def guarded_server(token: str = "") -> Iterator[None]:
-    """Let a websocket server that is made in this block refuse the requests that `refusal` names.
+    """Make a websocket server that is created in this `with` block check each request.
+
+    The server refuses a request for which `refusal` returns a reason, or which lacks a required token.
 
     Args:
         token: Secret text that a browser must send: once in the address (?token=…), and from then

@@ -37,8 +37,8 @@ RESEND_S = 0.2
 """Time, in seconds, after which SIGINT is sent again if Python has lost the KeyboardInterrupt of a
 Ctrl-C (see `interrupt_again`).
 
-The time is long enough for the hook that lost the exception to end, also on a busy machine, and so
-short that a user does not notice it.
+The time is long enough for `sys.unraisablehook`, in which a second signal would be lost as well, to
+return even on a busy machine, and so short that a user does not notice it.
 """
 
 WHEELS = {

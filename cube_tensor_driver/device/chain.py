@@ -46,9 +46,9 @@ MIN_LAG_S = 0.05
 attributed to a host that is too slow. The kernel's buffer of a serial port holds about what a hub
 with many cubes sends in this time, so a shorter delay loses nothing."""
 OVERLOAD_S = 0.5
-"""Delay, in s, of this process in reading received bytes, above which it drops whole scans (one
-sample of every cube) if samples are lost at the same time: the host is too slow. After a shorter
-delay it catches up without loss. Dropping ends when no further sample was lost for as long."""
+"""Delay, in s, of this process in reading received bytes, above which lost samples show that the
+host is too slow. The process then drops whole scans (one sample of every cube), until no sample was
+lost and no scan dropped for this time. After a shorter delay it catches up without loss."""
 
 
 @dataclass(frozen=True)

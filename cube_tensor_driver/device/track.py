@@ -25,8 +25,8 @@ RESTART_US = 1_000_000
 """Smallest time, in µs of the hub's clock, by which a sample must be older than the newest one to
 show that the hub has restarted. A sample that is older by less has only come out of order."""
 NEVER = -(1 << 62)
-"""Time, in ns, that is earlier than every device time (hub's clock) and every host time. It stands
-for the time of a sample before the first one came."""
+"""Time, in ns, that is earlier than every device time (hub's clock) and every host time. The
+time of a sample, such as the newest one, has this value as long as there is no such sample."""
 
 _TYPES: dict[str, Any] = {
     "int": c_int64,

@@ -84,8 +84,12 @@ _CENTRE_COLUMN = math.ceil(np.arcsinh(MAX_LEG_RATIO) / GRID_STEP)
 a polygon's edge, from the point of this line that is nearest to the cube."""
 
 _GRID_COLUMNS = 2 * _CENTRE_COLUMN + 1
-"""Number of columns of the polygon tables, one for each value of t, the length along the line
-through a polygon's edge. t is negative on one side of the point that is nearest to the cube."""
+"""Number of columns of the tables of stress at a cube under polygons of traction on the surface.
+
+Each column is for one value of t / sqrt(1 + d**2), where d and t give the position on the line
+through a polygon's edge (see `GRID_STEP`). Values of both signs are tabulated, because t is
+negative on one side of the point of the line that is nearest to the cube.
+"""
 
 _MIN_EDGE_LENGTH = 1e-12
 """Length of a polygon's edge, divided by the depth of the cubes' centres below the surface, below

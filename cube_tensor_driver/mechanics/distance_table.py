@@ -63,7 +63,7 @@ class DistanceTable:
     """
 
     def __init__(self, depth: float) -> None:
-        """Define the distances.
+        """Compute the distances at which values are tabulated.
 
         Args:
             depth: Distance from the centres of the cubes to the surface, in m.

@@ -371,8 +371,8 @@ class Touch:
     def _locate(self, stamp_ns: int) -> Touches:
         """Return the touches and their forces.
 
-        A touch is a touched cube with a larger pressure than its neighbours and than what another
-        load may cause there.
+        A touch is reported at each touched cube whose pressure is at least that of each touched
+        neighbour, and above the limit of the pressure that a load at another cube causes there.
 
         Args:
             stamp_ns: Time of the earliest sample of the scan, in ns.

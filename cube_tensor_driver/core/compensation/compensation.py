@@ -1,6 +1,6 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""The effects on the pads that are subtracted, because they are no load: the sum of all of them.
+"""Compensation of weight, creep and temperature: the sum of their effects on the pads' readings.
 
     v = (f - f0) / (f_highest - f)        pad law: stress on a pad / its stiffness
     v - offset,  offset = sum of effects  what the load contributes

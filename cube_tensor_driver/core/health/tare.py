@@ -99,7 +99,8 @@ def measure_rest(
     Pads that do not work, and cubes that are not tared, keep their rest frequencies.
 
     Args:
-        health: Health of the pads, with the statistics of the last windows, and its pipeline.
+        health: Health of the pads, which holds the statistics of the last windows of 0.5 s, and
+            the pipeline with the calibrations and the present rest frequencies.
         cubes: Numbers of the cubes to tare.
         duration: Duration of the newest data to average, in s, in steps of `WINDOW_S`.
         names: Names of all cubes, for messages.

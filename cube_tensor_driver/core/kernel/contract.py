@@ -220,15 +220,16 @@ class Offsets(NamedTuple):
         offset: Offsets by creep and temperature at the time `since_ns` (C, P).
         slope: Change of the offset per second (C, P), for v = 0.
         gain: Additional change of the offset per second and per v (C, P).
-        lasting: Status bits of creep and temperature (C,), for rows at most `MAX_GAP_NS` later than
-            `since_ns`. If any bit is set, rows that are later get COMPENSATION instead.
+        lasting: Status bits of creep and temperature (C,), for rows from `since_ns` to `MAX_GAP_NS`
+            later. Other rows get COMPENSATION instead, unless the status bits are 0.
         response: Response of the pads to specific force (C, 3, P), per m/s².
         weighing: Status bits of weight (C,), for rows with a known specific force. Other rows get
             COMPENSATION instead.
         newest_ns: Time stamp of the newest row of each cube (C,), in ns; 0: none.
         reading: v of the newest row before the subtraction (C, P); NaN where a pad was not used.
         subtracted: Offset that was subtracted from `reading` (C, P).
-        newest_force: Specific force of the newest row that has this column (C, 3); NaN: unknown.
+        newest_force: Specific force of the newest row for which `Columns.force` was not None
+            (C, 3), in m/s²; NaN: unknown.
     """
 
     step_ns: Times
