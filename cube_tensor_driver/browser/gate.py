@@ -95,7 +95,7 @@ def check_host(host: str) -> None:
 def guarded_server(token: str = "") -> Iterator[None]:
     """Make a websocket server that is created in this `with` block check each request.
 
-    The server refuses a request for which `refusal` returns a reason, or which lacks a required token.
+    It refuses a request for which `refusal` returns a reason, or which lacks a required token.
 
     Args:
         token: Secret text that a browser must send: once in the address (?token=…), and from then
