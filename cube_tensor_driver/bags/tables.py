@@ -88,7 +88,7 @@ def make_cube_column(rows: FrequencyRows | StressRows, cubes: pyarrow.Array) -> 
 
     Args:
         rows: N rows.
-        cubes: Names of the cubes by their indices, then one name for all higher indices.
+        cubes: Names of the cubes by their indices, then a last name for unknown cubes.
     """
     index = np.minimum(rows.cube, len(cubes) - 1)
     return pyarrow.DictionaryArray.from_arrays(index.astype(np.int32), cubes)
@@ -99,7 +99,7 @@ def make_stress_batch(rows: StressRows, cubes: pyarrow.Array) -> pyarrow.RecordB
 
     Args:
         rows: N rows.
-        cubes: Names of the cubes by their indices, then one name for all higher indices.
+        cubes: Names of the cubes by their indices, then a last name for unknown cubes.
     """
     columns = [
         pyarrow.array(rows.stamp_ns),
@@ -175,7 +175,7 @@ class TableWriter(BufferedTable):
 
         Args:
             path: File to create; the format is CSV if its suffix is ``.csv``, otherwise Parquet.
-            cubes: Names of the cubes by their indices, then one name for all higher indices.
+            cubes: Names of the cubes by their indices, then a last name for unknown cubes.
 
         Raises:
             BagError: The file cannot be written.

@@ -42,7 +42,7 @@ class ZarrWriter(BufferedTable):
 
         Args:
             path: Folder of the group, which is created or replaced.
-            cubes: Names of the cubes by their indices, then one name for all higher indices.
+            cubes: Names of the cubes by their indices, then a last name for unknown cubes.
                 They are stored as an attribute of the column `cube`.
 
         Raises:

@@ -434,19 +434,19 @@ def _solve(
     growth: float,
     bend: float,
 ) -> _CreepSolution:
-    """Fit the amplitudes of the law to averaged readings by regularised least squares.
+    """Fit the amplitudes of the creep law to averaged readings by regularised least squares.
 
-    The regularisation makes amplitudes of successive relaxation times a smooth sequence.
+    The regularisation makes the amplitudes a_k of successive relaxation times a smooth sequence.
 
     Args:
-        means: Averaged readings.
-        memory: Averages of the low-passed readings (N, K, P), in Pa.
+        means: Averages of the readings over N blocks of time.
+        memory: Averages of the low-passed readings (N, K, P), in Pa, for K relaxation times.
         load: Mean reading of each pad under the load (P,), in Pa.
         noise: Standard deviation of a reading of each pad (P,), in Pa.
         forecast: Low-passed readings (K,) at the end of a long load with a constant reading of 1.
-        growth: Expected ratio of an amplitude to that of the next shorter relaxation time.
-        bend: Standard deviation of second differences of the amplitudes, from which the growth is
-            divided out, relative to the mean amplitude.
+        growth: Expected ratio q of an amplitude to that of the next shorter relaxation time.
+        bend: Expected standard deviation of the differences a_k+1 - 2 q a_k + q² a_k-1, divided by
+            the mean amplitude.
     """
     n_times = memory.shape[1]
     held = means.reading[means.is_loaded > 0]

@@ -384,13 +384,15 @@ def _solve(
     degree: int,
     slope: float,
 ) -> _Solution:
-    """Compute the coefficients for given time constants by weighted least squares.
+    """Fit the stress on each pad as a polynomial in the temperature of the elastomer.
 
     Args:
         data: Averages over blocks of time.
-        lags: Time constants, in s, the longest first.
-        degree: Highest power of the temperature.
-        slope: Rms of the linear coefficients over the pads, in Pa/K; 0: not known yet.
+        lags: Time constants, in s, of the low-pass filters that compute the temperature of the
+            elastomer, the longest first.
+        degree: Degree of the polynomial.
+        slope: Rms of the linear coefficients over the pads, in Pa/K, for the weights of the blocks;
+            0: not known yet.
     """
     filtered = _filter(data, lags)
     u = filtered - data.temperature[0]

@@ -36,13 +36,15 @@ demonstrations; a real cube needs a calibration with fitted or computed values.
 """
 
 _FREE_SHEAR_Z = 0.4
-"""Response, in Pa per Pa, of the pad +z-x (face +z, on the side of -x) to the mode zx_x-yz_y, in
-which the gradients of σzx along x and σyz along y are opposite. The value is chosen freely for
-demonstrations."""
+"""Illustrative response, in Pa per Pa, of the pad +z-x (face +z, on the side of -x) to the mode
+zx_x-yz_y: σzx grows along x, and σyz falls along y by as much. The amplitude of the mode is this
+gradient times half the side of the cube. The value is chosen freely: `ILLUSTRATIVE` does not
+determine it."""
 _FREE_SHEAR_X = 0.2
-"""Response, in Pa per Pa, of the pad +z-x (face +z, on the side of -x) to the mode xy_y-zx_z, in
-which the gradients of σxy along y and σzx along z are opposite. The value is chosen freely for
-demonstrations."""
+"""Illustrative response, in Pa per Pa, of the pad +z-x (face +z, on the side of -x) to the mode
+xy_y-zx_z: σxy grows along y, and σzx falls along z by as much. The amplitude of the mode is this
+gradient times half the side of the cube. The value is chosen freely: `ILLUSTRATIVE` does not
+determine it."""
 
 ILLUSTRATIVE_CUBE = {
     "+z-x:zz": 1.4,

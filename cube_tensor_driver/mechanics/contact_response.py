@@ -149,9 +149,10 @@ class ContactResponse:
         distance = np.maximum(true_distance, _MIN_DISTANCE * self._depth)
         parts = self._interpolate_slopes(distance, size)
 
-        # A force with the components F_r from the contact to the cube, F_t across and F_z causes
-        # the circular components c = exp(i m phi) (R F_r + Z F_z + i T F_t), with the radial
-        # functions R, Z and T (circular.py). `loads` are c / exp(i m phi) and its derivatives.
+        # A force F_r towards the cube, F_t across and F_z along z causes the circular components of
+        # stress and gradient c = exp(i m phi) (R F_r + Z F_z + i T F_t), where R, Z and T depend on
+        # the distance (circular.py). `loads` are c / exp(i m phi), its derivative by the distance,
+        # and its first and second derivative by the natural logarithm of the radius.
         cosine = np.cos(direction).astype(np.float32)[:, None]
         sine = np.sin(direction).astype(np.float32)[:, None]
         force = force[..., None].astype(np.float32)

@@ -74,12 +74,12 @@ class CubeMeasurement:
         scale: float,
         model: MeasurementModel | None = None,
     ) -> None:
-        """Prepare the matrices.
+        """Compute the matrices from circular components to the measured components in Pa.
 
         Args:
             layer: Elastic layer that contains the cubes.
             depth: Distance from the centres of the cubes to the surface, in m.
-            scale: Length in m by which gradients are multiplied.
+            scale: Length in m by which gradients are multiplied, so that they are in Pa, too.
             model: Measurement model of the cubes; None: they measure stress and gradient at points.
 
         Raises:

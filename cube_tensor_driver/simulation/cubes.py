@@ -278,7 +278,8 @@ def find_hub_members(skin: Skin, link: str) -> Index:
         else:
             by_index[cube.index] = number
 
-    # A hub may have cubes that are not in the skin, whose indices then stay free.
+    # The highest index can exceed the number of the hub's cubes in the skin, because the hub may
+    # have further cubes that are not in the skin.
     highest = max(by_index, default=-1)
     size = max(len(by_index) + len(by_uid), highest + 1)
     members = np.full(size, ABSENT)

@@ -129,7 +129,11 @@ class Intake:
         return is_late, NativeSamples(links, raws, stamps_ns), others
 
     def _ask_links(self, timeout_s: float) -> tuple[bool, NativeSamples, list[LinkRead]]:
-        """Read the open links again and again until frames have come; see `read`."""
+        """Read the open links repeatedly until frames or an error come, at most for `timeout_s`.
+
+        Returns:
+            As `read`, with all frames among the other results: they are not decoded in C.
+        """
         until = time.monotonic() + timeout_s
         while True:
             is_open = [i for i, link in enumerate(self._links) if link.is_open]

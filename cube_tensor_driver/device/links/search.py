@@ -95,7 +95,10 @@ def _listen(links: list[tuple[Link, Port]]) -> None:
 
 
 def _has_answered(link: Link, port: Port) -> bool:
-    """Read a link, and return whether its hub has answered, or it cannot be read any more."""
+    """Read a link, and return whether no further answer is expected from its hub.
+
+    Then the hub has answered (`port.hello` is set) or reading has failed (`port.problem` is set).
+    """
     try:
         frames = link.decoder.feed(link.read())
     except LinkError as error:

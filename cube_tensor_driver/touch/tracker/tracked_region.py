@@ -497,11 +497,14 @@ class TrackedRegion:
             self._first_misfit = MAX_HERTZ_MISFIT / MAX_MISFIT_GROWTH
 
     def subtract_others(self, values: LocalValues, total: Array, deviation: Array) -> None:
-        """Set `others`, the response to the other regions that a fit subtracts from its values.
+        """Set `others`, the response to all other regions.
+
+        The fit of this region subtracts it from the C measured components of each of its cubes.
 
         Args:
-            values: Positions and noise of the cubes of the fit; the attribute `disturbance` is set.
-            total: Response (cubes, C), in Pa, of all cubes to all regions.
+            values: Cubes of the fit. Its attribute `disturbance` is set to the standard deviation
+                of `others`.
+            total: Response (cubes, C), in Pa, of all cubes to all regions, this one included.
             deviation: Standard deviation (cubes, C) of this response, in Pa.
         """
         cubes = values.cubes
