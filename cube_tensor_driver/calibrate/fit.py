@@ -594,8 +594,9 @@ def _advise(
                 "give them as fixed, or choose a larger symmetry"
             )
             break
-        # Sometimes the best load determines a coefficient only together with the load that is
-        # advised next. Then the sentence names all undetermined coefficients.
+        # The advice names the coefficients that the best load determines. If there are none,
+        # because it determines some only together with the next load, it names all undetermined
+        # ones.
         settled = names[is_open & ~new_open]
         subject = settled if len(settled) else names[is_open]
         name = model.structure.modes.names[mode]

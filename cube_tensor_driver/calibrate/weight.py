@@ -47,9 +47,9 @@ class WeightFit(NamedTuple):
     """Response of the pads to specific force (weight and inertia), fitted to a recording.
 
     Attributes:
-        calibration: The recorded calibration with the response.
-        seconds: Times of the N blocks of the first cube (N,), in s.
-        before: Stresses on the pads of the first cube, averaged over the blocks (N, P), in Pa,
+        calibration: The calibration that the recording contains, with the response added.
+        seconds: Times (N,), in s, of the N blocks (0.5 s each) in which the first cube has data.
+        before: Stresses on the pads of the first cube, averaged over each block (N, P), in Pa,
             minus a fitted constant and linear drift.
         after: `before` minus the fitted effect of weight (N, P), in Pa.
     """

@@ -73,11 +73,13 @@ _LETTERS = {
     "zz_z": ("g", -1),
     "xx_x": ("h", 1),
 }
-"""Letter, and its sign, by which Kiyota & Shinoda (eq. 1) name the response of the pad V1 to each
-mode. The mode zx has equal stresses sigma_zx and sigma_xz, so its response is c + d."""
+"""Mode (linear stress field) -> name and sign of the coefficient that is the response of the first
+pad to it. The names are the letters of Kiyota & Shinoda (eq. 1), who call this pad V1. The mode zx
+has equal stresses sigma_zx and sigma_xz, so its response is c + d."""
 _PAPER_LETTERS = _LETTERS | {"zx": ("c", -1), "xz": ("d", -1)}
-"""Letter, and its sign, by which Kiyota & Shinoda (eq. 1) name the response of the pad V1 to each
-of their modes. They treat sigma_zx and sigma_xz as independent, so each of the two has a letter."""
+"""The same table as `_LETTERS` (names and signs of the coefficients of the first pad, by mode) for
+the modes of Kiyota & Shinoda. They treat the shear stresses sigma_zx and sigma_xz as independent,
+so each of the two has a coefficient of its own."""
 
 
 def generate_group(generators: Sequence[Matrix]) -> Index:

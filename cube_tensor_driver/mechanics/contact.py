@@ -345,8 +345,9 @@ def _compute_airy(
 
     third_derivatives = {axes: third(*axes) for axes in _THIRD_DERIVATIVES}
 
-    # C_xx = g_yy, C_yy = g_xx, C_xy = -g_xy. The depth Z is -d_z, so a derivative by z is the
-    # negative of the derivative by Z.
+    # The field C consists of second derivatives of the Airy function g: C_xx = g_yy, C_yy = g_xx,
+    # C_xy = -g_xy. The depth Z below a force is -z, so a derivative by z is the negative of the one
+    # by Z.
     *points, _ = distance.shape
     n_components = len(_STRESS_AXES)
     stress = np.zeros((*points, n_components))

@@ -36,7 +36,8 @@ integers; their rounding error is a tenth of the error of the finite elements.""
 _NUMBERS = ("pad_size", "side", "depth", "thickness", "poisson", "step")
 """Names of the arrays of a file of influence functions that hold one number each."""
 _TABLES = ("positions", "normals", "place", "pads")
-"""Names of the arrays of a file of influence functions that hold tables of numbers."""
+"""Names of the arrays of a file of influence functions that hold several numbers each: positions
+and normals of the pads, positions of the forces, and the stresses of the pads."""
 
 _PARSE_ERRORS = (OSError, KeyError, TypeError, ValueError)
 """Errors of a file of influence functions that cannot be read, lacks an array, or has an array of

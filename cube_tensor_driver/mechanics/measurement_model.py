@@ -1,10 +1,11 @@
 # Copyright 2026 cube_tensor_driver authors
 # SPDX-License-Identifier: Apache-2.0
-"""Measurement model of cubes: the values that they measure, from circular components.
+"""Measurement model of cubes: the values that they measure, from the stress around them.
 
-The stress around a cube follows from circular components (circular.py), which depend on the load
-and on the offset of load and cube. What the cube measures depends linearly on them, with a matrix
-that also contains its calibration and which of its pads are in use.
+The stress around a cube is described by circular components, combinations of stress and gradient
+that only change phase under a rotation about z (circular.py). They depend on the load and on the
+offset of load and cube. What the cube measures depends linearly on them, with a matrix that also
+contains its calibration and which of its pads are in use.
 """
 
 from __future__ import annotations

@@ -51,7 +51,7 @@ with this wavenumber has decayed by a factor of about exp(-25)."""
 
 N_WAVENUMBERS = 256
 """Number of Gauss points in integrals over the wavenumber k. They resolve the Bessel functions
-J(k r) up to distances r from the load of 20 depths (of the cubes' centres below the surface)."""
+J(k r) for distances r from the load up to 20 times the depth of the cubes' centres."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -93,7 +93,10 @@ def read_thermal_stress(name: str, n_pads: int) -> ThermalLayer:
 
 
 class WarmLayer:
-    """Computes how the temperature of the layer at some cubes changes with ground and air."""
+    """Computes the temperature across the elastomer layer at some cubes as time advances.
+
+    It follows from the temperatures of the ground below the layer and of the air above it.
+    """
 
     def __init__(
         self,

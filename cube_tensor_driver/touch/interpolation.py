@@ -129,12 +129,12 @@ class Interpolation:
         return weights
 
     def _solve(self, chosen: Index, known: Mask) -> tuple[Array, Array]:
-        """Compute the interpolation weights of some patches.
+        """Compute the interpolation weights of some patches (grids of points around cubes).
 
         Args:
             chosen: Indices (patches,) of the patches.
-            known: Whether the value, and each derivative in use, is known (cubes, width). The width
-                is 1 without derivatives and 3 with both.
+            known: Whether each number of a cube is known (cubes, width). The numbers are the value
+                alone (width 1), or the value and its derivatives along x and y (width 3).
 
         Returns:
             Weights (patches, points, neighbours x width) of the neighbours' values, and the

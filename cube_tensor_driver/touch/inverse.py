@@ -349,7 +349,7 @@ class SurfaceInverse:
         """
         y = self._fill(residual)
         # `variance_with_values` is the variance of each pad's error, divided by the variance of its
-        # noise: 1 for the noise itself, plus the part of the gain error.
+        # noise: 1 for the noise itself, plus the variance that the error of the pad's gain causes.
         known = self._known
         known_values = np.where(known, scaled, 0.0)
         to_pads = stress_matrices(self.by_pad, known)

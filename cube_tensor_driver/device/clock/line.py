@@ -51,9 +51,10 @@ adapters delay samples by up to 16 ms. The hub's or the host's clock counts as s
 `MIN_BUCKETS_HIGH` successive seconds exceed the smallest earlier delay by more, or if one delay is
 smaller than it by more."""
 MAX_FALL_NS = 4e6
-"""Largest credible decrease of the smallest delay of samples (arrival minus sampling) within 1 s,
-in ns. A larger one, after the first second, shows that the hub's or the host's clock was set.
-Steps of 5 ms shall be found; 1 ms is left for the error of the estimated delay."""
+"""Largest credible decrease, within 1 s, of the smallest delay (arrival minus sampling) of a hub's
+samples, in ns. A larger one shows that the hub's or the host's clock was set, except in the first
+second, in which the smallest delay is not known yet. Steps of 5 ms shall be found; 1 ms is left for
+the error of the estimated delay."""
 MIN_BUCKETS_HIGH = 2
 """Number of successive buckets (intervals of 1 s) in which the delays of all samples must exceed
 the smallest delay by more than `MAX_RISE_NS` before the hub's or the host's clock counts as set.

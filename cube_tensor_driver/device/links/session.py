@@ -207,8 +207,9 @@ class Session:
             now: Monotonic time, in s.
 
         Raises:
-            LinkError: No byte has come for `REOPEN_S`, or no HELLO from a port given as a pattern,
-                or sending failed. The link must be closed.
+            LinkError: No byte has come for `REOPEN_S`; the port was found by a pattern such as
+                /dev/ttyACM*, and no hub has identified itself there (HELLO) within `REOPEN_S`; or
+                sending failed. The link must be closed.
         """
         link = self.link
         if link.unsent:

@@ -259,11 +259,12 @@ class ScanBuilder:
         return scans
 
     def _holds_late_sample(self, missing: set[int]) -> bool:
-        """Return whether the pending scan holds a late sample, whose scan was delivered without it.
+        """Return whether a sample of the pending scan belongs to a scan that is already delivered.
 
-        A late sample is delivered alone. If it waited for the next samples of the other links, its
-        link would stay one sample behind from then on. A sample counts as late if its time is
-        nearer to the last delivered sample of every missing link than to that of its own link.
+        Such a late sample is delivered alone. If it waited for the next samples of the other links,
+        its link would stay one sample behind from then on. To find it, the times of the samples
+        delivered last are compared: if that of every missing link is nearer to the sample than that
+        of the sample's own link, the missing links have delivered their samples of the same time.
 
         Args:
             missing: Links that deliver but have no sample in the pending scan.

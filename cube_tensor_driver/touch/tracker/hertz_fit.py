@@ -107,9 +107,11 @@ class Linearisation(NamedTuple):
         jacobian: Derivatives (n C, p) of the whitened values.
         offset: Parameters (p,) of the contacts minus their prior mean.
         precision: Prior precisions (p,) of the parameters.
-        information: Posterior precision (p, p) of the parameters for a misfit of 1.
+        information: Posterior precision (p, p) of the parameters if the residuals are no larger
+            than the noise explains.
         covariance: Inverse (p, p) of `information`.
-        nearest: Indices of the `SHAPE_CUBES` cubes nearest to the contacts.
+        nearest: Indices of the `SHAPE_CUBES` cubes with the smallest distances from a contact,
+            whose residuals test the assumed shape of the contacts.
     """
 
     contacts: Discs
