@@ -242,7 +242,11 @@ class McapReader:
         # Recorders write messages of several topics slightly out of the order of their times.
         chosen = chosen[np.argsort(head["recorded_ns"][chosen], kind="stable")]
         return StoredMessages(
-            data, message_begin, message_end, head["recorded_ns"], head["channel"]
+            data,
+            message_begin,
+            message_end,
+            head["recorded_ns"],
+            head["channel"],
         ).select(chosen)
 
     def _read_unindexed_messages(

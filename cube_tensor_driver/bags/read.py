@@ -308,7 +308,12 @@ class Bag:
         for file, messages in self._read_stored(topics, start_ns, stop_ns):
             for channel, time_ns, data in messages:
                 connection = file.connections[channel]
-                yield Entry(connection.topic, connection.msgtype, time_ns, data)
+                yield Entry(
+                    connection.topic,
+                    connection.msgtype,
+                    time_ns,
+                    data,
+                )
 
     def _read_stored(
         self,
@@ -452,7 +457,10 @@ class Bag:
         return self._decode_batches(topic, stress_codec, stress_codec.decode)
 
     def columns(
-        self, topic: str, codec: MessageCodec[Any], names: Sequence[str]
+        self,
+        topic: str,
+        codec: MessageCodec[Any],
+        names: Sequence[str],
     ) -> Iterator[list[AnyArray]]:
         """Read some columns of frequencies or stress, which is faster than reading all.
 

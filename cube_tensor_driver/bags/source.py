@@ -113,7 +113,12 @@ class BagSource:
         count = len(segment.messages)
         self.messages -= count
         self.rows -= len(segment.messages.rows)
-        self.bag.skip(self.topic, int(segment.recorded_ns[0]), error, count)
+        self.bag.skip(
+            self.topic,
+            int(segment.recorded_ns[0]),
+            error,
+            count,
+        )
 
     def segments(self, *, use_health: bool = False) -> Iterator[Segment]:
         """Yield all messages in the order of recording, with their rows (samples of cubes).

@@ -83,7 +83,13 @@ def join(messages: Sequence[tuple[int, int, bytes]]) -> StoredMessages:
     channel, time_ns, data = zip(*messages, strict=True)
     sizes = np.array([len(one) for one in data])
     end = np.cumsum(sizes)
-    return StoredMessages(b"".join(data), end - sizes, end, np.array(time_ns), np.array(channel))
+    return StoredMessages(
+        b"".join(data),
+        end - sizes,
+        end,
+        np.array(time_ns),
+        np.array(channel),
+    )
 
 
 def join_in_blocks(messages: Iterable[tuple[int, int, bytes]]) -> Iterator[StoredMessages]:

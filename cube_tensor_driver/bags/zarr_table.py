@@ -27,7 +27,11 @@ _COMPONENTS = {"stress": STRESS, "gradient": GRADIENT}
 """Names of the components of each column with several numbers per row, such as xx, yy, … of
 stress."""
 
-_TYPES: dict[str, Any] = {"cube": np.uint16, "stress": np.float32, "gradient": np.float32}
+_TYPES: dict[str, Any] = {
+    "cube": np.uint16,
+    "stress": np.float32,
+    "gradient": np.float32,
+}
 """Type of each column that is not in `COLUMN_TYPES`."""
 
 

@@ -152,9 +152,18 @@ class ThermalFit:
             base: Calibration with which the stresses were computed.
             source: Text that states the origin of the values.
         """
-        rest = pad_frequency(self.offset, base.rest_frequency, base.beta, base.modulus)
+        rest = pad_frequency(
+            self.offset,
+            base.rest_frequency,
+            base.beta,
+            base.modulus,
+        )
         return replace(
-            base, rest_frequency=rest, temperature=None, thermal=self.model, source=source
+            base,
+            rest_frequency=rest,
+            temperature=None,
+            thermal=self.model,
+            source=source,
         )
 
 
@@ -415,7 +424,14 @@ def _solve(
 
     residual = (data.stress - columns @ values) * weight[:, None]
     misfit = 0.5 * np.log((residual**2).mean()) - np.log(weight).mean()
-    return _Solution(lags, degree, columns, weight, values, float(misfit))
+    return _Solution(
+        lags,
+        degree,
+        columns,
+        weight,
+        values,
+        float(misfit),
+    )
 
 
 def _describe(data: Warming, best: _Solution) -> ThermalFit:
@@ -464,7 +480,13 @@ def _describe(data: Warming, best: _Solution) -> ThermalFit:
         deviation=size[degrees].T * sign,
         ramp=ramp,
     )
-    return ThermalFit(data, model, best.values[0], level, residual)
+    return ThermalFit(
+        data,
+        model,
+        best.values[0],
+        level,
+        residual,
+    )
 
 
 def _check(

@@ -64,7 +64,13 @@ def make_jobs(
             )
         names[name] = bag
     return [
-        ReprocessJob(bag, folder / f"{name}{SUFFIXES[form]}", form, overrides, contacts)
+        ReprocessJob(
+            bag,
+            folder / f"{name}{SUFFIXES[form]}",
+            form,
+            overrides,
+            contacts,
+        )
         for name, bag in names.items()
     ]
 

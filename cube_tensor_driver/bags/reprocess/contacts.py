@@ -147,7 +147,12 @@ class ContactWriter:
         is_due = self._is_due(stamp_ns)
         begins_to_slip = finder.follow(time_s, values)
         if is_due:
-            finder.update(time_s, values, self._latest.left_out, self._latest.status)
+            finder.update(
+                time_s,
+                values,
+                self._latest.left_out,
+                self._latest.status,
+            )
         elif not begins_to_slip:
             return
         message = make_contacts_message(

@@ -394,7 +394,14 @@ def _measure_rest(
         cube = rows.cube.astype(np.intp)
         offset = np.zeros(rows.frequency.shape)
         out = pipeline.make_rows(rows)
-        compensation.process(rows, None, watch=None, known=None, out=out, offset=offset)
+        compensation.process(
+            rows,
+            None,
+            watch=None,
+            known=None,
+            out=out,
+            offset=offset,
+        )
         inside = (rows.stamp_ns >= begin_ns) & (rows.stamp_ns < end_ns)
         rows = rows.select(inside)
         if not len(rows):
