@@ -256,7 +256,12 @@ class Charts:
             )
 
 
-def make_chart(history: History, names: Sequence[str], cubes: Sequence[int], group: str) -> Chart:
+def make_chart(
+    history: History,
+    names: Sequence[str],
+    cubes: Sequence[int],
+    group: str,
+) -> Chart:
     """Return a chart with one line for each cube and each value of a group that is observed.
 
     At most `MAX_LINES` lines are drawn. A value counts as observed if it was known for any cube at

@@ -158,7 +158,12 @@ class ReplayClient:
             return
         request = SteerReplay.Request(position=np.nan, paused=not self.state.paused)
         # The page shows whether the replay is paused, so an action that succeeds needs no note.
-        self._services.ask("replay", self._client, request, notes_success=False)
+        self._services.ask(
+            "replay",
+            self._client,
+            request,
+            notes_success=False,
+        )
 
     def jump_to(self, position: float) -> None:
         """Store a position, in s after the start of the bag, to which a later `update` jumps.

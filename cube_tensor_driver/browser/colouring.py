@@ -36,7 +36,12 @@ class Colouring(NamedTuple):
 
     @classmethod
     def of(
-        cls, scan: Scan, surface: Surface, quantity: Quantity, fixed_top: float, last_top: float
+        cls,
+        scan: Scan,
+        surface: Surface,
+        quantity: Quantity,
+        fixed_top: float,
+        last_top: float,
     ) -> Colouring:
         """Compute the values and the range of the colour scale for one picture.
 

@@ -103,7 +103,11 @@ def guarded_server(token: str = "") -> Iterator[None]:
     """
     serve: Callable[..., Any] = websockets.asyncio.server.serve
 
-    def guarded_serve(*arguments: Any, process_request: Callable[..., Any], **options: Any) -> Any:
+    def guarded_serve(
+        *arguments: Any,
+        process_request: Callable[..., Any],
+        **options: Any,
+    ) -> Any:
         def check(connection: Any, request: Request) -> Any:
             return _answer(connection, request, token, process_request)
 
@@ -117,7 +121,10 @@ def guarded_server(token: str = "") -> Iterator[None]:
 
 
 def _answer(
-    connection: Any, request: Request, token: str, process_request: Callable[..., Any]
+    connection: Any,
+    request: Request,
+    token: str,
+    process_request: Callable[..., Any],
 ) -> Any:
     """Refuse a request, or let viser answer it and add a cookie with the token to the answer.
 
@@ -177,4 +184,9 @@ def _contains(texts: list[str], wanted: str) -> bool:
 def _make_refusal(problem: str) -> Response:
     headers = Headers({"Content-Type": "text/plain; charset=utf-8"})
     text = f"refused: {problem}\n".encode()
-    return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", headers, text)
+    return Response(
+        http.HTTPStatus.FORBIDDEN,
+        "Forbidden",
+        headers,
+        text,
+    )

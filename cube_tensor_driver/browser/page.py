@@ -142,7 +142,11 @@ class Page:
     """
 
     def __init__(
-        self, client: viser.ClientHandle, layout: PageLayout, skin: ShownSkin, act: Act
+        self,
+        client: viser.ClientHandle,
+        layout: PageLayout,
+        skin: ShownSkin,
+        act: Act,
     ) -> None:
         self._client, self._layout, self._skin = client, layout, skin
         self._scan: Scan | None = None
@@ -400,7 +404,11 @@ def set_up(
     place_camera(client, layout, INCLINED)
 
 
-def place_camera(client: viser.ClientHandle, layout: PageLayout, direction: str) -> None:
+def place_camera(
+    client: viser.ClientHandle,
+    layout: PageLayout,
+    direction: str,
+) -> None:
     """Place the camera of a browser in one of the `CAMERA_DIRECTIONS` from the skin.
 
     Args:

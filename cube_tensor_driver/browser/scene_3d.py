@@ -88,7 +88,11 @@ BLUE: Colour = (25, 105, 210)
 EDGE_COLOUR: Colour = (110, 114, 122)
 """Colour of the edges of the cubes."""
 
-FAULT_COLOURS = {DOUBTFUL: (230, 130, 0), FAULTY: (215, 25, 25), STALE: DARK}
+FAULT_COLOURS = {
+    DOUBTFUL: (230, 130, 0),
+    FAULTY: (215, 25, 25),
+    STALE: DARK,
+}
 """Health of a cube -> colour of the cross that is drawn over it, as red, green, blue from 0 to 255.
 
 A cube whose health is `FINE` has no cross.
@@ -228,7 +232,11 @@ class Scene:
         self.first_cube = int(distance.argmin())
         self.bar = round_down(SPAN / placement.unit / 4)
 
-    def add_to(self, api: viser.SceneApi, pick: Callable[[int], None]) -> dict[str, Any]:
+    def add_to(
+        self,
+        api: viser.SceneApi,
+        pick: Callable[[int], None],
+    ) -> dict[str, Any]:
         """Add all objects to the scene of a browser.
 
         Args:
@@ -244,7 +252,11 @@ class Scene:
             self._add_edges(api)
         objects: dict[str, Any] = {
             f"field/{step}": api.add_mesh_simple(
-                f"/field/{step}", *NO_MESH, flat_shading=True, side="double", **NO_SHADOWS
+                f"/field/{step}",
+                *NO_MESH,
+                flat_shading=True,
+                side="double",
+                **NO_SHADOWS,
             )
             for step in range(COLOUR_STEPS + 1)
         }
@@ -264,7 +276,12 @@ class Scene:
             start, direction = np.array(event.ray_origin), np.array(event.ray_direction)
             # viser reports a click as a ray from the camera through the point that was clicked.
             placement = self._placement
-            cube = find_hit_cube(placement.poses.position, placement.pitch, start, direction)
+            cube = find_hit_cube(
+                placement.poses.position,
+                placement.pitch,
+                start,
+                direction,
+            )
             if cube is not None:
                 pick(cube)
 
@@ -344,7 +361,13 @@ class Scene:
             values = np.append(values, colouring.cubes)
             visible = np.append(visible, np.full(len(colouring.cubes), True))
 
-        meshes = paint_squares(self._squares, quantity, values, top, visible)
+        meshes = paint_squares(
+            self._squares,
+            quantity,
+            values,
+            top,
+            visible,
+        )
         colours_of_steps = step_colours(quantity).tolist()
         for step, mesh in enumerate(meshes):
             colour = tuple(colours_of_steps[step])
@@ -422,7 +445,12 @@ class Scene:
 
         start = np.array([low[0], y, z])
         end = start + np.array([self.bar * placement.unit, 0, 0])
-        api.add_line_segments("/bar", np.array([[start, end]]), DARK, thickness=0.012 * SPAN)
+        api.add_line_segments(
+            "/bar",
+            np.array([[start, end]]),
+            DARK,
+            thickness=0.012 * SPAN,
+        )
         middle = tuple((start + end) / 2 - np.array([0, 0.03 * SPAN, 0]))
         text = f"{1e3 * self.bar:g} mm"
         api.add_label(

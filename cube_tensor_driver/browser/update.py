@@ -89,7 +89,11 @@ class ViewSettings(NamedTuple):
 
 
 def build_update(
-    skin: ShownSkin, scan: Scan, history: History, settings: ViewSettings, before: Ranges
+    skin: ShownSkin,
+    scan: Scan,
+    history: History,
+    settings: ViewSettings,
+    before: Ranges,
 ) -> tuple[Update, Ranges]:
     """Return everything that a page shows of one scan.
 
@@ -113,14 +117,24 @@ def build_update(
         before.colours,
     )
     ranges = before.follow(scan.values, scan.residual, colouring.top)
-    update = skin.scene.draw(scan, colouring, settings.parts, cube, ranges)
+    update = skin.scene.draw(
+        scan,
+        colouring,
+        settings.parts,
+        cube,
+        ranges,
+    )
 
     above = None if colouring.above is None else colouring.above[cube]
     # Each text is the content of an HTML element of the same name (page.py).
     texts = {
         "headline": markup.headline(scan, settings.is_paused, settings.is_recording),
         "legend": markup.legend(settings.quantity, colouring.top, scan.field),
-        "meaning": markup.explanation(skin.scene.bar, *skin.scene.per_bar(ranges), scan.field),
+        "meaning": markup.explanation(
+            skin.scene.bar,
+            *skin.scene.per_bar(ranges),
+            scan.field,
+        ),
         "numbers": markup.numbers(scan, cube, above),
         "contact list": markup.contacts(scan),
         "health": markup.conditions(skin.names, scan),

@@ -384,8 +384,21 @@ def run_view(
     stop = stop_event()
     with (
         node_session("view") as (node, executor),
-        contextlib.closing(Viewer(node, host, port, depth, recordings)) as viewer,
+        contextlib.closing(
+            Viewer(
+                node,
+                host,
+                port,
+                depth,
+                recordings,
+            )
+        ) as viewer,
     ):
         print(f"{viewer.url}  (Ctrl-C ends it)", flush=True)
-        spin_until(executor, stop.is_set, step_s=MAX_STEP_S, on_step=viewer.step)
+        spin_until(
+            executor,
+            stop.is_set,
+            step_s=MAX_STEP_S,
+            on_step=viewer.step,
+        )
     return 0

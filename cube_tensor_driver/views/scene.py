@@ -219,7 +219,12 @@ class Ranges(NamedTuple):
     traction: float = 0.0
     gradient: float = 0.0
 
-    def follow(self, values: Array, residual: Array, colours: float) -> Ranges:
+    def follow(
+        self,
+        values: Array,
+        residual: Array,
+        colours: float,
+    ) -> Ranges:
         """Return the ranges of the next picture.
 
         Args:
@@ -229,7 +234,11 @@ class Ranges(NamedTuple):
             colours: Upper end of the colour scale of the next picture, in SI units.
         """
         # Columns 2 to 4 are the stress components zz, yz and zx, which act on the upper face.
-        traction = choose_automatic_top(QUANTITIES["shear"], values[:, 2:5], self.traction)
+        traction = choose_automatic_top(
+            QUANTITIES["shear"],
+            values[:, 2:5],
+            self.traction,
+        )
         gradient = QUANTITIES["gradient"]
         magnitude = gradient.of(values, residual)
         longest_gradient = choose_automatic_top(gradient, magnitude, self.gradient)
@@ -420,7 +429,12 @@ def heads(arrows: Array, normal: Array) -> Array:
     return np.stack([arrows, *barbs], axis=1)
 
 
-def ring(centre: Array, normal: Array, radius: float, corners: int) -> Array:
+def ring(
+    centre: Array,
+    normal: Array,
+    radius: float,
+    corners: int,
+) -> Array:
     """Return the sides (corners, 2, 3) of a polygon that approximates a circle.
 
     Args:

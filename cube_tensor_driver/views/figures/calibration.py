@@ -45,7 +45,13 @@ def draw_layout(layout: Layout) -> Figure:
         layout.normals,
         strict=True,
     ):
-        _draw_pad(axes, name, centre, normal, layout.pad_size)
+        _draw_pad(
+            axes,
+            name,
+            centre,
+            normal,
+            layout.pad_size,
+        )
     # matplotlib needs the direction of view as two angles.
     x, y, z = _VIEW
     elevation = np.arctan2(z, np.hypot(x, y))
@@ -108,7 +114,12 @@ def _draw_pad(
         zorder=order,
     )
     if is_in_front:
-        area = Poly3DCollection([outline], facecolor="C0", alpha=0.25, zorder=2)
+        area = Poly3DCollection(
+            [outline],
+            facecolor="C0",
+            alpha=0.25,
+            zorder=2,
+        )
         axes.add_collection3d(area)
     axes.text(
         # The name is written a little above the face, so that the pad does not cover it.
@@ -194,27 +205,55 @@ def draw_thermal_fit(fit: ThermalFit) -> Figure:
     # The times of the blocks begin at 0 in each bag. So the index of a block is drawn instead,
     # which puts the bags one after the other. It is a time in s, because a block lasts 1 s.
     time = np.arange(len(data.seconds)) / 60
-    warm.plot(time, data.temperature, "k-", label="thermometer of the hub")
+    warm.plot(
+        time,
+        data.temperature,
+        "k-",
+        label="thermometer of the hub",
+    )
     elastomer = fit.level + float(fit.model.reference)
     lags = " + ".join(f"{lag:.0f} s" for lag in fit.model.lag.tolist())
-    warm.plot(time, elastomer, "C3--", label=f"elastomer, lag {lags}")
+    warm.plot(
+        time,
+        elastomer,
+        "C3--",
+        label=f"elastomer, lag {lags}",
+    )
     warm.set(ylabel="temperature / °C")
     warm.legend(fontsize=7)
-    _draw_pads(before, after, time, data.stress - fit.offset, fit.residual)
+    _draw_pads(
+        before,
+        after,
+        time,
+        data.stress - fit.offset,
+        fit.residual,
+    )
     if fit.model.ramp is not None:
         # Predicted deviation of a typical pad (rms of all) while the temperature changes, because
         # the elastomer follows the thermometer with a lag.
         squared_slope = (fit.model.ramp**2).sum(axis=1)
         typical_slope = float(np.sqrt(squared_slope.mean()))
         bound = typical_slope * np.abs(data.temperature - elastomer)
-        after.fill_between(time, -bound, bound, color="C0", alpha=0.25, label="deviation")
+        after.fill_between(
+            time,
+            -bound,
+            bound,
+            color="C0",
+            alpha=0.25,
+            label="deviation",
+        )
         after.legend(fontsize=7)
     before.set_title(f"stress of the {data.stress.shape[1]} pads without load", fontsize=9)
     return figure
 
 
 @print_style()
-def draw_correction(title: str, seconds: Array, before: Array, after: Array) -> Figure:
+def draw_correction(
+    title: str,
+    seconds: Array,
+    before: Array,
+    after: Array,
+) -> Figure:
     """Draw stresses of pads before and after the effect of creep or weight is removed by a fit.
 
     Args:
@@ -224,12 +263,24 @@ def draw_correction(title: str, seconds: Array, before: Array, after: Array) -> 
     """
     figure = Figure(figsize=(7, 4))
     upper, lower = figure.subplots(2, 1, sharex=True)
-    _draw_pads(upper, lower, seconds / 60, before, after)
+    _draw_pads(
+        upper,
+        lower,
+        seconds / 60,
+        before,
+        after,
+    )
     upper.set_title(title, fontsize=9)
     return figure
 
 
-def _draw_pads(upper: Any, lower: Any, minutes: Array, before: Array, after: Array) -> None:
+def _draw_pads(
+    upper: Any,
+    lower: Any,
+    minutes: Array,
+    before: Array,
+    after: Array,
+) -> None:
     """Draw stresses of pads before and after a compensation.
 
     Args:

@@ -29,7 +29,11 @@ MAX_LEGEND_LINES = 12
 
 
 @print_style()
-def draw_panels(times: Array, time_label: str, panels: Sequence[Panel]) -> Figure:
+def draw_panels(
+    times: Array,
+    time_label: str,
+    panels: Sequence[Panel],
+) -> Figure:
     """Draw panels one below the other over a common time axis.
 
     Args:

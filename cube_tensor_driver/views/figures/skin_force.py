@@ -71,7 +71,15 @@ def draw_forces(
     for points, style in (
         (cubes, {"marker": "s", "ls": "", "color": "0.8"}),
         (centre, {"color": "black", "lw": 1}),
-        (measured_centre, {"marker": "o", "ls": "", "color": "C3", "mfc": "none"}),
+        (
+            measured_centre,
+            {
+                "marker": "o",
+                "ls": "",
+                "color": "C3",
+                "mfc": "none",
+            },
+        ),
     ):
         x, y, _ = MM_PER_M * points.T
         path.plot(y, x, ms=3, **style)

@@ -47,7 +47,10 @@ class TimeSeries:
 
 
 def read_cube_series(
-    source: BagSource, name: str | None, start_s: float, end_s: float
+    source: BagSource,
+    name: str | None,
+    start_s: float,
+    end_s: float,
 ) -> TimeSeries:
     """Read the frequencies of one cube from a bag, and compute the stress from them.
 
@@ -107,8 +110,16 @@ def draw_series(series: TimeSeries, title: str) -> Figure:
     """
     change_percent = 100 * (series.frequency / series.rest - 1)
     rows = series.rows
-    stress = zip(map(symbol, STRESS), 1e-3 * rows.stress.T, strict=True)
-    gradient = zip(map(symbol, GRADIENT), 1e-6 * rows.gradient.T, strict=True)
+    stress = zip(
+        map(symbol, STRESS),
+        1e-3 * rows.stress.T,
+        strict=True,
+    )
+    gradient = zip(
+        map(symbol, GRADIENT),
+        1e-6 * rows.gradient.T,
+        strict=True,
+    )
     figure = draw_panels(
         series.seconds,
         "time after the start of the bag / s",
@@ -127,6 +138,13 @@ def draw_series(series: TimeSeries, title: str) -> Figure:
             # The residual of an invalid row is NaN; its mark is drawn at zero.
             residual = np.nan_to_num(rows.residual[is_marked])
             seconds = series.seconds[is_marked]
-            bottom.plot(seconds, residual, marker, color="C3", ms=4, label=label)
+            bottom.plot(
+                seconds,
+                residual,
+                marker,
+                color="C3",
+                ms=4,
+                label=label,
+            )
     bottom.legend(loc="upper right", fontsize=7)
     return figure

@@ -42,7 +42,11 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
-def make_table(names: Iterable[str], numbers: Iterable[str], title: str = "") -> Table:
+def make_table(
+    names: Iterable[str],
+    numbers: Iterable[str],
+    title: str = "",
+) -> Table:
     """Make a table without rows, with left-justified columns and then right-justified columns.
 
     Args:
@@ -51,7 +55,12 @@ def make_table(names: Iterable[str], numbers: Iterable[str], title: str = "") ->
         title: Line above the table; empty: none.
     """
     # Without lines between the columns, most tables fit into 80 characters.
-    table = Table(title=title or None, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    table = Table(
+        title=title or None,
+        title_justify="left",
+        box=SIMPLE_HEAD,
+        pad_edge=False,
+    )
     for heading in names:
         table.add_column(heading, overflow="fold")
     for heading in numbers:
