@@ -148,7 +148,11 @@ def show_skin(bag: Bag, topic: str) -> None:
             gap_ms = f"{1e3 * summary.longest_gap:.1f}"
             cells = [f"{summary.rate:.1f}", str(summary.lost), str(summary.gaps), gap_ms]
         rows.append((cube.name, f"{cube.uid:#x}", str(summary.samples), *cells))
-    print_table(("cube", "uid"), ("samples", "Hz", "lost", "gaps", "longest gap / ms"), rows)
+    print_table(
+        ("cube", "uid"),
+        ("samples", "Hz", "lost", "gaps", "longest gap / ms"),
+        rows,
+    )
 
 
 def format_diagnostics(status: Any) -> str:

@@ -52,7 +52,13 @@ completely and 1 if it explains nothing.
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
     parser.add_text("port", "PORT", "device path, or socket://host:port")
-    parser.add_output("-o", "--output", kind="skin", required=True, help="skin file to write")
+    parser.add_output(
+        "-o",
+        "--output",
+        kind="skin",
+        required=True,
+        help="skin file to write",
+    )
     parser.add_argument("--name", default="skin", help="name of the skin (default: %(default)s)")
     parser.add_text(
         "--calibration",
@@ -188,7 +194,11 @@ def watch_rest(source: LinkSource) -> PadsAtRest:
     parts: list[tuple[np.ndarray, np.ndarray]] = []
     next_shown_s = 0.0
     console = Console(highlight=False)
-    with Live(console=console, transient=True, auto_refresh=False) as live:
+    with Live(
+        console=console,
+        transient=True,
+        auto_refresh=False,
+    ) as live:
         for rows in source:
             parts.append(split_into_scans(rows, len(source.skin.cubes)))
             _, first_times = parts[0]
@@ -303,7 +313,13 @@ def pad_table(rest: PadsAtRest, skin: Skin) -> Table:
         name = skin.names[cube] if pad == 0 else ""
         fault = pad_fault(rest, cube, pad)
         style = "red" if fault else ""
-        table.add_row(name, pads[pad], *numbers, fault or "ok", style=style)
+        table.add_row(
+            name,
+            pads[pad],
+            *numbers,
+            fault or "ok",
+            style=style,
+        )
     return table
 
 
@@ -321,7 +337,11 @@ def pad_fault(rest: PadsAtRest, cube: int, pad: int) -> str:
     return ""
 
 
-def show_explanation(name: str, explanation: Explanation, pads: Sequence[str]) -> None:
+def show_explanation(
+    name: str,
+    explanation: Explanation,
+    pads: Sequence[str],
+) -> None:
     """Print the rotation and the swapped pads of a cube, as found from the presses.
 
     Args:

@@ -16,8 +16,20 @@ from .parser import Parser, count, positive
 def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
     grid = parser.add_subcommand("grid", "write the skin file of a flat grid of cubes")
-    grid.add_number("--nx", count, "N", "cubes along x", required=True)
-    grid.add_number("--ny", count, "N", "cubes along y", required=True)
+    grid.add_number(
+        "--nx",
+        count,
+        "N",
+        "cubes along x",
+        required=True,
+    )
+    grid.add_number(
+        "--ny",
+        count,
+        "N",
+        "cubes along y",
+        required=True,
+    )
     grid.add_number(
         "--pitch",
         positive,
@@ -26,7 +38,11 @@ def add_arguments(parser: Parser) -> None:
         default=DEFAULT_PITCH,
     )
     grid.add_number(
-        "--links", count, "N", "hubs that share the cubes (default: %(default)s)", default=1
+        "--links",
+        count,
+        "N",
+        "hubs that share the cubes (default: %(default)s)",
+        default=1,
     )
     grid.add_rate()
     grid.add_argument("--name", default="skin", help="name of the skin (default: %(default)s)")
@@ -36,14 +52,23 @@ def add_arguments(parser: Parser) -> None:
         help="ports; {} is the number of the link (default: %(default)s)",
     )
     grid.add_text(
-        "--layout", "NAME", "layout of the cubes (default: %(default)s)", default="planar"
+        "--layout",
+        "NAME",
+        "layout of the cubes (default: %(default)s)",
+        default="planar",
     )
     grid.add_text(
         "--calibration",
         "FILE",
         "calibration file or name (default: that of the package for the layout)",
     )
-    grid.add_output("-o", "--output", kind="skin", required=True, help="skin file to write")
+    grid.add_output(
+        "-o",
+        "--output",
+        kind="skin",
+        required=True,
+        help="skin file to write",
+    )
     check = parser.add_subcommand("check", "list what is wrong with a skin file, or what it holds")
     check.add_path("file", "FILE", "skin file")
 

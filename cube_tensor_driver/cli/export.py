@@ -34,8 +34,19 @@ def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
     lerobot = parser.add_subcommand("lerobot", "one LeRobot data set (v3.0) of all bags")
     _add_common(lerobot)
-    lerobot.add_number("--fps", count, "N", "frames per second of the data set", required=True)
-    lerobot.add_text("--task", "TEXT", "what was done (default: %(default)s)", default="touch")
+    lerobot.add_number(
+        "--fps",
+        count,
+        "N",
+        "frames per second of the data set",
+        required=True,
+    )
+    lerobot.add_text(
+        "--task",
+        "TEXT",
+        "what was done (default: %(default)s)",
+        default="touch",
+    )
     lerobot.add_text(
         "--marks",
         "TOPIC",
@@ -65,7 +76,11 @@ def add_arguments(parser: Parser) -> None:
 def _add_common(parser: Parser) -> None:
     parser.add_bags()
     parser.add_output(
-        "-o", "--output", kind="folder", required=True, help="folder, empty or not there yet"
+        "-o",
+        "--output",
+        kind="folder",
+        required=True,
+        help="folder, empty or not there yet",
     )
     reprocess.add_overrides(parser)
 

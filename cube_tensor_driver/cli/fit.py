@@ -58,18 +58,35 @@ def add_arguments(parser: Parser) -> None:
         nargs="+",
     )
     parser.add_text(
-        "--symmetry", "G", "full, slab, mirrors or none (default: %(default)s)", default="full"
+        "--symmetry",
+        "G",
+        "full, slab, mirrors or none (default: %(default)s)",
+        default="full",
     )
     parser.add_output(
-        "-o", "--output", kind="yaml", required=True, help="calibration file to write"
+        "-o",
+        "--output",
+        kind="yaml",
+        required=True,
+        help="calibration file to write",
     )
     parser.add_text(
         "--base",
         "FILE",
         "calibration that gives beta, modulus and half side (default: the shipped one)",
     )
-    parser.add_number("--area", positive, "M2", "area that fx fy fz act on, square metres")
-    parser.add_number("--uid", uid, "UID", "uid of the only cube that the calibration is for")
+    parser.add_number(
+        "--area",
+        positive,
+        "M2",
+        "area that fx fy fz act on, square metres",
+    )
+    parser.add_number(
+        "--uid",
+        uid,
+        "UID",
+        "uid of the only cube that the calibration is for",
+    )
     parser.add_output(
         "--figure",
         kind="picture",
@@ -117,7 +134,12 @@ def run(options: argparse.Namespace) -> int:
     temperature = None if loads.temperature is None else loads.temperature[loaded]
     measured = measured_stress(base, loads.frequency[loaded], temperature)
     structure = find_structure(layout, options.symmetry)
-    result = fit(structure, loads.state[loaded], measured, base.noise)
+    result = fit(
+        structure,
+        loads.state[loaded],
+        measured,
+        base.noise,
+    )
 
     show_fit(result, f"rest frequencies {rest_source}")
     if options.json is not None:
@@ -188,7 +210,10 @@ def run_weight(options: argparse.Namespace) -> int:
     if model is not None and model.deviation is not None:
         rows = []
         for pad, values, deviations in zip(
-            calibration.layout.pads, model.response, model.deviation, strict=True
+            calibration.layout.pads,
+            model.response,
+            model.deviation,
+            strict=True,
         ):
             pairs = zip(values, deviations, strict=True)
             rows.append((pad, *(f"{value:+.3f} ± {sd:.2g}" for value, sd in pairs)))
@@ -210,7 +235,11 @@ def run_creep(options: argparse.Namespace) -> int:
     rows = []
     at_once, *later = (compute_step_reading(result.model, time) for time in (1.0, 600.0, 3600.0))
     for pad, load, *readings in zip(
-        calibration.layout.pads, result.load, at_once, *later, strict=True
+        calibration.layout.pads,
+        result.load,
+        at_once,
+        *later,
+        strict=True,
     ):
         growth = [f"{100 * (reading / readings[0] - 1):.2f}" for reading in readings[1:]]
         rows.append((pad, f"{load:.0f}", *growth))
@@ -220,7 +249,15 @@ def run_creep(options: argparse.Namespace) -> int:
         f"{100 * result.misfit:.2g} % of the load"
     )
     title = f"change of the {len(result.load)} pads' readings under a constant load, and after it"
-    save(draw_correction(title, result.seconds, result.before, result.after), options.figure)
+    save(
+        draw_correction(
+            title,
+            result.seconds,
+            result.before,
+            result.after,
+        ),
+        options.figure,
+    )
     write_result(options.output, calibration, f"--creep {options.creep.name}")
     return 0
 
@@ -254,7 +291,11 @@ def read_inputs(
     rest: Array | None
     if options.reference is not None:
         loads, base = read_recorded_loads(
-            options.loads, options.cube, options.reference, layout, options.area
+            options.loads,
+            options.cube,
+            options.reference,
+            layout,
+            options.area,
         )
         # Unloaded rows cannot be found in a bag, because a reference sensor never measures exactly
         # 0. Therefore the rest frequencies are those of the last tare during the recording.
@@ -307,7 +348,12 @@ def show_fit(result: Fit, remark: str) -> None:
     pads = result.structure.layout.pads
     gains = [
         (pad, f"{gain:.5f}", f"{deviation:.2g}")
-        for pad, gain, deviation in zip(pads, result.gain, result.gain_deviation, strict=True)
+        for pad, gain, deviation in zip(
+            pads,
+            result.gain,
+            result.gain_deviation,
+            strict=True,
+        )
     ]
     print_table(("pad",), ("gain", "standard deviation"), gains)
 

@@ -80,7 +80,12 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def show_layout(layout: Layout, symmetry: str, result: dict[str, Any], source: str) -> None:
+def show_layout(
+    layout: Layout,
+    symmetry: str,
+    result: dict[str, Any],
+    source: str,
+) -> None:
     """Print what the pads of a layout can measure: ranks, condition numbers and noise.
 
     Args:

@@ -172,7 +172,10 @@ def make_help_text() -> str:
         for name, text in commands.items():
             first = f"  {name}".ljust(indent)
             lines += textwrap.wrap(
-                text, width, initial_indent=first, subsequent_indent=" " * indent
+                text,
+                width,
+                initial_indent=first,
+                subsequent_indent=" " * indent,
             )
     last = (
         f"{PROGRAM} COMMAND --help explains a command, {PROGRAM} --version prints the version, "
@@ -210,6 +213,10 @@ def interrupt_again(lost: Any) -> None:
     """
     if lost.exc_type is KeyboardInterrupt:
         # A signal that is sent at once would arrive inside of this hook and be lost as well.
-        threading.Timer(RESEND_S, os.kill, (os.getpid(), signal.SIGINT)).start()
+        threading.Timer(
+            RESEND_S,
+            os.kill,
+            (os.getpid(), signal.SIGINT),
+        ).start()
     else:
         sys.__unraisablehook__(lost)

@@ -53,7 +53,12 @@ class Parser(argparse.ArgumentParser):
         self._flags += action.option_strings
         return action
 
-    def add_output(self, *flags: str, kind: str = "file", **settings: Any) -> None:
+    def add_output(
+        self,
+        *flags: str,
+        kind: str = "file",
+        **settings: Any,
+    ) -> None:
         """Add an option or argument that names a file or folder to write.
 
         Args:
@@ -68,7 +73,13 @@ class Parser(argparse.ArgumentParser):
         self._outputs.append(Output(flags[0], action.dest, kind))
         self.set_defaults(outputs=self._outputs)
 
-    def add_path(self, name: str, metavar: str, text: str, **settings: Any) -> None:
+    def add_path(
+        self,
+        name: str,
+        metavar: str,
+        text: str,
+        **settings: Any,
+    ) -> None:
         """Add an argument or option that names a file or folder to read.
 
         Args:
@@ -77,11 +88,28 @@ class Parser(argparse.ArgumentParser):
             text: Help text.
             settings: Further arguments of `add_argument`.
         """
-        self.add_argument(name, type=Path, metavar=metavar, help=text, **settings)
+        self.add_argument(
+            name,
+            type=Path,
+            metavar=metavar,
+            help=text,
+            **settings,
+        )
 
-    def add_text(self, name: str, metavar: str, text: str, **settings: Any) -> None:
+    def add_text(
+        self,
+        name: str,
+        metavar: str,
+        text: str,
+        **settings: Any,
+    ) -> None:
         """Add an argument or option whose value is a text; `add_path` describes the arguments."""
-        self.add_argument(name, metavar=metavar, help=text, **settings)
+        self.add_argument(
+            name,
+            metavar=metavar,
+            help=text,
+            **settings,
+        )
 
     def add_number(
         self,
@@ -100,7 +128,13 @@ class Parser(argparse.ArgumentParser):
             text: Help text.
             settings: Further arguments of `add_argument`.
         """
-        self.add_argument(name, type=kind, metavar=metavar, help=text, **settings)
+        self.add_argument(
+            name,
+            type=kind,
+            metavar=metavar,
+            help=text,
+            **settings,
+        )
 
     def add_switch(self, flag: str, text: str) -> None:
         """Add an option without a value, which is true if it is given; `text` is its help text."""
@@ -116,16 +150,30 @@ class Parser(argparse.ArgumentParser):
 
     def add_bags(self) -> None:
         """Add the argument BAG ..., several bags to read."""
-        self.add_path("bags", "BAG", "folders or files of bags", nargs="+")
+        self.add_path(
+            "bags",
+            "BAG",
+            "folders or files of bags",
+            nargs="+",
+        )
 
     def add_jobs(self) -> None:
         """Add the option --jobs N, the number of processes that work at the same time."""
-        self.add_number("--jobs", count, "N", "number of processes (default: one per core)")
+        self.add_number(
+            "--jobs",
+            count,
+            "N",
+            "number of processes (default: one per core)",
+        )
 
     def add_rate(self) -> None:
         """Add the option --rate HZ, the sample rate in a skin file."""
         self.add_number(
-            "--rate", sample_rate, "HZ", "samples per second (default: %(default)g)", default=100.0
+            "--rate",
+            sample_rate,
+            "HZ",
+            "samples per second (default: %(default)g)",
+            default=100.0,
         )
 
     def add_subcommand(self, name: str, text: str) -> Parser:
@@ -138,7 +186,11 @@ class Parser(argparse.ArgumentParser):
             text: Its line of help, without a capital letter and a full stop.
         """
         if self._subcommands is None:
-            self._subcommands = self.add_subparsers(dest="what", metavar="WHAT", required=True)
+            self._subcommands = self.add_subparsers(
+                dest="what",
+                metavar="WHAT",
+                required=True,
+            )
         added: Parser = self._subcommands.add_parser(name, help=text, description=sentence(text))
         return added
 

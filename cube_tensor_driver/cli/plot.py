@@ -30,7 +30,13 @@ def add_arguments(parser: Parser) -> None:
         dest="end",
         default=math.inf,
     )
-    parser.add_output("-o", "--output", kind="picture", required=True, help="picture to write")
+    parser.add_output(
+        "-o",
+        "--output",
+        kind="picture",
+        required=True,
+        help="picture to write",
+    )
 
 
 def run(options: argparse.Namespace) -> int:

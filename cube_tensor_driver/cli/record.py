@@ -34,7 +34,10 @@ def add_arguments(parser: Parser) -> None:
         default=RECORDED,
     )
     parser.add_number(
-        "--duration", positive, "S", "end S seconds after the first message (default: Ctrl-C)"
+        "--duration",
+        positive,
+        "S",
+        "end S seconds after the first message (default: Ctrl-C)",
     )
     parser.add_argument(
         "--storage",
@@ -42,8 +45,18 @@ def add_arguments(parser: Parser) -> None:
         default="mcap",
         help="format of the files (default: %(default)s)",
     )
-    parser.add_number("--split-size", positive, "MB", "begin a new file after MB megabytes")
-    parser.add_number("--split-time", positive, "S", "begin a new file after S seconds")
+    parser.add_number(
+        "--split-size",
+        positive,
+        "MB",
+        "begin a new file after MB megabytes",
+    )
+    parser.add_number(
+        "--split-time",
+        positive,
+        "S",
+        "begin a new file after S seconds",
+    )
 
 
 def run(options: argparse.Namespace) -> int:

@@ -33,7 +33,11 @@ def add_arguments(parser: Parser) -> None:
     """Add the options of the command."""
     parser.add_bag()
     parser.add_number(
-        "--rate", positive, "R", "times the recorded speed (default: %(default)g)", default=1.0
+        "--rate",
+        positive,
+        "R",
+        "times the recorded speed (default: %(default)g)",
+        default=1.0,
     )
     parser.add_switch("--loop", "begin again at the end")
     parser.add_number(

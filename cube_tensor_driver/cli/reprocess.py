@@ -91,7 +91,13 @@ def run(options: argparse.Namespace) -> int:
     from ..views.terminal.output import progress_bar
 
     overrides, contacts = read_overrides(options), read_contact_options(options)
-    jobs = make_jobs(options.bags, options.output, options.format, overrides, contacts)
+    jobs = make_jobs(
+        options.bags,
+        options.output,
+        options.format,
+        overrides,
+        contacts,
+    )
     write_recipe(options.output, jobs[0])
     # A bag whose result exists is skipped, so that an interrupted run can be continued.
     waiting = [job for job in jobs if not job.output.exists()]

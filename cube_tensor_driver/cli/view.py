@@ -50,4 +50,9 @@ def run(options: argparse.Namespace) -> int:
     # The module imports viser, which the other commands do not need.
     from ..browser.viewer import run_view
 
-    return run_view(options.host, options.port, options.depth, options.recordings.expanduser())
+    return run_view(
+        options.host,
+        options.port,
+        options.depth,
+        options.recordings.expanduser(),
+    )
